@@ -1,0 +1,195 @@
+"""One typed configuration for the nodes and the command line; defaults are the paper's.
+
+A section is a stage. Each field states its description and range once: here. The ROS parameters
+`section.field` are declared from this, and a YAML file is a ROS parameter file that also works
+with `deworldsg run --config`.
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Union
+
+import msgspec
+
+from deworldsg_ros.scene.errors import ConfigurationError
+
+
+def _number(description: str, **limits: float) -> msgspec.Meta:
+    return msgspec.Meta(description=description, **limits)
+
+
+class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Stage a: image → 2D scene graph and instance labels."""
+
+    detector: Annotated[str, _number("detector backend")] = "nanodet"
+    segmenter: Annotated[str, _number("box-conditioned segmenter backend")] = "rgbd"
+    relation_head: Annotated[str, _number("relation head backend")] = "geometric"
+    predicate_set: Annotated[
+        Literal["replica_ssg", "3dssg"],
+        _number("predicates of the graph: ReplicaSSG (Visual Genome, 50) or 3DSSG (7)"),
+    ] = "replica_ssg"
+    score_threshold: Annotated[
+        float,
+        _number(
+            "least detection score (the paper: 0.7); -1 = the backend's own default", ge=-1, le=1
+        ),
+    ] = -1.0
+    max_objects: Annotated[int, _number("most objects kept a frame, best first", ge=1, le=300)] = 50
+    top_relations: Annotated[int, _number("relations kept a frame", ge=0, le=1000)] = 10
+    threads: Annotated[int, _number("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
+
+
+class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Stage b: depth refinement and Gaussians (Eq. 1-4)."""
+
+    tau: Annotated[float, _number("relative tolerance to the local median, Eq. 1", ge=0, le=1)] = (
+        0.05
+    )
+    epsilon_m: Annotated[
+        float, _number("absolute tolerance to the local median, metres, Eq. 1", ge=0, le=1)
+    ] = 1e-3
+    gamma_base_m: Annotated[
+        float, _number("least separation of depth clusters, metres, Eq. 2", gt=0, le=10)
+    ] = 0.03
+    alpha: Annotated[float, _number("factor of the median depth step, Eq. 2", ge=0, le=1000)] = 10.0
+    beta: Annotated[float, _number("factor of the reference depth, Eq. 2", ge=0, le=1)] = 0.02
+    min_pixels: Annotated[
+        int, _number("valid pixels below which an object is no observation", ge=2, le=100000)
+    ] = 10
+    covariance_ridge_m2: Annotated[
+        float, _number("ridge of the covariance, square metres, Eq. 4", gt=0, le=1)
+    ] = 1e-6
+    surface_points: Annotated[
+        int, _number("surface points sampled an object and frame", ge=0, le=4096)
+    ] = 64
+
+
+class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Stage c: association and fusion (Eq. 5-7)."""
+
+    hellinger_threshold: Annotated[
+        float, _number("Hellinger distance below which nodes may merge, Eq. 6", gt=0, lt=1)
+    ] = 0.7
+    class_distance_threshold: Annotated[
+        float, _number("class distance below which nodes may merge, Eq. 6", gt=0, le=1)
+    ] = 0.8
+    surface_points: Annotated[int, _number("surface points kept a node", ge=0, le=100000)] = 512
+
+
+class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Stage d: pairing, world-model evidence and fusion (Eq. 8-10)."""
+
+    world_model: Annotated[str, _number("world model backend; none = visual evidence only")] = (
+        "none"
+    )
+    geo_cost_threshold: Annotated[
+        float, _number("geometric cost below which a pair is a neighbour, Eq. 8", gt=0, le=100)
+    ] = 0.45
+    clip_length: Annotated[int, _number("frames of a clip", ge=1, le=256)] = 16
+    entropy_threshold_nats: Annotated[
+        float, _number("visual entropy above which the prior enters, nats", ge=0, le=10)
+    ] = 1.0
+    fusion_alpha: Annotated[float, _number("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
+    queue_size: Annotated[
+        int, _number("clips that may wait for the world model", ge=1, le=4096)
+    ] = 32
+    seed: Annotated[int, _number("seed of the deterministic world model", ge=0)] = 0
+
+
+class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What comes in, and what is refused."""
+
+    transport: Annotated[
+        Literal["auto", "raw", "compressed"],
+        _number("Image or CompressedImage topics; auto = whichever is published"),
+    ] = "auto"
+    reliability: Annotated[
+        Literal["auto", "reliable", "best_effort"],
+        _number("QoS of the image topics; auto = reliable where every publisher offers it"),
+    ] = "auto"
+    pose_source: Annotated[
+        Literal["auto", "pose", "odometry", "tf"],
+        _number("PoseStamped, Odometry or TF; auto = what is published on camera/pose"),
+    ] = "auto"
+    world_frame: Annotated[
+        str, _number("world frame that poses must have; empty = that of the first pose")
+    ] = ""
+    world_up: Annotated[
+        Literal["z", "y", "-y", "unknown"],
+        _number("axis of the world frame that points up, for the geometric relation head"),
+    ] = "z"
+    slop_s: Annotated[
+        float, _number("most difference of the stamps of RGB and depth, seconds", ge=0, le=1)
+    ] = 0.02
+    pose_slop_s: Annotated[
+        float, _number("most time between an image and the nearest pose, seconds", ge=0, le=10)
+    ] = 0.1
+    max_step_m: Annotated[
+        float, _number("camera movement between frames above which it is a jump, metres", gt=0)
+    ] = 1.0
+    depth_scale: Annotated[
+        float, _number("metres of one unit of a 16UC1 depth image", gt=0, le=1)
+    ] = 0.001
+    max_depth_m: Annotated[float, _number("depth beyond which is invalid, metres", gt=0)] = 10.0
+
+
+class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What goes out on /scene_graph."""
+
+    rate_hz: Annotated[float, _number("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
+    top_k: Annotated[int, _number("classes or predicates told a node or edge", ge=1, le=1000)] = 5
+    min_observations: Annotated[
+        int, _number("frames in which a node was seen before it is published", ge=1, le=1000)
+    ] = 1
+    surface_points: Annotated[
+        bool, _number("surface points of each node in /scene_graph (large)")
+    ] = False
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole configuration."""
+
+    inputs: InputsConfig = InputsConfig()
+    perception: PerceptionConfig = PerceptionConfig()
+    lifting: LiftingConfig = LiftingConfig()
+    merging: MergingConfig = MergingConfig()
+    relations: RelationsConfig = RelationsConfig()
+    output: OutputConfig = OutputConfig()
+
+
+def load_config(path: Union[str, Path]) -> Config:
+    """Read a ROS parameter file, or the bare sections.
+
+    Raises:
+        ConfigurationError: with the file, the field, what was seen and what was wanted.
+    """
+    try:
+        content = msgspec.yaml.decode(Path(path).read_bytes())
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ConfigurationError(f"configuration {path}: {error}") from error
+    for key in ("/**", "ros__parameters"):
+        if isinstance(content, dict) and key in content:
+            content = content[key]
+    content = {} if content is None else content
+    if isinstance(content, dict):
+        content.pop("use_sim_time", None)
+    return from_mapping(content, str(path))
+
+
+def from_mapping(content: Any, source: str = "configuration") -> Config:
+    """Validate nested plain values into a Config; raises ConfigurationError."""
+    try:
+        return msgspec.convert(content, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"{source}: {error}") from error
+
+
+def to_mapping(config: Config) -> dict[str, Any]:
+    """Nested plain values of a configuration, as they stand in a file."""
+    mapping: dict[str, Any] = msgspec.to_builtins(config)
+    return mapping
+
+
+def to_yaml(config: Config) -> str:
+    """ROS parameter file of a configuration."""
+    content = {"/**": {"ros__parameters": to_mapping(config)}}
+    return msgspec.yaml.encode(content).decode()

@@ -1,0 +1,1 @@
+"""The nouns: cameras and frames, Gaussians, frame graphs, the global graph, messages, errors."""

@@ -1,0 +1,177 @@
+"""Pinhole intrinsics, rigid poses and posed RGB-D frames.
+
+Poses are 4x4 float64 matrices named `T_target_source`: they take points of the source frame into
+the target frame. The camera frame is the optical one: x right, y down, z forward. Pixel centres
+are at integers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.errors import RefusedInput
+
+Float64 = NDArray[np.float64]
+
+# A rotation whose R Rᵀ differs from the identity by more than this is not a rotation.
+ROTATION_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole intrinsics of a rectified image, in pixels.
+
+    Raises:
+        RefusedInput: ``invalid_intrinsics`` for non-finite values, focal lengths or sizes <= 0.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        values = (self.fx, self.fy, self.cx, self.cy)
+        if not all(math.isfinite(value) for value in values) or self.fx <= 0 or self.fy <= 0:
+            raise RefusedInput(
+                "invalid_intrinsics",
+                f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: "
+                "wanted finite values with fx > 0 and fy > 0 (is the camera calibrated?)",
+            )
+        if self.width <= 0 or self.height <= 0:
+            raise RefusedInput(
+                "invalid_intrinsics", f"image size {self.width}x{self.height}: wanted > 0"
+            )
+
+    @property
+    def matrix(self) -> Float64:
+        """K, (3, 3) float64."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class RgbdFrame:
+    """One registered RGB-D image with its pose; checked once, here.
+
+    Attributes:
+        stamp_ns: time of the RGB image, nanoseconds.
+        rgb: (H, W, 3) uint8, RGB order.
+        depth_m: (H, W) float32, metres along the optical axis; 0 = invalid.
+        intrinsics: of both images.
+        T_world_camera: (4, 4) float64, camera optical frame to world.
+        frame_id: name of the world frame.
+
+    Raises:
+        RefusedInput: ``grid_mismatch`` where the sizes differ, ``invalid_pose`` for a bad pose.
+    """
+
+    stamp_ns: int
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    frame_id: str = "world"
+
+    def __post_init__(self) -> None:
+        grid = (self.intrinsics.height, self.intrinsics.width)
+        if self.rgb.shape != (*grid, 3) or self.depth_m.shape != grid:
+            raise RefusedInput(
+                "grid_mismatch",
+                f"RGB is {_size(self.rgb)}, depth {_size(self.depth_m)}, camera_info "
+                f"{grid[1]}x{grid[0]}: wanted one size (is depth registered to RGB?)",
+            )
+        check_pose(self.T_world_camera)
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}" if image.ndim >= 2 else f"of shape {image.shape}"
+
+
+def check_pose(T: Float64) -> None:
+    """Refuse what is not a rigid transform: ``invalid_pose``."""
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise RefusedInput("invalid_pose", f"pose {T.tolist()}: wanted a finite 4x4 matrix")
+    rotation = T[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+        raise RefusedInput(
+            "invalid_pose",
+            f"pose rotation is off orthonormal by {error:.2g} (determinant "
+            f"{np.linalg.det(rotation):.3f}): wanted a right-handed rotation",
+        )
+
+
+def pose_from_quaternion(translation_m: Float64, quat_xyzw: Float64) -> Float64:
+    """Rigid transform from a translation (3,) in metres and a quaternion (4,) x, y, z, w.
+
+    Raises:
+        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion that is not near unit.
+    """
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    translation = np.asarray(translation_m, dtype=np.float64)
+    norm = float(np.linalg.norm(quat))
+    if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
+        raise RefusedInput(
+            "invalid_pose",
+            f"pose position {translation.tolist()}, orientation {quat.tolist()}: wanted finite",
+        )
+    if abs(norm - 1.0) > 1e-2:
+        raise RefusedInput(
+            "invalid_pose", f"orientation {quat.tolist()} has norm {norm:.4f}: wanted 1"
+        )
+    x, y, z, w = quat / norm
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = translation
+    return T
+
+
+def quaternion_from_rotation(rotation: Float64) -> Float64:
+    """Unit quaternion (4,) x, y, z, w with w >= 0 of a rotation matrix (3, 3)."""
+    # The eigenvector form of Bar-Itzhack has no special cases.
+    r = rotation
+    k = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
+            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
+            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], np.trace(r)],
+        ]
+    )
+    quat = np.linalg.eigh(k / 3.0)[1][:, -1]
+    return np.asarray(-quat if quat[3] < 0 else quat)
+
+
+def invert_pose(T: Float64) -> Float64:
+    """Inverse of a rigid transform (4, 4)."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T[:3, :3].T
+    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return inverse
+
+
+def interpolate_pose(T_a: Float64, T_b: Float64, fraction: float) -> Float64:
+    """Pose between two poses: linear in translation, spherical in rotation; 0 gives T_a."""
+    quat_a = quaternion_from_rotation(T_a[:3, :3])
+    quat_b = quaternion_from_rotation(T_b[:3, :3])
+    dot = float(quat_a @ quat_b)
+    if dot < 0:
+        quat_b, dot = -quat_b, -dot
+    angle = math.acos(min(dot, 1.0))
+    if angle < 1e-6:
+        quat = (1 - fraction) * quat_a + fraction * quat_b
+    else:
+        quat = math.sin((1 - fraction) * angle) * quat_a + math.sin(fraction * angle) * quat_b
+    translation = (1 - fraction) * T_a[:3, 3] + fraction * T_b[:3, 3]
+    return pose_from_quaternion(translation, quat / np.linalg.norm(quat))

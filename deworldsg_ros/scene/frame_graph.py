@@ -1,0 +1,213 @@
+"""What one frame saw: in the image (FrameGraph), and lifted into the world (LocalGraph)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Names of the classes and of the predicates, in the order of the distributions."""
+
+    classes: tuple[str, ...]
+    predicates: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Relations:
+    """Visual relation logits of ordered pairs of one frame's objects (m pairs, R predicates).
+
+    Attributes:
+        pairs: (m, 2) int64, subject and object, rows of the frame's objects, subject != object.
+        logits: (m, R) float64, pre-sigmoid.
+        scores: (m,) float64 in [0, 1], the pair scores by which the best were kept.
+    """
+
+    pairs: Int64
+    logits: Float64
+    scores: Float64
+
+    def __post_init__(self) -> None:
+        count = len(self.pairs)
+        _check("relation pairs", self.pairs, (count, 2))
+        _check("relation logits", self.logits, (count, self.logits.shape[-1]))
+        _check("relation scores", self.scores, (count,))
+        if (self.pairs[:, 0] == self.pairs[:, 1]).any():
+            raise ValueError("relation pairs: an object cannot be related to itself")
+
+    @staticmethod
+    def none(predicate_count: int) -> Relations:
+        """No relations."""
+        return Relations(np.zeros((0, 2), np.int64), np.zeros((0, predicate_count)), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class FrameGraph:
+    """The 2D scene graph of one frame (n objects, C classes), best score first.
+
+    Attributes:
+        stamp_ns: time of the image.
+        frame_id: camera optical frame.
+        width, height: image size in pixels.
+        vocabulary: names of classes and predicates.
+        boxes_xyxy: (n, 4) float64 pixels, corners x1, y1, x2, y2, inside the image.
+        class_probabilities: (n, C) float64, calibrated, rows sum to one.
+        scores: (n,) float64, the detector's own score.
+        relations: visual relations between rows.
+
+    The k-th object (from 0) has the value k + 1 in the frame's instance image, (H, W) uint16.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    width: int
+    height: int
+    vocabulary: Vocabulary
+    boxes_xyxy: Float64
+    class_probabilities: Float64
+    scores: Float64
+    relations: Relations
+
+    def __post_init__(self) -> None:
+        count = len(self.boxes_xyxy)
+        _check("boxes", self.boxes_xyxy, (count, 4))
+        _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
+        _check_relations(count, self.vocabulary, self.relations)
+
+    def __len__(self) -> int:
+        return len(self.boxes_xyxy)
+
+
+@dataclass(frozen=True)
+class LocalGraph:
+    """The local 3D scene graph of one frame, world frame (n lifted objects).
+
+    Attributes:
+        stamp_ns: time of the image.
+        frame_id: world frame of means, covariances and surface points.
+        width, height: image size in pixels.
+        T_world_camera: (4, 4) float64 pose that lifted it.
+        vocabulary: names of classes and predicates.
+        instance_ids: (n,) int64, value of the object in the frame's instance image (from 1).
+        boxes_xyxy: (n, 4) float64 pixels.
+        class_probabilities: (n, C) float64, rows sum to one.
+        scores: (n,) float64.
+        means_world: (n, 3) float64, metres (Eq. 4).
+        covariances_world: (n, 3, 3) float64, square metres (Eq. 4).
+        depths_m: (n,) float64, mean depth of the inliers in the camera frame (z of Eq. 8).
+        pixel_counts: (n,) int64, number of refined inlier pixels.
+        surface_points_world: n arrays (k, 3) float32, a deterministic sample of the inliers.
+        relations: visual relations between rows.
+        drops: number of objects not lifted, by reason.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    width: int
+    height: int
+    T_world_camera: Float64
+    vocabulary: Vocabulary
+    instance_ids: Int64
+    boxes_xyxy: Float64
+    class_probabilities: Float64
+    scores: Float64
+    means_world: Float64
+    covariances_world: Float64
+    depths_m: Float64
+    pixel_counts: Int64
+    surface_points_world: tuple[NDArray[np.float32], ...]
+    relations: Relations
+    drops: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.means_world)
+        _check("means", self.means_world, (count, 3))
+        _check("covariances", self.covariances_world, (count, 3, 3))
+        _check("boxes", self.boxes_xyxy, (count, 4))
+        _check("depths", self.depths_m, (count,))
+        _check("instance ids", self.instance_ids, (count,))
+        _check("pixel counts", self.pixel_counts, (count,))
+        if len(self.surface_points_world) != count:
+            raise ValueError(f"{len(self.surface_points_world)} point sets for {count} objects")
+        for row, points in enumerate(self.surface_points_world):
+            _check(f"surface points of object {row}", points, (len(points), 3))
+        _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
+        _check_relations(count, self.vocabulary, self.relations)
+
+    def __len__(self) -> int:
+        return len(self.means_world)
+
+
+def _check(name: str, array: NDArray[np.generic], shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise ValueError(f"{name} have shape {array.shape}: wanted {shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} hold NaN or infinity: wanted finite values")
+
+
+def _check_objects(
+    count: int, vocabulary: Vocabulary, class_probabilities: Float64, scores: Float64
+) -> None:
+    _check("class probabilities", class_probabilities, (count, len(vocabulary.classes)))
+    _check("scores", scores, (count,))
+    if count and not np.allclose(class_probabilities.sum(axis=1), 1.0, atol=1e-6):
+        worst = class_probabilities.sum(axis=1)
+        raise ValueError(
+            f"class probabilities sum to {worst[np.abs(worst - 1).argmax()]:.6f}: wanted 1"
+        )
+
+
+def _check_relations(count: int, vocabulary: Vocabulary, relations: Relations) -> None:
+    if relations.logits.shape[1] != len(vocabulary.predicates):
+        raise ValueError(
+            f"relation logits have {relations.logits.shape[1]} predicates: "
+            f"wanted {len(vocabulary.predicates)}"
+        )
+    if len(relations.pairs) and (relations.pairs.min() < 0 or relations.pairs.max() >= count):
+        raise ValueError(f"a relation names object {relations.pairs.max()} of {count}")
+
+
+@dataclass(frozen=True)
+class RelationEvidence:
+    """Geometric neighbours of one frame (Eq. 8) and what a world model says of some of them.
+
+    Attributes:
+        stamp_ns: frame whose local graph the pairs refer to.
+        vocabulary: names of classes and predicates.
+        pairs: (m, 2) int64 ordered pairs, subject and object, rows of that local graph.
+        pair_classes: (m, 2) int64, arg-max classes of subject and object in that frame.
+        geo_costs: (m,) float64, the cost of Eq. 8.
+        predictions: (m, R) float64, the probe's distribution of each pair; a row of NaN where no
+            clip was encoded (yet).
+        source: name of the world model, ``none`` where there is none.
+    """
+
+    stamp_ns: int
+    vocabulary: Vocabulary
+    pairs: Int64
+    pair_classes: Int64
+    geo_costs: Float64
+    predictions: Float64
+    source: str
+
+    def __post_init__(self) -> None:
+        count = len(self.pairs)
+        _check("evidence pairs", self.pairs, (count, 2))
+        _check("evidence pair classes", self.pair_classes, (count, 2))
+        _check("geometric costs", self.geo_costs, (count,))
+        if self.predictions.shape != (count, len(self.vocabulary.predicates)):
+            raise ValueError(
+                f"predictions have shape {self.predictions.shape}: "
+                f"wanted {(count, len(self.vocabulary.predicates))}"
+            )
+
+    @property
+    def predicted(self) -> NDArray[np.bool_]:
+        """(m,) bool: rows that carry a prediction."""
+        return ~np.isnan(self.predictions).any(axis=1)

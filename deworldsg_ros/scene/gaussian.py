@@ -1,0 +1,82 @@
+"""Batches of 3D Gaussians: moments, change of frame, Hellinger distance, fusion.
+
+Leading dimensions broadcast: means are (..., 3) in metres, covariances (..., 3, 3) in square
+metres, all float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+
+
+def moments(points_xyz: Float64, ridge_m2: float) -> tuple[Float64, Float64]:
+    """Sample mean and covariance with a ridge (Eq. 4).
+
+    Args:
+        points_xyz: (N, 3) points in any frame, metres, N >= 2.
+        ridge_m2: the ε of εI, square metres.
+
+    Returns:
+        mean (3,) and covariance (3, 3) with N - 1 in the denominator.
+    """
+    points = np.asarray(points_xyz, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+        raise ValueError(f"points of shape {points.shape}: wanted (N, 3) with N >= 2")
+    mean = points.mean(axis=0)
+    centred = points - mean
+    return mean, centred.T @ centred / (len(points) - 1) + ridge_m2 * np.eye(3)
+
+
+def transform(means: Float64, covariances: Float64, T: Float64) -> tuple[Float64, Float64]:
+    """Gaussians under a rigid transform (4, 4): μ → Rμ + t, Σ → RΣRᵀ."""
+    rotation = T[:3, :3]
+    moved = rotation @ covariances @ rotation.T
+    # Rounding must not make a covariance asymmetric.
+    return means @ rotation.T + T[:3, 3], (moved + np.swapaxes(moved, -1, -2)) / 2
+
+
+def bhattacharyya_distance(
+    mean_a: Float64, covariance_a: Float64, mean_b: Float64, covariance_b: Float64
+) -> Float64:
+    """BD = dᵀS⁻¹d / 8 + ½ ln(|S| / √(|A||B|)), S = (A + B) / 2; clamped at >= 0.
+
+    The clamp is part of the definition here: for two equal Gaussians rounding gives a tiny
+    negative value, and the square root in the Hellinger distance would give NaN.
+    """
+    mixed = (covariance_a + covariance_b) / 2
+    difference = mean_a - mean_b
+    solved = np.linalg.solve(mixed, difference[..., None])[..., 0]
+    mahalanobis = np.sum(difference * solved, axis=-1)
+    log_ratio = (
+        np.linalg.slogdet(mixed)[1]
+        - (np.linalg.slogdet(covariance_a)[1] + np.linalg.slogdet(covariance_b)[1]) / 2
+    )
+    return np.maximum(mahalanobis / 8 + log_ratio / 2, 0.0)
+
+
+def hellinger_distance(
+    mean_a: Float64, covariance_a: Float64, mean_b: Float64, covariance_b: Float64
+) -> Float64:
+    """HD = √(1 - exp(-BD)), in [0, 1] (the distance of Eq. 6)."""
+    return np.sqrt(-np.expm1(-bhattacharyya_distance(mean_a, covariance_a, mean_b, covariance_b)))
+
+
+def fuse(
+    weight_i: float,
+    mean_i: Float64,
+    covariance_i: Float64,
+    weight_j: float,
+    mean_j: Float64,
+    covariance_j: Float64,
+) -> tuple[Float64, Float64]:
+    """Moment-preserving fusion of two weighted Gaussians (Eq. 7)."""
+    total = weight_i + weight_j
+    difference = mean_i - mean_j
+    mean = (weight_i * mean_i + weight_j * mean_j) / total
+    covariance = (weight_i * covariance_i + weight_j * covariance_j) / total + (
+        weight_i * weight_j / total**2
+    ) * np.outer(difference, difference)
+    return mean, covariance
