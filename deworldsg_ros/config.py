@@ -13,7 +13,7 @@ import msgspec
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
-def _number(description: str, **limits: float) -> msgspec.Meta:
+def _number(description: str, **limits: Any) -> Any:
     return msgspec.Meta(description=description, **limits)
 
 
@@ -114,9 +114,9 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str, _number("world frame that poses must have; empty = that of the first pose")
     ] = ""
     world_up: Annotated[
-        Literal["z", "y", "-y", "unknown"],
-        _number("axis of the world frame that points up, for the geometric relation head"),
-    ] = "z"
+        Literal["auto", "z", "y", "-y"],
+        _number("axis of the world frame that points up; auto = z if the poses agree, else theirs"),
+    ] = "auto"
     slop_s: Annotated[
         float, _number("most difference of the stamps of RGB and depth, seconds", ge=0, le=1)
     ] = 0.02

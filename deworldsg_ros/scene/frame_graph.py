@@ -210,4 +210,4 @@ class RelationEvidence:
     @property
     def predicted(self) -> NDArray[np.bool_]:
         """(m,) bool: rows that carry a prediction."""
-        return ~np.isnan(self.predictions).any(axis=1)
+        return np.asarray(~np.isnan(self.predictions).any(axis=1))

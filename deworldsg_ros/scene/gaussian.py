@@ -54,7 +54,7 @@ def bhattacharyya_distance(
         np.linalg.slogdet(mixed)[1]
         - (np.linalg.slogdet(covariance_a)[1] + np.linalg.slogdet(covariance_b)[1]) / 2
     )
-    return np.maximum(mahalanobis / 8 + log_ratio / 2, 0.0)
+    return np.asarray(np.maximum(mahalanobis / 8 + log_ratio / 2, 0.0))
 
 
 def hellinger_distance(
