@@ -1,0 +1,52 @@
+"""Stage d: neighbour pairs (Eq. 8), clips, world models, evidence and fusion (Eq. 9-10)."""
+
+from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip
+from deworldsg_ros.relations.clips import FrameBuffer, crop_clip, union_box
+from deworldsg_ros.relations.evidence import (
+    ClassPairPrior,
+    FusedEdge,
+    FusedEdges,
+    choose_directions,
+    entropy_nats,
+    fuse_distributions,
+    fuse_edge,
+    fuse_edges,
+    visual_distribution,
+)
+from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
+from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
+from deworldsg_ros.relations.worker import EvidenceWorker
+from deworldsg_ros.relations.world_model import (
+    ClipRequest,
+    PairContext,
+    WorldModel,
+    build_world_model,
+    world_model_names,
+)
+
+__all__ = [
+    "ClassPairPrior",
+    "ClipQueue",
+    "ClipRequest",
+    "EvidenceWorker",
+    "FrameBuffer",
+    "FusedEdge",
+    "FusedEdges",
+    "PairContext",
+    "QueuedClip",
+    "RelationCounters",
+    "RelationReasoner",
+    "WorldModel",
+    "build_world_model",
+    "choose_directions",
+    "crop_clip",
+    "entropy_nats",
+    "fuse_distributions",
+    "fuse_edge",
+    "fuse_edges",
+    "geometric_costs",
+    "neighbour_pairs",
+    "union_box",
+    "visual_distribution",
+    "world_model_names",
+]

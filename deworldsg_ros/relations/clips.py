@@ -1,0 +1,114 @@
+"""Clips of object pairs: the last frames, cropped to the pair's union box.
+
+Frames are kept by reference and cropped only when a clip is encoded, so that a pair that is never
+encoded costs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right, insort
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64 = NDArray[np.float64]
+Rgb = NDArray[np.uint8]
+CropBox = tuple[int, int, int, int]
+
+
+class FrameBuffer:
+    """The last frames of the RGB stream, ordered by stamp; bounded, by reference.
+
+    Images that are added must not be changed afterwards. Images of another size than the stored
+    ones replace them: the camera has changed, and a clip cannot mix the two.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        if capacity < 1:
+            raise ValueError(f"frame buffer of {capacity} frames: wanted at least 1")
+        self.capacity = capacity
+        self._stamps_ns: list[int] = []
+        self._images: dict[int, Rgb] = {}
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    def add(self, stamp_ns: int, rgb: Rgb) -> None:
+        """Keep one image, (H, W, 3) uint8; the oldest leaves where there is no room.
+
+        An image whose stamp is already here, or is older than all of a full buffer, is ignored.
+        """
+        if stamp_ns in self._images:
+            return
+        if self._stamps_ns and self._images[self._stamps_ns[-1]].shape != rgb.shape:
+            self.clear()
+        insort(self._stamps_ns, stamp_ns)
+        self._images[stamp_ns] = rgb
+        if len(self._stamps_ns) > self.capacity:
+            del self._images[self._stamps_ns.pop(0)]
+
+    def window(self, stamp_ns: int, length: int) -> tuple[int, ...]:
+        """Stamps of the at most `length` consecutive frames that end with this one.
+
+        Empty where the frame with this stamp is not here.
+        """
+        if stamp_ns not in self._images:
+            return ()
+        end = bisect_right(self._stamps_ns, stamp_ns)
+        return tuple(self._stamps_ns[max(0, end - length) : end])
+
+    def images(self, stamps_ns: Sequence[int]) -> list[Rgb] | None:
+        """The images with these stamps; None where one of them has left the buffer."""
+        if not all(stamp_ns in self._images for stamp_ns in stamps_ns):
+            return None
+        return [self._images[stamp_ns] for stamp_ns in stamps_ns]
+
+    def clear(self) -> None:
+        """Forget every frame."""
+        self._stamps_ns.clear()
+        self._images.clear()
+
+
+def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int) -> CropBox:
+    """Smallest box of whole pixels around two boxes, clipped to the image.
+
+    Args:
+        box_a_xyxy: (4,) float64 pixels.
+        box_b_xyxy: likewise.
+        width: image width in pixels.
+        height: image height in pixels.
+
+    Returns:
+        x1, y1, x2, y2 with the far edges exclusive; at least one pixel wide and high, even where
+        the boxes lie outside of the image.
+    """
+    x1 = min(max(math.floor(min(box_a_xyxy[0], box_b_xyxy[0])), 0), width - 1)
+    y1 = min(max(math.floor(min(box_a_xyxy[1], box_b_xyxy[1])), 0), height - 1)
+    x2 = max(min(math.ceil(max(box_a_xyxy[2], box_b_xyxy[2])), width), x1 + 1)
+    y2 = max(min(math.ceil(max(box_a_xyxy[3], box_b_xyxy[3])), height), y1 + 1)
+    return x1, y1, x2, y2
+
+
+def crop_clip(images: Sequence[Rgb], crop_xyxy: CropBox, length: int) -> Rgb:
+    """Clip of fixed length out of the frames up to the last reliable one.
+
+    Args:
+        images: 1 to `length` images (H, W, 3) uint8, oldest first; the last is the most recent
+            frame in which both objects were seen.
+        crop_xyxy: box of whole pixels in those images, far edges exclusive.
+        length: T, frames of the clip; where there are fewer images the last is repeated at the
+            end.
+
+    Returns:
+        (T, h, w, 3) uint8, a copy.
+    """
+    if not 1 <= len(images) <= length:
+        raise ValueError(f"clip of {len(images)} frames: wanted 1 to {length}")
+    x1, y1, x2, y2 = crop_xyxy
+    clip = np.empty((length, y2 - y1, x2 - x1, 3), np.uint8)
+    for row, image in enumerate(images):
+        clip[row] = image[y1:y2, x1:x2]
+    clip[len(images) :] = clip[len(images) - 1]
+    return clip

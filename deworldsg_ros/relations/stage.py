@@ -1,0 +1,272 @@
+"""Stage d on a stream of frames: pairs at once, predictions when there is time for them."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip
+from deworldsg_ros.relations.clips import FrameBuffer, Rgb, crop_clip, union_box
+from deworldsg_ros.relations.pairing import neighbour_pairs
+from deworldsg_ros.relations.prior import SUM_TOLERANCE
+from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+# Frames kept, in clip lengths: a clip stays encodable while one more clip length of frames comes.
+BUFFERED_CLIP_LENGTHS = 2
+
+
+@dataclass(frozen=True)
+class RelationCounters:
+    """What became of the clips so far.
+
+    Attributes:
+        queued: clips that were put into the queue.
+        pending: clips that wait now.
+        encoded: clips that the world model answered.
+        dropped: clips lost, by reason: ``queue_full`` (a better one took its place), ``stale``
+            (its frames had left the buffer), ``world_model_error`` (the model failed on it),
+            ``cleared`` (by a reset or at the end), and ``no_frame`` (never queued, because the
+            frame's image did not come or came too late).
+    """
+
+    queued: int
+    pending: int
+    encoded: int
+    dropped: dict[str, int]
+
+
+class RelationReasoner:
+    """Finds neighbour pairs (Eq. 8) and has the world model look at their clips.
+
+    `observe` and `add_frame` never wait for the world model; `work` may be called in another
+    thread. A world model that fails costs its clip and nothing else.
+
+    Args:
+        config: section ``relations`` of the configuration.
+        world_model: None for neighbour pairs alone; then no image is kept and no clip queued.
+        report: told each new failure of the world model in one sentence; default: the log.
+
+    Raises:
+        ConfigurationError: where the model wants clips of another length than configured.
+    """
+
+    def __init__(
+        self,
+        config: RelationsConfig,
+        world_model: WorldModel | None,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
+        if world_model is not None and world_model.clip_length != config.clip_length:
+            raise ConfigurationError(
+                f"relations.clip_length is {config.clip_length}: world model "
+                f"'{world_model.name}' wants clips of {world_model.clip_length} frames"
+            )
+        self.source = "none" if world_model is None else world_model.name
+        self._config = config
+        self._world_model = world_model
+        self._report = logging.getLogger(__name__).warning if report is None else report
+        self._reported = ""
+        self._lock = threading.Lock()
+        self._frames = FrameBuffer(BUFFERED_CLIP_LENGTHS * config.clip_length)
+        self._queue = ClipQueue(config.queue_size)
+        self._queued = 0
+        self._encoded = 0
+        self._dropped: Counter[str] = Counter()
+
+    def add_frame(self, stamp_ns: int, rgb: Rgb) -> None:
+        """Keep an image, (H, W, 3) uint8, for clips; it must not be changed afterwards.
+
+        For images that come before their local graph, or without one.
+        """
+        if self._world_model is not None:
+            with self._lock:
+                self._frames.add(stamp_ns, rgb)
+
+    def observe(self, local: LocalGraph, rgb: Rgb | None = None) -> RelationEvidence:
+        """Neighbour pairs of a frame (Eq. 8); their clips are queued.
+
+        Args:
+            local: the frame's local graph.
+            rgb: its image; None where `add_frame` was given it.
+
+        Returns:
+            both directions of every neighbour pair, without predictions.
+        """
+        pairs, costs = neighbour_pairs(
+            local.boxes_xyxy,
+            local.depths_m,
+            local.width,
+            local.height,
+            self._config.geo_cost_threshold,
+        )
+        classes = local.class_probabilities.argmax(axis=1).astype(np.int64)[pairs].reshape(-1, 2)
+        if self._world_model is not None:
+            self._queue_clips(local, rgb, pairs, classes, costs)
+        return RelationEvidence(
+            stamp_ns=local.stamp_ns,
+            vocabulary=local.vocabulary,
+            pairs=pairs,
+            pair_classes=classes,
+            geo_costs=costs,
+            predictions=np.full((len(pairs), len(local.vocabulary.predicates)), np.nan),
+            source=self.source,
+        )
+
+    def work(self) -> RelationEvidence | None:
+        """Encode the first queued clip that can be; None when the queue is empty.
+
+        Returns:
+            the predictions of both directions of its pair, rows of the local graph with that
+            stamp.
+        """
+        while True:
+            with self._lock:
+                item = self._queue.pop()
+                if item is None:
+                    return None
+                images = self._frames.images(item.frame_stamps_ns)
+                if images is None:
+                    self._dropped["stale"] += 1
+                    continue
+            # The model takes its time: outside of the lock.
+            evidence = self._encode(item, images)
+            with self._lock:
+                if evidence is None:
+                    self._dropped["world_model_error"] += 1
+                    continue
+                self._encoded += 1
+            return evidence
+
+    def drain(self) -> list[RelationEvidence]:
+        """Encode everything that is queued, first to last.
+
+        After each `observe`, this makes a run in one thread deterministic.
+        """
+        return list(iter(self.work, None))
+
+    def clear(self) -> None:
+        """Forget images and queued clips: time has jumped, or the end has come."""
+        with self._lock:
+            count = self._queue.clear()
+            self._frames.clear()
+            if count:
+                self._dropped["cleared"] += count
+
+    @property
+    def pending(self) -> int:
+        """Number of clips that wait."""
+        with self._lock:
+            return len(self._queue)
+
+    def counters(self) -> RelationCounters:
+        """What became of the clips so far."""
+        with self._lock:
+            return RelationCounters(
+                self._queued, len(self._queue), self._encoded, dict(self._dropped)
+            )
+
+    def _queue_clips(
+        self, local: LocalGraph, rgb: Rgb | None, pairs: Int64, classes: Int64, costs: Float64
+    ) -> None:
+        # One clip serves both directions.
+        once = np.flatnonzero(pairs[:, 0] < pairs[:, 1])
+        with self._lock:
+            if rgb is not None:
+                self._frames.add(local.stamp_ns, rgb)
+            stamps_ns = self._frames.window(local.stamp_ns, self._config.clip_length)
+            if not stamps_ns:
+                if len(once):
+                    self._dropped["no_frame"] += len(once)
+                return
+            for row in once.tolist():
+                i, j = pairs[row].tolist()
+                boxes = (local.boxes_xyxy[i], local.boxes_xyxy[j])
+                item = QueuedClip(
+                    stamp_ns=local.stamp_ns,
+                    frame_stamps_ns=stamps_ns,
+                    crop_xyxy=union_box(*boxes, local.width, local.height),
+                    vocabulary=local.vocabulary,
+                    rows=(i, j),
+                    classes=(int(classes[row, 0]), int(classes[row, 1])),
+                    boxes_xyxy=boxes,
+                    geo_cost=float(costs[row]),
+                )
+                self._queued += 1
+                if self._queue.put(item) is not None:
+                    self._dropped["queue_full"] += 1
+
+    def _encode(self, item: QueuedClip, images: list[Rgb]) -> RelationEvidence | None:
+        """Predictions of both directions of a clip; None where the world model failed."""
+        model = self._world_model
+        assert model is not None  # nothing is queued without one
+        request = _request_of(item, images, self._config.clip_length)
+        try:
+            answers = model.predict_batch([request])
+            if len(answers) != 1:
+                raise ValueError(f"{len(answers)} answers for one clip")
+            predictions = _checked(answers[0], len(request.pairs), len(item.vocabulary.predicates))
+        except Exception as error:  # whatever a backend raises, the other stages go on
+            self._report_once(f"world model '{model.name}' failed: {type(error).__name__}: {error}")
+            return None
+        i, j = item.rows
+        return RelationEvidence(
+            stamp_ns=item.stamp_ns,
+            vocabulary=item.vocabulary,
+            pairs=np.array([[i, j], [j, i]], np.int64),
+            pair_classes=np.array([item.classes, item.classes[::-1]], np.int64),
+            geo_costs=np.full(2, item.geo_cost),
+            predictions=predictions,
+            source=self.source,
+        )
+
+    def _report_once(self, message: str) -> None:
+        """Every failure is counted; only a new one is told."""
+        if message != self._reported:
+            self._reported = message
+            self._report(message)
+
+
+def _request_of(item: QueuedClip, images: list[Rgb], clip_length: int) -> ClipRequest:
+    """The clip of a queued pair, cropped now, and both directions of the pair in it."""
+    x1, y1, _, _ = item.crop_xyxy
+    boxes = [box - np.array([x1, y1, x1, y1], np.float64) for box in item.boxes_xyxy]
+    names = [item.vocabulary.classes[index] for index in item.classes]
+    directions = tuple(
+        PairContext(
+            subject_box_xyxy=boxes[subject],
+            object_box_xyxy=boxes[object_],
+            subject_class=item.classes[subject],
+            object_class=item.classes[object_],
+            subject_name=names[subject],
+            object_name=names[object_],
+        )
+        for subject, object_ in ((0, 1), (1, 0))
+    )
+    return ClipRequest(crop_clip(images, item.crop_xyxy, clip_length), directions, item.vocabulary)
+
+
+def _checked(answer: Float64, pair_count: int, predicate_count: int) -> Float64:
+    """A world model's answer as distributions in float64; ValueError where it is none."""
+    values = np.asarray(answer, dtype=np.float64)
+    if values.shape != (pair_count, predicate_count):
+        raise ValueError(f"answer of shape {values.shape}: wanted {(pair_count, predicate_count)}")
+    sums = values.sum(axis=1)
+    if (
+        not (np.isfinite(values).all() and (values >= 0).all())
+        or (np.abs(sums - 1) > SUM_TOLERANCE).any()
+    ):
+        raise ValueError(f"answer {values.tolist()}: wanted distributions that sum to one")
+    distributions: Float64 = values / sums[:, None]
+    return distributions

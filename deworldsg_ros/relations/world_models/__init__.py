@@ -1,0 +1,1 @@
+"""World models, one a file; each has `build(config: RelationsConfig) -> WorldModel | None`."""
