@@ -1,0 +1,214 @@
+"""Pose messages to T_world_camera, a buffer that interpolates, and a gate against jumps."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from typing import Any
+
+import numpy as np
+
+from deworldsg_ros.scene.camera import Float64, interpolate_pose, pose_from_quaternion
+from deworldsg_ros.scene.errors import RefusedInput
+
+NANOSECONDS = 10**9
+# Where neither the configuration nor the message names the world frame.
+UNNAMED_FRAME = "world"
+
+
+def stamp_ns_of(message: Any) -> int:
+    """Time of a message's header, nanoseconds."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def pose_from_message(message: Any) -> tuple[Float64, str]:
+    """T_world_camera (4, 4) and the world frame of a PoseStamped or Odometry message.
+
+    Raises:
+        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion that is not of norm 1.
+    """
+    pose = message.pose
+    if not hasattr(pose, "position"):  # Odometry: a PoseWithCovariance
+        pose = pose.pose
+    T = _rigid(pose.position, pose.orientation)
+    return T, str(message.header.frame_id) or UNNAMED_FRAME
+
+
+def pose_from_transform(transform: Any) -> Float64:
+    """T_parent_child (4, 4) of a `geometry_msgs/Transform`; refuses as `pose_from_message`."""
+    return _rigid(transform.translation, transform.rotation)
+
+
+def _rigid(position: Any, orientation: Any) -> Float64:
+    return pose_from_quaternion(
+        np.array([position.x, position.y, position.z], np.float64),
+        np.array([orientation.x, orientation.y, orientation.z, orientation.w], np.float64),
+    )
+
+
+class PoseBuffer:
+    """A bounded run of poses in stamp order, read at any stamp.
+
+    Args:
+        slop_ns: most time between a stamp and the poses that stand for it.
+        capacity: poses kept, newest.
+    """
+
+    def __init__(self, slop_ns: int, capacity: int = 10000) -> None:
+        self._slop_ns = slop_ns
+        self._capacity = capacity
+        self._stamps_ns: list[int] = []
+        self._poses: list[Float64] = []
+
+    def __len__(self) -> int:
+        return len(self._stamps_ns)
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest pose."""
+        return self._stamps_ns[-1] if self._stamps_ns else None
+
+    def add(self, stamp_ns: int, T: Float64) -> None:
+        """Keep a pose; one with the same stamp is replaced."""
+        row = bisect_left(self._stamps_ns, stamp_ns)
+        if row < len(self._stamps_ns) and self._stamps_ns[row] == stamp_ns:
+            self._poses[row] = T
+            return
+        self._stamps_ns.insert(row, stamp_ns)
+        self._poses.insert(row, T)
+        if len(self._stamps_ns) > 2 * self._capacity:
+            self._forget(len(self._stamps_ns) - self._capacity)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop poses that no stamp from here on can need."""
+        rows = bisect_left(self._stamps_ns, stamp_ns - self._slop_ns) - 1
+        # Deleting from the front of a list moves the rest: do it seldom.
+        if rows > 256:
+            self._forget(rows)
+
+    def _forget(self, rows: int) -> None:
+        del self._stamps_ns[:rows]
+        del self._poses[:rows]
+
+    def settled(self, stamp_ns: int) -> bool:
+        """Whether a later pose cannot change the answer at this stamp, poses being in order."""
+        return bool(self._stamps_ns) and self._stamps_ns[-1] >= stamp_ns
+
+    def at(self, stamp_ns: int) -> Float64:
+        """The pose at a stamp: interpolated between its neighbours, else the nearest.
+
+        Raises:
+            RefusedInput: ``no_pose`` where the nearest is further away than the slop.
+        """
+        stamps_ns = self._stamps_ns
+        row = bisect_left(stamps_ns, stamp_ns)
+        if row < len(stamps_ns) and stamps_ns[row] == stamp_ns:
+            return self._poses[row]
+        before_ns = stamp_ns - stamps_ns[row - 1] if row > 0 else None
+        after_ns = stamps_ns[row] - stamp_ns if row < len(stamps_ns) else None
+        has_before = before_ns is not None and before_ns <= self._slop_ns
+        has_after = after_ns is not None and after_ns <= self._slop_ns
+        if has_before and has_after:
+            assert before_ns is not None and after_ns is not None
+            fraction = before_ns / (before_ns + after_ns)
+            return interpolate_pose(self._poses[row - 1], self._poses[row], fraction)
+        if has_before or has_after:
+            return self._poses[row if has_after else row - 1]
+        known = [gap for gap in (before_ns, after_ns) if gap is not None]
+        seen = f"the nearest pose is {min(known) / 1e9:.3f} s away" if known else "there is no pose"
+        raise RefusedInput(
+            "no_pose",
+            f"image at {stamp_ns / 1e9:.3f} s: {seen}, wanted one within "
+            f"{self._slop_ns / 1e9:g} s (inputs.pose_slop_s)",
+        )
+
+
+class PoseStream:
+    """The poses of one topic, all in one world frame.
+
+    Args:
+        slop_ns: as `PoseBuffer`.
+        world_frame: frame that poses must have; empty = that of the first.
+    """
+
+    def __init__(self, slop_ns: int, world_frame: str = "") -> None:
+        self._buffer = PoseBuffer(slop_ns)
+        self.world_frame = world_frame
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def add(self, message: Any, stamp_ns: int) -> None:
+        """Keep a pose.
+
+        Raises:
+            RefusedInput: ``invalid_pose``, or ``wrong_frame`` for another world frame.
+        """
+        T, frame_id = pose_from_message(message)
+        if self.world_frame and frame_id != self.world_frame:
+            raise RefusedInput(
+                "wrong_frame", f"pose is in frame '{frame_id}', expected '{self.world_frame}'"
+            )
+        self.world_frame = frame_id
+        self._buffer.add(stamp_ns, T)
+
+    def settled(self, stamp_ns: int, camera_frame: str) -> bool:
+        """Whether a later pose cannot change the answer at this stamp."""
+        del camera_frame
+        return self._buffer.settled(stamp_ns)
+
+    def at(self, stamp_ns: int, camera_frame: str) -> tuple[Float64, str]:
+        """T_world_camera and the world frame at a stamp; ``no_pose`` as `PoseBuffer.at`."""
+        del camera_frame
+        return self._buffer.at(stamp_ns), self.world_frame
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop poses that no stamp from here on can need."""
+        self._buffer.forget_before(stamp_ns)
+
+
+class JumpGate:
+    """Refuses a frame whose camera jumped; a place that is held is believed after a while.
+
+    A tracker that loses itself for a frame must not smear the graph; one that relocalises must
+    not silence it for good.
+
+    Args:
+        max_step_m: camera movement between frames above which it is a jump.
+        believed_after: consecutive frames without a jump between them that make a new place true.
+    """
+
+    def __init__(self, max_step_m: float, believed_after: int = 5) -> None:
+        self._max_step_m = max_step_m
+        self._believed_after = believed_after
+        self._accepted: Float64 | None = None
+        self._candidate: Float64 | None = None
+        self._held = 0
+
+    def check(self, T_world_camera: Float64) -> None:
+        """Accept a frame's pose, or refuse it: ``pose_jump``."""
+        position = T_world_camera[:3, 3].copy()
+        if self._accepted is None or self._near(self._accepted, position):
+            self._accept(position)
+            return
+        near_candidate = self._candidate is not None and self._near(self._candidate, position)
+        self._held = self._held + 1 if near_candidate else 1
+        self._candidate = position
+        if self._held >= self._believed_after:
+            self._accept(position)
+            return
+        step_m = float(np.linalg.norm(position - self._accepted))
+        raise RefusedInput(
+            "pose_jump",
+            f"camera moved {step_m:.2f} m since the last accepted frame: wanted at most "
+            f"{self._max_step_m:g} m (inputs.max_step_m), or {self._believed_after} frames at the "
+            f"new place (this is number {self._held})",
+        )
+
+    def _near(self, a: Float64, b: Float64) -> bool:
+        return float(np.linalg.norm(a - b)) <= self._max_step_m
+
+    def _accept(self, position: Float64) -> None:
+        self._accepted = position
+        self._candidate = None
+        self._held = 0
