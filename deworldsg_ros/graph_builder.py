@@ -1,0 +1,174 @@
+"""Merging and relation fusion, composed: local graphs and relation evidence become the graph.
+
+The graph node and the in-process pipeline both run this, so that they end with the same graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.merging.stage import Merging
+from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
+from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.delta import diff
+from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
+from deworldsg_ros.scene.graph import SceneGraph
+
+
+class GraphBuilder:
+    """Keeps the global graph, and tells what of it is published.
+
+    Args:
+        config: sections ``merging``, ``relations`` and ``output`` are used.
+        vocabulary: of every local graph that will come.
+        frame_id: world frame of every local graph that will come.
+    """
+
+    def __init__(self, config: Config, vocabulary: Vocabulary, frame_id: str) -> None:
+        self._relations = config.relations
+        self._output = config.output
+        self._merging = Merging(config.merging)
+        self.graph = SceneGraph(vocabulary, frame_id, config.merging.surface_points)
+        self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
+        self._newest_ns: int | None = None
+        self._associations: list[wire.Association] = []
+        self._published = self._message(0, self._output.surface_points)
+
+    def integrate(self, local: LocalGraph) -> list[int]:
+        """Merge a frame's local graph; returns the node id of each of its rows.
+
+        Raises:
+            RefusedInput: ``out_of_order`` for a frame not newer than the newest one, and what
+                `Merging.merge` refuses.
+        """
+        if self._newest_ns is not None and local.stamp_ns <= self._newest_ns:
+            raise RefusedInput(
+                "out_of_order",
+                f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
+            )
+        node_ids = self._merging.merge(self.graph, local)
+        self._newest_ns = local.stamp_ns
+        self._associations.append(
+            wire.Association(wire.stamp_from_ns(local.stamp_ns), list(node_ids))
+        )
+        return node_ids
+
+    def add_evidence(self, evidence: RelationEvidence) -> None:
+        """Take in neighbour pairs, and predictions where there are some.
+
+        Raises:
+            RefusedInput: ``vocabulary_mismatch``; ``unknown_frame`` where no local graph with
+                that stamp is remembered.
+        """
+        self._check_vocabulary(evidence.vocabulary)
+        node_ids = self.graph.nodes_of_frame(evidence.stamp_ns)
+        if node_ids is None or (len(evidence.pairs) and evidence.pairs.max() >= len(node_ids)):
+            raise RefusedInput(
+                "unknown_frame",
+                f"relation evidence for {evidence.stamp_ns} ns: no local graph of that frame "
+                "is remembered",
+            )
+        self.prior.update(evidence.pair_classes, evidence.predictions)
+        # A prediction comes after the message that named its pair as a neighbour.
+        for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
+            self.graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
+
+    def update(self) -> wire.SceneGraphUpdateMessage | None:
+        """What changed since this was last called; None where nothing did."""
+        current = self._message(self._published.sequence + 1, self._output.surface_points)
+        removed = self.graph.take_removals()
+        same = (current.nodes, current.edges) == (self._published.nodes, self._published.edges)
+        if same and not removed:
+            return None
+        message = diff(self._published, current, removed, self._associations)
+        self._associations = []
+        self._published = current
+        return message
+
+    def snapshot(self) -> wire.SceneGraphMessage:
+        """The graph as of the last `update`."""
+        return self._published
+
+    def full(self) -> wire.SceneGraphMessage:
+        """The graph as it is now, with surface points; no update is made of it."""
+        return self._message(self._published.sequence, with_points=True)
+
+    def _message(self, sequence: int, with_points: bool) -> wire.SceneGraphMessage:
+        nodes = self.graph.node_states(
+            self._output.top_k, self._output.min_observations, with_points
+        )
+        pairs = [pair for pair in sorted(self.graph.edges) if pair[0] in nodes and pair[1] in nodes]
+        return wire.SceneGraphMessage(
+            schema=wire.schema_of(wire.SceneGraphMessage),
+            stamp=wire.stamp_from_ns(self._newest_ns or 0),
+            frame_id=self.graph.frame_id,
+            sequence=sequence,
+            nodes=list(nodes.values()),
+            edges=self._edge_states(pairs),
+        )
+
+    def _edge_states(self, pairs: Sequence[Pair]) -> list[wire.EdgeState]:
+        """Messages of the edges of which something is believed (Eq. 9-10)."""
+        if not pairs:
+            return []
+        evidence = [self.graph.edges[pair] for pair in pairs]
+        has_visual = np.array([item.frames > 0 for item in evidence])
+        priors, has_prior = self.prior.lookup(self._classes_of(pairs))
+        fused = fuse_edges(
+            np.array([item.visual_logits for item in evidence]),
+            has_visual,
+            priors,
+            has_prior,
+            self._relations.fusion_alpha,
+            self._relations.entropy_threshold_nats,
+        )
+        known = np.flatnonzero(fused.known)
+        chosen = choose_directions(
+            [pairs[row] for row in known], has_visual[known], fused.probabilities[known]
+        )
+        return [
+            self._edge_state(pairs[row], evidence[row], fused, row)
+            for row in known[chosen].tolist()
+        ]
+
+    def _classes_of(self, pairs: Sequence[Pair]) -> np.ndarray:
+        """Arg-max classes of the ends of each pair, (E, 2) int64."""
+        table = self.graph.nodes
+        classes = table.class_probabilities.argmax(axis=1)
+        rows = np.array([[table.row(subject), table.row(object_)] for subject, object_ in pairs])
+        return np.asarray(classes[rows], np.int64)
+
+    def _edge_state(
+        self, pair: Pair, evidence: EdgeEvidence, fused: FusedEdges, row: int
+    ) -> wire.EdgeState:
+        predicates = self.graph.vocabulary.predicates
+        probabilities = fused.probabilities[row]
+        best = np.argsort(-probabilities, kind="stable")[: self._output.top_k].tolist()
+        beliefs = [wire.Belief(predicates[index], float(probabilities[index])) for index in best]
+        return wire.EdgeState(
+            subject=pair[0],
+            object=pair[1],
+            predicate=beliefs[0].label,
+            probability=beliefs[0].probability,
+            predicates=beliefs,
+            provenance=fused.provenances()[row],
+            entropy_nats=float(fused.entropies_nats[row]),
+            observations=evidence.frames,
+        )
+
+    def _check_vocabulary(self, vocabulary: Vocabulary) -> None:
+        if vocabulary != self.graph.vocabulary:
+            known = self.graph.vocabulary
+            raise RefusedInput(
+                "vocabulary_mismatch",
+                f"message has {len(vocabulary.classes)} classes and {len(vocabulary.predicates)} "
+                f"predicates; the graph was begun with {len(known.classes)} and "
+                f"{len(known.predicates)}, or others of that number (do all nodes run with one "
+                "configuration?)",
+            )

@@ -1,0 +1,117 @@
+"""The four stages in one process, without ROS: the same graph as the four nodes give."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What each stage made of one frame.
+
+    Attributes:
+        perceived: 2D scene graph and instance labels.
+        local: local 3D graph.
+        node_ids: node of the global graph that each row of `local` became.
+    """
+
+    perceived: Perceived
+    local: LocalGraph
+    node_ids: list[int]
+
+
+class Perceiver(Protocol):
+    """Stage a, as the pipeline needs it."""
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
+        """The 2D scene graph and the instance labels of `frame`."""
+        ...
+
+
+class Pipeline:
+    """perceive → lift → merge → relate, a frame at a time.
+
+    Args:
+        config: the whole configuration.
+        perceiver: in place of the configured perception, e.g. recorded detections.
+
+    Attributes:
+        builder: holds the global graph; None before the first frame, whose world frame it takes.
+        drops: what was left out so far, by reason.
+        times_s: seconds spent in each stage, a list entry a frame.
+    """
+
+    def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
+        self.config = config
+        self.perception = perceiver or build_perception(
+            config.perception, world_up=config.inputs.world_up
+        )
+        self.lifting = Lifting(config.lifting)
+        self.relations = RelationReasoner(config.relations, build_world_model(config.relations))
+        self.builder: GraphBuilder | None = None
+        self.drops: Counter[str] = Counter()
+        self.times_s: dict[str, list[float]] = {
+            name: [] for name in ("perception", "lifting", "merging", "relations")
+        }
+
+    def process(self, frame: RgbdFrame) -> FrameResult:
+        """Take one frame into the graph.
+
+        Raises:
+            RefusedInput: where the frame does not fit those before it; the graph is unchanged.
+        """
+        with self._timed("perception"):
+            perceived = self.perception.perceive(frame)
+        with self._timed("lifting"):
+            local = self.lifting.lift(
+                perceived.frame_graph,
+                perceived.instances,
+                frame.depth_m,
+                frame.intrinsics,
+                frame.T_world_camera,
+                frame.frame_id,
+            )
+        if self.builder is None:
+            self.builder = GraphBuilder(self.config, local.vocabulary, local.frame_id)
+        with self._timed("merging"):
+            node_ids = self.builder.integrate(local)
+        with self._timed("relations"):
+            self.builder.add_evidence(self.relations.observe(local, frame.rgb))
+            for evidence in self.relations.drain():
+                self.builder.add_evidence(evidence)
+        self.drops.update(perceived.drops)
+        self.drops.update(local.drops)
+        return FrameResult(perceived, local, node_ids)
+
+    def graph(self) -> wire.SceneGraphMessage:
+        """The whole graph so far, with surface points.
+
+        Raises:
+            RefusedInput: ``no_frames`` before the first frame.
+        """
+        if self.builder is None:
+            raise RefusedInput("no_frames", "no frame was processed: there is no graph")
+        return self.builder.full()
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.times_s[stage].append(time.perf_counter() - start)
