@@ -1,7 +1,8 @@
 """A deterministic stand-in for a world model, for tests and measurements; it has learnt nothing.
 
 Like a probe it is consistent for a class pair and varies from clip to clip, and like one it gives
-the same answer to the same clip on every machine: hashes, no random generator.
+the same answer to the same clip in every run and on every machine (to rounding): hashes, no
+random generator.
 """
 
 from __future__ import annotations

@@ -1,0 +1,86 @@
+"""Small local graphs and world models for the tests of the relations stage."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+
+WIDTH, HEIGHT = 64, 48
+VOCABULARY = Vocabulary(("chair", "table", "cup"), ("on", "near", "under", "behind"))
+
+
+def local_graph(stamp_ns, boxes_xyxy, depths_m, classes) -> LocalGraph:
+    count = len(boxes_xyxy)
+    probabilities = np.full((count, len(VOCABULARY.classes)), 0.1)
+    probabilities[np.arange(count), np.asarray(classes, int)] = 0.8
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id="world",
+        width=WIDTH,
+        height=HEIGHT,
+        T_world_camera=np.eye(4),
+        vocabulary=VOCABULARY,
+        instance_ids=np.arange(1, count + 1),
+        boxes_xyxy=np.asarray(boxes_xyxy, np.float64).reshape(-1, 4),
+        class_probabilities=probabilities,
+        scores=np.ones(count),
+        means_world=np.zeros((count, 3)),
+        covariances_world=np.tile(np.eye(3), (count, 1, 1)),
+        depths_m=np.asarray(depths_m, np.float64),
+        pixel_counts=np.full(count, 50),
+        surface_points_world=tuple(np.zeros((0, 3), np.float32) for _ in range(count)),
+        relations=Relations.none(len(VOCABULARY.predicates)),
+    )
+
+
+def pair_graph(stamp_ns: int) -> LocalGraph:
+    """A cup on a table: one neighbour pair."""
+    return local_graph(stamp_ns, [[10, 20, 50, 40], [20, 10, 30.5, 22]], [1.5, 1.4], [1, 2])
+
+
+def crowd_graph(stamp_ns: int, count: int) -> LocalGraph:
+    """Objects in a row, all neighbours of each other."""
+    left = np.linspace(0, 40, count)
+    boxes = np.stack([left, np.full(count, 10.0), left + 8, np.full(count, 20.0)], axis=1)
+    return local_graph(stamp_ns, boxes, np.full(count, 2.0), np.arange(count) % 3)
+
+
+def picture(stamp_ns: int) -> np.ndarray:
+    """An image whose content tells its stamp."""
+    generator = np.random.default_rng(stamp_ns)
+    return generator.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+def config(**changes) -> RelationsConfig:
+    return RelationsConfig(**{"world_model": "fake", "clip_length": 4, "queue_size": 8, **changes})
+
+
+class RecordingModel(FakeWorldModel):
+    """The fake, remembering what it was asked."""
+
+    def __init__(self, clip_length: int = 4) -> None:
+        super().__init__(clip_length, seed=0)
+        self.requests = []
+
+    def predict_batch(self, requests):
+        self.requests.extend(requests)
+        return super().predict_batch(requests)
+
+
+class GatedModel(RecordingModel):
+    """Begins a clip and does not return before it is allowed to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun = threading.Semaphore(0)
+        self.allowed = threading.Semaphore(0)
+
+    def predict_batch(self, requests):
+        self.begun.release()
+        assert self.allowed.acquire(timeout=30)
+        return super().predict_batch(requests)

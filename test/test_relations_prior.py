@@ -1,0 +1,128 @@
+"""The class-pair prior: a running mean that does not know an order."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deworldsg_ros.relations.evidence import ClassPairPrior
+
+CLASSES, PREDICATES = 4, 3
+
+
+def random_predictions(count, seed):
+    generator = np.random.default_rng(seed)
+    classes = generator.integers(0, CLASSES, (count, 2))
+    return classes, generator.dirichlet(np.ones(PREDICATES), count)
+
+
+def every_class_pair():
+    return np.argwhere(np.ones((CLASSES, CLASSES)))
+
+
+def test_empty_prior_knows_nothing():
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    changed = prior.update(np.zeros((0, 2), np.int64), np.zeros((0, PREDICATES)))
+    assert changed.shape == (0, 2) and len(prior) == 0
+    assert prior.mean(0, 1) is None
+    priors, has_prior = prior.lookup(every_class_pair())
+    assert not has_prior.any() and (priors == 0).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 40), st.integers(0, 10_000), st.integers(1, 7))
+def test_is_the_mean_in_any_order_and_any_portions(count, seed, portions):
+    classes, predictions = random_predictions(count, seed)
+    whole = ClassPairPrior(CLASSES, PREDICATES)
+    whole.update(classes, predictions)
+    shuffled = ClassPairPrior(CLASSES, PREDICATES)
+    order = np.random.default_rng(seed + 1).permutation(count)
+    for portion in np.array_split(order, portions):
+        shuffled.update(classes[portion], predictions[portion])
+    pairs = every_class_pair()
+    np.testing.assert_allclose(whole.lookup(pairs)[0], shuffled.lookup(pairs)[0], rtol=1e-12)
+    assert (whole.revisions(pairs) == shuffled.revisions(pairs)).all()
+    for subject, object_ in pairs:
+        rows = (classes == [subject, object_]).all(axis=1)
+        mean = whole.mean(subject, object_)
+        if not rows.any():
+            assert mean is None
+            continue
+        np.testing.assert_allclose(mean, predictions[rows].mean(axis=0), rtol=1e-12)
+        assert mean.sum() == pytest.approx(1.0)
+
+
+def test_pairs_without_a_prediction_do_not_enter():
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    predictions = np.array([[0.2, 0.3, 0.5], [np.nan] * 3])
+    changed = prior.update(np.array([[0, 1], [2, 3]]), predictions)
+    assert changed.tolist() == [[0, 1]]
+    assert prior.mean(2, 3) is None
+    np.testing.assert_allclose(prior.mean(0, 1), predictions[0])
+
+
+def test_direction_matters():
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    prior.update(np.array([[0, 1]]), np.array([[1.0, 0, 0]]))
+    assert prior.mean(1, 0) is None
+
+
+def test_revision_changes_with_its_class_pair_alone():
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    pairs = np.array([[0, 1], [1, 0]])
+    row = np.array([[0.5, 0.25, 0.25]])
+    assert prior.revisions(pairs).tolist() == [0, 0]
+    prior.update(pairs[:1], row)
+    prior.update(pairs[:1], row)
+    assert prior.revisions(pairs).tolist() == [2, 0]
+
+
+def test_saved_and_loaded_it_is_the_same_and_goes_on():
+    classes, predictions = random_predictions(30, 5)
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    prior.update(classes, predictions)
+    loaded = ClassPairPrior.from_state(json.loads(json.dumps(prior.to_state())))
+    for _ in range(2):
+        pairs = every_class_pair()
+        assert (loaded.lookup(pairs)[0] == prior.lookup(pairs)[0]).all()
+        assert (loaded.revisions(pairs) == prior.revisions(pairs)).all()
+        prior.update(*random_predictions(9, 6))
+        loaded.update(*random_predictions(9, 6))
+
+
+@pytest.mark.parametrize(
+    ("classes", "predictions", "message"),
+    [
+        ([[0, 9]], [[0.2, 0.3, 0.5]], "classes 0 to 9: wanted 0 to 3"),
+        ([[-1, 0]], [[0.2, 0.3, 0.5]], "classes -1 to 0"),
+        ([[0, 1]], [[0.2, 0.3, 0.6]], "sums of 1.1 to 1.1"),
+        ([[0, 1]], [[-0.5, 1.0, 0.5]], "least value of -0.5"),
+        ([[0, 1]], [[0.5, 0.5]], r"shape \(1, 2\): wanted \(1, 3\)"),
+    ],
+)
+def test_refuses_what_is_no_prediction_and_stays_as_it_was(classes, predictions, message):
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    with pytest.raises(ValueError, match=message):
+        prior.update(np.array(classes), np.array(predictions))
+    assert len(prior) == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"counts": [1, 2]},
+        {"counts": [0]},
+        {"class_pairs": [[0, 1], [0, 1]]},
+        {"class_pairs": [[0, 7]]},
+        {"sums": [[5.0, 0.0, 0.0]]},
+    ],
+)
+def test_refuses_a_saved_state_that_does_not_fit(change):
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    prior.update(np.array([[0, 1]]), np.array([[0.2, 0.3, 0.5]]))
+    with pytest.raises(ValueError):
+        ClassPairPrior.from_state({**prior.to_state(), **change})
