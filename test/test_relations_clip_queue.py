@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from relations_support import VOCABULARY
 
 from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip, newest_first
 from deworldsg_ros.relations.clips import FrameBuffer
-from relations_support import VOCABULARY
 
 
 def clip(stamp_ns, geo_cost=0.1, rows=(0, 1)):

@@ -1,0 +1,183 @@
+"""Stage d: pairing and fusion against plain loops, and what a frame costs without a model's time.
+
+    python bench/relations.py
+
+Both sides of a comparison take turns within one run; the ratio is the median over the turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations import (
+    ClassPairPrior,
+    RelationReasoner,
+    build_world_model,
+    choose_directions,
+    fuse_edges,
+    neighbour_pairs,
+)
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+
+WIDTH, HEIGHT = 640, 480
+CLASSES, PREDICATES = 80, 50
+ALPHA, ENTROPY_THRESHOLD_NATS, GEO_COST_THRESHOLD = 0.5, 1.0, 0.45
+
+
+def pairs_by_loop(boxes, depths):
+    found = []
+    for i in range(len(boxes)):
+        for j in range(len(boxes)):
+            if i == j:
+                continue
+            dx = (boxes[i, 0] + boxes[i, 2] - boxes[j, 0] - boxes[j, 2]) / 2
+            dy = (boxes[i, 1] + boxes[i, 3] - boxes[j, 1] - boxes[j, 3]) / 2
+            cost = 0.5 * math.hypot(dx, dy) / math.hypot(WIDTH, HEIGHT)
+            cost += abs(depths[i] - depths[j])
+            if cost < GEO_COST_THRESHOLD:
+                found.append((i, j, cost))
+    return found
+
+
+def fuse_by_loop(logits, has_visual, priors, has_prior):
+    """One edge at a time, with numpy over its predicates."""
+    edges = []
+    for row in range(len(logits)):
+        summed = logits[row] if has_visual[row] else np.zeros(logits.shape[1])
+        weights = np.exp(summed - summed.max())
+        visual = weights / weights.sum()
+        entropy = -(visual * np.log(np.maximum(visual, 1e-300))).sum()
+        if has_prior[row] and entropy > ENTROPY_THRESHOLD_NATS:
+            mixed = visual + ALPHA * priors[row]
+            edges.append(mixed / mixed.sum())
+        else:
+            edges.append(visual if has_visual[row] else None)
+    return edges
+
+
+def paired(name: str, ours: Callable[[], object], loop: Callable[[], object], turns: int) -> None:
+    """Print the medians of both and the median of the ratios."""
+    times = np.array([[timed(ours), timed(loop)] for _ in range(turns)])
+    ours_ms, loop_ms = 1e3 * np.median(times, axis=0)
+    ratio = np.median(times[:, 1] / times[:, 0])
+    print(f"{name:34} {ours_ms:8.3f} ms   loop {loop_ms:8.3f} ms   loop / ours {ratio:6.1f}")
+
+
+def timed(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def objects(count: int, generator: np.random.Generator):
+    corners = generator.uniform(0, (WIDTH, HEIGHT), (count, 2, 2))
+    boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    return boxes, generator.uniform(1.0, 2.0, count)
+
+
+def local_graph(stamp_ns: int, count: int, generator: np.random.Generator) -> LocalGraph:
+    boxes, depths = objects(count, generator)
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id="world",
+        width=WIDTH,
+        height=HEIGHT,
+        T_world_camera=np.eye(4),
+        vocabulary=Vocabulary(
+            tuple(f"class {n}" for n in range(CLASSES)),
+            tuple(f"predicate {n}" for n in range(PREDICATES)),
+        ),
+        instance_ids=np.arange(1, count + 1),
+        boxes_xyxy=boxes,
+        class_probabilities=generator.dirichlet(np.ones(CLASSES), count),
+        scores=np.ones(count),
+        means_world=np.zeros((count, 3)),
+        covariances_world=np.tile(np.eye(3), (count, 1, 1)),
+        depths_m=depths,
+        pixel_counts=np.full(count, 100),
+        surface_points_world=tuple(np.zeros((0, 3), np.float32) for _ in range(count)),
+        relations=Relations.none(PREDICATES),
+    )
+
+
+def frame_costs(count: int, turns: int) -> None:
+    """Print what `observe` costs a frame, with clips queued but not encoded."""
+    generator = np.random.default_rng(2)
+    config = RelationsConfig(world_model="fake")
+    reasoner = RelationReasoner(config, build_world_model(config))
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    graphs = [local_graph(stamp, count, generator) for stamp in range(turns)]
+    times = [timed(lambda graph=graph: reasoner.observe(graph, image)) for graph in graphs]
+    counters = reasoner.counters()
+    print(
+        f"observe, {count} objects               {1e3 * np.median(times):8.3f} ms   "
+        f"{counters.queued / turns:.1f} clips queued a frame"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--objects", type=int, default=12)
+    parser.add_argument("--edges", type=int, default=5000)
+    parser.add_argument("--turns", type=int, default=31)
+    options = parser.parse_args()
+    generator = np.random.default_rng(1)
+
+    boxes, depths = objects(options.objects, generator)
+    vectorised = neighbour_pairs(boxes, depths, WIDTH, HEIGHT, GEO_COST_THRESHOLD)
+    looped = pairs_by_loop(boxes, depths)
+    assert [tuple(pair) for pair in vectorised[0].tolist()] == [pair[:2] for pair in looped]
+    paired(
+        f"Eq. 8, {options.objects} objects",
+        lambda: neighbour_pairs(boxes, depths, WIDTH, HEIGHT, GEO_COST_THRESHOLD),
+        lambda: pairs_by_loop(boxes, depths),
+        options.turns * 10,
+    )
+
+    edges = options.edges
+    logits = generator.normal(0, 2, (edges, PREDICATES))
+    priors = generator.dirichlet(np.ones(PREDICATES), edges)
+    has_visual, has_prior = generator.random((2, edges)) < 0.7
+    inputs = (logits, has_visual, priors, has_prior)
+    fused = fuse_edges(*inputs, ALPHA, ENTROPY_THRESHOLD_NATS)
+    for row, edge in enumerate(fuse_by_loop(*inputs)):
+        assert (edge is not None) == fused.known[row]
+        assert edge is None or np.allclose(edge, fused.probabilities[row])
+    paired(
+        f"Eq. 9-10, {edges} edges",
+        lambda: fuse_edges(*inputs, ALPHA, ENTROPY_THRESHOLD_NATS),
+        lambda: fuse_by_loop(*inputs),
+        options.turns,
+    )
+
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    classes = generator.integers(0, CLASSES, (edges, 2))
+    prior.update(classes, priors)
+    paired(
+        f"prior of {edges} edges",
+        lambda: prior.lookup(classes),
+        lambda: [prior.mean(subject, object_) for subject, object_ in classes.tolist()],
+        options.turns,
+    )
+    ids = np.stack([np.arange(edges) // 2, np.arange(edges) // 2 + 1], axis=1)
+    ids[1::2] = ids[1::2, ::-1]
+    times = [
+        timed(lambda: choose_directions(ids, has_visual, fused.probabilities))
+        for _ in range(options.turns)
+    ]
+    print(f"directions of {edges} edges           {1e3 * np.median(times):8.3f} ms")
+    frame_costs(options.objects, 10 * options.turns)
+
+
+if __name__ == "__main__":
+    main()
