@@ -6,6 +6,8 @@ metres, all float64.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -80,3 +82,32 @@ def fuse(
         weight_i * weight_j / total**2
     ) * np.outer(difference, difference)
     return mean, covariance
+
+
+def log_determinant(covariance: Float64) -> float:
+    """The logarithm of |Σ| of one covariance (3, 3), by its LDLᵀ pivots.
+
+    The operations are those of the association kernel, one by one, so that for two equal
+    Gaussians the kernel's distance is exactly 0.
+
+    Raises:
+        ValueError: where the covariance is not positive definite.
+    """
+    (c00, _, _), (c10, c11, _), (c20, c21, c22) = covariance.tolist()
+    if c00 > 0.0:
+        pivot_1 = c11 - c10 / c00 * c10
+        if pivot_1 > 0.0:
+            rest = c21 - c20 / c00 * c10
+            pivot_2 = c22 - c20 / c00 * c20 - rest / pivot_1 * rest
+            if pivot_2 > 0.0:
+                return math.log(c00 * pivot_1 * pivot_2)
+    raise ValueError(f"covariance {covariance.tolist()} is not positive definite")
+
+
+def eigenvalue_bound(covariance: Float64) -> float:
+    """A number no smaller than the largest eigenvalue of a covariance (3, 3).
+
+    The Frobenius norm: equal to it for a thin Gaussian, at most √3 times it for a sphere.
+    """
+    flat = covariance.ravel()
+    return math.sqrt(flat @ flat)

@@ -1,0 +1,110 @@
+"""The directed edges of the global graph: a sparse map, and who is joined to whom."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from deworldsg_ros.scene.gaussian import Float64
+
+Pair = tuple[int, int]
+
+
+class EdgeEvidence(NamedTuple):
+    """What is known of one directed pair of nodes (R predicates); a value, never changed in place.
+
+    Attributes:
+        visual_logits: (R,) float64, the sum of the visual relation logits (Eq. 9); zeros where
+            there were none, which is the uniform distribution.
+        frames: number of frames with visual evidence; 0 = a geometric neighbour only.
+        last_seen_ns: time of the newest evidence of either kind.
+        neighbour_frames: number of frames in which the pair was a geometric neighbour (Eq. 8).
+        revision: graph revision at which this last changed.
+    """
+
+    visual_logits: Float64
+    frames: int
+    last_seen_ns: int
+    neighbour_frames: int
+    revision: int
+
+
+class EdgeMap:
+    """Directed pairs (subject id, object id) with their evidence."""
+
+    def __init__(self, predicate_count: int) -> None:
+        # All pairs without visual evidence share one row of zeros.
+        self._no_logits = np.zeros(predicate_count)
+        self._no_logits.flags.writeable = False
+        self._evidence: dict[Pair, EdgeEvidence] = {}
+        self._partners: dict[int, dict[int, None]] = {}
+
+    @property
+    def evidence(self) -> Mapping[Pair, EdgeEvidence]:
+        """The map itself, read only."""
+        return MappingProxyType(self._evidence)
+
+    def partners(self, node_id: int) -> list[int]:
+        """Nodes that share an edge with this one, in either direction."""
+        return list(self._partners.get(node_id, ()))
+
+    def add(
+        self,
+        pair: Pair,
+        *,
+        logits: Float64 | None,
+        frames: int,
+        neighbour_frames: int,
+        stamp_ns: int,
+        revision: int,
+    ) -> None:
+        """Add evidence to a pair: logits and frames are summed."""
+        known = self._evidence.get(pair)
+        if known is None:
+            known = EdgeEvidence(self._no_logits, 0, stamp_ns, 0, revision)
+            self._partners.setdefault(pair[0], {})[pair[1]] = None
+            self._partners.setdefault(pair[1], {})[pair[0]] = None
+        self._evidence[pair] = EdgeEvidence(
+            known.visual_logits if logits is None else known.visual_logits + logits,
+            known.frames + frames,
+            max(known.last_seen_ns, stamp_ns),
+            known.neighbour_frames + neighbour_frames,
+            revision,
+        )
+
+    def repoint(self, gone_id: int, keep_id: int, revision: int) -> None:
+        """Move all edges of one node to another, summing evidence; O(degree of `gone_id`).
+
+        An edge between the two would become one from a node to itself and is dropped.
+        """
+        for (subject, object_), evidence in self._pop_all(gone_id):
+            pair = (
+                keep_id if subject == gone_id else subject,
+                keep_id if object_ == gone_id else object_,
+            )
+            if pair[0] != pair[1]:
+                self.add(
+                    pair,
+                    logits=evidence.visual_logits if evidence.frames else None,
+                    frames=evidence.frames,
+                    neighbour_frames=evidence.neighbour_frames,
+                    stamp_ns=evidence.last_seen_ns,
+                    revision=revision,
+                )
+
+    def drop(self, node_id: int) -> None:
+        """Drop all edges of a node."""
+        self._pop_all(node_id)
+
+    def _pop_all(self, node_id: int) -> list[tuple[Pair, EdgeEvidence]]:
+        popped = []
+        for partner in self._partners.pop(node_id, {}):
+            del self._partners[partner][node_id]
+            for pair in ((node_id, partner), (partner, node_id)):
+                evidence = self._evidence.pop(pair, None)
+                if evidence is not None:
+                    popped.append((pair, evidence))
+        return popped

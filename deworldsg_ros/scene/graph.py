@@ -1,0 +1,297 @@
+"""The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from deworldsg_ros.scene import storage, wire
+from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.gaussian import Float64, fuse
+from deworldsg_ros.scene.node_states import NodeStateCache
+from deworldsg_ros.scene.nodes import NodeTable
+from deworldsg_ros.scene.surface import EMPTY_SAMPLE, SurfaceSample, merge_samples
+
+
+class SceneGraph:
+    """The state of the map; stages change it through the methods below and nothing else.
+
+    Ids start at 1, are never reused, and survive `save` and `load`. When two nodes are merged the
+    older id lives on, and `resolve` follows the one that went. `revision` increases with every
+    change; nodes and edges carry the revision at which they last changed, so that whoever keeps
+    something derived from them rebuilds only that much.
+
+    Attributes:
+        vocabulary: names of classes and predicates.
+        frame_id: world frame.
+        surface_point_capacity: most surface points kept a node.
+        remembered_frames: number of newest frames that `nodes_of_frame` knows.
+        nodes: the nodes as parallel arrays; read only.
+        revision: number of changes so far.
+    """
+
+    def __init__(
+        self,
+        vocabulary: Vocabulary,
+        frame_id: str,
+        surface_point_capacity: int = 512,
+        remembered_frames: int = 1024,
+    ) -> None:
+        self.vocabulary = vocabulary
+        self.frame_id = frame_id
+        self.surface_point_capacity = surface_point_capacity
+        self.remembered_frames = remembered_frames
+        self.nodes = NodeTable(len(vocabulary.classes))
+        self.revision = 0
+        self._edges = EdgeMap(len(vocabulary.predicates))
+        self._next_id = 1
+        # Where each id that is gone went; 0 = nowhere. Two integers an id for the graph's life.
+        self._successors: dict[int, int] = {}
+        self._removals: list[int] = []
+        self._frames: dict[int, tuple[int, ...]] = {}
+        self._states = NodeStateCache()
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __contains__(self, node_id: object) -> bool:
+        return node_id in self.nodes
+
+    # Nodes ------------------------------------------------------------------------------------
+
+    def add_node(
+        self,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surface: SurfaceSample = EMPTY_SAMPLE,
+        weight: float = 1.0,
+    ) -> int:
+        """Add a node for a first observation and return its id.
+
+        Args:
+            mean_world: (3,) metres.
+            covariance_world: (3, 3) square metres, positive definite.
+            class_probabilities: (C,), scaled to sum to one.
+            stamp_ns: time of the observation.
+            surface: sample of its surface points, of at most the graph's capacity.
+            weight: number of observations it stands for.
+
+        Raises:
+            ValueError: where the covariance is not positive definite.
+        """
+        node_id = self._next_id
+        row = self.nodes.append(node_id)
+        try:
+            self.nodes.put(
+                row,
+                mean_world,
+                covariance_world,
+                class_probabilities / class_probabilities.sum(),
+                weight,
+                surface,
+            )
+        except ValueError:
+            self.nodes.remove(node_id)
+            raise
+        self._next_id += 1
+        self.nodes.first_seen_ns[row] = self.nodes.last_seen_ns[row] = stamp_ns
+        self.nodes.revisions[row] = self._changed()
+        return node_id
+
+    def observe(
+        self,
+        node_id: int,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surface: SurfaceSample = EMPTY_SAMPLE,
+        weight: float = 1.0,
+    ) -> None:
+        """Fuse one more observation into a live node (Eq. 7); arguments as in `add_node`."""
+        row = self.nodes.row(node_id)
+        self._fuse_into(
+            row,
+            mean_world,
+            covariance_world,
+            class_probabilities / class_probabilities.sum(),
+            weight,
+            surface,
+            stamp_ns,
+            stamp_ns,
+        )
+
+    def merge_nodes(self, a_id: int, b_id: int) -> int:
+        """Merge two live nodes (Eq. 7) and return the id that lives on, the older one.
+
+        Edges of the other are re-pointed and their evidence summed; an edge between the two is
+        dropped.
+        """
+        if a_id == b_id:
+            raise ValueError(f"node {a_id} cannot be merged with itself")
+        keep_id, gone_id = min(a_id, b_id), max(a_id, b_id)
+        nodes, gone = self.nodes, self.nodes.row(gone_id)
+        self._fuse_into(
+            nodes.row(keep_id),
+            nodes.means[gone],
+            nodes.covariances[gone],
+            nodes.class_probabilities[gone],
+            float(nodes.weights[gone]),
+            nodes.surfaces[gone],
+            int(nodes.first_seen_ns[gone]),
+            int(nodes.last_seen_ns[gone]),
+        )
+        self._edges.repoint(gone_id, keep_id, self.revision)
+        self._forget(gone_id, keep_id)
+        return keep_id
+
+    def remove_node(self, node_id: int) -> None:
+        """Remove a live node and its edges; nothing takes its place."""
+        self.nodes.row(node_id)
+        self._changed()
+        self._edges.drop(node_id)
+        self._forget(node_id, 0)
+
+    def resolve(self, node_id: int) -> int:
+        """The live node that stands for an id today, following merges; 0 = none."""
+        path = []
+        while node_id in self._successors:
+            path.append(node_id)
+            node_id = self._successors[node_id]
+        for passed in path[:-1]:
+            self._successors[passed] = node_id
+        return node_id if node_id in self.nodes else 0
+
+    def take_removals(self) -> dict[int, int | None]:
+        """Ids gone since this was last called, each with the live node it was merged into."""
+        removals = {gone: self.resolve(gone) or None for gone in self._removals}
+        self._removals.clear()
+        return removals
+
+    # Frames -----------------------------------------------------------------------------------
+
+    def remember_frame(self, stamp_ns: int, node_ids: Iterable[int]) -> None:
+        """Keep which node each row of a frame's local graph became."""
+        self._frames.pop(stamp_ns, None)
+        self._frames[stamp_ns] = tuple(node_ids)
+        if len(self._frames) > self.remembered_frames:
+            del self._frames[next(iter(self._frames))]
+
+    def nodes_of_frame(self, stamp_ns: int) -> list[int] | None:
+        """The live node of each row of a frame's local graph (0 = gone); None = not remembered."""
+        node_ids = self._frames.get(stamp_ns)
+        return None if node_ids is None else [self.resolve(node_id) for node_id in node_ids]
+
+    # Edges ------------------------------------------------------------------------------------
+
+    @property
+    def edges(self) -> Mapping[Pair, EdgeEvidence]:
+        """Evidence of each directed pair (subject id, object id); read only.
+
+        Pairs with `frames == 0` are geometric neighbours without visual evidence.
+        """
+        return self._edges.evidence
+
+    def add_visual(
+        self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int, frames: int = 1
+    ) -> bool:
+        """Sum a frame's visual relation logits (R,) into an edge (Eq. 9).
+
+        Ids are resolved first; returns False, and does nothing, where one of them is gone or both
+        have become one node.
+        """
+        return self._add_evidence(subject_id, object_id, logits, frames, 0, stamp_ns)
+
+    def add_neighbour(self, subject_id: int, object_id: int, stamp_ns: int) -> bool:
+        """Count a frame in which the pair was a geometric neighbour (Eq. 8); as `add_visual`."""
+        return self._add_evidence(subject_id, object_id, None, 0, 1, stamp_ns)
+
+    # Snapshots --------------------------------------------------------------------------------
+
+    def node_states(
+        self, top_k: int, min_observations: int = 1, with_points: bool = False
+    ) -> dict[int, wire.NodeState]:
+        """Messages of the nodes by ascending id; those that did not change are the same objects."""
+        return self._states.states(
+            self.nodes, self.vocabulary.classes, top_k, min_observations, with_points
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Write the whole state, without loss."""
+        storage.write(path, storage.state_of(self))
+
+    @staticmethod
+    def load(path: str | Path) -> SceneGraph:
+        """Read what `save` wrote; raises RefusedInput ``invalid_graph_file``."""
+        return storage.graph_of(storage.read(path), str(path))
+
+    # ------------------------------------------------------------------------------------------
+
+    def _changed(self) -> int:
+        self.revision += 1
+        return self.revision
+
+    def _fuse_into(
+        self,
+        row: int,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        weight: float,
+        surface: SurfaceSample,
+        first_seen_ns: int,
+        last_seen_ns: int,
+    ) -> None:
+        nodes = self.nodes
+        known = float(nodes.weights[row])
+        total = known + weight
+        mean, covariance = fuse(
+            known,
+            nodes.means[row],
+            nodes.covariances[row],
+            weight,
+            mean_world,
+            covariance_world,
+        )
+        classes = (known * nodes.class_probabilities[row] + weight * class_probabilities) / total
+        surfaces = merge_samples(nodes.surfaces[row], surface, self.surface_point_capacity)
+        nodes.put(row, mean, covariance, classes, total, surfaces)
+        nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
+        nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)
+        nodes.revisions[row] = self._changed()
+
+    def _forget(self, node_id: int, successor: int) -> None:
+        self.nodes.remove(node_id)
+        self._states.forget(node_id)
+        self._successors[node_id] = successor
+        self._removals.append(node_id)
+
+    def _add_evidence(
+        self,
+        subject_id: int,
+        object_id: int,
+        logits: Float64 | None,
+        frames: int,
+        neighbour_frames: int,
+        stamp_ns: int,
+    ) -> bool:
+        pair = (self.resolve(subject_id), self.resolve(object_id))
+        if 0 in pair or pair[0] == pair[1]:
+            return False
+        if logits is not None and logits.shape != (len(self.vocabulary.predicates),):
+            raise ValueError(
+                f"relation logits have shape {logits.shape}: "
+                f"wanted ({len(self.vocabulary.predicates)},)"
+            )
+        self._edges.add(
+            pair,
+            logits=logits,
+            frames=frames,
+            neighbour_frames=neighbour_frames,
+            stamp_ns=stamp_ns,
+            revision=self._changed(),
+        )
+        return True

@@ -1,0 +1,66 @@
+"""The messages of the nodes, rebuilt only for the nodes that changed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.nodes import NodeTable
+
+# What a message was built with: top k, with surface points.
+_Form = tuple[int, bool]
+
+
+class NodeStateCache:
+    """The newest message of each node, in each form asked for, with the revision it shows."""
+
+    def __init__(self) -> None:
+        self._known: dict[_Form, dict[int, tuple[int, wire.NodeState]]] = {}
+
+    def states(
+        self,
+        nodes: NodeTable,
+        classes: tuple[str, ...],
+        top_k: int,
+        min_observations: int,
+        with_points: bool,
+    ) -> dict[int, wire.NodeState]:
+        """Messages by ascending id of the nodes seen in at least `min_observations` frames."""
+        known = self._known.setdefault((top_k, with_points), {})
+        states = {}
+        rows = np.flatnonzero(nodes.weights >= min_observations)
+        rows = rows[np.argsort(nodes.ids[rows])]
+        ids, revisions = nodes.ids[rows].tolist(), nodes.revisions[rows].tolist()
+        for row, node_id, revision in zip(rows.tolist(), ids, revisions):
+            entry = known.get(node_id)
+            if entry is None or entry[0] != revision:
+                entry = (revision, _state(nodes, row, classes, top_k, with_points))
+                known[node_id] = entry
+            states[node_id] = entry[1]
+        return states
+
+    def forget(self, node_id: int) -> None:
+        """Drop the messages of a node that is gone."""
+        for known in self._known.values():
+            known.pop(node_id, None)
+
+
+def _state(
+    nodes: NodeTable, row: int, classes: tuple[str, ...], top_k: int, with_points: bool
+) -> wire.NodeState:
+    probabilities = nodes.class_probabilities[row]
+    # Stable: of equal probabilities the first class of the vocabulary comes first.
+    order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
+    beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
+    points = nodes.surfaces[row].points_world
+    return wire.NodeState(
+        id=int(nodes.ids[row]),
+        label=beliefs[0].label,
+        classes=beliefs,
+        mean_m=nodes.means[row].tolist(),
+        covariance_m2=nodes.covariances[row].ravel().tolist(),
+        observations=int(nodes.weights[row]),
+        first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
+        last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
+        surface_points_m=points.tolist() if with_points else [],
+    )

@@ -1,0 +1,129 @@
+"""The nodes of the global graph as parallel, contiguous arrays.
+
+Row r of every array belongs to the node `ids[r]`. Rows are compact: when a node goes, the last
+row takes its place, so rows move and ids do not. The public arrays are views of the live rows;
+they are replaced when a node is added or removed, so do not keep them across such a change.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
+from deworldsg_ros.scene.surface import EMPTY_SAMPLE, SurfaceSample
+
+Int64 = NDArray[np.int64]
+
+_FIRST_CAPACITY = 64
+
+
+class NodeTable:
+    """n nodes with distributions over C classes.
+
+    Attributes:
+        ids: (n,) int64, stable, from 1.
+        means: (n, 3) float64, metres, world frame.
+        covariances: (n, 3, 3) float64, square metres, positive definite.
+        class_probabilities: (n, C) float64, rows sum to one.
+        weights: (n,) float64, number of observations (the w of Eq. 7).
+        log_determinants: (n,) float64, of the covariances.
+        eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
+        first_seen_ns, last_seen_ns: (n,) int64.
+        revisions: (n,) int64, graph revision at which the node last changed.
+        surfaces: n surface samples.
+    """
+
+    ids: Int64
+    means: Float64
+    covariances: Float64
+    class_probabilities: Float64
+    weights: Float64
+    log_determinants: Float64
+    eigenvalue_bounds: Float64
+    first_seen_ns: Int64
+    last_seen_ns: Int64
+    revisions: Int64
+
+    def __init__(self, class_count: int) -> None:
+        self.surfaces: list[SurfaceSample] = []
+        self._rows: dict[int, int] = {}
+        capacity = _FIRST_CAPACITY
+        self._storage: dict[str, NDArray[Any]] = {
+            "ids": np.zeros(capacity, np.int64),
+            "means": np.zeros((capacity, 3)),
+            "covariances": np.zeros((capacity, 3, 3)),
+            "class_probabilities": np.zeros((capacity, class_count)),
+            "weights": np.zeros(capacity),
+            "log_determinants": np.zeros(capacity),
+            "eigenvalue_bounds": np.zeros(capacity),
+            "first_seen_ns": np.zeros(capacity, np.int64),
+            "last_seen_ns": np.zeros(capacity, np.int64),
+            "revisions": np.zeros(capacity, np.int64),
+        }
+        self._show(0)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __contains__(self, node_id: object) -> bool:
+        return node_id in self._rows
+
+    def row(self, node_id: int) -> int:
+        """Present row of a live node; KeyError where it is not in the graph."""
+        try:
+            return self._rows[node_id]
+        except KeyError:
+            raise KeyError(f"node {node_id} is not in the graph") from None
+
+    def append(self, node_id: int) -> int:
+        """Add an empty row for a new node and return it; `put` fills it."""
+        row = len(self._rows)
+        if row == len(self._storage["ids"]):
+            for name, column in self._storage.items():
+                self._storage[name] = np.concatenate((column, np.zeros_like(column)))
+        self._rows[node_id] = row
+        self.surfaces.append(EMPTY_SAMPLE)
+        self._show(row + 1)
+        self.ids[row] = node_id
+        return row
+
+    def put(
+        self,
+        row: int,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        weight: float,
+        surface: SurfaceSample,
+    ) -> None:
+        """Replace what a row holds, and the values cached of its covariance.
+
+        Raises:
+            ValueError: where the covariance is not positive definite.
+        """
+        self.log_determinants[row] = log_determinant(covariance_world)
+        self.eigenvalue_bounds[row] = eigenvalue_bound(covariance_world)
+        self.means[row] = mean_world
+        self.covariances[row] = covariance_world
+        self.class_probabilities[row] = class_probabilities
+        self.weights[row] = weight
+        self.surfaces[row] = surface
+
+    def remove(self, node_id: int) -> None:
+        """Remove a node; the last row takes its place."""
+        row, last = self.row(node_id), len(self._rows) - 1
+        moved = int(self.ids[last])
+        for column in self._storage.values():
+            column[row] = column[last]
+        self.surfaces[row] = self.surfaces[last]
+        self.surfaces.pop()
+        self._rows[moved] = row
+        del self._rows[node_id]
+        self._show(last)
+
+    def _show(self, count: int) -> None:
+        for name, column in self._storage.items():
+            setattr(self, name, column[:count])

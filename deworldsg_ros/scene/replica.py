@@ -1,0 +1,69 @@
+"""A client's copy of the scene graph, kept by snapshots and updates."""
+
+from __future__ import annotations
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.scene.errors import RefusedInput
+
+
+class GraphReplica:
+    """Rebuilds `/scene_graph` from `/scene_graph/updates`, exactly.
+
+    A client that was there from the first update needs no snapshot. One that joins later, or that
+    lost an update, calls `reset` with the newest `/scene_graph`, then goes on applying updates;
+    those that the snapshot already shows are passed over.
+    """
+
+    def __init__(self) -> None:
+        self.reset(empty_scene_graph(""))
+
+    @property
+    def sequence(self) -> int:
+        """Number of the last update that this copy shows."""
+        return self._sequence
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        """Start anew from a snapshot."""
+        self._stamp = snapshot.stamp
+        self._frame_id = snapshot.frame_id
+        self._sequence = snapshot.sequence
+        self._nodes = {node.id: node for node in snapshot.nodes}
+        self._edges = {(edge.subject, edge.object): edge for edge in snapshot.edges}
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        """Apply the next update; returns False for one that this copy already shows.
+
+        Raises:
+            RefusedInput: ``lost_updates`` where updates are missing in between; the copy is left
+                as it was and needs a `reset`.
+        """
+        if update.sequence <= self._sequence:
+            return False
+        if update.sequence > self._sequence + 1:
+            raise RefusedInput(
+                "lost_updates",
+                f"update {update.sequence} after {self._sequence}: "
+                f"{update.sequence - self._sequence - 1} lost, reset from /scene_graph",
+            )
+        for node in update.removed_nodes:
+            self._nodes.pop(node.id, None)
+        for edge in update.removed_edges:
+            self._edges.pop((edge.subject, edge.object), None)
+        self._nodes.update((node.id, node) for node in update.nodes)
+        self._edges.update(((edge.subject, edge.object), edge) for edge in update.edges)
+        self._stamp = update.stamp
+        self._frame_id = update.frame_id
+        self._sequence = update.sequence
+        return True
+
+    def message(self) -> wire.SceneGraphMessage:
+        """The graph as a snapshot, equal to the publisher's: nodes by id, edges by pair."""
+        return wire.SceneGraphMessage(
+            schema=wire.schema_of(wire.SceneGraphMessage),
+            stamp=self._stamp,
+            frame_id=self._frame_id,
+            sequence=self._sequence,
+            nodes=[self._nodes[node_id] for node_id in sorted(self._nodes)],
+            edges=[self._edges[pair] for pair in sorted(self._edges)],
+        )
