@@ -130,7 +130,7 @@ class GraphBuilder:
         )
         known = np.flatnonzero(fused.known)
         chosen = choose_directions(
-            [pairs[row] for row in known], has_visual[known], fused.probabilities[known]
+            [pairs[row] for row in known.tolist()], has_visual[known], fused.probabilities[known]
         )
         return [
             self._edge_state(pairs[row], evidence[row], fused, row)

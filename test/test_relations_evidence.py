@@ -185,7 +185,8 @@ SURE, UNSURE = [0.9, 0.05, 0.05], [0.4, 0.3, 0.3]
         ([(1, 2), (2, 1)], [False, False], [SURE, UNSURE], [True, False]),
         ([(2, 1), (1, 2)], [False, False], [SURE, UNSURE], [True, False]),
         ([(2, 1), (1, 2)], [False, False], [UNSURE, UNSURE], [False, True]),  # tie: smaller id
-        ([(1, 2), (2, 1)], [False, True], [UNSURE, SURE], [True, True]),  # something was seen
+        ([(1, 2), (2, 1)], [False, True], [UNSURE, SURE], [False, True]),  # only one was seen
+        ([(1, 2), (2, 1)], [True, True], [UNSURE, SURE], [True, True]),
         ([(1, 2), (2, 3), (3, 1)], [False] * 3, [SURE, SURE, SURE], [True] * 3),
         (
             [(5, 3), (1, 2), (3, 5), (2, 1)],
@@ -214,6 +215,6 @@ def test_choice_of_directions_equals_the_reference(seed):
         wanted = True
         if (b, a) in edges:
             other = edges.index((b, a))
-            if not seen[row] and not seen[other]:
-                wanted = (entropies[row], a) < (entropies[other], b)
+            unseen_wins = (entropies[row], a) < (entropies[other], b)
+            wanted = seen[row] or (not seen[other] and unseen_wins)
         assert chosen[row] == wanted

@@ -187,11 +187,12 @@ def fuse_edge(
 def choose_directions(
     edges: Int64 | Sequence[tuple[int, int]], has_visual: Bool, probabilities: Float64
 ) -> Bool:
-    """Which directed edges are published, where nothing was seen of a pair in either direction.
+    """Which directed edges are published, where the prior has completed pairs.
 
-    The prior completes both directions of such a pair, usually with a predicate and something
-    like its inverse; only the direction whose distribution has less entropy is told. On a tie it
-    is the one with the smaller subject id.
+    The prior completes both directions of a pair, usually with a predicate and something like its
+    inverse. A direction that nothing was seen of is told only where nothing was seen of the other
+    either, and then only the one whose distribution has less entropy; on a tie, the one with the
+    smaller subject id.
 
     Args:
         edges: (E, 2) subject and object ids, each directed edge at most once, any order.
@@ -199,8 +200,8 @@ def choose_directions(
         probabilities: (E, R) float64 fused distributions.
 
     Returns:
-        (E,) bool; true for every edge whose pair has visual evidence in some direction, or whose
-        reverse is not among the edges.
+        (E,) bool; true for every edge with visual evidence, or whose reverse is not among the
+        edges.
     """
     ids = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
     kept = np.ones(len(ids), dtype=np.bool_)
@@ -212,9 +213,11 @@ def choose_directions(
     order = np.lexsort((~forward, high, low))
     first, second = order[:-1], order[1:]
     both = (low[first] == low[second]) & (high[first] == high[second])
-    both &= ~(has_visual[first] | has_visual[second])
     first, second = first[both], second[both]
+    seen_first, seen_second = has_visual[first], has_visual[second]
     entropies = entropy_nats(probabilities)
+    # Where neither was seen, one goes; where one was, the other goes; where both were, both stay.
     second_wins = entropies[second] < entropies[first] - ENTROPY_TIE_NATS
-    kept[np.where(second_wins, first, second)] = False
+    kept[first] = seen_first | (~seen_second & ~second_wins)
+    kept[second] = seen_second | (~seen_first & second_wins)
     return kept

@@ -1,0 +1,196 @@
+"""The four stages composed: frames in, one consistent graph and its updates out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.replica import GraphReplica
+
+VOCABULARY = Vocabulary(("cup", "table", "chair"), ("on", "near", "under"))
+INTRINSICS = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
+# Box in the image, depth and class of each object; the cup is close to the table, the chair far.
+OBJECTS = (((60, 40, 80, 60), 1.0, 0), ((20, 60, 90, 100), 1.1, 1), ((110, 20, 150, 110), 2.5, 2))
+
+
+class Scripted:
+    """A perceiver that knows the objects, and sees the cup on the table."""
+
+    def __init__(self, logits: tuple[float, ...] = (3.0, -3.0, -3.0)) -> None:
+        self.logits = np.array([logits])
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
+        instances = np.zeros(frame.depth_m.shape, np.uint16)
+        for row, ((x1, y1, x2, y2), depth_m, _) in enumerate(OBJECTS):
+            window = (slice(y1, y2), slice(x1, x2))
+            instances[window][np.abs(frame.depth_m[window] - depth_m) < 0.05] = row + 1
+        count = len(OBJECTS)
+        graph = FrameGraph(
+            frame.stamp_ns,
+            "camera",
+            160,
+            120,
+            VOCABULARY,
+            np.array([box for box, _, _ in OBJECTS], np.float64),
+            np.full((count, 3), 0.05) + 0.85 * np.eye(3)[[kind for _, _, kind in OBJECTS]],
+            np.full(count, 0.9),
+            Relations(np.array([[0, 1]]), self.logits, np.array([0.8])),
+        )
+        return Perceived(graph, instances, {})
+
+
+def frame(index: int) -> RgbdFrame:
+    """Frame of a still camera; millimetre noise differs from frame to frame."""
+    rng = np.random.default_rng(index)
+    depth_m = np.zeros((120, 160), np.float32)
+    for (x1, y1, x2, y2), distance_m, _ in reversed(OBJECTS):
+        depth_m[y1:y2, x1:x2] = distance_m
+    depth_m[depth_m > 0] += rng.normal(0, 0.002, int((depth_m > 0).sum())).astype(np.float32)
+    rgb = rng.integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    return RgbdFrame(index * 10**8, rgb, depth_m, INTRINSICS, np.eye(4), "map")
+
+
+def local_graph(index: int) -> LocalGraph:
+    seen = frame(index)
+    perceived = Scripted().perceive(seen)
+    return Lifting(Config().lifting).lift(
+        perceived.frame_graph,
+        perceived.instances,
+        seen.depth_m,
+        INTRINSICS,
+        seen.T_world_camera,
+        "map",
+    )
+
+
+def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object() -> None:
+    pipeline = Pipeline(Config(), Scripted())
+    for index in range(200):
+        result = pipeline.process(frame(index))
+        assert result.node_ids == [1, 2, 3]
+    graph = pipeline.graph()
+    assert [node.label for node in graph.nodes] == ["cup", "table", "chair"]
+    assert [node.observations for node in graph.nodes] == [200, 200, 200]
+    assert all(node.surface_points_m for node in graph.nodes)
+    (edge,) = graph.edges
+    assert (edge.subject, edge.object, edge.predicate, edge.provenance) == (1, 2, "on", "visual")
+    assert edge.observations == 200
+    assert edge.probability > 0.999
+
+
+def test_no_graph_before_the_first_frame() -> None:
+    with pytest.raises(RefusedInput, match="no frame was processed"):
+        Pipeline(Config(), Scripted()).graph()
+
+
+def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
+    config = Config(relations=RelationsConfig(world_model="fake"))
+    pipeline = Pipeline(config, Scripted(logits=(0.001, 0.0, 0.0)))
+    for index in range(3):
+        pipeline.process(frame(index))
+    builder = pipeline.builder
+    assert builder is not None
+    (edge,) = pipeline.graph().edges  # cup and table alone are neighbours (Eq. 8)
+    assert edge.provenance == "fused"
+    assert edge.entropy_nats == pytest.approx(np.log(3), abs=1e-4)
+    prior = builder.prior.mean(0, 1)
+    visual = np.exp([0.003, 0.0, 0.0]) / np.exp([0.003, 0.0, 0.0]).sum()
+    expected = (visual + 0.5 * prior) / 1.5
+    told = {belief.label: belief.probability for belief in edge.predicates}
+    for predicate, value in zip(VOCABULARY.predicates, expected):
+        assert told[predicate] == pytest.approx(value, abs=1e-12)
+
+
+def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
+    sure = Pipeline(Config(), Scripted())
+    asked = Pipeline(Config(relations=RelationsConfig(world_model="fake")), Scripted())
+    for index in range(3):
+        sure.process(frame(index))
+        asked.process(frame(index))
+    assert asked.graph().edges == sure.graph().edges
+
+
+def test_evidence_that_comes_late_gives_the_same_graph() -> None:
+    config = Config(relations=RelationsConfig(world_model="fake"))
+    pipeline = Pipeline(config, Scripted())
+    late = GraphBuilder(config, VOCABULARY, "map")
+    reasoner = RelationReasoner(config.relations, build_world_model(config.relations))
+    evidence = []
+    for index in range(8):
+        pipeline.process(frame(index))
+        late.integrate(local_graph(index))
+        evidence.append(reasoner.observe(local_graph(index), frame(index).rgb))
+        evidence += reasoner.drain()
+    for item in reversed(evidence):
+        late.add_evidence(item)
+    now, then = pipeline.graph(), late.full()
+    assert now.nodes == then.nodes
+    assert [(e.subject, e.object, e.predicate, e.provenance) for e in now.edges] == [
+        (e.subject, e.object, e.predicate, e.provenance) for e in then.edges
+    ]
+    for one, other in zip(now.edges, then.edges):
+        assert one.probability == pytest.approx(other.probability, abs=1e-12)
+
+
+@pytest.mark.parametrize("points", [False, True])
+def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> None:
+    config = Config(output=OutputConfig(surface_points=points))
+    builder = GraphBuilder(config, VOCABULARY, "map")
+    replica = GraphReplica()
+    replica.reset(builder.snapshot())
+    for index in range(6):
+        builder.integrate(local_graph(index))
+        update = builder.update()
+        assert update is not None
+        assert update.sequence == index + 1
+        assert [entry.nodes for entry in update.associations] == [[1, 2, 3]]
+        sent = wire.decode(wire.encode(update), wire.SceneGraphUpdateMessage)
+        replica.apply(sent)
+        assert replica.message() == builder.snapshot()
+    assert builder.update() is None
+
+
+@pytest.mark.parametrize("index", [3, 2])
+def test_a_frame_that_is_not_newer_is_refused_and_changes_nothing(index: int) -> None:
+    builder = GraphBuilder(Config(), VOCABULARY, "map")
+    builder.integrate(local_graph(3))
+    before = builder.full()
+    with pytest.raises(RefusedInput) as refused:
+        builder.integrate(local_graph(index))
+    assert refused.value.reason == "out_of_order"
+    assert builder.full() == before
+
+
+def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
+    builder = GraphBuilder(Config(), VOCABULARY, "map")
+    evidence = RelationReasoner(Config().relations, None).observe(local_graph(0))
+    with pytest.raises(RefusedInput) as refused:
+        builder.add_evidence(evidence)
+    assert refused.value.reason == "unknown_frame"
+    other = GraphBuilder(Config(), Vocabulary(("cup",), ("on",)), "map")
+    with pytest.raises(RefusedInput) as refused:
+        other.add_evidence(evidence)
+    assert refused.value.reason == "vocabulary_mismatch"
+    with pytest.raises(RefusedInput) as refused:
+        other.integrate(local_graph(0))
+    assert refused.value.reason == "vocabulary_mismatch"
+
+
+def test_only_nodes_seen_often_enough_are_published() -> None:
+    config = Config(output=OutputConfig(min_observations=2))
+    pipeline = Pipeline(config, Scripted())
+    pipeline.process(frame(0))
+    assert pipeline.graph().nodes == []
+    pipeline.process(frame(1))
+    assert len(pipeline.graph().nodes) == 3
