@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deworldsg_ros.relations.evidence import ClassPairPrior
+from deworldsg_ros.scene.errors import RefusedInput
 
 CLASSES, PREDICATES = 4, 3
 
@@ -106,9 +107,9 @@ def test_saved_and_loaded_it_is_the_same_and_goes_on():
 )
 def test_refuses_what_is_no_prediction_and_stays_as_it_was(classes, predictions, message):
     prior = ClassPairPrior(CLASSES, PREDICATES)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(RefusedInput, match=message) as refused:
         prior.update(np.array(classes), np.array(predictions))
-    assert len(prior) == 0
+    assert refused.value.reason == "invalid_prediction" and len(prior) == 0
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.errors import RefusedInput
+
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
@@ -45,11 +47,15 @@ class ClassPairPrior:
             (k, 2) int64, the class pairs whose prior changed, each once, in order.
 
         Raises:
-            ValueError: for a class that does not exist, or a row that is not a distribution.
+            RefusedInput: ``invalid_prediction`` for a class that does not exist, or a row that is
+                not a distribution; nothing of it is added.
         """
         told = ~np.isnan(predictions).any(axis=1)
         classes, values = pair_classes[told], predictions[told]
-        self._check(classes, values)
+        try:
+            self._check(classes, values)
+        except ValueError as error:
+            raise RefusedInput("invalid_prediction", str(error)) from error
         changed = np.unique(classes, axis=0)
         self._add_rows(changed[self._rows[changed[:, 0], changed[:, 1]] < 0])
         rows = self._rows[classes[:, 0], classes[:, 1]]
