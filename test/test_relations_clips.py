@@ -65,9 +65,9 @@ def test_images_are_kept_by_reference():
 @pytest.mark.parametrize(
     ("a", "b", "wanted"),
     [
-        ([1, 2, 3, 4], [1, 2, 3, 4], (1, 2, 3, 4)),
-        ([1.9, 2.1, 3.1, 4.0], [10, 11, 12.01, 13], (1, 2, 13, 13)),  # whole pixels, outwards
-        ([-5, -5, 3, 4], [60, 40, 900, 900], (0, 0, WIDTH, HEIGHT)),  # clipped to the image
+        ([1, 2, 3, 4], [1, 2, 3, 4], (1, 2, 4, 5)),  # pixel centres are at integers
+        ([1.4, 2.6, 3.1, 4.0], [10, 11, 12.6, 13.4], (1, 3, 14, 14)),  # every pixel touched
+        ([-5, -5, 3, 4], [60, 40, 63, 900], (0, 0, WIDTH, HEIGHT)),  # clipped to the image
         ([5, 5, 5, 5], [5, 5, 5, 5], (5, 5, 6, 6)),  # never empty
         ([64, 48, 64, 48], [64, 48, 64, 48], (63, 47, 64, 48)),
         ([-9, -9, -3, -3], [-9, -9, -3, -3], (0, 0, 1, 1)),
@@ -80,12 +80,14 @@ def test_union_box(a, b, wanted):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000))
-def test_union_box_is_the_least_that_holds_both(seed):
+def test_union_box_is_every_pixel_between_the_outer_edges(seed):
     corners = np.random.default_rng(seed).uniform(0, (WIDTH, HEIGHT), (2, 2, 2))
     a, b = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
-    x1, y1, x2, y2 = union_box(a, b, WIDTH, HEIGHT)
-    assert x1 <= min(a[0], b[0]) < x1 + 1 and y1 <= min(a[1], b[1]) < y1 + 1
-    assert x2 - 1 < max(a[2], b[2]) <= x2 and y2 - 1 < max(a[3], b[3]) <= y2
+    left, top, right, bottom = min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+    columns = [k for k in range(WIDTH) if left < k + 0.5 and k - 0.5 < right]
+    rows = [k for k in range(HEIGHT) if top < k + 0.5 and k - 0.5 < bottom]
+    wanted = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    assert union_box(a, b, WIDTH, HEIGHT) == wanted
 
 
 def test_clip_is_the_crop_of_each_frame():

@@ -80,9 +80,9 @@ def test_model_is_given_the_union_crop_of_the_last_reliable_frame():
     stage.work()
     (request,) = model.requests
     # The union of (10, 20, 50, 40) and (20, 10, 30.5, 22).
-    assert request.clip.shape == (4, 30, 40, 3)
+    assert request.clip.shape == (4, 31, 41, 3)
     for frame, stamp in zip(request.clip, (1, 2, 2, 2)):
-        assert (frame == picture(stamp)[10:40, 10:50]).all()
+        assert (frame == picture(stamp)[10:41, 10:51]).all()
     table_first, cup_first = request.pairs
     assert (table_first.subject_name, table_first.object_name) == ("table", "cup")
     assert (cup_first.subject_class, cup_first.object_class) == (2, 1)
@@ -99,7 +99,7 @@ def test_frames_without_a_local_graph_are_in_the_clip():
     stage.observe(pair_graph(5))
     stage.work()
     for frame, stamp in zip(model.requests[0].clip, (2, 3, 4, 5)):
-        assert (frame == picture(stamp)[10:40, 10:50]).all()
+        assert (frame == picture(stamp)[10:41, 10:51]).all()
 
 
 def test_newest_clip_is_first():

@@ -72,7 +72,9 @@ class FrameBuffer:
 
 
 def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int) -> CropBox:
-    """Smallest box of whole pixels around two boxes, clipped to the image.
+    """The pixels that two boxes and what lies between them touch, clipped to the image.
+
+    Pixel centres are at integers: pixel k reaches from k - 1/2 to k + 1/2.
 
     Args:
         box_a_xyxy: (4,) float64 pixels.
@@ -84,10 +86,12 @@ def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int)
         x1, y1, x2, y2 with the far edges exclusive; at least one pixel wide and high, even where
         the boxes lie outside of the image.
     """
-    x1 = min(max(math.floor(min(box_a_xyxy[0], box_b_xyxy[0])), 0), width - 1)
-    y1 = min(max(math.floor(min(box_a_xyxy[1], box_b_xyxy[1])), 0), height - 1)
-    x2 = max(min(math.ceil(max(box_a_xyxy[2], box_b_xyxy[2])), width), x1 + 1)
-    y2 = max(min(math.ceil(max(box_a_xyxy[3], box_b_xyxy[3])), height), y1 + 1)
+    left, top = np.minimum(box_a_xyxy[:2], box_b_xyxy[:2]).tolist()
+    right, bottom = np.maximum(box_a_xyxy[2:], box_b_xyxy[2:]).tolist()
+    x1 = min(max(math.floor(left + 0.5), 0), width - 1)
+    y1 = min(max(math.floor(top + 0.5), 0), height - 1)
+    x2 = max(min(math.ceil(right + 0.5), width), x1 + 1)
+    y2 = max(min(math.ceil(bottom + 0.5), height), y1 + 1)
     return x1, y1, x2, y2
 
 
