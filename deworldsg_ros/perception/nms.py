@@ -1,0 +1,55 @@
+"""Suppression of boxes that show one object, remembering which box stands for which."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.scene.frame_graph import Float64, Int64
+
+
+def pairwise_iou(boxes_a: Float64, boxes_b: Float64) -> Float64:
+    """Intersection over union, (n, m), of boxes (n, 4) and (m, 4) given as x1, y1, x2, y2."""
+    top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
+    bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
+    intersection = np.clip(bottom_right - top_left, 0.0, None).prod(axis=2)
+    area_a = np.clip(boxes_a[:, 2:] - boxes_a[:, :2], 0.0, None).prod(axis=1)
+    area_b = np.clip(boxes_b[:, 2:] - boxes_b[:, :2], 0.0, None).prod(axis=1)
+    union = area_a[:, None] + area_b[None, :] - intersection
+    return np.asarray(intersection / np.maximum(union, 1e-12))
+
+
+def cluster_boxes(
+    boxes_xyxy: Float64,
+    scores: Float64,
+    classes: Int64,
+    *,
+    same_class_iou: float,
+    any_class_iou: float,
+) -> Int64:
+    """Greedy non-maximum suppression that says who suppressed whom.
+
+    The best remaining box stands for itself and for every remaining one that overlaps it by more
+    than `same_class_iou` with the same class, or by more than `any_class_iou` with any class.
+
+    Args:
+        boxes_xyxy: (n, 4) pixels.
+        scores: (n,).
+        classes: (n,) likeliest class.
+        same_class_iou: overlap above which boxes of one class are one object.
+        any_class_iou: overlap above which any boxes are one object.
+
+    Returns:
+        (n,) int64: the row of the box that stands for each; a survivor stands for itself.
+    """
+    order = np.argsort(-scores, kind="stable")
+    iou = pairwise_iou(boxes_xyxy[order], boxes_xyxy[order])
+    same_class = classes[order][:, None] == classes[order][None, :]
+    covers = (iou > any_class_iou) | (same_class & (iou > same_class_iou))
+    keeper = np.full(len(order), -1, dtype=np.int64)
+    for rank in range(len(order)):
+        if keeper[rank] < 0:
+            keeper[(keeper < 0) & covers[rank]] = rank
+            keeper[rank] = rank
+    result = np.empty(len(order), dtype=np.int64)
+    result[order] = order[keeper]
+    return result

@@ -1,0 +1,143 @@
+"""What a backend has to do: one small protocol each for detector, segmenter and relation head."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import Float64, Relations
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Objects of one image (n objects, C classes), best score first.
+
+    Attributes:
+        boxes_xyxy: (n, 4) float64 pixels, corners x1, y1, x2, y2; pixel centres at integers.
+        class_probabilities: (n, C) float64, calibrated, rows sum to one.
+        scores: (n,) float64 in [0, 1], the detector's own score.
+    """
+
+    boxes_xyxy: Float64
+    class_probabilities: Float64
+    scores: Float64
+
+    def __post_init__(self) -> None:
+        count = len(self.scores)
+        if self.boxes_xyxy.shape != (count, 4) or len(self.class_probabilities) != count:
+            raise ValueError(
+                f"{count} scores, boxes of shape {self.boxes_xyxy.shape}, class probabilities of "
+                f"shape {self.class_probabilities.shape}: wanted one row an object"
+            )
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detections:
+        """The objects of `rows`, in that order."""
+        return Detections(self.boxes_xyxy[rows], self.class_probabilities[rows], self.scores[rows])
+
+
+@dataclass(frozen=True)
+class MaskPatch:
+    """Mask of one object, kept as the part of the image around it.
+
+    Attributes:
+        top, left: image row and column of the patch's first pixel.
+        pixels: (h, w) bool; h or w may be 0 where the object has no pixel.
+    """
+
+    top: int
+    left: int
+    pixels: NDArray[np.bool_]
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """The slices of the image that the patch covers."""
+        height, width = self.pixels.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    def to_image(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+        """The mask on the whole image, (H, W) bool."""
+        image = np.zeros(shape, dtype=bool)
+        image[self.window] = self.pixels
+        return image
+
+
+class Detector(Protocol):
+    """Image to objects."""
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the C classes, in the order of the distributions."""
+
+    @property
+    def default_score_threshold(self) -> float:
+        """The least score that means "probably an object" for this backend.
+
+        The paper's 0.7 is one for softmax scores; sigmoid scores of a small network are lower.
+        """
+
+    def detect(self, rgb: NDArray[np.uint8], score_threshold: float) -> Detections:
+        """Objects of `rgb`, (H, W, 3) uint8 in RGB order, with score >= `score_threshold`."""
+
+
+class Segmenter(Protocol):
+    """Boxes to masks."""
+
+    def segment(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        boxes_xyxy: Float64,
+        class_names: list[str] | None = None,
+    ) -> list[MaskPatch]:
+        """The visible surface of the object in each box.
+
+        Args:
+            rgb: (H, W, 3) uint8, RGB order.
+            depth_m: (H, W) float32, metres along the optical axis; 0 = invalid.
+            intrinsics: of both images.
+            boxes_xyxy: (n, 4) pixels; may reach beyond the image.
+            class_names: the likeliest class of each box; a hint that may be ignored.
+
+        Returns:
+            n masks, in the order of the boxes.
+        """
+
+
+class RelationHead(Protocol):
+    """Objects to relations between them."""
+
+    @property
+    def predicates(self) -> tuple[str, ...]:
+        """Names of the R predicates, in the order of the logits."""
+
+    def relate(
+        self,
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        boxes_xyxy: Float64,
+        class_names: list[str],
+        scores: Float64,
+        instances: NDArray[np.uint16],
+        up_camera: Float64 | None,
+        top_relations: int,
+    ) -> Relations:
+        """The `top_relations` best ordered pairs of the frame, best first.
+
+        Args:
+            depth_m: (H, W) float32, metres; 0 = invalid.
+            intrinsics: of the depth.
+            boxes_xyxy: (n, 4) pixels.
+            class_names: likeliest class of each object.
+            scores: (n,) in [0, 1].
+            instances: (H, W) uint16; k + 1 on the pixels of row k, 0 on nothing.
+            up_camera: (3,) unit vector against gravity in the camera frame; None = unknown.
+            top_relations: most pairs returned.
+        """

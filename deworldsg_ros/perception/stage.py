@@ -1,0 +1,125 @@
+"""Stage a: one RGB-D frame → its 2D scene graph and its instance labels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.protocols import Detections, Detector, RelationHead, Segmenter
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.up import UpEstimator
+
+# Below this a box has no inside to segment.
+MIN_BOX_SIDE_PX = 2.0
+
+
+@dataclass(frozen=True)
+class Perceived:
+    """What one frame showed.
+
+    Attributes:
+        frame_graph: objects, best score first, and the relations between them.
+        instances: (H, W) uint16; k + 1 on the pixels of the k-th object, 0 on nothing.
+        drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
+            image), ``over_max_objects``.
+    """
+
+    frame_graph: FrameGraph
+    instances: NDArray[np.uint16]
+    drops: dict[str, int] = field(default_factory=dict)
+
+
+class Perception:
+    """Detector, segmenter and relation head, composed.
+
+    Args:
+        detector, segmenter, relation_head: the backends.
+        config: thresholds and limits.
+        world_up: axis of the world frame that points up: auto, z, y or -y (`UpEstimator`).
+    """
+
+    def __init__(
+        self,
+        detector: Detector,
+        segmenter: Segmenter,
+        relation_head: RelationHead,
+        config: PerceptionConfig,
+        *,
+        world_up: str = "auto",
+    ) -> None:
+        self._detector = detector
+        self._segmenter = segmenter
+        self._relation_head = relation_head
+        self._config = config
+        self._up = UpEstimator(world_up)
+        self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
+        self.score_threshold = (
+            detector.default_score_threshold
+            if config.score_threshold < 0
+            else config.score_threshold
+        )
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
+        """The 2D scene graph and the instance labels of `frame`."""
+        intrinsics = frame.intrinsics
+        shape = (intrinsics.height, intrinsics.width)
+        found = self._detector.detect(frame.rgb, self.score_threshold)
+        objects, drops = self._select(found, intrinsics.width, intrinsics.height)
+        classes = objects.class_probabilities.argmax(axis=1)
+        names = [self.vocabulary.classes[index] for index in classes]
+        masks = self._segmenter.segment(
+            frame.rgb, frame.depth_m, intrinsics, objects.boxes_xyxy, names
+        )
+        instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
+        up_camera = self._up_camera(frame.T_world_camera)
+        relations = Relations.none(len(self.vocabulary.predicates))
+        if len(objects) > 1 and self._config.top_relations:
+            relations = self._relation_head.relate(
+                frame.depth_m,
+                intrinsics,
+                objects.boxes_xyxy,
+                names,
+                objects.scores,
+                instances,
+                up_camera,
+                self._config.top_relations,
+            )
+        frame_graph = FrameGraph(
+            stamp_ns=frame.stamp_ns,
+            frame_id=frame.frame_id,
+            width=intrinsics.width,
+            height=intrinsics.height,
+            vocabulary=self.vocabulary,
+            boxes_xyxy=objects.boxes_xyxy,
+            class_probabilities=objects.class_probabilities,
+            scores=objects.scores,
+            relations=relations,
+        )
+        return Perceived(frame_graph, instances, dict(drops))
+
+    def _select(
+        self, found: Detections, width: int, height: int
+    ) -> tuple[Detections, Counter[str]]:
+        """Boxes cut to the image, best score first, at most `max_objects`."""
+        boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
+        usable = ((boxes[:, 2:] - boxes[:, :2]) >= MIN_BOX_SIDE_PX).all(axis=1)
+        order = np.argsort(-found.scores, kind="stable")
+        order = order[usable[order]]
+        kept = order[: self._config.max_objects]
+        drops: Counter[str] = Counter()
+        if not usable.all():
+            drops["box_too_small"] = int((~usable).sum())
+        if len(order) > len(kept):
+            drops["over_max_objects"] = len(order) - len(kept)
+        return Detections(boxes, found.class_probabilities, found.scores).take(kept), drops
+
+    def _up_camera(self, T_world_camera: Float64) -> Float64:
+        """Direction against gravity in the camera frame, (3,) unit vector."""
+        self._up.observe(T_world_camera)
+        return np.asarray(T_world_camera[:3, :3].T @ self._up.up_world())

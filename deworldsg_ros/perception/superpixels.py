@@ -1,0 +1,292 @@
+"""A reduced RGB-D image cut into small regions of one surface and one colour.
+
+Felzenszwalb and Huttenlocher's graph-based segmentation (2004) on edge weights of colour, depth
+and surface direction, and the adjacency of its regions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.camera import Intrinsics
+
+# Differences between neighbouring cells that count 1, of CIE Lab colour (8-bit scale), of depth
+# relative to depth, and of 1 - cos of the angle between normals.
+COLOUR_STEP = 8.0
+DEPTH_STEP = 0.015
+NORMAL_STEP = 1.0
+# A border between a cell with depth and one without says little.
+HOLE_STEP = 0.55
+# Felzenszwalb's k: the larger, the coarser.
+COARSENESS = 4.0
+MIN_CELLS = 3
+WEIGHT_BINS = 512
+BINS_A_UNIT = 64.0
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The reduced image (h, w), one cell for `stride` x `stride` pixels.
+
+    Attributes:
+        stride: pixels a cell; cell (y, x) covers pixels from (y stride, x stride).
+        lab: (h, w, 3) float32, CIE Lab in 8-bit scale.
+        points: (h, w, 3) float32, metres, camera frame; 0 where depth is invalid.
+        normals: (h, w, 3) float32, unit, towards the camera.
+    """
+
+    stride: int
+    lab: NDArray[np.float32]
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Regions of a reduced image (c regions, m adjacent pairs).
+
+    Attributes:
+        labels: (h, w) int32 from 0.
+        area: (c,) cells.
+        lab: (c, 3) mean colour.
+        valid: (c,) cells with depth.
+        point: (c, 3) mean point, metres.
+        normal: (c, 3) mean normal, unit.
+        flatness: (c,) length of the mean of the unit normals; 1 = flat.
+        pairs: (m, 2) int32 adjacent regions.
+        strength: (m,) mean edge weight along the border.
+    """
+
+    labels: NDArray[np.int32]
+    area: NDArray[np.float64]
+    lab: NDArray[np.float64]
+    valid: NDArray[np.float64]
+    point: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    flatness: NDArray[np.float64]
+    pairs: NDArray[np.int32]
+    strength: NDArray[np.float64]
+
+
+def reduce_frame(
+    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], intrinsics: Intrinsics, stride: int
+) -> Cells:
+    """The cells of a frame: mean colour, median depth, normals by plane gradients."""
+    height, width = depth_m.shape[0] // stride, depth_m.shape[1] // stride
+    middle = slice(stride // 2, None, stride)
+    smooth = cv2.blur(rgb, (stride, stride))[middle, middle][:height, :width]
+    lab = cv2.cvtColor(np.ascontiguousarray(smooth), cv2.COLOR_RGB2Lab).astype(np.float32)
+    z = cv2.medianBlur(np.ascontiguousarray(depth_m[middle, middle][:height, :width]), 3)
+    columns = (np.arange(width) * stride + stride // 2 - intrinsics.cx) / intrinsics.fx
+    rows = (np.arange(height) * stride + stride // 2 - intrinsics.cy) / intrinsics.fy
+    points, normals = _geometry(
+        z, cv2.blur(z, (5, 5)), columns.astype(np.float32), rows.astype(np.float32)
+    )
+    return Cells(stride, lab, points, normals)
+
+
+def cut_regions(cells: Cells) -> Regions:
+    """The regions of a reduced image and their adjacency."""
+    weights = _edge_weights(cells.lab, cells.points, cells.normals)
+    labels, count = _merge(weights, COARSENESS, MIN_CELLS)
+    sums = _region_sums(labels, count, cells.lab, cells.points, cells.normals)
+    area, valid = sums[:, 0], sums[:, 4]
+    normal_length = np.linalg.norm(sums[:, 8:11], axis=1)
+    pairs, strength = _adjacency(labels, count, weights)
+    return Regions(
+        labels=labels,
+        area=area,
+        lab=sums[:, 1:4] / area[:, None],
+        valid=valid,
+        point=sums[:, 5:8] / np.maximum(valid, 1.0)[:, None],
+        normal=sums[:, 8:11] / np.maximum(normal_length, 1e-9)[:, None],
+        flatness=normal_length / np.maximum(valid, 1.0),
+        pairs=pairs,
+        strength=strength,
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _geometry(z, smooth, columns, rows):  # type: ignore[no-untyped-def]
+    height, width = z.shape
+    points = np.zeros((height, width, 3), np.float32)
+    normals = np.zeros((height, width, 3), np.float32)
+    reach = 2
+    step_x = columns[1] - columns[0]
+    step_y = rows[1] - rows[0]
+    for y in range(height):
+        for x in range(width):
+            depth = z[y, x]
+            if not depth > 0:
+                continue
+            points[y, x, 0] = columns[x] * depth
+            points[y, x, 1] = rows[y] * depth
+            points[y, x, 2] = depth
+            left, right = max(x - reach, 0), min(x + reach, width - 1)
+            top, bottom = max(y - reach, 0), min(y + reach, height - 1)
+            slope_x = (smooth[y, right] - smooth[y, left]) / ((right - left) * step_x)
+            slope_y = (smooth[bottom, x] - smooth[top, x]) / ((bottom - top) * step_y)
+            # Gradient of the depth over the image plane at distance 1.
+            a, b = slope_x, slope_y
+            c = -(depth + columns[x] * slope_x + rows[y] * slope_y)
+            length = np.sqrt(a * a + b * b + c * c) + 1e-12
+            normals[y, x, 0] = a / length
+            normals[y, x, 1] = b / length
+            normals[y, x, 2] = c / length
+    return points, normals
+
+
+@numba.njit(cache=True, nogil=True)
+def _edge_weights(lab, points, normals):  # type: ignore[no-untyped-def]
+    height, width = lab.shape[:2]
+    weights = np.full((2, height, width), np.float32(np.inf))
+    for y in range(height):
+        for x in range(width):
+            for direction in range(2):
+                v = y + direction
+                u = x + 1 - direction
+                if v >= height or u >= width:
+                    continue
+                square = np.float32(0.0)
+                for k in range(3):
+                    d = (lab[y, x, k] - lab[v, u, k]) / np.float32(COLOUR_STEP)
+                    square += d * d
+                here, there = points[y, x, 2], points[v, u, 2]
+                if here > 0 and there > 0:
+                    d = (here - there) / (np.float32(DEPTH_STEP) * min(here, there))
+                    square += d * d
+                    cosine = np.float32(0.0)
+                    for k in range(3):
+                        cosine += normals[y, x, k] * normals[v, u, k]
+                    square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
+                elif here > 0 or there > 0:
+                    square += np.float32(HOLE_STEP * HOLE_STEP)
+                weights[direction, y, x] = np.sqrt(square)
+    return weights
+
+
+@numba.njit(cache=True, nogil=True)
+def _root(parent, node):  # type: ignore[no-untyped-def]
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@numba.njit(cache=True, nogil=True)
+def _merge(weights, coarseness, min_cells):  # type: ignore[no-untyped-def]
+    _, height, width = weights.shape
+    cells = height * width
+    flat = weights.reshape(2 * cells)
+    # Counting sort: the order within 1/64 of a step does not matter.
+    start = np.zeros(WEIGHT_BINS + 1, np.int32)
+    bins = np.empty(2 * cells, np.int16)
+    for edge in range(2 * cells):
+        weight = flat[edge]
+        if weight == np.inf:
+            bins[edge] = -1
+            continue
+        bins[edge] = min(int(weight * BINS_A_UNIT), WEIGHT_BINS - 1)
+        start[bins[edge] + 1] += 1
+    for b in range(WEIGHT_BINS):
+        start[b + 1] += start[b]
+    total = start[WEIGHT_BINS]
+    order = np.empty(total, np.int32)
+    for edge in range(2 * cells):
+        if bins[edge] >= 0:
+            order[start[bins[edge]]] = edge
+            start[bins[edge]] += 1
+    parent = np.arange(cells).astype(np.int32)
+    size = np.ones(cells, np.int32)
+    internal = np.zeros(cells, np.float32)
+    for sweep in range(2):
+        for i in range(total):
+            edge = order[i]
+            if edge < cells:
+                a, b = edge, edge + 1
+            else:
+                a, b = edge - cells, edge - cells + width
+            a, b = _root(parent, a), _root(parent, b)
+            if a == b:
+                continue
+            weight = flat[edge]
+            if sweep == 0:
+                join = weight <= min(
+                    internal[a] + coarseness / size[a], internal[b] + coarseness / size[b]
+                )
+            else:
+                join = size[a] < min_cells or size[b] < min_cells
+            if join:
+                if size[a] < size[b]:
+                    a, b = b, a
+                parent[b] = a
+                size[a] += size[b]
+                internal[a] = weight
+    labels = np.empty(cells, np.int32)
+    number = np.full(cells, -1, np.int32)
+    count = 0
+    for cell in range(cells):
+        root = _root(parent, cell)
+        if number[root] < 0:
+            number[root] = count
+            count += 1
+        labels[cell] = number[root]
+    return labels.reshape(height, width), count
+
+
+@numba.njit(cache=True, nogil=True)
+def _region_sums(labels, count, lab, points, normals):  # type: ignore[no-untyped-def]
+    sums = np.zeros((count, 11))
+    height, width = labels.shape
+    for y in range(height):
+        for x in range(width):
+            row = sums[labels[y, x]]
+            row[0] += 1
+            for k in range(3):
+                row[1 + k] += lab[y, x, k]
+            if points[y, x, 2] > 0:
+                row[4] += 1
+                for k in range(3):
+                    row[5 + k] += points[y, x, k]
+                    row[8 + k] += normals[y, x, k]
+    return sums
+
+
+@numba.njit(cache=True, nogil=True)
+def _adjacency(labels, count, weights):  # type: ignore[no-untyped-def]
+    height, width = labels.shape
+    keys = np.empty(2 * height * width, np.int64)
+    values = np.empty(2 * height * width, np.float32)
+    found = 0
+    for y in range(height):
+        for x in range(width):
+            a = labels[y, x]
+            for direction in range(2):
+                v = y + direction
+                u = x + 1 - direction
+                if v < height and u < width and labels[v, u] != a:
+                    b = labels[v, u]
+                    keys[found] = np.int64(min(a, b)) * count + max(a, b)
+                    values[found] = weights[direction, y, x]
+                    found += 1
+    order = np.argsort(keys[:found], kind="mergesort")
+    pairs = np.empty((found, 2), np.int32)
+    strength = np.zeros(found)
+    length = np.zeros(found)
+    m = -1
+    last = np.int64(-1)
+    for i in order:
+        if keys[i] != last:
+            m += 1
+            last = keys[i]
+            pairs[m, 0] = last // count
+            pairs[m, 1] = last % count
+        strength[m] += values[i]
+        length[m] += 1
+    m += 1
+    return pairs[:m].copy(), strength[:m] / length[:m]

@@ -1,0 +1,78 @@
+"""Names of classes and predicates, in the order of the distributions."""
+
+from __future__ import annotations
+
+# COCO's 80 detection classes, by their official names.
+# fmt: off
+COCO_CLASSES: tuple[str, ...] = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat",
+    "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack",
+    "umbrella", "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball",
+    "kite", "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket",
+    "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple",
+    "sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair",
+    "couch", "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse",
+    "remote", "keyboard", "cell phone", "microwave", "oven", "toaster", "sink",
+    "refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier",
+    "toothbrush",
+)
+# fmt: on
+
+# ReplicaSSG's 150 Visual Genome classes (34 occur in its scenes).
+# fmt: off
+VISUAL_GENOME_CLASSES: tuple[str, ...] = (
+    "airplane", "animal", "arm", "bag", "banana", "basket", "beach", "bear", "bed", "bench",
+    "bike", "bird", "board", "boat", "book", "boot", "bottle", "bowl", "box", "boy", "branch",
+    "building", "bus", "cabinet", "cap", "car", "cat", "chair", "child", "clock", "coat",
+    "counter", "cow", "cup", "curtain", "desk", "dog", "door", "drawer", "ear", "elephant",
+    "engine", "eye", "face", "fence", "finger", "flag", "flower", "food", "fork", "fruit",
+    "giraffe", "girl", "glass", "glove", "guy", "hair", "hand", "handle", "hat", "head",
+    "helmet", "hill", "horse", "house", "jacket", "jean", "kid", "kite", "lady", "lamp",
+    "laptop", "leaf", "leg", "letter", "light", "logo", "man", "men", "motorcycle",
+    "mountain", "mouth", "neck", "nose", "number", "orange", "pant", "paper", "paw", "people",
+    "person", "phone", "pillow", "pizza", "plane", "plant", "plate", "player", "pole", "post",
+    "pot", "racket", "railing", "rock", "roof", "room", "screen", "seat", "sheep", "shelf",
+    "shirt", "shoe", "short", "sidewalk", "sign", "sink", "skateboard", "ski", "skier",
+    "sneaker", "snow", "sock", "stand", "street", "surfboard", "table", "tail", "tie", "tile",
+    "tire", "toilet", "towel", "tower", "track", "train", "tree", "truck", "trunk",
+    "umbrella", "vase", "vegetable", "vehicle", "wave", "wheel", "window", "windshield",
+    "wing", "wire", "woman", "zebra",
+)
+# fmt: on
+
+# 3DSSG's 20 ScanNet classes.
+# fmt: off
+SCANNET_CLASSES: tuple[str, ...] = (
+    "bathtub", "bed", "bookshelf", "cabinet", "chair", "counter", "curtain", "desk", "door",
+    "floor", "otherfurniture", "picture", "refridgerator", "shower curtain", "sink", "sofa",
+    "table", "toilet", "wall", "window",
+)
+# fmt: on
+
+# ReplicaSSG's 50 Visual Genome predicates (nine occur).
+# fmt: off
+REPLICA_SSG_PREDICATES: tuple[str, ...] = (
+    "above", "across", "against", "along", "and", "at", "attached to", "behind",
+    "belonging to", "between", "carrying", "covered in", "covering", "eating", "flying in",
+    "for", "from", "growing on", "hanging from", "has", "holding", "in", "in front of",
+    "laying on", "looking at", "lying on", "made of", "mounted on", "near", "of", "on",
+    "on back of", "over", "painted on", "parked on", "part of", "playing", "riding", "says",
+    "sitting on", "standing on", "to", "under", "using", "walking in", "walking on",
+    "watching", "wearing", "wears", "with",
+)
+# fmt: on
+
+# 3DSSG's seven predicates.
+# fmt: off
+SCANNET_PREDICATES: tuple[str, ...] = (
+    "attached to", "build in", "connected to", "hanging on", "part of", "standing on",
+    "supported by",
+)
+# fmt: on
+
+# By the name the configuration uses.
+PREDICATE_SETS: dict[str, tuple[str, ...]] = {
+    "replica_ssg": REPLICA_SSG_PREDICATES,
+    "3dssg": SCANNET_PREDICATES,
+}
