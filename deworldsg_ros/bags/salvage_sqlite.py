@@ -1,0 +1,59 @@
+"""Read what is left of a damaged rosbag2 SQLite3 file: row by row, without its index."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+Message = tuple[str, str, int, bytes]
+
+# Rows of a broken page raise one by one; after this many in a row nothing is left.
+MOST_BROKEN_ROWS = 10_000
+
+
+def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
+    """Give (topic, type, log time in nanoseconds, CDR) of each readable row in file order.
+
+    Args:
+        path: the file.
+        note: is told, in a sentence, of each loss.
+    """
+    database = sqlite3.connect(f"file:{path.resolve()}?immutable=1", uri=True)
+    try:
+        topics = {
+            key: (name, msgtype)
+            for key, name, msgtype in database.execute("SELECT id, name, type FROM topics")
+        }
+        yield from _rows(database, topics, path, note)
+    except sqlite3.DatabaseError as error:
+        note(f"{path.name} cannot be read as a database ({error}); nothing of it was read")
+    finally:
+        database.close()
+
+
+def _rows(
+    database: sqlite3.Connection,
+    topics: dict[int, tuple[str, str]],
+    path: Path,
+    note: Callable[[str], None],
+) -> Iterator[Message]:
+    row_id = broken = lost = 0
+    while broken < MOST_BROKEN_ROWS:
+        try:
+            for key, topic, time_ns, data in database.execute(
+                "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id",
+                (row_id,),
+            ):
+                row_id, lost, broken = key, lost + broken, 0
+                if topic in topics:
+                    yield (*topics[topic], time_ns, data)
+            break
+        except sqlite3.DatabaseError:
+            broken += 1
+            row_id += 1
+    if lost or broken:
+        note(
+            f"{path.name}: {lost} damaged messages were skipped"
+            + (", and the rest of the file is lost" if broken else "")
+        )

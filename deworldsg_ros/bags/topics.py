@@ -1,0 +1,132 @@
+"""Which topic of a bag is RGB, which depth, …: by type and name, unless told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from deworldsg_ros.bags.errors import RecordingError
+from deworldsg_ros.bags.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    POSE_STAMPED,
+    TF_MESSAGE,
+    Role,
+)
+from deworldsg_ros.bags.storage import Topic
+
+IMAGES = (IMAGE, COMPRESSED_IMAGE)
+POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
+# Images that are neither colour nor depth.
+OTHER_IMAGES = ("infra", "/ir/", "instance", "label", "mask", "segment", "semantic", "mono")
+
+TYPES = {
+    Role.RGB: IMAGES,
+    Role.DEPTH: IMAGES,
+    Role.CAMERA_INFO: (CAMERA_INFO,),
+    Role.POSE: POSES,
+}
+WANTED = {
+    Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
+    Role.DEPTH: "an Image or CompressedImage with depth in its name",
+    Role.CAMERA_INFO: "a CameraInfo beside the RGB image",
+    Role.POSE: "a PoseStamped, an Odometry or /tf",
+}
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """Topics named by the user; empty = found by type and name."""
+
+    rgb: str = ""
+    depth: str = ""
+    camera_info: str = ""
+    pose: str = ""
+
+
+def find_topics(topics: Sequence[Topic], choice: TopicChoice, recording: str) -> dict[Role, Topic]:
+    """The topic of each role.
+
+    Raises:
+        RecordingError: names the role, the topics seen and what was wanted.
+    """
+    filled = [topic for topic in topics if topic.count]
+    rgb = _find(Role.RGB, filled, choice.rgb, _rgb_score, recording)
+    depth = _find(Role.DEPTH, filled, choice.depth, _depth_score, recording)
+    camera_info = _find(
+        Role.CAMERA_INFO,
+        filled,
+        choice.camera_info,
+        lambda topic: _camera_info_score(topic, rgb.name),
+        recording,
+    )
+    pose = _find(Role.POSE, filled, choice.pose, _pose_score, recording)
+    return {Role.RGB: rgb, Role.DEPTH: depth, Role.CAMERA_INFO: camera_info, Role.POSE: pose}
+
+
+def _find(
+    role: Role,
+    topics: Sequence[Topic],
+    chosen: str,
+    score: Callable[[Topic], tuple[float, ...] | None],
+    recording: str,
+) -> Topic:
+    option = "--" + role.value.replace("_", "-")
+    if chosen:
+        for topic in topics:
+            if topic.name == chosen and topic.msgtype in TYPES[role]:
+                return topic
+        problem = f"{option} {chosen} is not a topic that can be {role.value}"
+    else:
+        scored = [
+            (value, topic)
+            for topic in topics
+            if topic.msgtype in TYPES[role] and (value := score(topic)) is not None
+        ]
+        if scored:
+            # The best; among equals the one that sorts first.
+            return min(scored, key=lambda item: ([-value for value in item[0]], item[1].name))[1]
+        problem = f"no {role.value} topic"
+    seen = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in topics)
+    raise RecordingError(
+        f"recording {recording}: {problem}. It has: {seen or 'no messages at all'}. "
+        f"Wanted {WANTED[role]}; name one with {option} TOPIC"
+    )
+
+
+def _rgb_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if "depth" in name or any(word in name for word in OTHER_IMAGES):
+        return None
+    return ("rgb" in name or "color" in name, "image" in name, "rect" in name, *_plain(topic))
+
+
+def _depth_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if "depth" not in name or any(word in name for word in ("theora", "points")):
+        return None
+    return ("aligned" in name or "registered" in name, "compresseddepth" in name, *_plain(topic))
+
+
+def _plain(topic: Topic) -> tuple[float, ...]:
+    """More messages, and of equally many the uncompressed ones."""
+    return (topic.count, topic.msgtype == IMAGE)
+
+
+def _camera_info_score(topic: Topic, rgb_name: str) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    shared = 0
+    for ours, theirs in zip(topic.name.split("/"), rgb_name.split("/")):
+        if ours != theirs:
+            break
+        shared += 1
+    return (shared, "rgb" in name or "color" in name, "depth" not in name, topic.count)
+
+
+def _pose_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if topic.msgtype == TF_MESSAGE:
+        return None if name.endswith("tf_static") else (0, 0, 0, topic.count)
+    return (topic.msgtype == POSE_STAMPED, "camera" in name, "pose" in name, topic.count)

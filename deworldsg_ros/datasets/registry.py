@@ -1,0 +1,54 @@
+"""The data sets of this folder, found by looking: a new one touches no other file.
+
+A data set is a module with a class that derives from `Dataset`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from pathlib import Path
+
+from deworldsg_ros.bags.errors import RecordingError
+from deworldsg_ros.datasets.dataset import Dataset, DatasetOptions
+
+
+@functools.lru_cache(maxsize=1)
+def _datasets() -> dict[str, type[Dataset]]:
+    package = importlib.import_module(__package__ or "deworldsg_ros.datasets")
+    found: dict[str, type[Dataset]] = {}
+    for module in pkgutil.iter_modules(package.__path__):
+        content = vars(importlib.import_module(f"{package.__name__}.{module.name}"))
+        for item in content.values():
+            if isinstance(item, type) and issubclass(item, Dataset) and item is not Dataset:
+                found[item.kind] = item
+    return dict(sorted(found.items()))
+
+
+def dataset_names() -> list[str]:
+    """Names of the known data sets."""
+    return list(_datasets())
+
+
+def detect_dataset(path: Path) -> str | None:
+    """Name of the data set that a folder looks like; None for none of them."""
+    return next((name for name, kind in _datasets().items() if kind.looks_like(path)), None)
+
+
+def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -> Dataset:
+    """Open a folder as a data set.
+
+    Raises:
+        RecordingError: for an unknown name, or with the file that was expected and where.
+    """
+    if name not in _datasets():
+        raise RecordingError(f"data set '{name}' is unknown: wanted {', '.join(_datasets())}")
+    if not path.is_dir():
+        raise RecordingError(f"recording {path}: there is no such folder")
+    return _datasets()[name](path, options or DatasetOptions())
+
+
+def expectations() -> str:
+    """What a folder of each data set holds, in words."""
+    return "; ".join(f"{name}: {kind.expects}" for name, kind in _datasets().items())
