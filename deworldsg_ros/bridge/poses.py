@@ -21,6 +21,11 @@ def stamp_ns_of(message: Any) -> int:
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
 
 
+def set_stamp(message: Any, stamp_ns: int) -> None:
+    """Set the time of a message's header."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+
+
 def pose_from_message(message: Any) -> tuple[Float64, str]:
     """T_world_camera (4, 4) and the world frame of a PoseStamped or Odometry message.
 

@@ -56,8 +56,20 @@ class LiftingFrame:
     frame_id: str
 
 
+@dataclass(frozen=True)
+class PairingFrame:
+    """What relations need of one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
+
+    local: LocalGraph
+    rgb: NDArray[np.uint8]
+
+
 class _PosedAssembler(Assembler[T, Out]):
-    """Depth, camera_info and pose for the items of a leading stream."""
+    """Depth, camera_info and pose for the items of a leading stream.
+
+    Attributes:
+        camera_frame: the optical frame, as camera_info names it.
+    """
 
     def __init__(
         self,
@@ -87,6 +99,7 @@ class _PosedAssembler(Assembler[T, Out]):
         )
         self._slop_ns = round(inputs.slop_s * 1e9)
         self._intrinsics: list[tuple[int, Intrinsics]] = []
+        self.camera_frame = ""
         self._pose_slop_ns = round(inputs.pose_slop_s * 1e9)
         self._poses = PoseStream(self._pose_slop_ns, inputs.world_frame)
         self._transforms = TransformTree(self._pose_slop_ns, inputs.world_frame)
@@ -106,6 +119,7 @@ class _PosedAssembler(Assembler[T, Out]):
         except RefusedInput as refusal:
             self._drop(refusal.reason, str(refusal))
             return
+        self.camera_frame = str(message.header.frame_id)
         if not self._intrinsics or self._intrinsics[-1][1] != intrinsics:
             self._intrinsics = [*self._intrinsics[-15:], (stamp_ns, intrinsics)]
 
@@ -117,7 +131,7 @@ class _PosedAssembler(Assembler[T, Out]):
         except RefusedInput as refusal:
             self._drop(refusal.reason, str(refusal))
 
-    def add_transforms(self, message: Any, *, static: bool = False) -> None:
+    def add_transforms(self, message: Any, static: bool = False) -> None:
         """Keep the transforms of a TFMessage of /tf, or of /tf_static."""
         if not static:
             self._hear_pose(max(map(stamp_ns_of, message.transforms), default=0))
@@ -144,12 +158,12 @@ class _PosedAssembler(Assembler[T, Out]):
             return self._transforms
         return self._poses
 
-    def _posed(self, stamp_ns: int, camera_frame: str) -> bool:
+    def _posed(self, stamp_ns: int) -> bool:
         """Whether depth, camera_info and pose of this stamp are settled."""
         return (
             bool(self._intrinsics)
             and self._depth.settled(stamp_ns)
-            and self._source().settled(stamp_ns, camera_frame)
+            and self._source().settled(stamp_ns, self.camera_frame)
         )
 
     def _intrinsics_at(self, stamp_ns: int) -> Intrinsics:
@@ -214,12 +228,12 @@ class FrameAssembler(_PosedAssembler[Any, RgbdFrame]):
         self._gate = JumpGate(self._inputs.max_step_m)
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
-        return self._posed(stamp_ns, str(value.header.frame_id))
+        return self._posed(stamp_ns)
 
     def _build(self, stamp_ns: int, value: Any) -> RgbdFrame:
         # Cheap questions first: what is refused need not be decoded.
         intrinsics = self._intrinsics_at(stamp_ns)
-        T_world_camera, frame_id = self._source().at(stamp_ns, str(value.header.frame_id))
+        T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
         depth_m = self._depth_at(stamp_ns)
         rgb = rgb_from_message(value)
         frame = RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
@@ -230,7 +244,8 @@ class FrameAssembler(_PosedAssembler[Any, RgbdFrame]):
 class LiftingAssembler(_PosedAssembler[FrameGraph, LiftingFrame]):
     """Frame graphs with the instances, depth, intrinsics and pose that lift them.
 
-    Jumps of the pose are the segmentation's to refuse: what has a frame graph is accepted.
+    That their sizes agree is lifting's to check. Jumps of the pose are the segmentation's to
+    refuse: what has a frame graph is accepted.
     """
 
     def __init__(
@@ -256,28 +271,13 @@ class LiftingAssembler(_PosedAssembler[FrameGraph, LiftingFrame]):
         self._add(self._instances, stamp_ns, message)
 
     def _settled(self, stamp_ns: int, value: FrameGraph) -> bool:
-        return self._instances.settled(stamp_ns) and self._posed(stamp_ns, value.frame_id)
+        return self._instances.settled(stamp_ns) and self._posed(stamp_ns)
 
     def _build(self, stamp_ns: int, value: FrameGraph) -> LiftingFrame:
         intrinsics = self._intrinsics_at(stamp_ns)
-        T_world_camera, frame_id = self._source().at(stamp_ns, value.frame_id)
+        T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
         depth_m = self._depth_at(stamp_ns)
         instances = instances_from_message(self._instances.exact(stamp_ns))
-        sizes = {
-            "frame graph": (value.height, value.width),
-            "instances": instances.shape,
-            "depth": depth_m.shape,
-            "camera_info": (intrinsics.height, intrinsics.width),
-        }
-        if len(set(sizes.values())) > 1:
-            seen = ", ".join(f"{name} {width}x{height}" for name, (height, width) in sizes.items())
-            raise RefusedInput("grid_mismatch", f"sizes are {seen}: wanted one size")
-        if instances.max(initial=0) > len(value):
-            raise RefusedInput(
-                "invalid_instances",
-                f"instance image holds value {instances.max()}: wanted at most {len(value)}, the "
-                "number of objects in the frame graph",
-            )
         return LiftingFrame(value, instances, depth_m, intrinsics, T_world_camera, frame_id)
 
     def _forget(self, stamp_ns: int) -> None:
@@ -285,7 +285,7 @@ class LiftingAssembler(_PosedAssembler[FrameGraph, LiftingFrame]):
         self._drop_unmatched(self._instances, self._instances.forget_before(stamp_ns + 1))
 
 
-class RelationAssembler(Assembler[LocalGraph, "tuple[LocalGraph, NDArray[np.uint8]]"]):
+class RelationAssembler(Assembler[LocalGraph, PairingFrame]):
     """Local graphs with the RGB image of the same stamp."""
 
     def __init__(
@@ -312,15 +312,8 @@ class RelationAssembler(Assembler[LocalGraph, "tuple[LocalGraph, NDArray[np.uint
     def _settled(self, stamp_ns: int, value: LocalGraph) -> bool:
         return self._rgb.settled(stamp_ns)
 
-    def _build(self, stamp_ns: int, value: LocalGraph) -> tuple[LocalGraph, NDArray[np.uint8]]:
-        rgb = rgb_from_message(self._rgb.exact(stamp_ns))
-        if rgb.shape[:2] != (value.height, value.width):
-            raise RefusedInput(
-                "grid_mismatch",
-                f"RGB is {rgb.shape[1]}x{rgb.shape[0]}, local graph {value.width}x{value.height}: "
-                "wanted one size",
-            )
-        return value, rgb
+    def _build(self, stamp_ns: int, value: LocalGraph) -> PairingFrame:
+        return PairingFrame(value, rgb_from_message(self._rgb.exact(stamp_ns)))
 
     def _forget(self, stamp_ns: int) -> None:
         self._drop_unmatched(self._rgb, self._rgb.forget_before(stamp_ns + 1))

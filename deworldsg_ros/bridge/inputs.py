@@ -1,0 +1,103 @@
+"""Subscriptions to the camera: images, camera_info and poses, whatever form they come in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from deworldsg_ros.bridge.node import StageNode
+from deworldsg_ros.bridge.poses import stamp_ns_of
+from deworldsg_ros.bridge.qos import Source, reliable, source
+from deworldsg_ros.scene.errors import ConfigurationError
+
+try:  # On a full installation of ROS, and not in its wheels.
+    from tf2_msgs.msg import TFMessage
+except ImportError:
+    TFMessage = None
+
+# Called with a message and its stamp in nanoseconds.
+Taker = Callable[[Any, int], None]
+# An image has to survive one look at a slow network; poses and transforms come faster.
+IMAGE_DEPTH = 10
+POSE_DEPTH = 100
+
+
+def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[Source]:
+    """Where images may come from, in order of preference.
+
+    Args:
+        topic: of the raw images.
+        compressed_suffix: that image_transport appends, e.g. ``/compressed``.
+        transport: auto, raw or compressed.
+    """
+    raw = [source(topic, Image)]
+    compressed = [
+        source(topic + compressed_suffix, CompressedImage),
+        source(topic, CompressedImage),
+    ]
+    return {"raw": raw, "compressed": compressed, "auto": raw + compressed}[transport]
+
+
+def listen_rgb(node: StageNode, take: Taker) -> None:
+    """Take RGB images."""
+    inputs = node.parameters.inputs
+    topic = node.resolve_topic_name("rgb/image_raw")
+    sources = image_sources(topic, "/compressed", inputs.transport)
+    node.listen("rgb", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+
+
+def listen_depth(node: StageNode, take: Taker) -> None:
+    """Take depth images."""
+    inputs = node.parameters.inputs
+    topic = node.resolve_topic_name("depth/image_raw")
+    sources = image_sources(topic, "/compressedDepth", inputs.transport)
+    node.listen("depth", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+
+
+def listen_camera_info(node: StageNode, take: Taker) -> None:
+    """Take camera_info."""
+    sources = [source("rgb/camera_info", CameraInfo)]
+    reliability = node.parameters.inputs.reliability
+    node.listen("camera_info", sources, _stamped(take), reliability, IMAGE_DEPTH)
+
+
+def listen_pose(node: StageNode, take: Taker, take_transforms: Callable[[Any, bool], None]) -> None:
+    """Take poses, or transforms with whether they are static.
+
+    Raises:
+        ConfigurationError: where TF is wanted and its messages are not installed.
+    """
+    wanted = node.parameters.inputs.pose_source
+    if wanted == "tf" and TFMessage is None:
+        raise ConfigurationError(
+            "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a full "
+            "ROS 2 installation, or poses on camera/pose"
+        )
+    if wanted in ("auto", "tf") and TFMessage is not None:
+        for topic, static in (("/tf", False), ("/tf_static", True)):
+            _listen_transforms(node, topic, static, take_transforms)
+    if wanted == "tf":
+        return
+    kinds = {"pose": [PoseStamped], "odometry": [Odometry], "auto": [PoseStamped, Odometry]}
+    sources = [source("camera/pose", kind) for kind in kinds[wanted]]
+    reliability = node.parameters.inputs.reliability
+    node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
+
+
+def _listen_transforms(
+    node: StageNode, topic: str, static: bool, take: Callable[[Any, bool], None]
+) -> None:
+    def received(message: Any) -> None:
+        node.health.received(topic)
+        take(message, static)
+
+    profile = reliable(POSE_DEPTH, latched=static)
+    node.create_subscription(TFMessage, topic, node.guarded(received), profile)
+
+
+def _stamped(take: Taker) -> Callable[[Any], None]:
+    return lambda message: take(message, stamp_ns_of(message))

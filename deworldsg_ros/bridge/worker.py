@@ -1,0 +1,78 @@
+"""A thread for work that must not hold up the executor, with a bounded queue in order."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Worker(Generic[T]):
+    """Calls `work` with each item, in order, in a thread of its own.
+
+    Args:
+        name: of the thread.
+        work: must not raise.
+        size: items that may wait.
+        on_overrun: called when a new item pushes out the oldest.
+    """
+
+    def __init__(
+        self, name: str, work: Callable[[T], None], *, size: int, on_overrun: Callable[[], None]
+    ) -> None:
+        self._work = work
+        self._size = size
+        self._on_overrun = on_overrun
+        self._items: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._busy = False
+        # A daemon, so that work that never ends cannot keep the process alive.
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Number of items that wait."""
+        return len(self._items)
+
+    def submit(self, item: T) -> None:
+        """Queue an item; never waits."""
+        overrun = False
+        with self._changed:
+            if len(self._items) >= self._size:
+                self._items.popleft()
+                overrun = True
+            self._items.append(item)
+            self._changed.notify_all()
+        if overrun:
+            self._on_overrun()
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until nothing is queued or in work; False where time ran out."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not (self._items or self._busy), timeout_s)
+
+    def stop(self, timeout_s: float = 5.0) -> bool:
+        """Leave what is queued, finish what is in work; False where time ran out."""
+        with self._changed:
+            self._stopping = True
+            self._items.clear()
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._items or self._stopping)
+                if self._stopping:
+                    return
+                item = self._items.popleft()
+                self._busy = True
+            self._work(item)

@@ -1,0 +1,136 @@
+"""graph_node: local graphs and relation evidence → /scene_graph, its updates and its markers."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from builtin_interfaces.msg import Time
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from deworldsg_ros.bridge.markers import marker_array
+from deworldsg_ros.bridge.node import StageNode, run
+from deworldsg_ros.bridge.pending import PendingEvidence
+from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.merging.stage import Merging
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
+from deworldsg_ros.view.markers import markers
+
+SILENCE_S = 2.0
+
+
+class GraphNode(StageNode):
+    """Stage c, and the fusion of stage d, as a node."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("graph_node", "graphs", **options)
+        Merging(self.parameters.merging).warm_up()
+        # The first local graph tells the world frame and the vocabulary.
+        self._builder: GraphBuilder | None = None
+        self._pending = PendingEvidence()
+        self._newest_ns = 0
+        self._changed_s: float | None = None
+        self._heard_s = time.monotonic()
+        self._publish_graph = self.json_publisher("/scene_graph", 1, latched=True)
+        self._publish_update = self.json_publisher("/scene_graph/updates", 50)
+        self._markers = self.create_publisher(
+            MarkerArray, "/scene_graph/markers", reliable(1, latched=True)
+        )
+        self.create_service(Trigger, "~/save", self._save)
+        self.listen_json("deworldsg/local_graph", wire.LocalGraphMessage, self._integrate, 50)
+        self.listen_json(
+            "deworldsg/relation_evidence", wire.RelationEvidenceMessage, self._add_evidence, 50
+        )
+        self.every(1.0 / self.parameters.output.rate_hz, self._publish)
+
+    def _integrate(self, message: wire.LocalGraphMessage) -> None:
+        self._heard_s = time.monotonic()
+        local = local_graph_from_message(message)
+        if self._builder is None:
+            self._builder = GraphBuilder(self.parameters, local.vocabulary, local.frame_id)
+        self._builder.integrate(local)
+        self._newest_ns = local.stamp_ns
+        self._note_change()
+        for evidence in self._pending.take(local.stamp_ns):
+            with self.refusing():
+                self._builder.add_evidence(evidence)
+
+    def _add_evidence(self, message: wire.RelationEvidenceMessage) -> None:
+        evidence = evidence_from_message(message)
+        if self._builder is None or evidence.stamp_ns > self._newest_ns:
+            self._pending.add(evidence)
+            return
+        self._builder.add_evidence(evidence)
+        self._note_change()
+
+    def _note_change(self) -> None:
+        if self._changed_s is None:
+            self._changed_s = time.monotonic()
+
+    def _publish(self) -> None:
+        if self._builder is None or self._changed_s is None:
+            return
+        changed_s, self._changed_s = self._changed_s, None
+        update = self._builder.update()
+        if update is None:
+            return
+        snapshot = self._builder.snapshot()
+        self._publish_update(update)
+        self._publish_graph(snapshot)
+        stamp = Time(sec=snapshot.stamp.sec, nanosec=snapshot.stamp.nanosec)
+        self._markers.publish(marker_array(markers(snapshot), snapshot.frame_id, stamp))
+        self.health.published(time.monotonic() - changed_s)
+
+    def _save(self, request: Any, response: Any) -> Any:
+        """Write the whole graph, with surface points, to the file that `save_path` names."""
+        response.message = "refused: see /diagnostics"
+        with self.refusing():
+            response.success, response.message = self._save_to(
+                Path(self.parameters.node.save_path).absolute()
+            )
+        return response
+
+    def _save_to(self, path: Path) -> tuple[bool, str]:
+        if self._builder is None:
+            return False, "there is no graph yet: no local graph has come"
+        message = self._builder.full()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part = path.with_name(path.name + ".part")
+            part.write_text(wire.encode(message), encoding="utf-8")
+            part.replace(path)
+        except OSError as error:
+            return False, f"{path}: {error}"
+        return True, f"{path}: {len(message.nodes)} nodes, {len(message.edges)} edges"
+
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """Whether local graphs have stopped coming."""
+        silence_s = now_ns / 1e9 - self._heard_s
+        topic = self.resolve_topic_name("deworldsg/local_graph")
+        return [f"no local_graph on {topic} for {silence_s:.0f} s"] if silence_s > SILENCE_S else []
+
+    def more_values(self) -> dict[str, str]:
+        """The size of the graph."""
+        if self._builder is None:
+            return {}
+        snapshot = self._builder.snapshot()
+        return {
+            "nodes": str(len(snapshot.nodes)),
+            "edges": str(len(snapshot.edges)),
+            "sequence": str(snapshot.sequence),
+            "evidence waiting": str(len(self._pending)),
+        }
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(GraphNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

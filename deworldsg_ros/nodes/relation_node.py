@@ -1,0 +1,70 @@
+"""relation_node: local graphs and RGB → deworldsg/relation_evidence, predictions when they come."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from deworldsg_ros.bridge.inputs import listen_rgb
+from deworldsg_ros.bridge.joining import JoiningNode
+from deworldsg_ros.bridge.node import run
+from deworldsg_ros.bridge.sync import PairingFrame, RelationAssembler
+from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.worker import EvidenceWorker
+from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
+from deworldsg_ros.scene.frame_graph import RelationEvidence
+from deworldsg_ros.scene.wire import LocalGraphMessage
+
+
+class RelationNode(JoiningNode[PairingFrame]):
+    """Stage d as a node; the world model has a thread of its own and is in nobody's way."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("relation_node", "evidence messages", **options)
+        config = self.parameters.relations
+        report = self.get_logger().warning
+        self._reasoner = RelationReasoner(config, build_world_model(config), report)
+        self._world_frame = ""
+        self._publish = self.json_publisher("deworldsg/relation_evidence", 50)
+        self._world_model = EvidenceWorker(self._reasoner, self._deliver, report)
+        self._world_model.start()
+        frames = self._frames = RelationAssembler(**self.assembler_options())
+        self.join(frames, self._relate)
+        listen_rgb(self, self.taking(frames.add_rgb))
+        self.listen_json(
+            "deworldsg/local_graph", LocalGraphMessage, self.taking(self._add_local_graph), 50
+        )
+
+    def _add_local_graph(self, message: LocalGraphMessage) -> None:
+        self._frames.add_local_graph(local_graph_from_message(message))
+
+    def _relate(self, frame: PairingFrame) -> None:
+        self._world_frame = frame.local.frame_id
+        self._deliver(self._world_model.observe(frame.local, frame.rgb))
+
+    def _deliver(self, evidence: RelationEvidence) -> None:
+        self._publish(evidence_to_message(evidence, self._world_frame))
+
+    def more_values(self) -> dict[str, str]:
+        """What became of the clips."""
+        counters = self._reasoner.counters()
+        clips = {"queued": counters.queued, "pending": counters.pending}
+        clips["encoded"] = counters.encoded
+        clips.update((f"dropped {reason}", n) for reason, n in sorted(counters.dropped.items()))
+        told = {f"clips {name}": str(count) for name, count in clips.items()}
+        return {**super().more_values(), **told}
+
+    def close(self) -> None:
+        """End the threads."""
+        super().close()
+        self._world_model.stop()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(RelationNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

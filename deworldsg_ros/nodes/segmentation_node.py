@@ -1,0 +1,58 @@
+"""segmentation_node: RGB-D frames with poses → deworldsg/frame_graph and deworldsg/instances."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+from sensor_msgs.msg import Image
+
+from deworldsg_ros.bridge.images import fill_image
+from deworldsg_ros.bridge.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
+from deworldsg_ros.bridge.joining import JoiningNode
+from deworldsg_ros.bridge.node import run
+from deworldsg_ros.bridge.poses import set_stamp
+from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.bridge.sync import FrameAssembler
+from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.codec import frame_graph_to_message
+
+
+class SegmentationNode(JoiningNode[RgbdFrame]):
+    """Stage a as a node."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("segmentation_node", "frame graphs", **options)
+        inputs = self.parameters.inputs
+        self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
+        self._publish_graph = self.json_publisher("deworldsg/frame_graph", 10)
+        self._instances = self.create_publisher(Image, "deworldsg/instances", reliable(10))
+        frames = self._frames = FrameAssembler(inputs, **self.assembler_options())
+        self.join(frames, self._segment)
+        listen_camera_info(self, self.taking(frames.add_camera_info))
+        listen_pose(self, self.taking(frames.add_pose), self.taking(frames.add_transforms))
+        listen_depth(self, self.taking(frames.add_depth))
+        listen_rgb(self, self.taking(frames.add_rgb))
+
+    def _segment(self, frame: RgbdFrame) -> None:
+        perceived = self._perception.perceive(frame)
+        camera_frame = self._frames.camera_frame
+        image = Image()
+        image.header.frame_id = camera_frame
+        set_stamp(image, frame.stamp_ns)
+        fill_image(image, perceived.instances, "mono16")
+        self._instances.publish(image)
+        graph = replace(perceived.frame_graph, frame_id=camera_frame)
+        self._publish_graph(frame_graph_to_message(graph))
+        self.health.left_out(perceived.drops)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(SegmentationNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
