@@ -9,7 +9,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import SurfaceSample, sample_each
+from deworldsg_ros.scene.surface import HashedPoints, hash_each
 
 
 class Merging:
@@ -37,7 +37,7 @@ class Merging:
                 does not speak of the same classes and predicates, or the same world frame.
         """
         _check_fits(graph, local)
-        surfaces = sample_each(local.surface_points_world, graph.surface_point_capacity)
+        surfaces = hash_each(local.surface_points_world)
         placed = [
             self._place(
                 graph,
@@ -61,7 +61,7 @@ class Merging:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: SurfaceSample,
+        surface: HashedPoints,
     ) -> int:
         nodes = graph.nodes
         row = nearest_row(

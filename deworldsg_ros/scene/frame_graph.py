@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.gaussian import log_determinant
+
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
@@ -99,7 +101,7 @@ class LocalGraph:
         class_probabilities: (n, C) float64, rows sum to one.
         scores: (n,) float64.
         means_world: (n, 3) float64, metres (Eq. 4).
-        covariances_world: (n, 3, 3) float64, square metres (Eq. 4).
+        covariances_world: (n, 3, 3) float64, square metres, positive definite (Eq. 4).
         depths_m: (n,) float64, mean depth of the inliers in the camera frame (z of Eq. 8).
         pixel_counts: (n,) int64, number of refined inlier pixels.
         surface_points_world: n arrays (k, 3) float32, a deterministic sample of the inliers.
@@ -129,6 +131,7 @@ class LocalGraph:
         count = len(self.means_world)
         _check("means", self.means_world, (count, 3))
         _check("covariances", self.covariances_world, (count, 3, 3))
+        _check_covariances(self.covariances_world)
         _check("boxes", self.boxes_xyxy, (count, 4))
         _check("depths", self.depths_m, (count,))
         _check("instance ids", self.instance_ids, (count,))
@@ -149,6 +152,15 @@ def _check(name: str, array: NDArray[np.generic], shape: tuple[int, ...]) -> Non
         raise ValueError(f"{name} have shape {array.shape}: wanted {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ValueError(f"{name} hold NaN or infinity: wanted finite values")
+
+
+def _check_covariances(covariances: Float64) -> None:
+    asymmetric = np.abs(covariances - np.swapaxes(covariances, 1, 2)) > 1e-9 * np.abs(covariances)
+    if asymmetric.any():
+        row = int(asymmetric.any(axis=(1, 2)).argmax())
+        raise ValueError(f"covariance {covariances[row].tolist()} of row {row} is not symmetric")
+    for covariance in covariances:
+        log_determinant(covariance)
 
 
 def _check_objects(

@@ -80,7 +80,7 @@ def fuse(
     mean = (weight_i * mean_i + weight_j * mean_j) / total
     covariance = (weight_i * covariance_i + weight_j * covariance_j) / total + (
         weight_i * weight_j / total**2
-    ) * np.outer(difference, difference)
+    ) * (difference[:, None] * difference)
     return mean, covariance
 
 
@@ -109,5 +109,4 @@ def eigenvalue_bound(covariance: Float64) -> float:
 
     The Frobenius norm: equal to it for a thin Gaussian, at most √3 times it for a sphere.
     """
-    flat = covariance.ravel()
-    return math.sqrt(flat @ flat)
+    return math.hypot(*covariance.ravel().tolist())

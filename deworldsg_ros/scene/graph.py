@@ -11,7 +11,7 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, fuse
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE, SurfaceSample, merge_samples
+from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, merge_samples
 
 
 class SceneGraph:
@@ -66,7 +66,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: SurfaceSample = EMPTY_SAMPLE,
+        surface: HashedPoints = EMPTY_SAMPLE,
         weight: float = 1.0,
     ) -> int:
         """Add a node for a first observation and return its id.
@@ -76,7 +76,7 @@ class SceneGraph:
             covariance_world: (3, 3) square metres, positive definite.
             class_probabilities: (C,), scaled to sum to one.
             stamp_ns: time of the observation.
-            surface: sample of its surface points, of at most the graph's capacity.
+            surface: points of its surface.
             weight: number of observations it stands for.
 
         Raises:
@@ -91,7 +91,7 @@ class SceneGraph:
                 covariance_world,
                 class_probabilities / class_probabilities.sum(),
                 weight,
-                surface,
+                merge_samples(EMPTY_SAMPLE, surface, self.surface_point_capacity),
             )
         except ValueError:
             self.nodes.remove(node_id)
@@ -108,7 +108,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: SurfaceSample = EMPTY_SAMPLE,
+        surface: HashedPoints = EMPTY_SAMPLE,
         weight: float = 1.0,
     ) -> None:
         """Fuse one more observation into a live node (Eq. 7); arguments as in `add_node`."""
@@ -241,7 +241,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         weight: float,
-        surface: SurfaceSample,
+        surface: HashedPoints,
         first_seen_ns: int,
         last_seen_ns: int,
     ) -> None:

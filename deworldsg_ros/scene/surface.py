@@ -21,17 +21,20 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 
 
-class SurfaceSample(NamedTuple):
-    """Points of a surface, by ascending hash.
+class HashedPoints(NamedTuple):
+    """Surface points with their content hashes, in any order.
 
     Attributes:
-        hashes: (k,) uint64, strictly ascending.
+        hashes: (k,) uint64.
         points_world: (k, 3) float32, metres.
     """
 
     hashes: UInt64
     points_world: Float32
 
+
+# A sample is a HashedPoints whose hashes ascend strictly.
+SurfaceSample = HashedPoints
 
 EMPTY_SAMPLE = SurfaceSample(np.zeros(0, np.uint64), np.zeros((0, 3), np.float32))
 
@@ -49,40 +52,39 @@ def content_hashes(points: Float32) -> UInt64:
     return state
 
 
-def sample_each(point_sets: tuple[Float32, ...], capacity: int) -> list[SurfaceSample]:
-    """The sample of each set of points (k, 3), hashed in one pass."""
-    if capacity == 0 or not point_sets:
-        return [EMPTY_SAMPLE] * len(point_sets)
+def hash_each(point_sets: tuple[Float32, ...]) -> list[HashedPoints]:
+    """The hashes of each set of points (k, 3), computed in one pass."""
+    if not point_sets:
+        return []
     hashes = content_hashes(np.concatenate(point_sets))
-    samples = []
+    hashed = []
     start = 0
     for points in point_sets:
         stop = start + len(points)
-        samples.append(_smallest(hashes[start:stop], points, capacity))
+        hashed.append(HashedPoints(hashes[start:stop], points))
         start = stop
-    return samples
+    return hashed
 
 
-def merge_samples(a: SurfaceSample, b: SurfaceSample, capacity: int) -> SurfaceSample:
-    """The sample of the union: commutative, associative, idempotent."""
-    if len(a.hashes) < len(b.hashes):
-        a, b = b, a
-    if len(a.hashes) == capacity:
-        # What lies beyond the largest hash kept can no longer enter: most points of most frames.
-        entering = int(np.searchsorted(b.hashes, a.hashes[-1])) if capacity else 0
-        if entering == 0:
-            return a
-        b = SurfaceSample(b.hashes[:entering], b.points_world[:entering])
-    elif len(b.hashes) == 0:
-        return a
-    return _smallest(
-        np.concatenate((a.hashes, b.hashes)),
-        np.concatenate((a.points_world, b.points_world)),
-        capacity,
-    )
+def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) -> SurfaceSample:
+    """The sample of the union of a sample and more points, or another sample.
 
-
-def _smallest(hashes: UInt64, points: Float32, capacity: int) -> SurfaceSample:
+    Between samples it is commutative, associative and idempotent.
+    """
+    if capacity == 0:
+        return EMPTY_SAMPLE
+    if len(sample.hashes) == capacity:
+        # What lies beyond the largest hash kept cannot enter: most points of most frames.
+        entering = np.flatnonzero(points.hashes < sample.hashes[-1])
+        points = HashedPoints(points.hashes[entering], points.points_world[entering])
+    if len(points.hashes) == 0:
+        return sample
+    hashes = np.concatenate((sample.hashes, points.hashes))
+    points_world = np.concatenate((sample.points_world, points.points_world))
+    # Stable sorting is by runs here, and the sample is one long run.
+    order = np.argsort(hashes, kind="stable")
+    ascending = hashes[order]
     # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
-    kept, first = np.unique(hashes, return_index=True)
-    return SurfaceSample(kept[:capacity], np.asarray(points[first[:capacity]], np.float32))
+    distinct = np.flatnonzero(ascending[1:] != ascending[:-1]) + 1
+    kept = order[np.concatenate(([0], distinct))[:capacity]]
+    return SurfaceSample(hashes[kept], points_world[kept])
