@@ -218,3 +218,11 @@ def test_choice_of_directions_equals_the_reference(seed):
             unseen_wins = (entropies[row], a) < (entropies[other], b)
             wanted = seen[row] or (not seen[other] and unseen_wins)
         assert chosen[row] == wanted
+
+
+def test_rounding_does_not_choose_a_direction():
+    """Two priors that were summed in another order differ in their last bits."""
+    almost = np.array([UNSURE, UNSURE]) + np.array([[0.0, 0, 0], [1e-14, -1e-14, 0]])
+    for probabilities in (almost, almost[::-1]):
+        chosen = choose_directions([(1, 2), (2, 1)], np.zeros(2, bool), probabilities)
+        assert chosen.tolist() == [True, False]

@@ -127,3 +127,9 @@ def test_refuses_a_saved_state_that_does_not_fit(change):
     prior.update(np.array([[0, 1]]), np.array([[0.2, 0.3, 0.5]]))
     with pytest.raises(ValueError):
         ClassPairPrior.from_state({**prior.to_state(), **change})
+
+
+def test_what_a_float32_probe_left_off_one_is_made_good():
+    prior = ClassPairPrior(CLASSES, PREDICATES)
+    prior.update(np.array([[0, 1]]), np.array([[0.2, 0.3, 0.5]]) * 1.0005)
+    np.testing.assert_allclose(prior.mean(0, 1), [0.2, 0.3, 0.5], rtol=1e-12)
