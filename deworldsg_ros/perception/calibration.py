@@ -14,31 +14,27 @@ SCORE_FLOOR = 1e-6
 
 @dataclass(frozen=True)
 class SoftmaxCalibration:
-    """p = (1 - uniform) softmax(logit(scores) / temperature) + uniform / C.
+    """p = softmax(logit(scores) / temperature).
 
     The network's sigmoids are independent: 80 classes at 0.01 each outweigh one at 0.5 when they
-    are merely normalised. The softmax of their logits with a fitted temperature is the one-
-    parameter family that keeps their order (Guo et al. 2017); the uniform share bounds the loss
-    where the network is surely wrong. bench/calibrate_detector.py fits both.
+    are merely normalised. The softmax of their logits keeps their order, and its one parameter is
+    fitted by likelihood (temperature scaling, Guo et al. 2017): bench/calibrate_detector.py.
 
     Attributes:
         temperature: > 0; below 1 sharpens.
-        uniform: in [0, 1), share of the uniform distribution.
     """
 
     temperature: float
-    uniform: float
 
     def __post_init__(self) -> None:
-        if self.temperature <= 0 or not 0 <= self.uniform < 1:
-            raise ValueError(f"{self}: wanted temperature > 0 and 0 <= uniform < 1")
+        if not self.temperature > 0:
+            raise ValueError(f"calibration temperature is {self.temperature}: wanted > 0")
 
     def __call__(self, scores: Float64) -> Float64:
         """Distributions (n, C), rows sum to one, of sigmoid scores (n, C)."""
         clipped = np.clip(np.asarray(scores, dtype=np.float64), SCORE_FLOOR, 1 - SCORE_FLOOR)
         logits = np.log(clipped / (1 - clipped)) / self.temperature
         if logits.size == 0:
-            return logits
+            return np.asarray(logits)
         weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-        softmax = weights / weights.sum(axis=1, keepdims=True)
-        return np.asarray((1 - self.uniform) * softmax + self.uniform / softmax.shape[1])
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))

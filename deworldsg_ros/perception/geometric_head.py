@@ -34,7 +34,21 @@ LEVEL_M = 0.06
 FURNITURE_M = 0.45
 
 CONTAINERS = frozenset(
-    "vase pot basket bowl cup sink bag box drawer backpack handbag suitcase bathtub".split()
+    [
+        "vase",
+        "pot",
+        "basket",
+        "bowl",
+        "cup",
+        "sink",
+        "bag",
+        "box",
+        "drawer",
+        "backpack",
+        "handbag",
+        "suitcase",
+        "bathtub",
+    ]
 )
 TABLES = frozenset({"table", "dining table", "desk", "counter", "bench"})
 SEATS = frozenset({"chair", "couch", "seat", "sofa", "stool"})
@@ -110,6 +124,7 @@ class GeometricRelationHead:
 def judge(layout: Layout, class_names: list[str]) -> dict[str, Float64]:
     """Logits (n, n) by predicate name, of both predicate sets."""
     size = layout.high - layout.low
+    width = np.maximum(size[:, :2].max(axis=1), 1e-3)
     is_furniture = size.max(axis=1) > FURNITURE_M
     both_furniture = is_furniture[:, None] & is_furniture[None, :]
     both_small = ~is_furniture[:, None] & ~is_furniture[None, :]
@@ -120,7 +135,7 @@ def judge(layout: Layout, class_names: list[str]) -> dict[str, Float64]:
     rests = _all(
         touches,
         (layout.covered - 0.4) / 0.2,
-        (np.log(size[None, :, :2].max(axis=2) / size[:, None, :2].max(axis=2)) + 0.1) / 0.1,
+        (np.log(width[None, :] / width[:, None]) + 0.1) / 0.1,
         ((layout.high[:, None, 2] - layout.low[None, :, 2]) - 0.02) / 0.02,
     )
     held = _all(

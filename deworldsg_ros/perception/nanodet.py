@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -29,7 +30,7 @@ SAME_CLASS_IOU = 0.5
 # Two boxes that agree this well show one object, whatever they call it.
 ANY_CLASS_IOU = 0.75
 # Fitted by bench/calibrate_detector.py; docs/perception.md says on what.
-CALIBRATION = SoftmaxCalibration(temperature=0.5, uniform=0.05)
+CALIBRATION = SoftmaxCalibration(temperature=0.35)
 
 
 class NanoDetDetector:
@@ -61,13 +62,17 @@ class NanoDetDetector:
 
     def detect(self, rgb: NDArray[np.uint8], score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8, with score >= `score_threshold`, best first."""
+        boxes, class_scores = self.candidates(rgb)
+        return combine(boxes, class_scores, score_threshold)
+
+    def candidates(self, rgb: NDArray[np.uint8]) -> tuple[Float64, Float64]:
+        """What the network says before suppression: boxes (k, 4) in pixels, scores (k, 80)."""
         tensor, scale = letterbox(rgb)
         heads = self._session.run(None, {self._input: tensor})
         boxes, class_scores = decode([np.asarray(head)[0] for head in heads])
         height, width = rgb.shape[:2]
         # Pixel centres at integers: the network's corner 0 is our -0.5.
-        boxes = np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2)
-        return combine(boxes, class_scores, score_threshold)
+        return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
 
 
 def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
@@ -111,7 +116,7 @@ def combine(
     boxes_xyxy: Float64,
     class_scores: Float64,
     score_threshold: float,
-    calibration: SoftmaxCalibration = CALIBRATION,
+    calibration: Callable[[Float64], Float64] = CALIBRATION,
 ) -> Detections:
     """Candidates → objects: suppression, and the evidence of near-identical boxes combined.
 
