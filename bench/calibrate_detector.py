@@ -20,10 +20,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from deworldsg_ros.perception.calibration import SoftmaxCalibration  # noqa: E402
-from deworldsg_ros.perception.nanodet import CALIBRATION, NanoDetDetector, combine  # noqa: E402
-from deworldsg_ros.perception.nms import pairwise_iou  # noqa: E402
-from deworldsg_ros.perception.vocabularies import COCO_CLASSES  # noqa: E402
+from deworldsg_ros.perception.calibration import SoftmaxCalibration
+from deworldsg_ros.perception.nanodet import CALIBRATION, NanoDetDetector, combine
+from deworldsg_ros.perception.nms import pairwise_iou
+from deworldsg_ros.perception.vocabularies import COCO_CLASSES
 
 # Replica's names for what COCO has, too.
 COCO_OF_REPLICA = {
