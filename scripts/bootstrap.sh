@@ -150,6 +150,16 @@ install_project() {
   echo "$wanted" >"$stamps/project"
 }
 
+# Each process of the graph takes 32 MB of shared memory for images (config/fastdds.xml).
+check_shared_memory() {
+  local free_mb
+  free_mb=$(df -Pm /dev/shm 2>/dev/null | awk 'NR == 2 { print $4 }')
+  if [ "${free_mb:-0}" -lt 256 ]; then
+    say "  /dev/shm has ${free_mb:-no} MB free, less than the 256 MB that lose no image;" \
+      "in a container: docker run --shm-size=512m"
+  fi
+}
+
 bootstrap() {
   local profile=$1 ros=wheels
   [ "$(uname -s)" = Linux ] || fail "needs Linux; this is $(uname -s)"
@@ -173,6 +183,7 @@ bootstrap() {
   install_requirements "$ros" "$profile"
   install_project
   exec 9>&-
+  check_shared_memory
 
   export VIRTUAL_ENV="$venv" PATH="$venv/bin:$PATH"
   export AMENT_PREFIX_PATH="$venv${AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}"

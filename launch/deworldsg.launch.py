@@ -1,0 +1,71 @@
+"""The four nodes of deworldsg_ros: RGB, depth, camera info and pose in, /scene_graph out.
+
+ros2 launch deworldsg_ros deworldsg.launch.py rgb:=/my/rgb depth:=/my/depth_registered ...
+"""
+
+from __future__ import annotations
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.substitutions import (
+    EnvironmentVariable,
+    LaunchConfiguration,
+    PathJoinSubstitution,
+)
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+PACKAGE = "deworldsg_ros"
+NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
+
+# Launch argument, the topic that the nodes subscribe to, what it carries.
+INPUTS = (
+    ("rgb", "rgb/image_raw", "colour images"),
+    ("camera_info", "rgb/camera_info", "intrinsics of the colour camera"),
+    ("depth", "depth/image_raw", "depth images, registered to the colour images"),
+    ("pose", "camera/pose", "poses of the colour camera's optical frame (PoseStamped, Odometry)"),
+)
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = FindPackageShare(PACKAGE)
+    arguments = [
+        DeclareLaunchArgument(
+            "params_file",
+            default_value=PathJoinSubstitution([share, "config", "robust.yaml"]),
+            description="ROS parameter file for all four nodes",
+        ),
+        DeclareLaunchArgument(
+            "use_sim_time",
+            default_value="false",
+            choices=["true", "false"],
+            description="take the time from /clock, as with ros2 bag play --clock",
+        ),
+        *(
+            DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {what}")
+            for name, topic, what in INPUTS
+        ),
+    ]
+    use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
+    nodes = [
+        Node(
+            package=PACKAGE,
+            executable=name,
+            name=name,
+            output="screen",
+            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
+            remappings=[(topic, LaunchConfiguration(argument)) for argument, topic, _ in INPUTS],
+        )
+        for name in NODES
+    ]
+    # Images between processes need the larger shared-memory segment; a profile that is set already
+    # is the user's.
+    profile = SetEnvironmentVariable(
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        EnvironmentVariable(
+            "FASTRTPS_DEFAULT_PROFILES_FILE",
+            default_value=PathJoinSubstitution([share, "config", "fastdds.xml"]),
+        ),
+    )
+    return LaunchDescription([*arguments, profile, *nodes])

@@ -1,0 +1,122 @@
+"""The choices that scripts/bootstrap.sh makes before it installs anything."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture()
+def checkout(tmp_path: Path, root_dir: Path) -> Path:
+    """A folder with nothing but the script."""
+    (tmp_path / "checkout" / "scripts").mkdir(parents=True)
+    script = tmp_path / "checkout" / "scripts" / "bootstrap.sh"
+    script.write_text((root_dir / "scripts" / "bootstrap.sh").read_text(encoding="utf-8"))
+    return tmp_path / "checkout"
+
+
+def bash(checkout: Path, code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code after sourcing the script, in an environment of its own."""
+    return subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", f". scripts/bootstrap.sh; {code}"],
+        cwd=checkout,
+        env={"PATH": os.defpath, "HOME": str(checkout), **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+def fake_python(folder: Path, name: str, version: str, *, has_venv: bool = True) -> None:
+    """A Python that knows its version and, perhaps, venv."""
+    folder.mkdir(exist_ok=True)
+    path = folder / name
+    path.write_text(
+        f"""#!/bin/sh
+case "$*" in
+  *version_info*) echo {version} ;;
+  *ensurepip*) exit {0 if has_venv else 1} ;;
+  *sys.executable*) echo {path} ;;
+esac
+"""
+    )
+    path.chmod(0o755)
+
+
+@pytest.fixture()
+def pythons(tmp_path: Path) -> Path:
+    """A PATH of its own: python3.10 to python3.13 are missing there, tools are not."""
+    folder = tmp_path / "pythons"
+    folder.mkdir()
+    for tool in ("sed", "bash", "dirname"):
+        (folder / tool).symlink_to(f"/usr/bin/{tool}")
+    for name in ("python3", "python3.13", "python3.12", "python3.11", "python3.10"):
+        (folder / name).write_text("#!/bin/sh\nexit 127\n")
+        (folder / name).chmod(0o755)
+    return folder
+
+
+def test_python3_is_preferred_when_it_is_suitable(checkout: Path, pythons: Path) -> None:
+    fake_python(pythons, "python3", "3.12")
+    fake_python(pythons, "python3.13", "3.13")
+    assert bash(checkout, "find_python", PATH=str(pythons)).stdout == f"{pythons}/python3\n"
+
+
+def test_newest_suitable_python_is_taken_when_python3_is_not(checkout: Path, pythons: Path) -> None:
+    fake_python(pythons, "python3", "3.14")
+    fake_python(pythons, "python3.10", "3.10")
+    fake_python(pythons, "python3.11", "3.11")
+    assert bash(checkout, "find_python", PATH=str(pythons)).stdout == f"{pythons}/python3.11\n"
+
+
+def test_refusal_names_what_was_found_and_what_is_wanted(checkout: Path, pythons: Path) -> None:
+    fake_python(pythons, "python3", "3.8")
+    fake_python(pythons, "python3.12", "3.12", has_venv=False)
+    done = bash(checkout, "find_python", PATH=str(pythons))
+    assert done.returncode != 0
+    assert "needs Python 3.10, 3.11, 3.12 or 3.13" in done.stderr
+    assert "python3 is 3.8" in done.stderr
+    assert "apt install python3.12-venv" in done.stderr
+
+
+def test_a_virtual_environment_of_the_user_is_left_alone(checkout: Path) -> None:
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    done = bash(checkout, "bootstrap run")
+    assert done.returncode != 0
+    assert ".venv exists and was not made by this script" in done.stderr
+    assert [path.name for path in (checkout / ".venv").iterdir()] == ["bin"]
+
+
+def test_hash_follows_content_and_names_and_not_compiled_files(checkout: Path) -> None:
+    def hash_of_package() -> str:
+        return bash(checkout, "hash_of package").stdout
+
+    (checkout / "package").mkdir()
+    (checkout / "package" / "a b.py").write_text("1")
+    first = hash_of_package()
+    assert len(first.strip()) == 64
+    (checkout / "package" / "a b.pyc").write_text("compiled")
+    assert hash_of_package() == first
+    (checkout / "package" / "a b.py").write_text("2")
+    second = hash_of_package()
+    (checkout / "package" / "a b.py").rename(checkout / "package" / "c.py")
+    assert len({first, second, hash_of_package()}) == 3
+
+
+def test_failing_step_shows_its_output_and_ends_the_start(checkout: Path) -> None:
+    code = 'mkdir -p "$stamps"; quietly "a step" sh -c "echo the reason; exit 3"; echo not reached'
+    done = bash(checkout, code)
+    assert done.returncode != 0
+    assert "the reason" in done.stderr
+    assert "a step failed with status 3" in done.stderr
+    assert done.stdout == ""
+
+
+def test_another_ros_is_put_aside(checkout: Path) -> None:
+    code = 'forget_other_ros; echo "${ROS_DISTRO-}${PYTHONPATH-}${LD_LIBRARY_PATH-}"'
+    done = bash(checkout, code, ROS_DISTRO="humble", PYTHONPATH="/old", LD_LIBRARY_PATH="/old")
+    assert done.stdout == "\n"
+    assert "ROS 2 humble is sourced" in done.stderr

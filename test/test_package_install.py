@@ -1,0 +1,198 @@
+"""Both ways to install, each into an empty folder, and what a ROS 2 user then finds there."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from ament_index_python.packages import (
+    get_package_prefix,
+    get_package_share_directory,
+    get_packages_with_prefixes,
+)
+
+PACKAGE = "deworldsg_ros"
+EXECUTABLES = {"segmentation_node", "lifting_node", "relation_node", "graph_node", "replay"}
+SOURCES = (
+    *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "requirements.txt", "LICENSE"),
+    *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),
+)
+SHARED = ("launch", "config", "msg_schemas", "bags")
+
+
+@dataclass(frozen=True)
+class Install:
+    """An installation of the package.
+
+    Attributes:
+        prefix: what AMENT_PREFIX_PATH names.
+        site: the folder that Python imports the package from.
+    """
+
+    prefix: Path
+    site: Path
+
+    def environment(self) -> Mapping[str, str]:
+        """The environment of a shell in which the installation is sourced."""
+        return {
+            **os.environ,
+            "AMENT_PREFIX_PATH": f"{self.prefix}:{os.environ['AMENT_PREFIX_PATH']}",
+            "PYTHONPATH": str(self.site),
+            "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+        }
+
+
+def run(*command: str | Path, cwd: Path, **options: object) -> None:
+    """Run a command; its output is in the failure's text."""
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=110,
+        **options,  # type: ignore[call-overload]
+    )
+    assert done.returncode == 0, done.stdout
+
+
+def copy_sources(root: Path, target: Path) -> Path:
+    """A copy, because both builders leave files beside what they build."""
+    target.mkdir()
+    for name in SOURCES:
+        source = root / name
+        if source.is_dir():
+            ignore = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(source, target / name, ignore=ignore)
+        elif source.exists():
+            shutil.copy2(source, target / name)
+    return target
+
+
+def install_with_pip(source: Path, folder: Path) -> Path:
+    """The prefix of a `pip install .`."""
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
+    prefix = folder / "prefix"
+    run(sys.executable, "-m", "pip", "install", *options, "--prefix", prefix, source, cwd=folder)
+    return prefix
+
+
+def install_with_colcon(source: Path, folder: Path) -> Path:
+    """The prefix of a `colcon build`."""
+    colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    assert colcon is not None, "no colcon: pip install -r requirements-test.txt"
+    run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
+    return folder / "install" / PACKAGE
+
+
+BUILDERS = {"pip": install_with_pip, "colcon": install_with_colcon}
+
+
+@pytest.fixture(scope="module", params=sorted(BUILDERS))
+def install(
+    request: pytest.FixtureRequest, root_dir: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Install:
+    """The package, installed in one of the two ways."""
+    folder = tmp_path_factory.mktemp(request.param)
+    prefix = BUILDERS[request.param](copy_sources(root_dir, folder / "source"), folder)
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    return Install(prefix, prefix / "lib" / version / "site-packages")
+
+
+@pytest.fixture()
+def sourced(install: Install, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """The installation, with this process as a shell in which it is sourced."""
+    monkeypatch.setenv("AMENT_PREFIX_PATH", install.environment()["AMENT_PREFIX_PATH"])
+    return install
+
+
+def files_below(folder: Path) -> set[str]:
+    """The data files below a folder, relative to it."""
+    return {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+
+
+def test_ament_index_finds_the_package(sourced: Install) -> None:
+    assert get_package_prefix(PACKAGE) == str(sourced.prefix)
+    assert get_package_share_directory(PACKAGE) == str(sourced.prefix / "share" / PACKAGE)
+    assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
+
+
+def test_share_has_what_the_checkout_has(sourced: Install, root_dir: Path) -> None:
+    share = Path(get_package_share_directory(PACKAGE))
+    assert (share / "package.xml").is_file()
+    for folder in SHARED:
+        wanted = files_below(root_dir / folder)
+        if folder != "launch":
+            wanted = {name for name in wanted if not name.endswith(".py")}
+        assert wanted <= files_below(share / folder)
+    assert {"robust.yaml", "paper.yaml", "fastdds.xml"} <= files_below(share / "config")
+    assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
+
+
+def test_ros2_run_finds_each_executable_once(sourced: Install) -> None:
+    folder = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
+    assert {path.name for path in folder.iterdir()} == EXECUTABLES
+    assert all(os.access(path, os.X_OK) for path in folder.iterdir())
+    assert {path.name for path in (sourced.prefix / "bin").iterdir()} == {"deworldsg"}
+
+
+def test_python_package_has_all_its_files(install: Install, root_dir: Path) -> None:
+    assert files_below(root_dir / PACKAGE) <= files_below(install.site / PACKAGE)
+    assert any(name.endswith(".onnx") for name in files_below(install.site / PACKAGE))
+
+
+@pytest.mark.parametrize("executable", sorted(EXECUTABLES - {"replay"}))
+def test_executable_starts_its_node(install: Install, tmp_path: Path, executable: str) -> None:
+    """A parameter that does not exist ends a node at start-up, with status 2 and its name."""
+    done = subprocess.run(
+        [install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such_thing:=1"],
+        cwd=tmp_path,
+        env=install.environment(),
+        capture_output=True,
+        text=True,
+        timeout=100,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "no_such_thing" in done.stderr
+
+
+def test_replay_and_deworldsg_tell_how_to_use_them(install: Install, tmp_path: Path) -> None:
+    for path in (install.prefix / "lib" / PACKAGE / "replay", install.prefix / "bin" / "deworldsg"):
+        run(path, "--help", cwd=tmp_path, env=install.environment())
+
+
+@pytest.mark.parametrize("prefix_has_python", [True, False])
+def test_executable_prefers_the_python_of_its_prefix(
+    root_dir: Path, tmp_path: Path, prefix_has_python: bool
+) -> None:
+    """`.venv/lib/deworldsg_ros/graph_node` works where .venv is not activated."""
+
+    def fake_python(folder: Path, name: str) -> None:
+        folder.mkdir(parents=True)
+        (folder / "python3").write_text(f'#!/bin/sh\necho {name} "$2"\n')
+        (folder / "python3").chmod(0o755)
+
+    executable = tmp_path / "a prefix" / "lib" / PACKAGE / "graph_node"
+    executable.parent.mkdir(parents=True)
+    shutil.copy(root_dir / "scripts" / "ros" / "graph_node", executable)
+    fake_python(tmp_path / "elsewhere", "path")
+    if prefix_has_python:
+        fake_python(tmp_path / "a prefix" / "bin", "prefix")
+    done = subprocess.run(
+        [executable, "an argument"],
+        env={"PATH": f"{tmp_path / 'elsewhere'}:/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        timeout=20,
+    )
+    assert done.stdout == f"{'prefix' if prefix_has_python else 'path'} an argument\n"

@@ -1,0 +1,105 @@
+"""The launch files' content.
+
+`launch` and `launch_ros` exist on a full ROS 2 installation only. Elsewhere the classes that the
+launch files use are replaced by ones that keep their arguments: that shows what the files ask for,
+and not that ROS 2 accepts it.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+
+class Kept:
+    """Any class of launch: its arguments, and nothing else."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.args = args
+        self.kwargs = kwargs
+
+
+CLASSES = {
+    "launch": ("LaunchDescription",),
+    "launch.actions": (
+        "DeclareLaunchArgument",
+        "IncludeLaunchDescription",
+        "SetEnvironmentVariable",
+    ),
+    "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
+    "launch.substitutions": ("EnvironmentVariable", "LaunchConfiguration", "PathJoinSubstitution"),
+    "launch_ros": (),
+    "launch_ros.actions": ("Node",),
+    "launch_ros.parameter_descriptions": ("ParameterValue",),
+    "launch_ros.substitutions": ("FindPackageShare",),
+}
+
+
+@pytest.fixture()
+def launch_classes(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[Kept]]:
+    """Modules launch and launch_ros whose classes keep their arguments; the classes by name."""
+    classes = {name: type(name, (Kept,), {}) for names in CLASSES.values() for name in names}
+    for path, names in CLASSES.items():
+        module = ModuleType(path)
+        for name in names:
+            setattr(module, name, classes[name])
+        monkeypatch.setitem(sys.modules, path, module)
+    return classes
+
+
+def describe(path: Path, classes: dict[str, type[Kept]], kind: str) -> list[Kept]:
+    """The entities of one kind in a launch file's description."""
+    (description,) = runpy.run_path(str(path))["generate_launch_description"]().args
+    return [entity for entity in description if isinstance(entity, classes[kind])]
+
+
+def test_four_nodes_take_the_parameter_file_and_the_inputs(
+    root_dir: Path, launch_classes: dict[str, type[Kept]]
+) -> None:
+    path = root_dir / "launch" / "deworldsg.launch.py"
+    nodes = describe(path, launch_classes, "Node")
+    names = [node.kwargs["executable"] for node in nodes]
+    assert names == ["segmentation_node", "lifting_node", "relation_node", "graph_node"]
+    assert all((root_dir / "scripts" / "ros" / name).is_file() for name in names)
+    for node in nodes:
+        assert node.kwargs["package"] == "deworldsg_ros"
+        file, extra = node.kwargs["parameters"]
+        assert file.args == ("params_file",)
+        assert list(extra) == ["use_sim_time"]
+        assert {topic: value.args[0] for topic, value in node.kwargs["remappings"]} == {
+            "rgb/image_raw": "rgb",
+            "rgb/camera_info": "camera_info",
+            "depth/image_raw": "depth",
+            "camera/pose": "pose",
+        }
+
+
+def test_every_launch_configuration_is_a_declared_argument(
+    root_dir: Path, launch_classes: dict[str, type[Kept]]
+) -> None:
+    path = root_dir / "launch" / "deworldsg.launch.py"
+    declared = {
+        entity.args[0] for entity in describe(path, launch_classes, "DeclareLaunchArgument")
+    }
+    assert declared == {"params_file", "use_sim_time", "rgb", "camera_info", "depth", "pose"}
+
+
+def test_realsense_passes_its_topics_on(
+    root_dir: Path, launch_classes: dict[str, type[Kept]]
+) -> None:
+    path = root_dir / "launch" / "realsense.launch.py"
+    (include,) = describe(path, launch_classes, "IncludeLaunchDescription")
+    passed = {name: value.args[0] for name, value in include.kwargs["launch_arguments"]}
+    declared = {
+        entity.args[0]: entity.kwargs["default_value"]
+        for entity in describe(path, launch_classes, "DeclareLaunchArgument")
+    }
+    assert passed == {name: name for name in declared}
+    assert declared["rgb"] == "/camera/camera/color/image_raw"
+    assert declared["depth"] == "/camera/camera/aligned_depth_to_color/image_raw"
+    assert declared["camera_info"] == "/camera/camera/color/camera_info"
