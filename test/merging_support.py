@@ -1,0 +1,114 @@
+"""Random Gaussians, poses and local graphs for the tests of scene and merging."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+
+VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_covariances(
+    rng: np.random.Generator, count: int, thinnest_m: float = 1e-3, largest_m: float = 1.0
+) -> NDArray[np.float64]:
+    """(n, 3, 3) with standard deviations spread evenly in magnitude."""
+    bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    deviations = np.exp(rng.uniform(np.log(thinnest_m), np.log(largest_m), (count, 1, 3)))
+    covariances = bases * deviations**2 @ bases.swapaxes(1, 2)
+    return (covariances + covariances.swapaxes(1, 2)) / 2
+
+
+def random_pose(rng: np.random.Generator) -> NDArray[np.float64]:
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    pose[:3, 3] = rng.normal(0, 3, 3)
+    return pose
+
+
+def random_classes(
+    rng: np.random.Generator, count: int, classes: int = 4, sharpness: float = 3.0
+) -> NDArray[np.float64]:
+    """(n, C) distributions, from flat to nearly certain."""
+    logits = rng.normal(0, sharpness, (count, classes))
+    powers = np.exp(logits - logits.max(axis=1, keepdims=True))
+    return powers / powers.sum(axis=1, keepdims=True)
+
+
+def local_graph(
+    stamp_ns: int,
+    means: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    classes: NDArray[np.float64],
+    *,
+    points: tuple[NDArray[np.float32], ...] | None = None,
+    pairs: list[tuple[int, int]] | None = None,
+    logits: NDArray[np.float64] | None = None,
+    vocabulary: Vocabulary = VOCABULARY,
+    frame_id: str = "world",
+) -> LocalGraph:
+    count = len(means)
+    predicates = len(vocabulary.predicates)
+    pair_array = np.array(pairs or [], np.int64).reshape(-1, 2)
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id=frame_id,
+        width=640,
+        height=480,
+        T_world_camera=np.eye(4),
+        vocabulary=vocabulary,
+        instance_ids=np.arange(1, count + 1),
+        boxes_xyxy=np.tile([0.0, 0.0, 10.0, 10.0], (count, 1)),
+        class_probabilities=classes,
+        scores=np.full(count, 0.9),
+        means_world=means,
+        covariances_world=covariances,
+        depths_m=np.ones(count),
+        pixel_counts=np.full(count, 100),
+        surface_points_world=points or tuple(np.zeros((0, 3), np.float32) for _ in range(count)),
+        relations=Relations(
+            pair_array,
+            np.zeros((len(pair_array), predicates)) if logits is None else logits,
+            np.ones(len(pair_array)),
+        ),
+    )
+
+
+def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGraph]:
+    """Frames that see a few objects again and again, noisily: they merge, split and chain."""
+    objects = int(rng.integers(2, 9))
+    means = rng.uniform(-1, 1, (objects, 3))
+    covariances = random_covariances(rng, objects, 0.02, 0.6)
+    classes = random_classes(rng, objects)
+    graphs = []
+    for stamp_ns in range(1, frames + 1):
+        seen = rng.integers(0, objects, int(rng.integers(0, 7)))
+        count = len(seen)
+        pairs = [
+            (subject, object_)
+            for subject in range(count)
+            for object_ in range(count)
+            if subject != object_ and rng.random() < 0.3
+        ]
+        noise = rng.normal(size=(count, 3)) * 10 ** rng.uniform(-3, -0.5)
+        scale = np.exp(rng.normal(0, 0.3, (count, 1, 1)))
+        flat = rng.dirichlet(np.ones(4), count).reshape(count, 4)
+        graphs.append(
+            local_graph(
+                stamp_ns,
+                means[seen] + noise,
+                covariances[seen] * scale,
+                0.8 * classes[seen] + 0.2 * flat,
+                points=tuple(
+                    rng.normal(means[row], 0.1, (5, 3)).astype(np.float32) for row in seen
+                ),
+                pairs=pairs,
+                logits=rng.normal(0, 2, (len(pairs), 3)),
+            )
+        )
+    return graphs
