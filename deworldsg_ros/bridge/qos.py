@@ -131,8 +131,10 @@ class AutoSubscription:
 
     def check(self) -> bool:
         """Look at the publishers, subscribe anew where need be; True where it did."""
-        choice = choose(self._sources, self._offers(), self._reliability)
-        if choice == self._choice:
+        offers = self._offers()
+        choice = choose(self._sources, offers, self._reliability)
+        # When the publishers go, what they were is the best guess of what comes back.
+        if choice == self._choice or (self._choice is not None and not offers):
             return False
         if self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
