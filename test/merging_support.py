@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.surface import hash_each
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 
@@ -112,3 +114,29 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
             )
         )
     return graphs
+
+
+def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> None:
+    """Everything that stages do to a graph, in random order."""
+    for _ in range(edits):
+        stamp_ns = int(rng.integers(0, 10**12))
+        live = graph.nodes.ids.tolist()
+        ever = int(max([*live, 1]))
+        gaussian = (rng.normal(size=3), random_covariances(rng, 1)[0], random_classes(rng, 1)[0])
+        points = hash_each((rng.normal(size=(4, 3)).astype(np.float32),))[0]
+        action = rng.choice(["add", "observe", "merge", "remove", "visual", "neighbour", "frame"])
+        if action == "add" or len(live) < 2:
+            graph.add_node(*gaussian, stamp_ns, points)
+        elif action == "observe":
+            graph.observe(int(rng.choice(live)), *gaussian, stamp_ns, points)
+        elif action == "merge":
+            graph.merge_nodes(*rng.choice(live, 2, replace=False).tolist())
+        elif action == "remove" and rng.random() < 0.5:
+            graph.remove_node(int(rng.choice(live)))
+        elif action == "visual":
+            pair = rng.integers(1, ever + 1, 2).tolist()
+            graph.add_visual(*pair, rng.normal(size=3), stamp_ns)
+        elif action == "neighbour":
+            graph.add_neighbour(*rng.integers(1, ever + 1, 2).tolist(), stamp_ns)
+        elif action == "frame":
+            graph.remember_frame(stamp_ns, rng.choice(live, 3).tolist())

@@ -1,0 +1,192 @@
+"""Time and memory of the merging stage (Eq. 5-7).
+
+Run as `python bench/merging.py`. The kernel and the np.linalg reference are measured turn by turn
+in one run, and the ratio given is the median of the paired ratios.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging import Merging
+from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
+from deworldsg_ros.merging.kernel import nearest_row, warm_up
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.gaussian import eigenvalue_bound, hellinger_distance, log_determinant
+from deworldsg_ros.scene.graph import SceneGraph
+
+CLASSES = 80
+PREDICATES = 50
+VOCABULARY = Vocabulary(
+    tuple(f"class_{index}" for index in range(CLASSES)),
+    tuple(f"predicate_{index}" for index in range(PREDICATES)),
+)
+LOCAL_NODES = 12
+DENSITY_PER_M2 = 3.0
+
+
+class World:
+    """Objects of 5-50 cm on a floor that grows with their number, seen from all sides."""
+
+    def __init__(self, count: int, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        side_m = (count / DENSITY_PER_M2) ** 0.5
+        self.means = rng.uniform((0, 0, 0), (side_m, side_m, 1.5), (count, 3))
+        bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+        variances = rng.uniform(0.05, 0.5, (count, 1, 3)) ** 2
+        # The surface that a camera sees is thin in one direction.
+        variances[:, :, 2] = 0.01**2
+        self.covariances = bases * variances @ bases.swapaxes(1, 2)
+        self.covariances = (self.covariances + self.covariances.swapaxes(1, 2)) / 2
+        self.classes = rng.integers(0, CLASSES, count)
+
+    def probabilities(self, rows: np.ndarray) -> np.ndarray:
+        """Class distributions (n, C) of an observation of these objects."""
+        probabilities = np.full((len(rows), CLASSES), 0.2 / CLASSES)
+        probabilities[np.arange(len(rows)), self.classes[rows]] += 0.8
+        return probabilities
+
+
+def graph_of(world: World) -> SceneGraph:
+    """One node an object; 5 edges a node."""
+    graph = SceneGraph(VOCABULARY, "world")
+    rows = np.arange(len(world.means))
+    for row, probabilities in zip(rows, world.probabilities(rows)):
+        graph.add_node(world.means[row], world.covariances[row], probabilities, 0)
+    rng = np.random.default_rng(1)
+    for subject in range(1, len(rows) + 1):
+        for object_ in rng.integers(1, len(rows) + 1, 5).tolist():
+            graph.add_visual(subject, object_, rng.normal(size=PREDICATES), 0)
+    return graph
+
+
+def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
+    """Frames of 12 objects each that are near one another, with millimetre noise."""
+    rng = np.random.default_rng(seed)
+    frames = []
+    for stamp_ns in range(1, count + 1):
+        centre = world.means[rng.integers(len(world.means))]
+        rows = np.argsort(np.linalg.norm(world.means - centre, axis=1))[:LOCAL_NODES]
+        n = len(rows)
+        pairs = np.array([[0, 1 + index] for index in range(min(10, n - 1))])
+        frames.append(
+            LocalGraph(
+                stamp_ns=stamp_ns,
+                frame_id="world",
+                width=640,
+                height=480,
+                T_world_camera=np.eye(4),
+                vocabulary=VOCABULARY,
+                instance_ids=np.arange(1, n + 1),
+                boxes_xyxy=np.zeros((n, 4)),
+                class_probabilities=world.probabilities(rows),
+                scores=np.ones(n),
+                means_world=world.means[rows] + rng.normal(0, 0.002, (n, 3)),
+                covariances_world=world.covariances[rows],
+                depths_m=np.ones(n),
+                pixel_counts=np.full(n, 1000),
+                surface_points_world=tuple(
+                    rng.normal(world.means[row], 0.1, (64, 3)).astype(np.float32) for row in rows
+                ),
+                relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(10)),
+            )
+        )
+    return frames
+
+
+def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
+    bound = bhattacharyya_bound(0.7)
+    return [
+        nearest_row(
+            mean,
+            covariance,
+            log_determinant(covariance),
+            eigenvalue_bound(covariance),
+            probabilities,
+            graph.nodes,
+            bound,
+            0.8,
+        )
+        for mean, covariance, probabilities in zip(
+            local.means_world, local.covariances_world, local.class_probabilities
+        )
+    ]
+
+
+def search_with_linalg(graph: SceneGraph, local: LocalGraph) -> list[int]:
+    nodes = graph.nodes
+    found = []
+    for mean, covariance, probabilities in zip(
+        local.means_world, local.covariances_world, local.class_probabilities
+    ):
+        distances = hellinger_distance(mean, covariance, nodes.means, nodes.covariances)
+        classes = class_distance(probabilities, nodes.class_probabilities)
+        passing = may_merge(distances, classes, 0.7, 0.8)
+        best = np.where(passing, distances, np.inf).argmin()
+        found.append(int(best) if passing[best] else -1)
+    return found
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    call()
+    return (time.perf_counter() - start) * 1e3
+
+
+def bench_search(count: int, rounds: int) -> None:
+    world = World(count)
+    graph = graph_of(world)
+    kernel, linalg = [], []
+    for local in frames_of(world, rounds):
+        assert search_with_kernel(graph, local) == search_with_linalg(graph, local)
+        kernel.append(milliseconds(lambda frame=local: search_with_kernel(graph, frame)))
+        linalg.append(milliseconds(lambda frame=local: search_with_linalg(graph, frame)))
+    ratio = statistics.median(slow / fast for slow, fast in zip(linalg, kernel))
+    print(
+        f"search {LOCAL_NODES} x {count:6d}: kernel {statistics.median(kernel):7.3f} ms, "
+        f"np.linalg {statistics.median(linalg):8.2f} ms, ratio {ratio:6.0f}"
+    )
+
+
+def bench_stage(count: int, rounds: int = 300) -> None:
+    world = World(count)
+    frames = frames_of(world, rounds)
+    tracemalloc.start()
+    graph = graph_of(world)
+    merging = Merging(MergingConfig())
+    for local in frames:
+        merging.merge(graph, local)
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    graph = graph_of(world)
+    before = len(graph)
+    times = [milliseconds(lambda frame=local: merging.merge(graph, frame)) for local in frames]
+    dense = count**2 * PREDICATES * 8
+    print(
+        f"stage {LOCAL_NODES} x {before:6d} nodes, {len(graph.edges)} edges: "
+        f"median {statistics.median(times):6.3f} ms, 95 % {sorted(times)[int(0.95 * rounds)]:6.3f} "
+        f"ms a frame; graph holds {held / 1e6:.1f} MB, peak {peak / 1e6:.1f} MB "
+        f"(a dense relation array would be {dense / 1e6:.0f} MB)"
+    )
+
+
+def main() -> None:
+    warm_up()
+    for count, rounds in ((100, 200), (1000, 40), (10_000, 8)):
+        bench_search(count, rounds)
+    for count in (300, 1000):
+        bench_stage(count)
+
+
+if __name__ == "__main__":
+    main()
