@@ -1,0 +1,94 @@
+"""Stage b on 12 masks of 640x480 (134 k mask pixels), CPU time, against the plain reference.
+
+python bench/lifting.py [ROUNDS]
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+
+from reference_lifting import reference_lift  # noqa: E402
+
+from deworldsg_ros.config import LiftingConfig  # noqa: E402
+from deworldsg_ros.lifting import Lifting  # noqa: E402
+from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary  # noqa: E402
+
+HEIGHT, WIDTH, OBJECTS = 480, 640, 12
+
+
+def make_frame(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Twelve elliptic masks over slanted surfaces; some of the mask lies on what is behind."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    depth = 4.0 - v / HEIGHT
+    instances = np.zeros((HEIGHT, WIDTH), np.uint16)
+    for k in range(OBJECTS):
+        row, column = divmod(k, 4)
+        x = (u - (80 + 160 * column)) / 56
+        y = (v - (80 + 160 * row)) / 56
+        surface = x**2 + y**2 < 1
+        depth[surface] = (1.2 + 0.15 * k + 0.1 * x)[surface]
+        instances[x**2 + y**2 < 1.13] = k + 1
+    if kind == "two layers":
+        depth[:, :: WIDTH // 16] += 2.0
+        depth[::3, : WIDTH // 2] += 0.8
+    depth += rng.normal(0, 0.002, depth.shape) * depth
+    depth[rng.random(depth.shape) < 0.02] = 0
+    if kind == "millimetres":
+        depth = np.round(depth, 3)
+    return instances, depth.astype(np.float32)
+
+
+def main(rounds: int = 31) -> None:
+    cv2.setNumThreads(1)
+    config = LiftingConfig()
+    lifting = Lifting(config)
+    start = time.process_time()
+    lifting.warm_up()
+    print(f"warm-up {time.process_time() - start:.2f} s")
+    intrinsics = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)
+    graph = FrameGraph(
+        0,
+        "camera",
+        WIDTH,
+        HEIGHT,
+        Vocabulary(("thing",), ()),
+        np.zeros((OBJECTS, 4)),
+        np.ones((OBJECTS, 1)),
+        np.ones(OBJECTS),
+        Relations.none(0),
+    )
+    for kind in ("smooth", "millimetres", "two layers"):
+        instances, depth_m = make_frame(kind)
+        kernel_ms, reference_ms = [], []
+        for _ in range(rounds):
+            start = time.process_time()
+            local = lifting.lift(graph, instances, depth_m, intrinsics, np.eye(4), "world")
+            middle = time.process_time()
+            reference = reference_lift(
+                instances, depth_m, intrinsics, np.eye(4), config, OBJECTS, fast_median=True
+            )
+            end = time.process_time()
+            kernel_ms.append(1e3 * (middle - start))
+            reference_ms.append(1e3 * (end - middle))
+        assert [int(r.inliers.sum()) for r in reference] == local.pixel_counts.tolist()
+        ratio = statistics.median(r / k for r, k in zip(reference_ms, kernel_ms))
+        print(
+            f"{kind:12} {int((instances > 0).sum())} mask pixels, {len(local)} objects: "
+            f"{statistics.median(kernel_ms):.2f} ms; reference "
+            f"{statistics.median(reference_ms):.1f} ms; ratio {ratio:.1f}"
+        )
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,102 @@
+"""The pixels of one object that carry depth, as parallel arrays, and the images they come from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.lifting.compiling import borrowed, kernel
+
+Float32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """N pixels of one object, row by row as in the image.
+
+    Attributes:
+        columns: (N,) int32, u.
+        rows: (N,) int32, v.
+        depths_m: (N,) float32, all valid.
+    """
+
+    columns: Int32
+    rows: Int32
+    depths_m: Float32
+
+    def __len__(self) -> int:
+        return len(self.depths_m)
+
+    def within(self, lowest_m: float, highest_m: float) -> Pixels:
+        """Those whose depth lies in [lowest_m, highest_m]."""
+        return Pixels(*_within(self.columns, self.rows, self.depths_m, lowest_m, highest_m))
+
+
+def valid_depth(depth_m: Float32) -> Float32:
+    """Depth image with 0 in place of NaN, infinity and negative values; (H, W) float32 metres."""
+    return _valid_depth(borrowed(depth_m, np.float32))
+
+
+def valid_pixel_counts(depth_m: Float32, instances: NDArray[np.uint16], count: int) -> Int64:
+    """Number of valid pixels in the mask of each object.
+
+    Args:
+        depth_m: (H, W) float32, 0 = invalid.
+        instances: (H, W) uint16, 0 = nothing, k = k-th object.
+        count: number of objects.
+
+    Returns:
+        (count + 1,) int64: the k-th is that of object k, the 0th that of all values > count.
+    """
+    return _valid_pixel_counts(borrowed(depth_m, np.float32), borrowed(instances, np.uint16), count)
+
+
+@kernel
+def _valid_depth(depth_m: Float32) -> Float32:
+    valid = np.empty_like(depth_m)
+    flat_in, flat_out = depth_m.reshape(-1), valid.reshape(-1)
+    zero = np.float32(0)
+    for index in range(flat_in.size):
+        depth = flat_in[index]
+        flat_out[index] = depth if (depth > zero) & (depth < np.inf) else zero
+    return valid
+
+
+@kernel
+def _valid_pixel_counts(depth_m: Float32, instances: NDArray[np.uint16], count: int) -> Int64:
+    counts = np.zeros(count + 1, np.int64)
+    depths, labels = depth_m.reshape(-1), instances.reshape(-1)
+    index = 0
+    while index < labels.size:
+        label = labels[index]
+        # Labels come in runs: count the run, then book it.
+        valid, start = 0, index
+        while index < labels.size and labels[index] == label:
+            valid += depths[index] > 0
+            index += 1
+        if label > count:
+            counts[0] += index - start
+        elif label > 0:
+            counts[label] += valid
+    return counts
+
+
+@kernel
+def _within(
+    columns: Int32, rows: Int32, depths_m: Float32, lowest_m: float, highest_m: float
+) -> tuple[Int32, Int32, Float32]:
+    kept_columns = np.empty_like(columns)
+    kept_rows = np.empty_like(rows)
+    kept_depths = np.empty_like(depths_m)
+    kept = 0
+    for index in range(depths_m.size):
+        depth = depths_m[index]
+        kept_columns[kept] = columns[index]
+        kept_rows[kept] = rows[index]
+        kept_depths[kept] = depth
+        kept += (depth >= lowest_m) & (depth <= highest_m)
+    return kept_columns[:kept], kept_rows[:kept], kept_depths[:kept]

@@ -1,0 +1,178 @@
+"""Stage b in one reading: frame graph, instance labels and depth become a local 3D graph."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.lifting.depth_layer import dominant_layer
+from deworldsg_ros.lifting.moments import Float64, back_project, estimate_gaussians
+from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
+from deworldsg_ros.lifting.spatial import spatial_inliers
+from deworldsg_ros.scene.camera import Intrinsics, check_pose
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
+
+
+class Lifting:
+    """Lifts the objects of a frame to 3D Gaussians in the world frame; keeps no state."""
+
+    def __init__(self, config: LiftingConfig) -> None:
+        self.config = config
+
+    def lift(
+        self,
+        frame_graph: FrameGraph,
+        instances: NDArray[np.uint16],
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        T_world_camera: Float64,
+        frame_id: str,
+    ) -> LocalGraph:
+        """Local 3D graph of one frame.
+
+        Args:
+            frame_graph: n objects and the relations between them.
+            instances: (H, W) uint16, 0 = nothing, k = k-th object of the frame graph.
+            depth_m: (H, W) float32 metres; 0, NaN, infinity and negative values are invalid.
+            intrinsics: of both images.
+            T_world_camera: (4, 4) float64.
+            frame_id: name of the world frame.
+
+        Returns:
+            The objects with enough valid pixels, in the order of the frame graph; the others are
+            counted in `drops` under ``few_mask_pixels``, ``few_spatial_inliers`` (Eq. 1) or
+            ``few_depth_inliers`` (Eq. 2), and their relations vanish with them.
+
+        Raises:
+            RefusedInput: ``grid_mismatch`` where sizes differ, ``invalid_pose``,
+                ``unknown_instance`` where the instance image has values beyond the frame graph.
+        """
+        _check_grids(frame_graph, instances, depth_m, intrinsics)
+        check_pose(T_world_camera)
+        depth_m = valid_depth(depth_m)
+        refined, drops = self._refine(depth_m, instances, len(frame_graph))
+
+        rows = np.array(sorted(refined), np.int64)
+        objects = [refined[row] for row in rows]
+        means, covariances, depths_m = estimate_gaussians(
+            objects, intrinsics, T_world_camera, self.config.covariance_ridge_m2
+        )
+        return LocalGraph(
+            stamp_ns=frame_graph.stamp_ns,
+            frame_id=frame_id,
+            width=frame_graph.width,
+            height=frame_graph.height,
+            T_world_camera=np.array(T_world_camera, np.float64),
+            vocabulary=frame_graph.vocabulary,
+            instance_ids=rows + 1,
+            boxes_xyxy=frame_graph.boxes_xyxy[rows],
+            class_probabilities=frame_graph.class_probabilities[rows],
+            scores=frame_graph.scores[rows],
+            means_world=means,
+            covariances_world=covariances,
+            depths_m=depths_m,
+            pixel_counts=np.array([len(pixels) for pixels in objects], np.int64),
+            surface_points_world=_surface_points(
+                objects, self.config.surface_points, intrinsics, T_world_camera
+            ),
+            relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
+            drops=drops,
+        )
+
+    def warm_up(self) -> None:
+        """Compile the kernels, or load them from numba's cache, before the first frame."""
+        vocabulary = Vocabulary(("thing",), ())
+        nothing = Relations.none(0)
+        graph = FrameGraph(
+            0, "", 8, 8, vocabulary, np.zeros((1, 4)), np.ones((1, 1)), np.ones(1), nothing
+        )
+        # Two layers, steps of many sizes: every kernel has work.
+        depth_m = (1.0 + 0.001 * np.arange(64) ** 1.5).reshape(8, 8).astype(np.float32)
+        depth_m[5:] += 5.0
+        instances = np.ones((8, 8), np.uint16)
+        intrinsics = Intrinsics(8.0, 8.0, 4.0, 4.0, 8, 8)
+        Lifting(LiftingConfig()).lift(graph, instances, depth_m, intrinsics, np.eye(4), "")
+
+    def _refine(
+        self, depth_m: NDArray[np.float32], instances: NDArray[np.uint16], count: int
+    ) -> tuple[dict[int, Pixels], dict[str, int]]:
+        """Final inliers by object (row of the frame graph), and the drops by reason."""
+        config = self.config
+        valid_counts = valid_pixel_counts(depth_m, instances, count)
+        if valid_counts[0]:
+            raise RefusedInput(
+                "unknown_instance",
+                f"{valid_counts[0]} pixels of the instance image, up to {instances.max()}: "
+                f"wanted values up to {count}, the number of objects in the frame graph",
+            )
+        spatial = spatial_inliers(depth_m, instances, valid_counts, config.tau, config.epsilon_m)
+        refined: dict[int, Pixels] = {}
+        drops: Counter[str] = Counter()
+        for row, pixels in enumerate(spatial):
+            if valid_counts[row + 1] < config.min_pixels:
+                drops["few_mask_pixels"] += 1
+                continue
+            if len(pixels) < config.min_pixels:
+                drops["few_spatial_inliers"] += 1
+                continue
+            layer_m = dominant_layer(
+                pixels.depths_m, config.gamma_base_m, config.alpha, config.beta
+            )
+            kept = pixels.within(*layer_m)
+            if len(kept) < config.min_pixels:
+                drops["few_depth_inliers"] += 1
+                continue
+            refined[row] = kept
+        return refined, dict(drops)
+
+
+def _check_grids(
+    frame_graph: FrameGraph,
+    instances: NDArray[np.uint16],
+    depth_m: NDArray[np.float32],
+    intrinsics: Intrinsics,
+) -> None:
+    wanted = (frame_graph.height, frame_graph.width)
+    grids = {
+        "instance image": instances.shape,
+        "depth": depth_m.shape,
+        "camera_info": (intrinsics.height, intrinsics.width),
+    }
+    for name, shape in grids.items():
+        if shape != wanted:
+            raise RefusedInput(
+                "grid_mismatch", f"{name} is (rows, columns) {shape}: the frame graph has {wanted}"
+            )
+
+
+def _surface_points(
+    objects: list[Pixels], most: int, intrinsics: Intrinsics, T_world_camera: Float64
+) -> tuple[NDArray[np.float32], ...]:
+    """At most so many points of each object, world frame: every n-th of its inliers."""
+    if not objects:
+        return ()
+    numbers = [min(most, len(pixels)) for pixels in objects]
+    chosen = [
+        np.arange(number) * len(pixels) // max(number, 1)
+        for number, pixels in zip(numbers, objects)
+    ]
+    sample = Pixels(
+        np.concatenate([pixels.columns[at] for pixels, at in zip(objects, chosen)]),
+        np.concatenate([pixels.rows[at] for pixels, at in zip(objects, chosen)]),
+        np.concatenate([pixels.depths_m[at] for pixels, at in zip(objects, chosen)]),
+    )
+    points = back_project(sample, intrinsics, T_world_camera).astype(np.float32)
+    return tuple(np.split(points, np.cumsum(numbers)[:-1]))
+
+
+def _kept_relations(relations: Relations, rows: NDArray[np.int64], count: int) -> Relations:
+    """Relations whose both ends are among these rows, with the rows renumbered."""
+    renumbered = np.full(count, -1, np.int64)
+    renumbered[rows] = np.arange(len(rows))
+    pairs = renumbered[relations.pairs]
+    kept = (pairs >= 0).all(axis=1)
+    return Relations(pairs[kept], relations.logits[kept], relations.scores[kept])
