@@ -11,7 +11,7 @@ from deworldsg_ros.bags.bag import BagSource
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import Role
 from deworldsg_ros.bags.source import Source
-from deworldsg_ros.bags.storage import SALVAGERS
+from deworldsg_ros.bags.storage import SALVAGERS, storage_files
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bridge.sync import FrameAssembler
 from deworldsg_ros.config import InputsConfig
@@ -103,10 +103,8 @@ def open_source(
     Raises:
         RecordingError: says what was looked for and where.
     """
-    if not path.exists():
-        raise RecordingError(f"recording {path}: there is no such file or folder")
     if kind == "auto":
-        kind = _detect(path)
+        kind = detect_kind(path)
     if kind == "rosbag2":
         return BagSource(path, topics, inputs)
     return open_dataset(kind, path, options)
@@ -125,14 +123,17 @@ def open_recording(
     return Recording(source, inputs)
 
 
-def _detect(path: Path) -> str:
+def detect_kind(path: Path) -> str:
+    """``rosbag2`` or the name of a data set, by looking; raises RecordingError."""
+    if not path.exists():
+        raise RecordingError(f"recording {path}: there is no such file or folder")
     if path.is_file():
         if path.suffix in BAG_SUFFIXES:
             return "rosbag2"
         if path.name == "metadata.yaml":
             raise RecordingError(f"recording {path}: give the folder that it is in")
         raise RecordingError(f"recording {path}: wanted a .mcap or .db3 file, or a folder")
-    if (path / "metadata.yaml").exists() or any(f.suffix in BAG_SUFFIXES for f in path.iterdir()):
+    if (path / "metadata.yaml").exists() or storage_files(path):
         return "rosbag2"
     found = detect_dataset(path)
     if found is None:

@@ -7,6 +7,7 @@ cut), a salvage reader takes what is left, and `losses` says in words that data 
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -97,11 +98,7 @@ class RawBag:
         """Storage files of the bag."""
         if self.path.is_file():
             return [self.path] if self.path.suffix in SALVAGERS else []
-        return sorted(
-            (file for file in self.path.iterdir() if file.suffix in SALVAGERS),
-            # name_2.mcap comes before name_10.mcap.
-            key=lambda file: (len(file.name), file.name),
-        )
+        return storage_files(self.path)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of the topics in the order in which they were recorded."""
@@ -149,6 +146,20 @@ class RawBag:
         if self._reader is not None:
             self._reader.close()
             self._reader = None
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The .mcap or .db3 files of a bag folder; none where they are not parts of one bag.
+
+    rosbag2 names the parts of a split bag NAME_0, NAME_1, …
+    """
+    found = sorted(
+        (file for file in folder.iterdir() if file.suffix in SALVAGERS),
+        # NAME_2 comes before NAME_10.
+        key=lambda file: (len(file.name), file.name),
+    )
+    bags = {(re.sub(r"_\d+$", "", file.stem), file.suffix) for file in found}
+    return found if len(bags) == 1 else []
 
 
 def _one_line(error: BaseException) -> str:

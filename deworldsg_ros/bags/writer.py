@@ -54,14 +54,9 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
     The file appears when it is complete: a conversion that is interrupted leaves nothing.
 
     Raises:
-        RecordingError: where the file exists, has another suffix, or nothing came.
+        RecordingError: as `check_output`, or where nothing came.
     """
-    if path.suffix != ".mcap":
-        raise RecordingError(f"output {path}: wanted a file name that ends in .mcap")
-    if path.exists():
-        raise RecordingError(f"output {path} exists already: remove it or take another name")
-    if not path.parent.is_dir():
-        raise RecordingError(f"output {path}: the folder {path.parent} does not exist")
+    check_output(path)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".deworldsg-") as folder:
         bag = Path(folder) / "bag"
         count = _write(iter(messages), bag)
@@ -69,6 +64,16 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
             raise RecordingError(f"output {path}: the recording gave no messages to write")
         shutil.move(bag / "bag.mcap", path)
     return count
+
+
+def check_output(path: Path) -> None:
+    """Refuse a file that cannot be made: RecordingError."""
+    if path.suffix != ".mcap":
+        raise RecordingError(f"output {path}: wanted a file name that ends in .mcap")
+    if path.exists():
+        raise RecordingError(f"output {path} exists already: remove it or take another name")
+    if not path.parent.is_dir():
+        raise RecordingError(f"output {path}: the folder {path.parent} does not exist")
 
 
 def _write(messages: Iterator[RawRoleMessage], bag: Path) -> int:

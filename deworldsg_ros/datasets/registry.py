@@ -43,7 +43,9 @@ def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -
         RecordingError: for an unknown name, or with the file that was expected and where.
     """
     if name not in _datasets():
-        raise RecordingError(f"data set '{name}' is unknown: wanted {', '.join(_datasets())}")
+        raise RecordingError(
+            f"format '{name}' is unknown: wanted {', '.join(_datasets())}, rosbag2 or auto"
+        )
     if not path.is_dir():
         raise RecordingError(f"recording {path}: there is no such folder")
     return _datasets()[name](path, options or DatasetOptions())

@@ -1,0 +1,51 @@
+"""`deworldsg info`: what a recording holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from deworldsg_ros.bags.errors import RecordingError
+from deworldsg_ros.bags.recording import detect_kind, open_source
+from deworldsg_ros.bags.storage import RawBag
+
+
+def show_recording(path: Path, console: Console) -> None:
+    """Print kind, topics, and which of them would be used; raises RecordingError."""
+    kind = detect_kind(path)
+    used: dict[str, str] = {}
+    problem = None
+    losses: list[str] = []
+    frames = 0
+    try:
+        source = open_source(path, kind=kind)
+    except RecordingError as error:
+        if kind != "rosbag2":
+            raise
+        problem = str(error)
+    else:
+        used = {topic.name: role.value for role, topic in source.topics.items()}
+        rows = [(topic.name, topic.msgtype, topic.count) for topic in source.topics.values()]
+        frames, losses = source.frame_count, source.losses
+        source.close()
+    if kind == "rosbag2":
+        bag = RawBag(path)
+        rows = [(topic.name, topic.msgtype, topic.count) for topic in bag.topics]
+        losses = bag.losses
+        bag.close()
+    console.print(f"{path}: {kind}, {frames} RGB images", highlight=False, soft_wrap=True)
+    table = Table(box=box.SIMPLE)
+    table.add_column("topic" if kind == "rosbag2" else "files", overflow="fold")
+    table.add_column("type", overflow="fold")
+    table.add_column("messages", justify="right")
+    table.add_column("used as")
+    for name, msgtype, count in rows:
+        table.add_row(name, msgtype.split("/")[-1], str(count), used.get(name, ""))
+    console.print(table)
+    for loss in losses:
+        console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
+    if problem:
+        raise RecordingError(problem)

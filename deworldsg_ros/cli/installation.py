@@ -1,0 +1,47 @@
+"""Where the files and executables of the package are: in a checkout, or installed."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+import deworldsg_ros
+
+PACKAGE = "deworldsg_ros"
+
+
+def checkout() -> Path | None:
+    """Root of the source tree that this package runs from; None where it is installed."""
+    root = Path(deworldsg_ros.__file__).resolve().parents[1]
+    return root if (root / "package.xml").exists() else None
+
+
+def prefixes() -> list[Path]:
+    """Installation prefixes that may hold the package, best first."""
+    found: list[Path] = []
+    # ament_index_python raises where AMENT_PREFIX_PATH is not set or does not know the package.
+    with contextlib.suppress(Exception):
+        from ament_index_python.packages import get_package_prefix
+
+        found.append(Path(get_package_prefix(PACKAGE)))
+    return [*found, Path(sys.prefix)]
+
+
+def find_shared(relative: str) -> Path | None:
+    """A file or folder of the package's share, e.g. ``config/robust.yaml``."""
+    source = checkout()
+    folders = [source] if source else []
+    folders += [prefix / "share" / PACKAGE for prefix in prefixes()]
+    return next((folder / relative for folder in folders if (folder / relative).exists()), None)
+
+
+def node_command(name: str) -> list[str]:
+    """Command that runs a node: its installed executable, else its module."""
+    if checkout() is None:
+        for prefix in prefixes():
+            executable = prefix / "lib" / PACKAGE / name
+            if os.access(executable, os.X_OK):
+                return [str(executable)]
+    return [sys.executable, "-m", f"{PACKAGE}.nodes.{name}"]

@@ -1,0 +1,229 @@
+"""The `deworldsg` program: its commands and options, and how errors end it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+from rich.console import Console
+
+from deworldsg_ros import __version__
+from deworldsg_ros.bags.topics import TopicChoice
+from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.scene.errors import DeWorldSGError
+
+# Bad usage, a bad configuration, a recording that cannot be used.
+EXIT_USAGE = 2
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    name="deworldsg",
+    help="Live 3D semantic scene graphs from an RGB-D camera, with world-model relations.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+# typer reads these while the program runs: no `X | None` before Python 3.10's own rules allow it.
+RecordingPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RECORDING",
+        help="rosbag2 folder, .mcap or .db3 file, 7-Scenes or TUM RGB-D folder",
+    ),
+]
+OutFolder = Annotated[Path, typer.Option("--out", help="folder for the results; made if need be")]
+ConfigFile = Annotated[
+    Optional[Path],
+    typer.Option("--config", help="parameter file; without one config/robust.yaml"),
+]
+Settings = Annotated[
+    Optional[list[str]],
+    typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="one value of it; may be repeated"),
+]
+MaxFrames = Annotated[
+    int, typer.Option("--max-frames", min=0, help="stop after so many frames; 0 = take all")
+]
+RgbTopic = Annotated[str, typer.Option("--rgb", metavar="TOPIC", help="RGB images in a bag")]
+DepthTopic = Annotated[str, typer.Option("--depth", metavar="TOPIC", help="depth images in a bag")]
+InfoTopic = Annotated[
+    str, typer.Option("--camera-info", metavar="TOPIC", help="calibration in a bag")
+]
+PoseTopic = Annotated[
+    str, typer.Option("--pose", metavar="TOPIC", help="poses in a bag: also an odometry or /tf")
+]
+FrameRate = Annotated[
+    float,
+    typer.Option("--rate", min=0, help="frames a second of a folder without stamps; 0 = its own"),
+]
+CameraIntrinsics = Annotated[
+    str,
+    typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="of a folder that does not tell"),
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"deworldsg {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print the version")
+    ] = False,
+) -> None:
+    """Options of the program itself."""
+
+
+@app.command()
+def run(
+    recording: RecordingPath,
+    out: OutFolder,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    max_frames: MaxFrames = 0,
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+    rate: FrameRate = 0.0,
+    intrinsics: CameraIntrinsics = "",
+) -> None:
+    """Make a recording's scene graph in one process."""
+    from deworldsg_ros.cli.run import run_recording
+
+    run_recording(
+        recording,
+        out,
+        config,
+        settings or [],
+        max_frames=max_frames,
+        topics=TopicChoice(rgb, depth, camera_info, pose),
+        options=_dataset_options(rate, intrinsics),
+        console=Console(),
+    )
+
+
+@app.command()
+def demo(
+    recording: Annotated[
+        Optional[Path],
+        typer.Argument(
+            metavar="RECORDING",
+            help="as for run; without one the recording that ships with the package",
+        ),
+    ] = None,
+    out: OutFolder = Path("demo_out"),
+    config: ConfigFile = None,
+    settings: Settings = None,
+    rate: Annotated[
+        float,
+        typer.Option("--rate", min=0, help="pace: 1 = real time, 0 = as fast as the nodes keep up"),
+    ] = 1.0,
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+    intrinsics: CameraIntrinsics = "",
+) -> None:
+    """Make it with the four ROS 2 nodes, from a replay."""
+    from deworldsg_ros.cli.demo import run_demo
+
+    run_demo(
+        recording,
+        out,
+        config,
+        settings or [],
+        rate=rate,
+        topics=TopicChoice(rgb, depth, camera_info, pose),
+        options=_dataset_options(0.0, intrinsics),
+        console=Console(),
+    )
+
+
+@app.command()
+def convert(
+    kind: Annotated[
+        str, typer.Argument(metavar="FORMAT", help="7scenes, tum, rosbag2, or auto = by looking")
+    ],
+    source: Annotated[Path, typer.Argument(metavar="SRC", help="folder or bag")],
+    output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="file to write")],
+    rate: FrameRate = 0.0,
+    intrinsics: CameraIntrinsics = "",
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+) -> None:
+    """Turn a folder or bag into one MCAP file."""
+    from deworldsg_ros.cli.convert import convert_recording
+
+    convert_recording(
+        kind,
+        source,
+        output,
+        topics=TopicChoice(rgb, depth, camera_info, pose),
+        options=_dataset_options(rate, intrinsics),
+        console=Console(),
+    )
+
+
+@app.command()
+def info(recording: RecordingPath) -> None:
+    """Tell what a recording holds and what is used."""
+    from deworldsg_ros.cli.info import show_recording
+
+    show_recording(recording, Console())
+
+
+app.command("topics", help="The same as info.", hidden=True)(info)
+
+
+@app.command("config")
+def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
+    """Print the effective configuration, described."""
+    from deworldsg_ros.cli.configuration import described_yaml, effective_config
+
+    typer.echo(described_yaml(effective_config(config, settings)), nl=False)
+
+
+def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:
+    if not intrinsics:
+        return DatasetOptions(rate_hz)
+    try:
+        fx, fy, cx, cy = (float(word) for word in intrinsics.split(","))
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"'{intrinsics}' is not FX,FY,CX,CY: wanted four numbers, in pixels"
+        ) from error
+    return DatasetOptions(rate_hz, (fx, fy, cx, cy))
+
+
+def main() -> int:
+    """Run the program; errors of the user end it with one sentence and code 2."""
+    try:
+        app(prog_name="deworldsg")
+    except DeWorldSGError as error:
+        Console(stderr=True, highlight=False, soft_wrap=True).print(
+            f"[bold red]error:[/] {_escaped(str(error))}"
+        )
+        return EXIT_USAGE
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted")
+        return EXIT_INTERRUPTED
+    return 0
+
+
+def _escaped(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,92 @@
+"""What run and demo leave: graph, picture, page, configuration, a report; and what they print."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from deworldsg_ros.config import Config, to_yaml
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import ConfigurationError
+
+GRAPH_FILE = "scene_graph.json"
+PICTURE_FILE = "scene_graph.png"
+PAGE_FILE = "scene_graph.html"
+CONFIG_FILE = "config.yaml"
+REPORT_FILE = "run.json"
+
+
+def prepare_folder(out: Path, config: Config) -> None:
+    """Make the folder and save the effective configuration; raises ConfigurationError."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / CONFIG_FILE).write_text(to_yaml(config), encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"--out {out}: cannot be written ({error.strerror})") from error
+
+
+def write_graph(out: Path, graph: wire.SceneGraphMessage) -> None:
+    """Write scene_graph.json."""
+    (out / GRAPH_FILE).write_text(wire.encode(graph), encoding="utf-8")
+
+
+def read_graph(out: Path) -> wire.SceneGraphMessage:
+    """Read scene_graph.json."""
+    return wire.decode((out / GRAPH_FILE).read_bytes(), wire.SceneGraphMessage)
+
+
+def show_graph(
+    out: Path, graph: wire.SceneGraphMessage, console: Console, cameras: Any = None
+) -> None:
+    """Print the tables, draw the picture and write the page."""
+    from deworldsg_ros.view import page, picture, table
+
+    table.print_graph(console, graph)
+    picture.draw(graph, out / PICTURE_FILE)
+    page.write(graph, out / PAGE_FILE)
+
+
+def write_report(out: Path, report: Mapping[str, Any]) -> None:
+    """Write run.json."""
+    text = json.dumps(report, indent=2, ensure_ascii=False)
+    (out / REPORT_FILE).write_text(text + "\n", encoding="utf-8")
+
+
+def print_files(console: Console, out: Path) -> None:
+    """Say where the results are."""
+    console.print(f"results in {out}:", highlight=False, soft_wrap=True)
+    for name, meaning in (
+        (PAGE_FILE, "3D view, open it in a browser"),
+        (PICTURE_FILE, "top view"),
+        (GRAPH_FILE, "the graph, with surface points"),
+        (CONFIG_FILE, "the configuration it was made with"),
+        (REPORT_FILE, "frames, drops by reason, times"),
+    ):
+        if (out / name).exists():
+            console.print(f"  {out / name}  [dim]{meaning}[/]", highlight=False, soft_wrap=True)
+
+
+def print_drops(
+    console: Console,
+    losses: Sequence[str],
+    drops: Mapping[str, Mapping[str, int]],
+    reasons: Mapping[str, str],
+) -> None:
+    """Say what was lost and left out: by who and reason, with an example where one is known."""
+    shown = list(dict.fromkeys(losses))
+    for loss in shown[:5]:
+        console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
+    if len(shown) > 5:
+        console.print(f"[yellow]lost:[/] … and {len(shown) - 5} more")
+    for owner, counts in drops.items():
+        for reason, count in sorted(counts.items()):
+            example = f" ({reasons[reason]})" if reason in reasons else ""
+            console.print(
+                f"[yellow]left out[/] by {owner}: {count} {reason}{example}",
+                highlight=False,
+                soft_wrap=True,
+            )
