@@ -75,7 +75,7 @@ class GraphBuilder:
                 "is remembered",
             )
         self.prior.update(evidence.pair_classes, evidence.predictions)
-        # A prediction comes after the message that named its pair as a neighbour.
+        # Its pair is named as a neighbour by a message of its own.
         for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
             self.graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
 
