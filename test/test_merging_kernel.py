@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from merging_support import random_classes, random_covariances, random_pose, seeds
 
 from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
-from deworldsg_ros.merging.kernel import nearest_row
+from deworldsg_ros.merging.kernel import _nearest, nearest_row, warm_up
 from deworldsg_ros.scene.gaussian import (
     bhattacharyya_distance,
     eigenvalue_bound,
@@ -17,14 +17,13 @@ from deworldsg_ros.scene.gaussian import (
     log_determinant,
 )
 from deworldsg_ros.scene.nodes import NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE
 
 
 def table_of(means, covariances, classes, ids=None) -> NodeTable:
     nodes = NodeTable(classes.shape[1])
     for index in range(len(means)):
         row = nodes.append(index + 1 if ids is None else int(ids[index]))
-        nodes.put(row, means[index], covariances[index], classes[index], 1.0, EMPTY_SAMPLE)
+        nodes.put(row, means[index], covariances[index], classes[index], 1.0)
     return nodes
 
 
@@ -95,6 +94,20 @@ def test_an_equal_gaussian_is_at_distance_zero_so_the_smallest_id_wins(seed: int
     ids = rng.permutation(np.arange(1, 11))
     nodes = table_of(np.tile(mean, (10, 1)), np.tile(covariance, (10, 1, 1)), np.ones((10, 1)), ids)
     assert nodes.ids[search(mean, covariance, np.ones(1), nodes, delta_g=1e-7)] == 1
+
+
+def test_after_the_warm_up_nothing_is_left_to_compile() -> None:
+    warm_up()
+    compiled = list(_nearest.signatures)
+    rng = np.random.default_rng(0)
+    nodes = table_of(rng.normal(size=(3, 3)), random_covariances(rng, 3), random_classes(rng, 3))
+    search(
+        rng.normal(size=(2, 3))[1],
+        random_covariances(rng, 2)[1],
+        nodes.class_probabilities[1],
+        nodes,
+    )
+    assert list(_nearest.signatures) == compiled
 
 
 def test_nothing_to_find() -> None:

@@ -146,7 +146,7 @@ def test_a_still_camera_ends_with_one_node_an_object_after_200_frames() -> None:
     np.testing.assert_allclose(
         graph.nodes.means, [surface.mean(axis=0) for surface in surfaces], atol=1e-3
     )
-    assert [len(item.hashes) for item in graph.nodes.surfaces] == [100] * objects
+    assert [len(item.points_world) for item in graph.nodes.surfaces] == [100] * objects
 
 
 def test_exactly_equal_observations_merge() -> None:

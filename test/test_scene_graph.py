@@ -222,7 +222,7 @@ def test_invariants_hold_through_any_edits(seed: int) -> None:
         for node_id in live:
             for partner in graph._edges.partners(node_id):
                 assert {(node_id, partner), (partner, node_id)} & graph.edges.keys()
-        assert all(len(surface.hashes) <= 6 for surface in graph.nodes.surfaces)
+        assert all(len(surface.points_world) <= 6 for surface in graph.nodes.surfaces)
         assert len(graph._frames) <= 3
 
 

@@ -11,6 +11,7 @@ from merging_support import seeds
 from deworldsg_ros.scene.surface import (
     EMPTY_SAMPLE,
     HashedPoints,
+    SurfaceReservoir,
     content_hashes,
     hash_each,
     merge_samples,
@@ -51,10 +52,12 @@ def test_it_is_bounded_and_depends_on_the_set_alone(seed: int, capacity: int, co
     shuffled = points[rng.permutation(count)]
     cuts = np.sort(rng.integers(0, count + 1, 2))
     parts = np.split(shuffled, cuts)
-    frame_by_frame = EMPTY_SAMPLE
+    frame_by_frame = SurfaceReservoir(capacity)
     for part in parts:
-        frame_by_frame = merge_samples(frame_by_frame, hashed(part), capacity)
-    assert same(frame_by_frame, whole)
+        frame_by_frame.add(hashed(part))
+        if rng.random() < 0.5:  # looking at it changes nothing
+            assert len(frame_by_frame.points_world) <= capacity
+    assert same(frame_by_frame.sample, whole)
     first, second, third = (sample_of(part, capacity) for part in parts)
     assert same(merge_samples(merge_samples(third, first, capacity), second, capacity), whole)
     assert same(merge_samples(third, merge_samples(second, first, capacity), capacity), whole)

@@ -19,7 +19,6 @@ from numba import njit
 
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.nodes import Int64, NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE
 
 # Rounding must not let a bound reject what the exact comparison would keep.
 _SLACK = 1.0 + 1e-9
@@ -141,5 +140,5 @@ def warm_up() -> None:
     """Compile the kernel, or load it from the cache."""
     nodes = NodeTable(1)
     row = nodes.append(1)
-    nodes.put(row, np.zeros(3), np.eye(3), np.ones(1), 1.0, EMPTY_SAMPLE)
+    nodes.put(row, np.zeros(3), np.eye(3), np.ones(1), 1.0)
     nearest_row(np.zeros(3), np.eye(3), 0.0, 2.0, np.ones(1), nodes, 1.0, 1.0)

@@ -11,7 +11,7 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, fuse
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, merge_samples
+from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints
 
 
 class SceneGraph:
@@ -42,7 +42,7 @@ class SceneGraph:
         self.frame_id = frame_id
         self.surface_point_capacity = surface_point_capacity
         self.remembered_frames = remembered_frames
-        self.nodes = NodeTable(len(vocabulary.classes))
+        self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.revision = 0
         self._edges = EdgeMap(len(vocabulary.predicates))
         self._next_id = 1
@@ -91,12 +91,12 @@ class SceneGraph:
                 covariance_world,
                 class_probabilities / class_probabilities.sum(),
                 weight,
-                merge_samples(EMPTY_SAMPLE, surface, self.surface_point_capacity),
             )
         except ValueError:
             self.nodes.remove(node_id)
             raise
         self._next_id += 1
+        self.nodes.surfaces[row].add(surface)
         self.nodes.first_seen_ns[row] = self.nodes.last_seen_ns[row] = stamp_ns
         self.nodes.revisions[row] = self._changed()
         return node_id
@@ -140,7 +140,7 @@ class SceneGraph:
             nodes.covariances[gone],
             nodes.class_probabilities[gone],
             float(nodes.weights[gone]),
-            nodes.surfaces[gone],
+            nodes.surfaces[gone].sample,
             int(nodes.first_seen_ns[gone]),
             int(nodes.last_seen_ns[gone]),
         )
@@ -257,8 +257,8 @@ class SceneGraph:
             covariance_world,
         )
         classes = (known * nodes.class_probabilities[row] + weight * class_probabilities) / total
-        surfaces = merge_samples(nodes.surfaces[row], surface, self.surface_point_capacity)
-        nodes.put(row, mean, covariance, classes, total, surfaces)
+        nodes.put(row, mean, covariance, classes, total)
+        nodes.surfaces[row].add(surface)
         nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
         nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)
         nodes.revisions[row] = self._changed()

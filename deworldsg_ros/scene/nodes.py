@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE, SurfaceSample
+from deworldsg_ros.scene.surface import SurfaceReservoir
 
 Int64 = NDArray[np.int64]
 
@@ -33,7 +33,7 @@ class NodeTable:
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
         revisions: (n,) int64, graph revision at which the node last changed.
-        surfaces: n surface samples.
+        surfaces: n bounded samples of surface points.
     """
 
     ids: Int64
@@ -47,8 +47,9 @@ class NodeTable:
     last_seen_ns: Int64
     revisions: Int64
 
-    def __init__(self, class_count: int) -> None:
-        self.surfaces: list[SurfaceSample] = []
+    def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
+        self.surfaces: list[SurfaceReservoir] = []
+        self._surface_point_capacity = surface_point_capacity
         self._rows: dict[int, int] = {}
         capacity = _FIRST_CAPACITY
         self._storage: dict[str, NDArray[Any]] = {
@@ -85,7 +86,7 @@ class NodeTable:
             for name, column in self._storage.items():
                 self._storage[name] = np.concatenate((column, np.zeros_like(column)))
         self._rows[node_id] = row
-        self.surfaces.append(EMPTY_SAMPLE)
+        self.surfaces.append(SurfaceReservoir(self._surface_point_capacity))
         self._show(row + 1)
         self.ids[row] = node_id
         return row
@@ -97,9 +98,8 @@ class NodeTable:
         covariance_world: Float64,
         class_probabilities: Float64,
         weight: float,
-        surface: SurfaceSample,
     ) -> None:
-        """Replace what a row holds, and the values cached of its covariance.
+        """Replace a row's Gaussian, classes and weight, and what is cached of its covariance.
 
         Raises:
             ValueError: where the covariance is not positive definite.
@@ -110,7 +110,6 @@ class NodeTable:
         self.covariances[row] = covariance_world
         self.class_probabilities[row] = class_probabilities
         self.weights[row] = weight
-        self.surfaces[row] = surface
 
     def remove(self, node_id: int) -> None:
         """Remove a node; the last row takes its place."""

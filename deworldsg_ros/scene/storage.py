@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.surface import SurfaceSample, content_hashes
+from deworldsg_ros.scene.surface import hash_each
 
 if TYPE_CHECKING:
     from deworldsg_ros.scene.graph import SceneGraph
@@ -104,7 +104,7 @@ def _graph_of(state: State) -> SceneGraph:
         header["remembered_frames"],
     )
     nodes = graph.nodes
-    points = _split(state["surface_points"], state["surface_point_counts"])
+    points = hash_each(tuple(_split(state["surface_points"], state["surface_point_counts"])))
     for index, node_id in enumerate(state["ids"].tolist()):
         row = nodes.append(node_id)
         nodes.put(
@@ -113,8 +113,8 @@ def _graph_of(state: State) -> SceneGraph:
             state["covariances"][index],
             state["class_probabilities"][index],
             float(state["weights"][index]),
-            SurfaceSample(content_hashes(points[index]), points[index]),
         )
+        nodes.surfaces[row].add(points[index])
         for name in ("first_seen_ns", "last_seen_ns", "revisions"):
             getattr(nodes, name)[row] = state[name][index]
     for pair, logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(

@@ -88,3 +88,50 @@ def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) ->
     distinct = np.flatnonzero(ascending[1:] != ascending[:-1]) + 1
     kept = order[np.concatenate(([0], distinct))[:capacity]]
     return SurfaceSample(hashes[kept], points_world[kept])
+
+
+class SurfaceReservoir:
+    """A surface sample that grows: points wait until there are enough of them to be merged in.
+
+    What it shows is at all times the sample of all points added, in whatever order.
+    """
+
+    __slots__ = ("_capacity", "_sample", "_waiting", "_waiting_count")
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._sample = EMPTY_SAMPLE
+        self._waiting: list[HashedPoints] = []
+        self._waiting_count = 0
+
+    def add(self, points: HashedPoints) -> None:
+        """Take in points, which may be those of another sample."""
+        if self._capacity == 0 or len(points.hashes) == 0:
+            return
+        # Copies: views would keep the arrays of whole frames alive.
+        self._waiting.append(HashedPoints(points.hashes.copy(), points.points_world.copy()))
+        self._waiting_count += len(points.hashes)
+        # Merged in whole capacities, most points are turned away without being sorted.
+        if self._waiting_count >= self._capacity:
+            self._merge_in()
+
+    @property
+    def sample(self) -> SurfaceSample:
+        """The sample of all points added."""
+        if self._waiting:
+            self._merge_in()
+        return self._sample
+
+    @property
+    def points_world(self) -> Float32:
+        """(k, 3) float32, metres; in the sample's order."""
+        return self.sample.points_world
+
+    def _merge_in(self) -> None:
+        points = HashedPoints(
+            np.concatenate([points.hashes for points in self._waiting]),
+            np.concatenate([points.points_world for points in self._waiting]),
+        )
+        self._waiting.clear()
+        self._waiting_count = 0
+        self._sample = merge_samples(self._sample, points, self._capacity)
