@@ -1,0 +1,39 @@
+"""One colour a class, the same in every view, and the same while a graph grows."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterable
+
+Rgb = tuple[float, float, float]
+
+PALETTE = (
+    "#3b6fb6", "#e07b28", "#3f9b4f", "#d1495b", "#8e5ea2", "#8c6d53", "#c9a227", "#3aa6a0",
+    "#d6679a", "#5b6c7d", "#7fa23a", "#b5542f", "#5360c4", "#2f8f8f", "#a83f6f", "#6f7f2f",
+    "#4aa3d8", "#e2965a", "#77b255", "#a78bd0",
+)  # fmt: skip
+
+PROVENANCE = {"visual": "#4a5568", "prior": "#b7791f", "fused": "#2b7a78"}
+
+
+def class_colours(labels: Iterable[str]) -> dict[str, str]:
+    """#rrggbb of each label.
+
+    A label has a preferred colour of its own; the next free one where that is taken by a label
+    that came before it. In the order of node ids, a colour thus stays when new labels turn up.
+    """
+    colours: dict[str, str] = {}
+    for label in labels:
+        if label in colours:
+            continue
+        start = zlib.crc32(label.encode())
+        order = [PALETTE[(start + step) % len(PALETTE)] for step in range(len(PALETTE))]
+        taken = set(colours.values())
+        colours[label] = next((colour for colour in order if colour not in taken), order[0])
+    return colours
+
+
+def to_rgb(colour: str) -> Rgb:
+    """#rrggbb as three values from 0 to 1."""
+    red, green, blue = (int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5))
+    return red, green, blue

@@ -1,0 +1,79 @@
+"""What the views share: axes of ellipsoids, the top view's axes, the edges worth drawing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene import wire
+
+Float64 = NDArray[np.float64]
+
+# Ellipses and ellipsoids are drawn at this many standard deviations.
+SIGMAS = 2.0
+
+# Relations that hold both ways, as far as a drawing is concerned: one line is enough.
+MUTUAL = frozenset({"near", "close by", "next to", "with", "against", "and"})
+
+
+def principal_axes(covariance: Float64) -> tuple[Float64, Float64]:
+    """Standard deviations along the principal axes, and the axes.
+
+    Args:
+        covariance: (3, 3) float64, square metres.
+
+    Returns:
+        (3,) metres, greatest first, and (3, 3), a right-handed rotation with the axes as columns.
+    """
+    variances, axes = np.linalg.eigh(covariance)
+    axes = axes[:, ::-1]
+    if np.linalg.det(axes) < 0:
+        axes = axes * np.array([1.0, 1.0, -1.0])
+    return np.sqrt(np.maximum(variances[::-1], 0.0)), axes
+
+
+def view_axes(up_world: Sequence[float] | Float64) -> Float64:
+    """Axes of a view from above: (3, 3), rows right, forward and up, right-handed.
+
+    Right is the world's x axis as far as that is level.
+
+    Args:
+        up_world: (3,) direction that points up in the world frame, not zero.
+    """
+    up = np.asarray(up_world, np.float64)
+    norm = float(np.linalg.norm(up)) if up.shape == (3,) else 0.0
+    if not np.isfinite(norm) or norm < 1e-9:
+        raise ValueError(f"up direction {up.tolist()}: wanted three values that are not all zero")
+    up = up / norm
+    seed = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    right = seed - (seed @ up) * up
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def means_of(graph: wire.SceneGraphMessage) -> Float64:
+    """(n, 3) metres, world frame."""
+    return np.array([node.mean_m for node in graph.nodes], np.float64).reshape(-1, 3)
+
+
+def covariances_of(graph: wire.SceneGraphMessage) -> Float64:
+    """(n, 3, 3) square metres, world frame."""
+    return np.array([node.covariance_m2 for node in graph.nodes], np.float64).reshape(-1, 3, 3)
+
+
+def drawable_edges(graph: wire.SceneGraphMessage) -> list[wire.EdgeState]:
+    """Edges whose both ends are in the graph, one of two that say the same the other way round."""
+    known = {node.id for node in graph.nodes}
+    best: dict[tuple[int, int, str], wire.EdgeState] = {}
+    for edge in graph.edges:
+        if edge.subject not in known or edge.object not in known:
+            continue
+        ends = (edge.subject, edge.object)
+        if edge.predicate in MUTUAL:
+            ends = (min(ends), max(ends))
+        key = (*ends, edge.predicate)
+        if key not in best or edge.probability > best[key].probability:
+            best[key] = edge
+    return list(best.values())

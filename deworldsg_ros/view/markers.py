@@ -1,0 +1,117 @@
+"""Markers for RViz and Foxglove, as plain descriptions; the bridge turns them into messages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.view.colours import class_colours, to_rgb
+from deworldsg_ros.view.geometry import (
+    SIGMAS,
+    Float64,
+    covariances_of,
+    means_of,
+    principal_axes,
+)
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+LEAST_DIAMETER_M = 0.01
+SHAFT_M, HEAD_M, HEAD_LENGTH_M = 0.012, 0.035, 0.06
+TEXT_M, SMALL_TEXT_M = 0.09, 0.06
+ID_LIMIT = 2**31
+
+
+@dataclass(frozen=True)
+class Marker:
+    """One thing to draw, in the frame of the graph.
+
+    Attributes:
+        namespace, id: name it for the life of the node or edge that it shows.
+        kind: "sphere" (an ellipsoid by its scale), "text" or "arrow".
+        position: metres; the origin for arrows.
+        quat_xyzw: orientation.
+        scale: metres; diameters of a sphere; (shaft, head, head length) of an arrow; the height
+            of a text is its third.
+        rgba: 0 to 1.
+        text: of a text.
+        points: tail and tip of an arrow.
+    """
+
+    namespace: str
+    id: int
+    kind: Literal["sphere", "text", "arrow"]
+    position: Vector
+    quat_xyzw: Quaternion
+    scale: Vector
+    rgba: Quaternion
+    text: str = ""
+    points: tuple[Vector, ...] = ()
+
+
+def markers(message: wire.SceneGraphMessage) -> list[Marker]:
+    """Ellipsoids (2σ) with labels, and arrows with predicates."""
+    colours = class_colours(node.label for node in message.nodes)
+    means, covariances = means_of(message), covariances_of(message)
+    result: list[Marker] = []
+    for node, mean, covariance in zip(message.nodes, means, covariances):
+        result += _node_markers(node, mean, covariance, colours[node.label])
+    row_of = {node.id: row for row, node in enumerate(message.nodes)}
+    for edge in message.edges:
+        if edge.subject in row_of and edge.object in row_of:
+            tail, tip = means[row_of[edge.subject]], means[row_of[edge.object]]
+            result += _edge_markers(edge, tail, tip)
+    return result
+
+
+def pair_id(subject: int, object_: int) -> int:
+    """One id for an ordered pair (Szudzik's pairing), unique while ids are below 46341."""
+    low_first = object_ * object_ + subject
+    high_first = subject * subject + subject + object_
+    return (high_first if subject >= object_ else low_first) % ID_LIMIT
+
+
+def _vector(values: Float64) -> Vector:
+    x, y, z = values.tolist()
+    return (x, y, z)
+
+
+def _node_markers(
+    node: wire.NodeState, mean: Float64, covariance: Float64, colour: str
+) -> list[Marker]:
+    deviations, axes = principal_axes(covariance)
+    x, y, z, w = quaternion_from_rotation(axes).tolist()
+    diameters = np.maximum(2 * SIGMAS * deviations, LEAST_DIAMETER_M)
+    above = mean + np.array([0.0, 0.0, SIGMAS * np.sqrt(covariance[2, 2]) + TEXT_M])
+    number = node.id % ID_LIMIT
+    ellipsoid = Marker(
+        "objects", number, "sphere", _vector(mean), (x, y, z, w), _vector(diameters),
+        (*to_rgb(colour), 0.55),
+    )  # fmt: skip
+    label = Marker(
+        "labels", number, "text", _vector(above), IDENTITY, (0.0, 0.0, TEXT_M),
+        (1.0, 1.0, 1.0, 1.0), f"{node.label} #{node.id}",
+    )  # fmt: skip
+    return [ellipsoid, label]
+
+
+def _edge_markers(edge: wire.EdgeState, tail: Float64, tip: Float64) -> list[Marker]:
+    number = pair_id(edge.subject, edge.object)
+    alpha = 0.25 + 0.7 * min(edge.probability, 1.0)
+    # The text is nearer to the tail: that of the opposite edge does not lie upon it.
+    place = tail + 0.4 * (tip - tail)
+    arrow = Marker(
+        "relations", number, "arrow", (0.0, 0.0, 0.0), IDENTITY, (SHAFT_M, HEAD_M, HEAD_LENGTH_M),
+        (0.95, 0.75, 0.2, alpha), "", (_vector(tail), _vector(tip)),
+    )  # fmt: skip
+    predicate = Marker(
+        "predicates", number, "text", _vector(place), IDENTITY, (0.0, 0.0, SMALL_TEXT_M),
+        (1.0, 0.9, 0.6, alpha), edge.predicate,
+    )  # fmt: skip
+    return [arrow, predicate]

@@ -1,0 +1,86 @@
+"""The graph as two tables on the terminal: objects, and relations."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.style import Style
+from rich.table import Table
+from rich.text import Text
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.view.colours import class_colours
+from deworldsg_ros.view.geometry import SIGMAS, covariances_of, principal_axes
+
+MOST_ROWS = 60
+PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}
+
+
+def print_graph(console: Console, graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> None:
+    """Print the objects seen most often and the surest relations, `most` of each at most."""
+    console.print(object_table(graph, most))
+    console.print(relation_table(graph, most))
+
+
+def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
+    """Objects, the most observed first; the size is that of the 2σ ellipsoid."""
+    table = Table(
+        title=_title("object", len(graph.nodes), most),
+        caption=f"position in frame {graph.frame_id!r}; size: {SIGMAS:g}σ ellipsoid, longest first",
+    )
+    table.add_column("object", no_wrap=True)
+    table.add_column("p", justify="right")
+    table.add_column("x, y, z [m]", justify="right", no_wrap=True)
+    table.add_column("size [cm]", justify="right", no_wrap=True)
+    table.add_column("seen", justify="right")
+    colours = class_colours(node.label for node in graph.nodes)
+    rows = sorted(
+        zip(graph.nodes, covariances_of(graph)), key=lambda row: (-row[0].observations, row[0].id)
+    )
+    for node, covariance in rows[:most]:
+        size_m = 2 * SIGMAS * principal_axes(covariance)[0]
+        table.add_row(
+            Text.assemble((node.label, Style(color=colours[node.label])), (f" #{node.id}", "dim")),
+            _percent(node.classes[0].probability) if node.classes else "",
+            " ".join(f"{value:6.2f}" for value in node.mean_m),
+            " × ".join(f"{100 * value:.0f}" for value in size_m),
+            str(node.observations),
+        )
+    return table
+
+
+def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
+    """Relations, the surest first."""
+    table = Table(title=_title("relation", len(graph.edges), most))
+    for name in ("subject", "predicate", "object"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("p", justify="right")
+    table.add_column("belief", no_wrap=True)
+    table.add_column("seen", justify="right")
+    names = {node.id: _name(node.label, node.id) for node in graph.nodes}
+    edges = sorted(
+        graph.edges,
+        key=lambda edge: (-edge.probability, -edge.observations, edge.subject, edge.object),
+    )
+    for edge in edges[:most]:
+        table.add_row(
+            names.get(edge.subject, _name("?", edge.subject)),
+            Text(edge.predicate, "bold"),
+            names.get(edge.object, _name("?", edge.object)),
+            _percent(edge.probability),
+            Text(edge.provenance, PROVENANCE_STYLES[edge.provenance]),
+            str(edge.observations),
+        )
+    return table
+
+
+def _title(noun: str, number: int, most: int) -> str:
+    plural = noun if number == 1 else f"{noun}s"
+    return f"{number} {plural}" + (f" (the first {most})" if number > most else "")
+
+
+def _name(label: str, node_id: int) -> Text:
+    return Text.assemble(label, (f" #{node_id}", "dim"))
+
+
+def _percent(probability: float) -> str:
+    return f"{100 * probability:.0f} %"
