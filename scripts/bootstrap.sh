@@ -139,7 +139,7 @@ install_project() {
     [ ! -e "$root/$name" ] || sources+=("$name")
   done
   wanted=$(hash_of "${sources[@]}")
-  is_current project "$wanted" && return
+  is_current project "$wanted" && [ -x "$venv/bin/deworldsg" ] && return
   rm -rf "$stamps/source" "$stamps/project"
   mkdir "$stamps/source"
   (cd "$root" && cp -r --parents "${sources[@]}" "$stamps/source")

@@ -77,7 +77,8 @@ def copy_sources(root: Path, target: Path) -> Path:
 
 def install_with_pip(source: Path, folder: Path) -> Path:
     """The prefix of a `pip install .`."""
-    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet")
+    # Without --ignore-installed pip would first uninstall the package from this environment.
+    options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--ignore-installed")
     prefix = folder / "prefix"
     run(sys.executable, "-m", "pip", "install", *options, "--prefix", prefix, source, cwd=folder)
     return prefix
