@@ -3,11 +3,13 @@
 The background is what lies mostly outside the box. It spreads inwards over the borders between
 regions, and to regions that continue one of its planes (the floor seen through a chair, the table
 under a cup). How much it had to overcome to reach a region is that region's distance. The cut
-between near (background) and far (object) regions is where two things agree: the distances fall
-into two classes (Otsu), and what is kept still touches all four sides of the box.
+between near (background) and far (object) regions is where three things agree: the distances fall
+into two classes (Otsu), what is kept still touches all four sides of the box, and it fills it.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -15,23 +17,49 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.perception.superpixels import Regions
 
-# A region with less than this share inside the box is background.
-INSIDE_SHARE = 0.6
-# Borders count with this power of their strength: many weak ones are no strong one, and a very
-# strong one (a depth step) is not stronger than several clear ones.
-STRENGTH_POWER = 0.6
-# A plane that goes on beyond the box reaches coplanar regions at this price, plus colour and fit.
-PLANE_PRICE = 1.0
-PLANE_COLOUR_STEP = 20.0
-# Noise of a region's mean depth: a floor, and growth with the square of the depth.
-PLANE_NOISE_M, PLANE_NOISE_PER_M2 = 0.008, 0.002
-PLANE_MIN_CELLS = 6
-# How much touching the box counts beside the two-class criterion, which is in [0, 1].
-TIGHTNESS = 2.0
-FAR = 20.0
+
+class CutSettings(NamedTuple):
+    """How background and object are told apart; the same for every object and scene.
+
+    Attributes:
+        inside_share: share of a region's cells inside the box above which it may be the object's.
+        slack_cells, slack_share: error of a box's edge, cells and share of the side. What lies
+            between box and slack, a strip that a box drawn too small cuts off, is neither object
+            nor does it vouch for the background.
+        strength_power: borders count with this power of their strength: many weak ones are no
+            strong one, and a depth step is not stronger than several clear ones.
+        plane_price: what the background pays to reach a region that continues its plane.
+        plane_colour: difference in CIE Lab that costs as much as 1.
+        plane_noise_m, plane_noise_per_m2: error of a region's mean depth, and its growth with the
+            square of the depth.
+        plane_min_cells: size below which a region's plane is not trusted.
+        tightness: weight of touching the box, beside the two-class criterion in [0, 1].
+        fill_expected, fill_weight: least share of its box that an object is expected to fill, and
+            the weight of what is missing.
+        far: distance beyond which all is equally far.
+    """
+
+    inside_share: float = 0.8
+    slack_cells: float = 1.0
+    slack_share: float = 0.04
+    strength_power: float = 0.6
+    plane_price: float = 2.0
+    plane_colour: float = 12.0
+    plane_noise_m: float = 0.008
+    plane_noise_per_m2: float = 0.002
+    plane_min_cells: float = 12.0
+    tightness: float = 1.0
+    fill_expected: float = 0.4
+    fill_weight: float = 0.5
+    far: float = 8.0
 
 
-def cut_boxes(regions: Regions, boxes_cells: NDArray[np.int64]) -> NDArray[np.int32]:
+SETTINGS = CutSettings()
+
+
+def cut_boxes(
+    regions: Regions, boxes_cells: NDArray[np.int64], settings: CutSettings = SETTINGS
+) -> NDArray[np.int32]:
     """The object of each region, (c,) int32: row of the box, or -1.
 
     Small boxes choose first: a cup's regions lie in the table's box too, but not the reverse.
@@ -39,9 +67,11 @@ def cut_boxes(regions: Regions, boxes_cells: NDArray[np.int64]) -> NDArray[np.in
     Args:
         regions: of the reduced image.
         boxes_cells: (n, 4) inclusive cell bounds x1, y1, x2, y2, inside the image.
+        settings: see there.
     """
     owner = np.full(len(regions.area), -1, dtype=np.int32)
     sides = boxes_cells[:, 2:] - boxes_cells[:, :2] + 1
+    strength = regions.strength**settings.strength_power
     for row in np.argsort(sides.prod(axis=1), kind="stable"):
         _cut_box(
             regions.labels,
@@ -52,22 +82,55 @@ def cut_boxes(regions: Regions, boxes_cells: NDArray[np.int64]) -> NDArray[np.in
             regions.normal,
             regions.flatness,
             regions.pairs,
-            regions.strength**STRENGTH_POWER,
+            strength,
             boxes_cells[row],
             owner,
             row,
+            settings,
         )
     return owner
 
 
 @numba.njit(cache=True, nogil=True)
 def _cut_box(  # type: ignore[no-untyped-def]
-    labels, area, lab, valid, point, normal, flatness, pairs, strength, box, owner, row
+    labels, area, lab, valid, point, normal, flatness, pairs, strength, box, owner, row, settings
 ):
     x1, y1, x2, y2 = box
     count = len(area)
+    inside, loosely, bounds = _count_inside(labels, count, box, settings)
+    distance = np.full(count, np.inf)
+    candidate = np.zeros(count, np.bool_)
+    for r in range(count):
+        if owner[r] >= 0:
+            continue
+        if inside[r] > settings.inside_share * area[r]:
+            candidate[r] = True
+        elif loosely[r] <= settings.inside_share * area[r]:
+            distance[r] = 0.0
+    members = np.flatnonzero(candidate)
+    if len(members) == 0:
+        return
+    _reach_by_planes(members, distance, owner, area, lab, valid, point, normal, flatness, settings)
+    _reach_by_borders(distance, owner, pairs, strength)
+    for r in members:
+        distance[r] = min(distance[r], settings.far)
+    order = members[np.argsort(-distance[members], kind="mergesort")]
+    free = 0.0
+    for r in range(count):
+        if inside[r] > 0 and owner[r] < 0:
+            free += inside[r]
+    box_area = (x2 - x1 + 1) * (y2 - y1 + 1)
+    kept = _best_prefix(order, distance, area, bounds, free, box_area, settings)
+    for i in range(kept):
+        owner[order[i]] = row
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_inside(labels, count, box, settings):  # type: ignore[no-untyped-def]
+    x1, y1, x2, y2 = box
+    rows, columns = labels.shape
     inside = np.zeros(count, np.int32)
-    bounds = np.empty((count, 4), np.int32)
+    bounds = np.zeros((count, 4), np.int32)
     for y in range(y1, y2 + 1):
         for x in range(x1, x2 + 1):
             r = labels[y, x]
@@ -77,68 +140,61 @@ def _cut_box(  # type: ignore[no-untyped-def]
             bounds[r, 0] = min(bounds[r, 0], x)
             bounds[r, 2] = max(bounds[r, 2], x)
             bounds[r, 3] = max(bounds[r, 3], y)
-    distance = np.full(count, np.inf)
-    candidate = np.zeros(count, np.bool_)
-    for r in range(count):
-        if owner[r] >= 0:
-            continue
-        if inside[r] > INSIDE_SHARE * area[r]:
-            candidate[r] = True
-        else:
-            distance[r] = 0.0
-    members = np.flatnonzero(candidate)
-    if len(members) == 0:
-        return
-    _reach_by_planes(members, distance, candidate, owner, area, lab, valid, point, normal, flatness)
-    _reach_by_borders(distance, owner, pairs, strength)
-    for r in members:
-        distance[r] = min(distance[r], FAR)
-    order = members[np.argsort(-distance[members], kind="mergesort")]
-    free = 0.0
-    for r in range(count):
-        if inside[r] > 0 and owner[r] < 0:
-            free += inside[r]
-    kept = _best_prefix(order, distance, area, bounds, free, (x2 - x1 + 1) * (y2 - y1 + 1))
-    for i in range(kept):
-        owner[order[i]] = row
+    loosely = inside.copy()
+    slack_x = int(settings.slack_cells + settings.slack_share * (x2 - x1) + 0.5)
+    slack_y = int(settings.slack_cells + settings.slack_share * (y2 - y1) + 0.5)
+    for y in range(max(y1 - slack_y, 0), min(y2 + slack_y, rows - 1) + 1):
+        for x in range(max(x1 - slack_x, 0), min(x2 + slack_x, columns - 1) + 1):
+            if x < x1 or x > x2 or y < y1 or y > y2:
+                loosely[labels[y, x]] += 1
+    return inside, loosely, bounds
 
 
 @numba.njit(cache=True, nogil=True)
 def _reach_by_planes(  # type: ignore[no-untyped-def]
-    members, distance, candidate, owner, area, lab, valid, point, normal, flatness
+    members, distance, owner, area, lab, valid, point, normal, flatness, settings
 ):
     for q in range(len(area)):
-        if candidate[q] or owner[q] >= 0 or valid[q] < PLANE_MIN_CELLS or flatness[q] < 0.9:
+        if distance[q] > 0.0 or owner[q] >= 0 or valid[q] < settings.plane_min_cells:
+            continue
+        if flatness[q] < 0.9:
             continue
         for r in members:
             if valid[r] < 3:
                 continue
             off = 0.0
-            cosine = 0.0
             for k in range(3):
                 off += (point[r, k] - point[q, k]) * normal[q, k]
-                cosine += normal[r, k] * normal[q, k]
-            noise = PLANE_NOISE_M + PLANE_NOISE_PER_M2 * point[r, 2] ** 2
+            noise = settings.plane_noise_m + settings.plane_noise_per_m2 * point[r, 2] ** 2
             off = abs(off) / noise
             if off > 3.0:
                 continue
+            cosine = 0.0
             colour = 0.0
             for k in range(3):
-                colour += ((lab[r, k] - lab[q, k]) / PLANE_COLOUR_STEP) ** 2
-            price = PLANE_PRICE + np.sqrt(0.3 * off * off + 5.0 * (1.0 - cosine) + colour)
-            distance[r] = min(distance[r], price)
+                cosine += normal[r, k] * normal[q, k]
+                colour += ((lab[r, k] - lab[q, k]) / settings.plane_colour) ** 2
+            price = np.sqrt(0.3 * off * off + 5.0 * (1.0 - cosine) + colour)
+            distance[r] = min(distance[r], settings.plane_price + price)
 
 
 @numba.njit(cache=True, nogil=True)
 def _reach_by_borders(distance, owner, pairs, strength):  # type: ignore[no-untyped-def]
+    # Borders between two regions of the background cannot matter.
+    relevant = np.empty(len(pairs), np.int32)
+    found = 0
+    for i in range(len(pairs)):
+        a, b = pairs[i]
+        if owner[a] < 0 and owner[b] < 0 and (distance[a] > 0.0 or distance[b] > 0.0):
+            relevant[found] = i
+            found += 1
     # Bellman-Ford; the pairs are in scan order, so a few sweeps settle it.
     changed = True
     while changed:
         changed = False
-        for i in range(len(pairs)):
+        for k in range(found):
+            i = relevant[k]
             a, b = pairs[i]
-            if owner[a] >= 0 or owner[b] >= 0:
-                continue
             if distance[b] + strength[i] < distance[a] - 1e-9:
                 distance[a] = distance[b] + strength[i]
                 changed = True
@@ -148,14 +204,16 @@ def _reach_by_borders(distance, owner, pairs, strength):  # type: ignore[no-unty
 
 
 @numba.njit(cache=True, nogil=True)
-def _best_prefix(order, distance, area, bounds, free, box_area):  # type: ignore[no-untyped-def]
+def _best_prefix(  # type: ignore[no-untyped-def]
+    order, distance, area, bounds, free, box_area, settings
+):
     total, total_square = 0.0, 0.0
     for r in order:
         total += area[r] * distance[r]
         total_square += area[r] * distance[r] ** 2
     variance = max(total_square / free - (total / free) ** 2, 1e-9)
     left, top, right, bottom = bounds[order[0]]
-    near, weight, best, kept = 0.0, 0.0, -1.0, 0
+    near, weight, best, kept = 0.0, 0.0, -np.inf, 0
     for i in range(len(order)):
         r = order[i]
         near += area[r]
@@ -166,7 +224,8 @@ def _best_prefix(order, distance, area, bounds, free, box_area):  # type: ignore
         rest = max(free - near, 1e-9)
         between = share * (1.0 - share) * (weight / near - (total - weight) / rest) ** 2
         tight = (right - left + 1) * (bottom - top + 1) / box_area
-        score = between / variance + TIGHTNESS * tight
+        sparse = max(1.0 - near / (settings.fill_expected * free), 0.0)
+        score = between / variance + settings.tightness * tight - settings.fill_weight * sparse
         if score > best:
             best, kept = score, i + 1
     return kept

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.perception.mask_upsampling import upsample_labels
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.region_cut import cut_boxes
 from deworldsg_ros.perception.superpixels import cut_regions, reduce_frame
@@ -39,12 +40,12 @@ class RgbdSegmenter:
         limits = np.array([columns - 1, rows - 1] * 2)
         boxes_cells = np.clip(np.round(boxes_xyxy) // stride, 0, limits).astype(np.int64)
         owner = cut_boxes(regions, boxes_cells)
-        labels = owner[regions.labels]
+        labels = upsample_labels(
+            owner[regions.labels], cells.rgb, cells.points[..., 2], rgb, depth, stride
+        )
         patches = []
         for row, box in enumerate(boxes_xyxy):
             left, top = np.clip(np.round(box[:2]), 0, [width, height]).astype(int)
             right, bottom = np.clip(np.round(box[2:]) + 1, 0, [width, height]).astype(int)
-            v = np.minimum(np.arange(top, bottom) // stride, rows - 1)
-            u = np.minimum(np.arange(left, right) // stride, columns - 1)
-            patches.append(MaskPatch(int(top), int(left), labels[np.ix_(v, u)] == row))
+            patches.append(MaskPatch(int(top), int(left), labels[top:bottom, left:right] == row))
         return patches

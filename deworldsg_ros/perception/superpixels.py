@@ -35,12 +35,14 @@ class Cells:
 
     Attributes:
         stride: pixels a cell; cell (y, x) covers pixels from (y stride, x stride).
-        lab: (h, w, 3) float32, CIE Lab in 8-bit scale.
+        rgb: (h, w, 3) uint8, mean colour.
+        lab: (h, w, 3) float32, the same in CIE Lab, 8-bit scale.
         points: (h, w, 3) float32, metres, camera frame; 0 where depth is invalid.
         normals: (h, w, 3) float32, unit, towards the camera.
     """
 
     stride: int
+    rgb: NDArray[np.uint8]
     lab: NDArray[np.float32]
     points: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -79,15 +81,16 @@ def reduce_frame(
     """The cells of a frame: mean colour, median depth, normals by plane gradients."""
     height, width = depth_m.shape[0] // stride, depth_m.shape[1] // stride
     middle = slice(stride // 2, None, stride)
-    smooth = cv2.blur(rgb, (stride, stride))[middle, middle][:height, :width]
-    lab = cv2.cvtColor(np.ascontiguousarray(smooth), cv2.COLOR_RGB2Lab).astype(np.float32)
+    mean = cv2.blur(rgb, (stride, stride))[middle, middle][:height, :width]
+    mean = np.ascontiguousarray(mean)
+    lab = cv2.cvtColor(mean, cv2.COLOR_RGB2Lab).astype(np.float32)
     z = cv2.medianBlur(np.ascontiguousarray(depth_m[middle, middle][:height, :width]), 3)
     columns = (np.arange(width) * stride + stride // 2 - intrinsics.cx) / intrinsics.fx
     rows = (np.arange(height) * stride + stride // 2 - intrinsics.cy) / intrinsics.fy
     points, normals = _geometry(
         z, cv2.blur(z, (5, 5)), columns.astype(np.float32), rows.astype(np.float32)
     )
-    return Cells(stride, lab, points, normals)
+    return Cells(stride, mean, lab, points, normals)
 
 
 def cut_regions(cells: Cells) -> Regions:
