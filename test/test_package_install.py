@@ -152,9 +152,9 @@ def test_python_package_has_all_its_files(install: Install, root_dir: Path) -> N
     assert any(name.endswith(".onnx") for name in files_below(install.site / PACKAGE))
 
 
-@pytest.mark.parametrize("executable", sorted(EXECUTABLES - {"replay"}))
+@pytest.mark.parametrize("executable", sorted(EXECUTABLES))
 def test_executable_starts_its_node(install: Install, tmp_path: Path, executable: str) -> None:
-    """A parameter that does not exist ends a node at start-up, with status 2 and its name."""
+    """A configuration that cannot be used ends a node at start-up, with status 2 and the reason."""
     done = subprocess.run(
         [install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such_thing:=1"],
         cwd=tmp_path,
@@ -164,12 +164,12 @@ def test_executable_starts_its_node(install: Install, tmp_path: Path, executable
         timeout=100,
     )
     assert done.returncode == 2, done.stderr
-    assert "no_such_thing" in done.stderr
+    # The replay misses its recording before it minds anything else.
+    assert ("recording" if executable == "replay" else "no_such_thing") in done.stderr
 
 
-def test_replay_and_deworldsg_tell_how_to_use_them(install: Install, tmp_path: Path) -> None:
-    for path in (install.prefix / "lib" / PACKAGE / "replay", install.prefix / "bin" / "deworldsg"):
-        run(path, "--help", cwd=tmp_path, env=install.environment())
+def test_deworldsg_tells_how_to_use_it(install: Install, tmp_path: Path) -> None:
+    run(install.prefix / "bin" / "deworldsg", "--help", cwd=tmp_path, env=install.environment())
 
 
 @pytest.mark.parametrize("prefix_has_python", [True, False])
