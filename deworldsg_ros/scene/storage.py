@@ -149,7 +149,7 @@ def write(path: str | Path, state: State) -> None:
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **state)
+        np.savez(file, **state)  # type: ignore[arg-type]  # its own options are named in the stub
         file.flush()
         os.fsync(file.fileno())
     partial.replace(path)
