@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import (
@@ -41,7 +41,7 @@ class BagSource:
         RecordingError: where it cannot be read, or a topic is missing.
     """
 
-    kind = "rosbag2"
+    kind: ClassVar[str] = "rosbag2"
 
     def __init__(
         self, path: Path, choice: TopicChoice | None = None, inputs: InputsConfig | None = None
@@ -58,7 +58,9 @@ class BagSource:
         except RecordingError:
             self._bag.close()
             raise
-        self.topics = {role: UsedTopic(*topic) for role, topic in found.items()}
+        self.topics = {
+            role: UsedTopic(topic.name, topic.msgtype, topic.count) for role, topic in found.items()
+        }
         self.frame_count = found[Role.RGB].count
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:

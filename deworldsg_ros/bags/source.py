@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from deworldsg_ros.bags.messages import Role, RoleMessage
@@ -22,7 +23,8 @@ class RawRoleMessage(NamedTuple):
     data: bytes
 
 
-class UsedTopic(NamedTuple):
+@dataclass(frozen=True)
+class UsedTopic:
     """Where the messages of a role come from: a topic of a bag, or files of a folder."""
 
     name: str
@@ -35,7 +37,6 @@ class Source(Protocol):
 
     Attributes:
         name: what to call it.
-        kind: e.g. ``rosbag2`` or ``7scenes``.
         topics: where each role comes from.
         frame_count: number of RGB images, an estimate of the frames.
         drops: frames and messages left out while reading, by reason.
@@ -43,11 +44,15 @@ class Source(Protocol):
     """
 
     name: str
-    kind: str
     topics: dict[Role, UsedTopic]
     frame_count: int
     drops: Counter[str]
     losses: list[str]
+
+    @property
+    def kind(self) -> str:
+        """``rosbag2`` or the name of a data set."""
+        ...
 
     def messages(self) -> Iterator[RoleMessage]:
         """Decoded messages in order of time."""

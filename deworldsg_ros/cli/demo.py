@@ -66,7 +66,7 @@ def run_demo(
     logs.mkdir(exist_ok=True)
 
     started_s = time.perf_counter()
-    with _sigterm_like_ctrl_c(), _processes(console) as processes:
+    with _one_interrupt(), _processes(console) as processes:
         parameters = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]
         environment = dds_environment()
         for node in NODES:
@@ -142,29 +142,31 @@ def _processes(console: Console) -> Iterator[list[LoggedProcess]]:
     try:
         yield processes
     finally:
-        # A second Ctrl-C must not leave nodes behind.
-        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            with console.status("ending the nodes …"):
-                # The replay first, so that nothing comes any more; then in the order of the data.
-                codes = end_all(processes[-1:]) | end_all(processes[:-1])
-        finally:
-            signal.signal(signal.SIGINT, previous)
+        with console.status("ending the nodes …"):
+            # The replay first, so that nothing comes any more.
+            codes = end_all(processes[-1:]) | end_all(processes[:-1])
         for name, code in codes.items():
-            if code not in (0, None):
+            # A node that is still loading has no handler yet: SIGINT itself ends it.
+            if code not in (0, -signal.SIGINT):
                 console.print(f"[yellow]{name} ended with code {code}[/]", highlight=False)
 
 
 @contextmanager
-def _sigterm_like_ctrl_c() -> Iterator[None]:
+def _one_interrupt() -> Iterator[None]:
+    """The first SIGINT or SIGTERM interrupts; more of them must not leave nodes behind."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
     def interrupt(*_: Any) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGTERM, interrupt)
+    previous = {number: signal.signal(number, interrupt) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def _follow(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
@@ -65,6 +67,20 @@ CameraIntrinsics = Annotated[
 ]
 
 
+@contextmanager
+def _telling_errors() -> Iterator[None]:
+    """Errors of the user end the program with a sentence; no traceback for them or Ctrl-C."""
+    try:
+        yield
+    except DeWorldSGError as error:
+        console = Console(stderr=True, highlight=False, soft_wrap=True)
+        console.print(f"[bold red]error:[/] {escape(str(error))}")
+        raise typer.Exit(EXIT_USAGE) from error
+    except KeyboardInterrupt as interrupt:
+        Console(stderr=True).print("interrupted")
+        raise typer.Exit(EXIT_INTERRUPTED) from interrupt
+
+
 def _version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"deworldsg {__version__}")
@@ -95,18 +111,19 @@ def run(
     intrinsics: CameraIntrinsics = "",
 ) -> None:
     """Make a recording's scene graph in one process."""
-    from deworldsg_ros.cli.run import run_recording
+    with _telling_errors():
+        from deworldsg_ros.cli.run import run_recording
 
-    run_recording(
-        recording,
-        out,
-        config,
-        settings or [],
-        max_frames=max_frames,
-        topics=TopicChoice(rgb, depth, camera_info, pose),
-        options=_dataset_options(rate, intrinsics),
-        console=Console(),
-    )
+        run_recording(
+            recording,
+            out,
+            config,
+            settings or [],
+            max_frames=max_frames,
+            topics=TopicChoice(rgb, depth, camera_info, pose),
+            options=_dataset_options(rate, intrinsics),
+            console=Console(),
+        )
 
 
 @app.command()
@@ -132,18 +149,19 @@ def demo(
     intrinsics: CameraIntrinsics = "",
 ) -> None:
     """Make it with the four ROS 2 nodes, from a replay."""
-    from deworldsg_ros.cli.demo import run_demo
+    with _telling_errors():
+        from deworldsg_ros.cli.demo import run_demo
 
-    run_demo(
-        recording,
-        out,
-        config,
-        settings or [],
-        rate=rate,
-        topics=TopicChoice(rgb, depth, camera_info, pose),
-        options=_dataset_options(0.0, intrinsics),
-        console=Console(),
-    )
+        run_demo(
+            recording,
+            out,
+            config,
+            settings or [],
+            rate=rate,
+            topics=TopicChoice(rgb, depth, camera_info, pose),
+            options=_dataset_options(0.0, intrinsics),
+            console=Console(),
+        )
 
 
 @app.command()
@@ -161,24 +179,26 @@ def convert(
     pose: PoseTopic = "",
 ) -> None:
     """Turn a folder or bag into one MCAP file."""
-    from deworldsg_ros.cli.convert import convert_recording
+    with _telling_errors():
+        from deworldsg_ros.cli.convert import convert_recording
 
-    convert_recording(
-        kind,
-        source,
-        output,
-        topics=TopicChoice(rgb, depth, camera_info, pose),
-        options=_dataset_options(rate, intrinsics),
-        console=Console(),
-    )
+        convert_recording(
+            kind,
+            source,
+            output,
+            topics=TopicChoice(rgb, depth, camera_info, pose),
+            options=_dataset_options(rate, intrinsics),
+            console=Console(),
+        )
 
 
 @app.command()
 def info(recording: RecordingPath) -> None:
     """Tell what a recording holds and what is used."""
-    from deworldsg_ros.cli.info import show_recording
+    with _telling_errors():
+        from deworldsg_ros.cli.info import show_recording
 
-    show_recording(recording, Console())
+        show_recording(recording, Console())
 
 
 app.command("topics", help="The same as info.", hidden=True)(info)
@@ -187,9 +207,10 @@ app.command("topics", help="The same as info.", hidden=True)(info)
 @app.command("config")
 def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
     """Print the effective configuration, described."""
-    from deworldsg_ros.cli.configuration import described_yaml, effective_config
+    with _telling_errors():
+        from deworldsg_ros.cli.configuration import described_yaml, effective_config
 
-    typer.echo(described_yaml(effective_config(config, settings)), nl=False)
+        typer.echo(described_yaml(effective_config(config, settings)), nl=False)
 
 
 def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:
@@ -204,26 +225,10 @@ def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:
     return DatasetOptions(rate_hz, (fx, fy, cx, cy))
 
 
-def main() -> int:
-    """Run the program; errors of the user end it with one sentence and code 2."""
-    try:
-        app(prog_name="deworldsg")
-    except DeWorldSGError as error:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(
-            f"[bold red]error:[/] {_escaped(str(error))}"
-        )
-        return EXIT_USAGE
-    except KeyboardInterrupt:
-        Console(stderr=True).print("interrupted")
-        return EXIT_INTERRUPTED
-    return 0
-
-
-def _escaped(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
+def main() -> None:
+    """Run the program; ends the process with 0, 2 for errors of the user, 130 after Ctrl-C."""
+    app(prog_name="deworldsg")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

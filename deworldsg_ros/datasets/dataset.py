@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -93,7 +93,7 @@ def image_size(path: Path) -> tuple[int, int]:
     return decode_image(read_file(path), cv2.IMREAD_COLOR, path).shape[1::-1]
 
 
-def decode_image(content: bytes, flags: int, path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:
     """Pixels of an image file's content; raises RecordingError where they cannot be decoded."""
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     if pixels is None:
