@@ -43,7 +43,7 @@ class Install:
         return {
             **os.environ,
             "AMENT_PREFIX_PATH": f"{self.prefix}:{os.environ['AMENT_PREFIX_PATH']}",
-            "PYTHONPATH": str(self.site),
+            "PYTHONPATH": f"{self.site}:{os.environ.get('PYTHONPATH', '')}".rstrip(":"),
             "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
         }
 
