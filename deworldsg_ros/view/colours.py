@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 Rgb = tuple[float, float, float]
 
@@ -13,7 +13,12 @@ PALETTE = (
     "#4aa3d8", "#e2965a", "#77b255", "#a78bd0",
 )  # fmt: skip
 
-PROVENANCE = {"visual": "#4a5568", "prior": "#b7791f", "fused": "#2b7a78"}
+PREDICATE_PALETTE = (
+    "#2f6fab", "#c2571a", "#2e8b57", "#8a4fbf", "#b8336a", "#8a7a1f", "#1f8a8a", "#7a4a2b",
+)  # fmt: skip
+# Said of so many pairs that its arrows should stay in the background.
+QUIET = frozenset({"near"})
+GREY = "#8d93a5"
 
 
 def class_colours(labels: Iterable[str]) -> dict[str, str]:
@@ -37,3 +42,17 @@ def to_rgb(colour: str) -> Rgb:
     """#rrggbb as three values from 0 to 1."""
     red, green, blue = (int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5))
     return red, green, blue
+
+
+def predicate_colours(counts: Mapping[str, int]) -> dict[str, str]:
+    """#rrggbb of each predicate, the most frequent first; those beyond the palette are grey."""
+    ordered = sorted(counts, key=lambda name: (-counts[name], name))
+    colours = dict.fromkeys(ordered, GREY)
+    loud = [name for name in ordered if name not in QUIET]
+    colours.update(zip(loud, PREDICATE_PALETTE))
+    return colours
+
+
+def shade(colour: str, factor: float) -> str:
+    """A darker colour: #rrggbb times a factor below one."""
+    return "#" + "".join(f"{round(255 * factor * value):02x}" for value in to_rgb(colour))

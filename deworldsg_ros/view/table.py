@@ -29,8 +29,8 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
     )
     table.add_column("object", no_wrap=True)
     table.add_column("p", justify="right")
-    table.add_column("x, y, z [m]", justify="right", no_wrap=True)
-    table.add_column("size [cm]", justify="right", no_wrap=True)
+    table.add_column("x, y, z (m)", justify="right", no_wrap=True)
+    table.add_column("size (cm)", justify="right", no_wrap=True)
     table.add_column("seen", justify="right")
     colours = class_colours(node.label for node in graph.nodes)
     rows = sorted(
@@ -54,7 +54,7 @@ def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Tabl
     for name in ("subject", "predicate", "object"):
         table.add_column(name, no_wrap=True)
     table.add_column("p", justify="right")
-    table.add_column("belief", no_wrap=True)
+    table.add_column("from", no_wrap=True)
     table.add_column("seen", justify="right")
     names = {node.id: _name(node.label, node.id) for node in graph.nodes}
     edges = sorted(
