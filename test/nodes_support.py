@@ -106,20 +106,24 @@ class Peer:
         self.node = Node(name, context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
-        self._publishers: dict[str, object] = {}
+        self.also_spin: list[SingleThreadedExecutor] = []
 
     def spin_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
         """Run callbacks until a condition holds."""
         end_s = time.monotonic() + limit_s
         while not condition():
             assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin_once()
 
     def spin_for(self, duration_s: float) -> None:
         """Run callbacks for a while."""
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
-            self._executor.spin_once(timeout_sec=0.05)
+            self._spin_once()
+
+    def _spin_once(self) -> None:
+        for executor in (self._executor, *self.also_spin):
+            executor.spin_once(timeout_sec=0.01)
 
     def collect(self, topic: str, depth: int = 100, *, latched: bool = False) -> list[str]:
         """A list that receives the texts of a topic."""

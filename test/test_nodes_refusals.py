@@ -3,216 +3,44 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import msgspec
-import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
-from nodes_support import Peer
-from sensor_msgs.msg import CameraInfo, Image
+from nodes_bench import (
+    CAMERA,
+    HEIGHT,
+    LIMIT_S,
+    STEP_NS,
+    Bench,
+    bench,
+    camera_info,
+    changed,
+    depth,
+    evidence,
+    frame_graph,
+    instances,
+    local_graph,
+    pose,
+    rgb,
+    send_frame,
+    works,
+)
+from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
-from deworldsg_ros.bridge.images import fill_image
-from deworldsg_ros.bridge.node import StageNode
-from deworldsg_ros.bridge.poses import set_stamp
-from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.scene import wire
 
-WIDTH, HEIGHT = 64, 48
-STEP_NS = 100 * 10**6
-LIMIT_S = 20.0
-
-
-def stamped(message: Any, stamp_ns: int, frame_id: str = "camera") -> Any:
-    set_stamp(message, stamp_ns)
-    message.header.frame_id = frame_id
-    return message
-
-
-def image(pixels: np.ndarray, encoding: str, stamp_ns: int) -> Image:
-    message = Image()
-    fill_image(message, pixels, encoding)
-    return stamped(message, stamp_ns)
-
-
-def rgb(stamp_ns: int) -> Image:
-    return image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8", stamp_ns)
-
-
-def depth(stamp_ns: int, height: int = HEIGHT) -> Image:
-    return image(np.full((height, WIDTH), 1500, np.uint16), "16UC1", stamp_ns)
-
-
-def camera_info(stamp_ns: int) -> CameraInfo:
-    message = CameraInfo(width=WIDTH, height=HEIGHT)
-    message.k = [60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0]
-    return stamped(message, stamp_ns)
-
-
-def pose(stamp_ns: int, x: float = 0.0, frame_id: str = "map") -> PoseStamped:
-    message = PoseStamped()
-    message.pose.position.x = x
-    message.pose.orientation.w = 1.0
-    return stamped(message, stamp_ns, frame_id)
-
-
-def instances(stamp_ns: int, value: int = 0) -> Image:
-    return image(np.full((HEIGHT, WIDTH), value, np.uint16), "mono16", stamp_ns)
-
-
-def schema(kind: type[wire.Message], stamp_ns: int, frame_id: str) -> dict[str, Any]:
-    return {
-        "schema": wire.schema_of(kind),
-        "stamp": wire.stamp_from_ns(stamp_ns),
-        "frame_id": frame_id,
-        "classes": ["chair", "cup"],
-        "predicates": ["on"],
-    }
-
-
-def frame_graph(stamp_ns: int) -> wire.FrameGraphMessage:
-    return wire.FrameGraphMessage(
-        **schema(wire.FrameGraphMessage, stamp_ns, "camera"),
-        width=WIDTH,
-        height=HEIGHT,
-        objects=[],
-        relations=[],
-    )
-
-
-def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
-    return wire.LocalGraphMessage(
-        **schema(wire.LocalGraphMessage, stamp_ns, "map"),
-        width=WIDTH,
-        height=HEIGHT,
-        T_world_camera=np.eye(4).ravel().tolist(),
-        objects=[
-            wire.LiftedObject(
-                instance=1,
-                box_xyxy=[1.0, 1.0, 9.0, 9.0],
-                score=0.9,
-                class_probabilities=[0.9, 0.1],
-                mean_m=[0.0, 0.0, 1.0],
-                covariance_m2=(0.01 * np.eye(3)).ravel().tolist(),
-                depth_m=1.0,
-                pixel_count=50,
-                surface_points_m=[],
-            )
-        ],
-        relations=[],
-    )
-
-
-def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
-    return wire.RelationEvidenceMessage(
-        **schema(wire.RelationEvidenceMessage, stamp_ns, "map"), source="none", pairs=[]
-    )
-
-
-class Bench:
-    """One node in this process, fed through DDS."""
-
-    def __init__(self, make: type[StageNode], topics: dict[str, type]) -> None:
-        self.peer = Peer("bench")
-        self.node = make(context=self.peer.context)
-        self.peer._executor.add_node(self.node)
-        self._publishers = {
-            topic: self.peer.node.create_publisher(kind, topic, reliable(50))
-            for topic, kind in topics.items()
-        }
-        self.stamp_ns = 1_700_000_000 * 10**9
-        self.peer.spin_until(
-            lambda: all(p.get_subscription_count() > 0 for p in self._publishers.values()),
-            LIMIT_S,
-            "the node to listen",
-        )
-
-    def send(self, **messages: Any) -> None:
-        """Publish messages on topics, named with __ for /."""
-        for name, message in messages.items():
-            if isinstance(message, msgspec.Struct):
-                message = String(data=wire.encode(message))
-            elif isinstance(message, str):
-                message = String(data=message)
-            self._publishers[name.replace("__", "/")].publish(message)
-
-    def next_stamp(self) -> int:
-        self.stamp_ns += STEP_NS
-        return self.stamp_ns
-
-    def products(self) -> int:
-        return self.node.health._published
-
-    def expect(self, condition: Callable[[], bool], what: str) -> None:
-        self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")
-
-    def refuses(self, reason: str, provoke: Callable[[], None], number: int = 1) -> None:
-        before = self.node.health.drops.get(reason, 0)
-        provoke()
-        self.expect(
-            lambda: self.node.health.drops.get(reason, 0) >= before + number, f"a drop of {reason}"
-        )
-
-    def close(self) -> None:
-        self.peer._executor.remove_node(self.node)
-        self.node.close()
-        self.node.destroy_node()
-        self.peer.close()
-
-
-def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
-    made = Bench(make, topics)
-    yield made
-    made.close()
-
-
-CAMERA = {
-    "rgb/image_raw": Image,
-    "depth/image_raw": Image,
-    "rgb/camera_info": CameraInfo,
-    "camera/pose": PoseStamped,
-}
-
 
 @pytest.fixture(scope="module")
 def segmentation() -> Iterator[Bench]:
     yield from bench(SegmentationNode, CAMERA)
-
-
-def send_frame(at: Bench, **changes: Any) -> None:
-    """A complete frame, with some messages changed (a function of the stamp) or left out."""
-    stamp_ns = at.next_stamp()
-    makers = {
-        "rgb__camera_info": camera_info,
-        "camera__pose": pose,
-        "depth__image_raw": depth,
-        "rgb__image_raw": rgb,
-        **changes,
-    }
-    at.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
-
-
-def works(at: Bench, send: Callable[[], None]) -> None:
-    """Good input gives a product."""
-    before = at.products()
-    send()
-    at.expect(lambda: at.products() > before, "a product")
-
-
-def changed(make: Callable[[int], Any], **fields: Any) -> Callable[[int], Any]:
-    def changing(stamp_ns: int) -> Any:
-        message = make(stamp_ns)
-        for name, value in fields.items():
-            setattr(message, name, value)
-        return message
-
-    return changing
 
 
 SEGMENTATION_CASES = {
@@ -286,8 +114,6 @@ def test_what_nobody_foresaw_is_counted_and_survived(
 def test_slow_work_lets_the_oldest_frames_go(
     segmentation: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import threading
-
     begin = threading.Event()
     perceive = segmentation.node._perception.perceive
 

@@ -1,0 +1,74 @@
+"""docs/nodes.md says what the code does; `python test/test_nodes_docs.py` writes its tables."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from deworldsg_ros.bridge.parameters import fields  # noqa: E402
+from deworldsg_ros.bridge.reasons import REASONS  # noqa: E402
+
+PAGE = ROOT / "docs" / "nodes.md"
+# What the nodes run.
+PACKAGES = ("bridge", "nodes", "perception", "lifting", "merging", "relations", "graph_builder.py")
+SCENE = ("camera.py", "codec.py", "wire.py")
+
+
+def reasons_table() -> str:
+    rows = [f"| `{reason}` | {advice} |" for reason, advice in REASONS.items()]
+    return "\n".join(["| reason | what it means, what to do |", "|---|---|", *rows])
+
+
+def parameters_table() -> str:
+    rows = []
+    for field in fields():
+        default = "''" if field.default == "" else str(field.default).lower()
+        limits = field.limits() or ("true, false" if field.kind is bool else "")
+        kind = field.kind.__name__
+        rows.append(f"| `{field.name}` | {kind} | `{default}` | {limits} | {field.description} |")
+    return "\n".join(["| name | type | default | allowed | |", "|---|---|---|---|---|", *rows])
+
+
+def with_tables(text: str) -> str:
+    for name, table in (("reasons", reasons_table()), ("parameters", parameters_table())):
+        pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
+        assert pattern.search(text), name
+        text = pattern.sub(lambda match, t=table: f"{match[1]}{t}\n{match[2]}", text)
+    return text
+
+
+def test_the_tables_of_the_page_are_those_of_the_code() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert text == with_tables(text), "run: python test/test_nodes_docs.py"
+
+
+def reasons_in(path: Path) -> set[str]:
+    """First arguments of every RefusedInput and drop that are literals."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and node.args:
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            literal = isinstance(node.args[0], ast.Constant)
+            if name in ("RefusedInput", "drop", "_drop") and literal:
+                found.add(node.args[0].value)
+    return found
+
+
+def test_every_reason_of_the_code_is_explained() -> None:
+    package = ROOT / "deworldsg_ros"
+    paths = [package / "scene" / name for name in SCENE]
+    for name in PACKAGES:
+        path = package / name
+        paths += [path] if path.is_file() else sorted(path.rglob("*.py"))
+    used = set().union(*(reasons_in(path) for path in paths))
+    assert used
+    assert used <= set(REASONS)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
