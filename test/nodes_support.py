@@ -47,7 +47,13 @@ class NodeProcess:
     def __init__(self, name: str, folder: Path, *arguments: str) -> None:
         self.name = name
         self.log_path = folder / f"{name}.log"
-        environment = {**os.environ, "PYTHONPATH": str(ROOT), "ROS_LOG_DIR": str(folder / "ros")}
+        # In front of what a sourced ROS 2 put there.
+        python_path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {
+            **os.environ,
+            "PYTHONPATH": python_path,
+            "ROS_LOG_DIR": str(folder / "ros"),
+        }
         command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *arguments]
         with self.log_path.open("w") as log:
             self._process = subprocess.Popen(

@@ -50,7 +50,9 @@ def bhattacharyya_distance(
     """
     mixed = (covariance_a + covariance_b) / 2
     difference = mean_a - mean_b
-    solved = np.linalg.solve(mixed, difference[..., None])[..., 0]
+    # As many axes as the matrices have: numpy 1 would take fewer for one vector, not a stack.
+    shape = np.broadcast_shapes(difference.shape, mixed.shape[:-1])
+    solved = np.linalg.solve(mixed, np.broadcast_to(difference, shape)[..., None])[..., 0]
     mahalanobis = np.sum(difference * solved, axis=-1)
     log_ratio = (
         np.linalg.slogdet(mixed)[1]
