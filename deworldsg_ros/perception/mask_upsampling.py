@@ -18,14 +18,14 @@ DEPTH_LIMIT = 9.0
 def upsample_labels(  # type: ignore[no-untyped-def]
     labels, cell_rgb, cell_depth, rgb, depth_m, stride
 ) -> NDArray[np.int32]:
-    """Each pixel takes the label of the most similar of the nine cells around it.
+    """Each pixel takes the label of the most similar of its own cell and the four beside it.
 
     Args:
         labels: (h, w) int32 of cells.
         cell_rgb: (h, w, 3) uint8 mean colour of cells.
         cell_depth: (h, w) float32 metres; 0 = invalid.
         rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 metres; 0 = invalid.
+        depth_m: (H, W) float32 metres; 0, NaN or infinity = invalid.
         stride: pixels a cell.
 
     Returns:
@@ -54,14 +54,17 @@ def upsample_labels(  # type: ignore[no-untyped-def]
                     best = np.float32(np.inf)
                     chosen = own
                     z = depth_m[y, x]
+                    known = z > 0 and z < np.inf
                     for b in range(v0, v1 + 1):
                         for a in range(u0, u1 + 1):
+                            if b != v and a != u:
+                                continue
                             cost = np.float32(0.0)
                             for k in range(3):
                                 d = np.float32(rgb[y, x, k]) - np.float32(cell_rgb[b, a, k])
                                 cost += d * d
                             cost /= np.float32(COLOUR_STEP * COLOUR_STEP)
-                            if z > 0 and cell_depth[b, a] > 0:
+                            if known and cell_depth[b, a] > 0:
                                 d = (z - cell_depth[b, a]) / (np.float32(DEPTH_STEP) * z)
                                 cost += min(d * d, np.float32(DEPTH_LIMIT))
                             d = np.float32(y - (b * stride + stride // 2)) / np.float32(stride)

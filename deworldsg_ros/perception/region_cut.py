@@ -51,7 +51,7 @@ class CutSettings(NamedTuple):
     tightness: float = 1.0
     fill_expected: float = 0.4
     fill_weight: float = 0.5
-    far: float = 8.0
+    far: float = 5.0
 
 
 SETTINGS = CutSettings()

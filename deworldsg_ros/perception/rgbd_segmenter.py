@@ -33,15 +33,14 @@ class RgbdSegmenter:
             return []
         height, width = depth_m.shape
         stride = max(1, round(width / TARGET_WIDTH))
-        depth = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
-        cells = reduce_frame(rgb, depth, intrinsics, stride)
+        cells = reduce_frame(rgb, depth_m, intrinsics, stride)
         regions = cut_regions(cells)
         rows, columns = regions.labels.shape
         limits = np.array([columns - 1, rows - 1] * 2)
         boxes_cells = np.clip(np.round(boxes_xyxy) // stride, 0, limits).astype(np.int64)
         owner = cut_boxes(regions, boxes_cells)
         labels = upsample_labels(
-            owner[regions.labels], cells.rgb, cells.points[..., 2], rgb, depth, stride
+            owner[regions.labels], cells.rgb, cells.points[..., 2], rgb, depth_m, stride
         )
         patches = []
         for row, box in enumerate(boxes_xyxy):

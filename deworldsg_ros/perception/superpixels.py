@@ -25,6 +25,8 @@ HOLE_STEP = 0.55
 # Felzenszwalb's k: the larger, the coarser.
 COARSENESS = 4.0
 MIN_CELLS = 3
+# Beyond this, and NaN, is no depth.
+MAX_DEPTH_M = 1000.0
 WEIGHT_BINS = 512
 BINS_A_UNIT = 64.0
 
@@ -84,7 +86,8 @@ def reduce_frame(
     mean = cv2.blur(rgb, (stride, stride))[middle, middle][:height, :width]
     mean = np.ascontiguousarray(mean)
     lab = cv2.cvtColor(mean, cv2.COLOR_RGB2Lab).astype(np.float32)
-    z = cv2.medianBlur(np.ascontiguousarray(depth_m[middle, middle][:height, :width]), 3)
+    z = depth_m[middle, middle][:height, :width]
+    z = cv2.medianBlur(np.where((z > 0) & (z < MAX_DEPTH_M), z, np.float32(0)), 3)
     columns = (np.arange(width) * stride + stride // 2 - intrinsics.cx) / intrinsics.fx
     rows = (np.arange(height) * stride + stride // 2 - intrinsics.cy) / intrinsics.fy
     points, normals = _geometry(
@@ -207,13 +210,13 @@ def _merge(weights, coarseness, min_cells):  # type: ignore[no-untyped-def]
     parent = np.arange(cells).astype(np.int32)
     size = np.ones(cells, np.int32)
     internal = np.zeros(cells, np.float32)
+    # First by strength; then what stayed too small joins its most similar neighbour.
     for sweep in range(2):
+        left = 0
         for i in range(total):
             edge = order[i]
-            if edge < cells:
-                a, b = edge, edge + 1
-            else:
-                a, b = edge - cells, edge - cells + width
+            a = edge if edge < cells else edge - cells
+            b = a + (1 if edge < cells else width)
             a, b = _root(parent, a), _root(parent, b)
             if a == b:
                 continue
@@ -224,12 +227,16 @@ def _merge(weights, coarseness, min_cells):  # type: ignore[no-untyped-def]
                 )
             else:
                 join = size[a] < min_cells or size[b] < min_cells
-            if join:
-                if size[a] < size[b]:
-                    a, b = b, a
-                parent[b] = a
-                size[a] += size[b]
-                internal[a] = weight
+            if not join:
+                order[left] = edge
+                left += 1
+                continue
+            if size[a] < size[b]:
+                a, b = b, a
+            parent[b] = a
+            size[a] += size[b]
+            internal[a] = weight
+        total = left
     labels = np.empty(cells, np.int32)
     number = np.full(cells, -1, np.int32)
     count = 0
