@@ -18,7 +18,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging import Merging
+from deworldsg_ros.merging import PaperMerging
 from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
@@ -164,7 +164,7 @@ def bench_stage(count: int, rounds: int = 300) -> None:
     frames = frames_of(world, rounds)
     tracemalloc.start()
     graph = graph_of(world)
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     for local in frames:
         merging.merge(graph, local)
     held, peak = tracemalloc.get_traced_memory()

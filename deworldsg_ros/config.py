@@ -72,6 +72,29 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     class_distance_threshold: Annotated[
         float, _number("class distance below which nodes may merge, Eq. 6", gt=0, le=1)
     ] = 0.8
+    association: Annotated[
+        Literal["paper", "surface"],
+        _number("rule that finds an object's node: the paper's Eq. 5-6, or overlap of surfaces"),
+    ] = "paper"
+    cell_m: Annotated[
+        float, _number("edge of a cell of the surface map, metres (surface rule)", gt=0, le=1)
+    ] = 0.03
+    overlap_threshold: Annotated[
+        float,
+        _number("share of overlap that makes two one, classes agreeing (surface rule)", gt=0, le=1),
+    ] = 0.3
+    overlap_threshold_other_class: Annotated[
+        float,
+        _number(
+            "share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1
+        ),
+    ] = 0.55
+    confirm_observations: Annotated[
+        int, _number("frames that make a node sure (surface rule)", ge=1, le=1000)
+    ] = 3
+    expire_tentative_s: Annotated[
+        float, _number("time unseen after which a tentative node goes (surface rule)", gt=0)
+    ] = 10.0
     surface_points: Annotated[int, _number("surface points kept a node", ge=0, le=100000)] = 512
 
 
@@ -137,9 +160,9 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     rate_hz: Annotated[float, _number("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
     top_k: Annotated[int, _number("classes or predicates told a node or edge", ge=1, le=1000)] = 5
-    min_observations: Annotated[
-        int, _number("frames in which a node was seen before it is published", ge=1, le=1000)
-    ] = 1
+    tentative_nodes: Annotated[
+        bool, _number("also nodes that were seen too rarely to be sure of (paper: there are none)")
+    ] = False
     surface_points: Annotated[
         bool, _number("surface points of each node in /scene_graph (large)")
     ] = False

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.merging.stage import Merging
+from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
@@ -33,7 +33,7 @@ class GraphBuilder:
     def __init__(self, config: Config, vocabulary: Vocabulary, frame_id: str) -> None:
         self._relations = config.relations
         self._output = config.output
-        self._merging = Merging(config.merging)
+        self._merging = build_merging(config.merging)
         self.graph = SceneGraph(vocabulary, frame_id, config.merging.surface_points)
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         self._newest_ns: int | None = None
@@ -101,7 +101,7 @@ class GraphBuilder:
 
     def _message(self, sequence: int, with_points: bool) -> wire.SceneGraphMessage:
         nodes = self.graph.node_states(
-            self._output.top_k, self._output.min_observations, with_points
+            self._output.top_k, self._output.tentative_nodes, with_points
         )
         pairs = [pair for pair in sorted(self.graph.edges) if pair[0] in nodes and pair[1] in nodes]
         return wire.SceneGraphMessage(

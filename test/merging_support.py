@@ -124,11 +124,15 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
         ever = int(max([*live, 1]))
         gaussian = (rng.normal(size=3), random_covariances(rng, 1)[0], random_classes(rng, 1)[0])
         points = hash_each((rng.normal(size=(4, 3)).astype(np.float32),))[0]
-        action = rng.choice(["add", "observe", "merge", "remove", "visual", "neighbour", "frame"])
+        action = rng.choice(
+            ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "frame"]
+        )
         if action == "add" or len(live) < 2:
-            graph.add_node(*gaussian, stamp_ns, points)
+            graph.add_node(*gaussian, stamp_ns, points, confirmed=bool(rng.integers(2)))
         elif action == "observe":
             graph.observe(int(rng.choice(live)), *gaussian, stamp_ns, points)
+        elif action == "confirm":
+            graph.confirm_node(int(rng.choice(live)))
         elif action == "merge":
             graph.merge_nodes(*rng.choice(live, 2, replace=False).tolist())
         elif action == "remove" and rng.random() < 0.5:

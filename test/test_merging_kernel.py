@@ -23,7 +23,7 @@ def table_of(means, covariances, classes, ids=None) -> NodeTable:
     nodes = NodeTable(classes.shape[1])
     for index in range(len(means)):
         row = nodes.append(index + 1 if ids is None else int(ids[index]))
-        nodes.put(row, means[index], covariances[index], classes[index], 1.0)
+        nodes.put(row, means[index], covariances[index], classes[index], 1.0, 1)
     return nodes
 
 

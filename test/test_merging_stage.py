@@ -15,7 +15,7 @@ from merging_support import (
 from reference_merging import ReferenceMerging
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging import Merging
+from deworldsg_ros.merging import PaperMerging
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import moments, transform
@@ -26,7 +26,7 @@ CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])
 
 def merge_all(frames: list[LocalGraph]) -> tuple[SceneGraph, list[list[int]]]:
     graph = SceneGraph(VOCABULARY, "world")
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     return graph, [merging.merge(graph, local) for local in frames]
 
 
@@ -130,7 +130,7 @@ def test_a_still_camera_ends_with_one_node_an_object_after_200_frames() -> None:
     classes = np.tile(0.1 * np.ones(4) / 4, (objects, 1))
     classes[np.arange(objects), np.arange(objects) % 4] += 0.9
     graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=100)
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     for stamp_ns in range(200):
         seen = [surface + rng.normal(0, 0.002, surface.shape) for surface in surfaces]
         gaussians = [moments(points, 1e-6) for points in seen]
@@ -192,7 +192,7 @@ def test_the_nearest_node_wins_and_of_equals_the_oldest() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     for x in (0.3, -0.3, 0.3 + 1.0):
         graph.add_node(*gaussian((x, 0, 0), 0.12), CERTAIN, 0)
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     assert merging.merge(graph, frame_of(1, gaussian((-0.05, 0, 0), 0.2))) == [2]
     graph = SceneGraph(VOCABULARY, "world")
     for x in (5.0, 0.3, -0.3):
@@ -204,7 +204,7 @@ def test_the_nearest_node_wins_and_of_equals_the_oldest() -> None:
 
 def test_a_bridge_joins_two_nodes_and_the_older_id_lives() -> None:
     graph = SceneGraph(VOCABULARY, "world")
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     apart = frame_of(1, gaussian((0, 0, 0)), gaussian((0.25, 0, 0)), gaussian((3, 0, 0)))
     assert merging.merge(graph, apart) == [1, 2, 3]
     graph.add_visual(2, 3, np.array([1.0, 0, 0]), 1)
@@ -251,7 +251,7 @@ def test_an_empty_frame_is_remembered() -> None:
 
 def test_another_vocabulary_or_frame_is_refused() -> None:
     graph = SceneGraph(VOCABULARY, "world")
-    merging = Merging(MergingConfig())
+    merging = PaperMerging(MergingConfig())
     with pytest.raises(RefusedInput, match="wanted 'world'") as refused:
         merging.merge(graph, frame_of(1, frame_id="map"))
     assert refused.value.reason == "frame_mismatch"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perceived
@@ -74,8 +74,12 @@ def local_graph(index: int) -> LocalGraph:
     )
 
 
-def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object() -> None:
-    pipeline = Pipeline(Config(), Scripted())
+@pytest.mark.parametrize("association", ["paper", "surface"])
+def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
+    association: str,
+) -> None:
+    config = Config(merging=MergingConfig(association=association))
+    pipeline = Pipeline(config, Scripted())
     for index in range(200):
         result = pipeline.process(frame(index))
         assert result.node_ids == [1, 2, 3]
@@ -187,10 +191,15 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
     assert refused.value.reason == "vocabulary_mismatch"
 
 
-def test_only_nodes_seen_often_enough_are_published() -> None:
-    config = Config(output=OutputConfig(min_observations=2))
-    pipeline = Pipeline(config, Scripted())
+def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
+    merging = MergingConfig(association="surface", confirm_observations=2)
+    pipeline = Pipeline(Config(merging=merging), Scripted())
+    asked = Pipeline(Config(merging=merging, output=OutputConfig(tentative_nodes=True)), Scripted())
     pipeline.process(frame(0))
-    assert pipeline.graph().nodes == []
+    asked.process(frame(0))
+    assert pipeline.graph().nodes == [] == pipeline.graph().edges
+    assert [node.confirmed for node in asked.graph().nodes] == [False] * 3
     pipeline.process(frame(1))
+    asked.process(frame(1))
     assert len(pipeline.graph().nodes) == 3
+    assert pipeline.graph().nodes == asked.graph().nodes

@@ -168,12 +168,29 @@ def test_what_did_not_change_keeps_its_message() -> None:
     graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
     second = graph.node_states(2, with_points=True)
     assert [second[node_id] is first[node_id] for node_id in (1, 2, 3)] == [True, False, True]
-    assert list(graph.node_states(2, min_observations=2)) == [2]
     graph.merge_nodes(1, 2)
     third = graph.node_states(2, with_points=True)
     assert list(third) == [1, 3]
     assert third[1].observations == 3
     assert third[3] is first[3]
+
+
+def test_tentative_nodes_are_told_only_on_request() -> None:
+    graph = graph_of(1)
+    for x in (5.0, 9.0):
+        graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
+    assert list(graph.node_states(2)) == [1]
+    asked = graph.node_states(2, tentative=True)
+    assert [(node.id, node.confirmed) for node in asked.values()] == [
+        (1, True),
+        (2, False),
+        (3, False),
+    ]
+    graph.confirm_node(3)
+    assert list(graph.node_states(2)) == [1, 3]
+    assert graph.node_states(2)[3].confirmed
+    assert graph.merge_nodes(2, 3) == 2  # what was sure of one is sure of both
+    assert list(graph.node_states(2)) == [1, 2]
 
 
 def test_the_message_of_a_node() -> None:

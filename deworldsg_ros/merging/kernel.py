@@ -140,5 +140,5 @@ def warm_up() -> None:
     """Compile the kernel, or load it from the cache."""
     nodes = NodeTable(1)
     row = nodes.append(1)
-    nodes.put(row, np.zeros(3), np.eye(3), np.ones(1), 1.0)
+    nodes.put(row, np.zeros(3), np.eye(3), np.ones(1), 1.0, 1)
     nearest_row(np.zeros(3), np.eye(3), 0.0, 2.0, np.ones(1), nodes, 1.0, 1.0)

@@ -16,7 +16,7 @@ from deworldsg_ros.bridge.node import StageNode, run
 from deworldsg_ros.bridge.pending import PendingEvidence
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.merging.stage import Merging
+from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
 from deworldsg_ros.view.markers import markers
@@ -29,7 +29,7 @@ class GraphNode(StageNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
-        Merging(self.parameters.merging).warm_up()
+        build_merging(self.parameters.merging).warm_up()
         # The first local graph tells the world frame and the vocabulary.
         self._builder: GraphBuilder | None = None
         self._pending = PendingEvidence()

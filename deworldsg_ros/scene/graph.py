@@ -68,6 +68,7 @@ class SceneGraph:
         stamp_ns: int,
         surface: HashedPoints = EMPTY_SAMPLE,
         weight: float = 1.0,
+        confirmed: bool = True,
     ) -> int:
         """Add a node for a first observation and return its id.
 
@@ -77,7 +78,8 @@ class SceneGraph:
             class_probabilities: (C,), scaled to sum to one.
             stamp_ns: time of the observation.
             surface: points of its surface.
-            weight: number of observations it stands for.
+            weight: w of Eq. 7, by which its Gaussian counts.
+            confirmed: whether it is sure to be an object; otherwise it is tentative.
 
         Raises:
             ValueError: where the covariance is not positive definite.
@@ -91,11 +93,13 @@ class SceneGraph:
                 covariance_world,
                 class_probabilities / class_probabilities.sum(),
                 weight,
+                observations=1,
             )
         except ValueError:
             self.nodes.remove(node_id)
             raise
         self._next_id += 1
+        self.nodes.confirmed[row] = confirmed
         self.nodes.surfaces[row].add(surface)
         self.nodes.first_seen_ns[row] = self.nodes.last_seen_ns[row] = stamp_ns
         self.nodes.revisions[row] = self._changed()
@@ -119,6 +123,7 @@ class SceneGraph:
             covariance_world,
             class_probabilities / class_probabilities.sum(),
             weight,
+            1,
             surface,
             stamp_ns,
             stamp_ns,
@@ -140,13 +145,22 @@ class SceneGraph:
             nodes.covariances[gone],
             nodes.class_probabilities[gone],
             float(nodes.weights[gone]),
+            int(nodes.observations[gone]),
             nodes.surfaces[gone].sample,
             int(nodes.first_seen_ns[gone]),
             int(nodes.last_seen_ns[gone]),
         )
+        nodes.confirmed[nodes.row(keep_id)] |= nodes.confirmed[gone]
         self._edges.repoint(gone_id, keep_id, self.revision)
         self._forget(gone_id, keep_id)
         return keep_id
+
+    def confirm_node(self, node_id: int) -> None:
+        """Note that a tentative node is sure to be an object."""
+        row = self.nodes.row(node_id)
+        if not self.nodes.confirmed[row]:
+            self.nodes.confirmed[row] = True
+            self.nodes.revisions[row] = self._changed()
 
     def remove_node(self, node_id: int) -> None:
         """Remove a live node and its edges; nothing takes its place."""
@@ -212,11 +226,14 @@ class SceneGraph:
     # Snapshots --------------------------------------------------------------------------------
 
     def node_states(
-        self, top_k: int, min_observations: int = 1, with_points: bool = False
+        self, top_k: int, tentative: bool = False, with_points: bool = False
     ) -> dict[int, wire.NodeState]:
-        """Messages of the nodes by ascending id; those that did not change are the same objects."""
+        """Messages of the confirmed nodes, or of all, by ascending id.
+
+        Those that did not change are the same objects.
+        """
         return self._states.states(
-            self.nodes, self.vocabulary.classes, top_k, min_observations, with_points
+            self.nodes, self.vocabulary.classes, top_k, tentative, with_points
         )
 
     def save(self, path: str | Path) -> None:
@@ -241,6 +258,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         weight: float,
+        observations: int,
         surface: HashedPoints,
         first_seen_ns: int,
         last_seen_ns: int,
@@ -256,8 +274,11 @@ class SceneGraph:
             mean_world,
             covariance_world,
         )
-        classes = (known * nodes.class_probabilities[row] + weight * class_probabilities) / total
-        nodes.put(row, mean, covariance, classes, total)
+        seen = int(nodes.observations[row])
+        classes = (seen * nodes.class_probabilities[row] + observations * class_probabilities) / (
+            seen + observations
+        )
+        nodes.put(row, mean, covariance, classes, total, seen + observations)
         nodes.surfaces[row].add(surface)
         nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
         nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)

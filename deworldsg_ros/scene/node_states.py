@@ -22,13 +22,13 @@ class NodeStateCache:
         nodes: NodeTable,
         classes: tuple[str, ...],
         top_k: int,
-        min_observations: int,
+        tentative: bool,
         with_points: bool,
     ) -> dict[int, wire.NodeState]:
-        """Messages by ascending id of the nodes seen in at least `min_observations` frames."""
+        """Messages by ascending id of the confirmed nodes, or with `tentative` of all."""
         known = self._known.setdefault((top_k, with_points), {})
         states = {}
-        rows = np.flatnonzero(nodes.weights >= min_observations)
+        rows = np.flatnonzero(nodes.confirmed | tentative)
         rows = rows[np.argsort(nodes.ids[rows])]
         ids, revisions = nodes.ids[rows].tolist(), nodes.revisions[rows].tolist()
         for row, node_id, revision in zip(rows.tolist(), ids, revisions):
@@ -59,7 +59,8 @@ def _state(
         classes=beliefs,
         mean_m=nodes.means[row].tolist(),
         covariance_m2=nodes.covariances[row].ravel().tolist(),
-        observations=int(nodes.weights[row]),
+        observations=int(nodes.observations[row]),
+        confirmed=bool(nodes.confirmed[row]),
         first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
         last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
         surface_points_m=points.tolist() if with_points else [],

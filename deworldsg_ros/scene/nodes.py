@@ -28,7 +28,10 @@ class NodeTable:
         means: (n, 3) float64, metres, world frame.
         covariances: (n, 3, 3) float64, square metres, positive definite.
         class_probabilities: (n, C) float64, rows sum to one.
-        weights: (n,) float64, number of observations (the w of Eq. 7).
+        weights: (n,) float64, the w of Eq. 7: number of observations, or a rule's own weight.
+        observations: (n,) int64, frames in which it was observed; class distributions average
+            with these.
+        confirmed: (n,) bool, whether the node is sure to be an object; others are tentative.
         log_determinants: (n,) float64, of the covariances.
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
@@ -41,6 +44,8 @@ class NodeTable:
     covariances: Float64
     class_probabilities: Float64
     weights: Float64
+    observations: Int64
+    confirmed: NDArray[np.bool_]
     log_determinants: Float64
     eigenvalue_bounds: Float64
     first_seen_ns: Int64
@@ -58,6 +63,8 @@ class NodeTable:
             "covariances": np.zeros((capacity, 3, 3)),
             "class_probabilities": np.zeros((capacity, class_count)),
             "weights": np.zeros(capacity),
+            "observations": np.zeros(capacity, np.int64),
+            "confirmed": np.zeros(capacity, np.bool_),
             "log_determinants": np.zeros(capacity),
             "eigenvalue_bounds": np.zeros(capacity),
             "first_seen_ns": np.zeros(capacity, np.int64),
@@ -98,8 +105,9 @@ class NodeTable:
         covariance_world: Float64,
         class_probabilities: Float64,
         weight: float,
+        observations: int,
     ) -> None:
-        """Replace a row's Gaussian, classes and weight, and what is cached of its covariance.
+        """Replace a row's Gaussian, classes and counts, and what is cached of its covariance.
 
         Raises:
             ValueError: where the covariance is not positive definite.
@@ -110,6 +118,7 @@ class NodeTable:
         self.covariances[row] = covariance_world
         self.class_probabilities[row] = class_probabilities
         self.weights[row] = weight
+        self.observations[row] = observations
 
     def remove(self, node_id: int) -> None:
         """Remove a node; the last row takes its place."""

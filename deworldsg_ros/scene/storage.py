@@ -32,6 +32,8 @@ _NODE_COLUMNS = (
     "covariances",
     "class_probabilities",
     "weights",
+    "observations",
+    "confirmed",
     "first_seen_ns",
     "last_seen_ns",
     "revisions",
@@ -113,9 +115,10 @@ def _graph_of(state: State) -> SceneGraph:
             state["covariances"][index],
             state["class_probabilities"][index],
             float(state["weights"][index]),
+            int(state["observations"][index]),
         )
         nodes.surfaces[row].add(points[index])
-        for name in ("first_seen_ns", "last_seen_ns", "revisions"):
+        for name in ("confirmed", "first_seen_ns", "last_seen_ns", "revisions"):
             getattr(nodes, name)[row] = state[name][index]
     for pair, logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(
         state["edge_pairs"].tolist(),

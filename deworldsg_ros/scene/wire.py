@@ -154,6 +154,9 @@ class NodeState(msgspec.Struct, frozen=True):
     observations: Annotated[int, msgspec.Meta(ge=1)]
     first_seen: Stamp
     last_seen: Stamp
+    confirmed: Annotated[
+        bool, msgspec.Meta(description="false = tentative: seen too rarely to be sure")
+    ] = True
     surface_points_m: list[Vector3] = []
 
 

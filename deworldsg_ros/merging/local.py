@@ -1,0 +1,35 @@
+"""What every association rule does with a local graph, before and after it has found the nodes."""
+
+from __future__ import annotations
+
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.graph import SceneGraph
+
+
+def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
+    """Refuse a local graph of another vocabulary or world frame than the scene graph's."""
+    if local.vocabulary != graph.vocabulary:
+        raise RefusedInput(
+            "vocabulary_mismatch",
+            f"local graph has {len(local.vocabulary.classes)} classes and "
+            f"{len(local.vocabulary.predicates)} predicates that are not the scene graph's "
+            f"{len(graph.vocabulary.classes)} and {len(graph.vocabulary.predicates)}",
+        )
+    if local.frame_id != graph.frame_id:
+        raise RefusedInput(
+            "frame_mismatch",
+            f"local graph is in frame {local.frame_id!r}: wanted {graph.frame_id!r}",
+        )
+
+
+def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
+    """Sum a frame's visual relation logits into the edges of the nodes its rows became."""
+    # Summed by pair first, so that a frame counts once also where two of its rows are one node.
+    sums: dict[tuple[int, int], Float64] = {}
+    for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
+        pair = (node_ids[subject], node_ids[object_])
+        sums[pair] = sums[pair] + logits if pair in sums else logits
+    for (subject_id, object_id), logits in sums.items():
+        graph.add_visual(subject_id, object_id, logits, local.stamp_ns)

@@ -1,0 +1,211 @@
+"""Association by overlap of surfaces: beyond the paper, for real input.
+
+The Hellinger distance of Eq. 6 saturates on thin visible surfaces and on partial views, and a
+label that flips founds a node a frame. Here two things are one where their surfaces coincide:
+each object of a frame votes with the cells of its surface for the nodes that were seen in them,
+objects and nodes are matched one to one, and a class that disagrees only raises the bar.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging.local import add_relations, check_fits
+from deworldsg_ros.merging.voxel_map import Int64, Overlap, VoxelMap
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.surface import hash_each
+
+# Classes agree where two labels drawn from the two distributions are the same this often.
+CLASS_AGREEMENT = 0.3
+# What agreeing classes add to the share of overlap, when several nodes could be the one.
+CLASS_BONUS = 0.5
+# A node of fewer cells than this says too little by lying within an object.
+MIN_REVERSE_CELLS = 4
+# Two nodes are one when this many objects more lay on both than saw them apart.
+JOINT_EVIDENCE = 3
+# Gaussians are weighted by their number of pixels; this many make an observation of weight 1.
+PIXELS_OF_UNIT_WEIGHT = 1000.0
+
+
+class _Candidates(NamedTuple):
+    """How well each object of a frame fits each owner (n objects, S owners).
+
+    Attributes:
+        shares: (n, S) share of overlap, in [0, 1].
+        values: (n, S) what the assignment maximises; 0 = cannot be the same.
+    """
+
+    shares: Float64
+    values: Float64
+
+
+class SurfaceMerging:
+    """Merges local graphs into a scene graph by the overlap of surfaces."""
+
+    def __init__(self, config: MergingConfig) -> None:
+        self._config = config
+        self._map = VoxelMap(config.cell_m)
+        # Owner index of each node in the map, and back; 0 = the index is free.
+        self._owner_of: dict[int, int] = {}
+        self._node_of: list[int] = []
+        self._joint: dict[tuple[int, int], int] = {}
+
+    def warm_up(self) -> None:
+        """Compile now what would else be compiled during the first frame."""
+        known = VoxelMap(self._config.cell_m)
+        cells = known.cells_of(np.zeros((1, 3), np.float32))
+        known.add(0, cells)
+        known.overlap(cells, 1)
+        known.remove(0)
+
+    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+        """Merge one frame into the graph; see `Merging.merge`.
+
+        Two objects of one frame are never one node: they stay two even where both overlap it.
+        """
+        check_fits(graph, local)
+        if not self._owner_of and len(graph):
+            self._restore(graph)
+        cells = [self._map.cells_of(points) for points in local.surface_points_world]
+        candidates = self._candidates(graph, local, cells)
+        matched = _one_to_one(candidates.values)
+        node_ids = self._place(graph, local, cells, matched)
+        self._note_joint(candidates, matched)
+        self._merge_grown(graph)
+        self._expire(graph, local.stamp_ns)
+        node_ids = [graph.resolve(node_id) for node_id in node_ids]
+        graph.remember_frame(local.stamp_ns, node_ids)
+        add_relations(graph, local, node_ids)
+        return node_ids
+
+    def _candidates(self, graph: SceneGraph, local: LocalGraph, cells: list[Int64]) -> _Candidates:
+        """Shares of overlap, and values where they suffice for the classes at hand."""
+        shares = np.zeros((len(local), len(self._node_of)))
+        values = np.zeros_like(shares)
+        for row in range(len(local)):
+            overlap = self._map.overlap(cells[row], len(self._node_of))
+            for owner in np.flatnonzero(overlap.reverse).tolist():
+                share = _share(overlap, owner, self._map.cell_count(owner))
+                node = graph.nodes.row(self._node_of[owner])
+                agreement = float(
+                    graph.nodes.class_probabilities[node] @ local.class_probabilities[row]
+                )
+                wanted = (
+                    self._config.overlap_threshold
+                    if agreement > CLASS_AGREEMENT
+                    else self._config.overlap_threshold_other_class
+                )
+                shares[row, owner] = share
+                if share >= wanted:
+                    values[row, owner] = share + CLASS_BONUS * agreement
+        return _Candidates(shares, values)
+
+    def _place(
+        self, graph: SceneGraph, local: LocalGraph, cells: list[Int64], matched: list[int]
+    ) -> list[int]:
+        """Fuse each object into the node of its owner, or found a tentative node."""
+        surfaces = hash_each(local.surface_points_world)
+        node_ids = []
+        for row, owner in enumerate(matched):
+            weight = float(local.pixel_counts[row]) / PIXELS_OF_UNIT_WEIGHT
+            observation = (
+                local.means_world[row],
+                local.covariances_world[row],
+                local.class_probabilities[row],
+                local.stamp_ns,
+                surfaces[row],
+                weight,
+            )
+            if owner < 0:
+                node_id = graph.add_node(*observation, confirmed=False)
+                owner = self._take_owner(node_id)
+            else:
+                node_id = self._node_of[owner]
+                graph.observe(node_id, *observation)
+            self._map.add(owner, cells[row])
+            node = graph.nodes.row(node_id)
+            if (
+                not graph.nodes.confirmed[node]
+                and graph.nodes.observations[node] >= self._config.confirm_observations
+            ):
+                graph.confirm_node(node_id)
+            node_ids.append(node_id)
+        return node_ids
+
+    def _note_joint(self, candidates: _Candidates, matched: list[int]) -> None:
+        """Count where one object lay on two nodes, against where both were seen apart."""
+        taken = {owner for owner in matched if owner >= 0}
+        for row, owner in enumerate(matched):
+            if owner < 0:
+                continue
+            for other in np.flatnonzero(candidates.values[row]).tolist():
+                if other != owner:
+                    pair = (min(owner, other), max(owner, other))
+                    change = -1 if other in taken else 1
+                    self._joint[pair] = self._joint.get(pair, 0) + change
+
+    def _merge_grown(self, graph: SceneGraph) -> None:
+        """Merge nodes that have turned out to be parts of one object."""
+        for pair in [pair for pair, count in self._joint.items() if count >= JOINT_EVIDENCE]:
+            if pair not in self._joint:  # one of them has just been merged
+                continue
+            a_id, b_id = (self._node_of[owner] for owner in pair)
+            kept = graph.merge_nodes(a_id, b_id)
+            gone = b_id if kept == a_id else a_id
+            cells = self._map.remove(self._owner_of[gone])
+            self._map.add(self._owner_of[kept], cells)
+            self._free_owner(gone)
+
+    def _expire(self, graph: SceneGraph, stamp_ns: int) -> None:
+        """Remove tentative nodes that have not been seen for long."""
+        nodes = graph.nodes
+        oldest_ns = stamp_ns - int(self._config.expire_tentative_s * 1e9)
+        for node_id in nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist():
+            graph.remove_node(node_id)
+            self._map.remove(self._owner_of[node_id])
+            self._free_owner(node_id)
+
+    def _restore(self, graph: SceneGraph) -> None:
+        """Take the nodes of a graph that was loaded, by their surface points."""
+        for node_id, surface in zip(graph.nodes.ids.tolist(), graph.nodes.surfaces):
+            self._map.add(self._take_owner(node_id), self._map.cells_of(surface.points_world))
+
+    def _take_owner(self, node_id: int) -> int:
+        try:
+            owner = self._node_of.index(0)
+            self._node_of[owner] = node_id
+        except ValueError:
+            owner = len(self._node_of)
+            self._node_of.append(node_id)
+        self._owner_of[node_id] = owner
+        return owner
+
+    def _free_owner(self, node_id: int) -> None:
+        owner = self._owner_of.pop(node_id)
+        self._node_of[owner] = 0
+        for pair in [pair for pair in self._joint if owner in pair]:
+            del self._joint[pair]
+
+
+def _share(overlap: Overlap, owner: int, owner_cells: int) -> float:
+    """Share of overlap: of the object's cells, or of the node's where the node is the smaller."""
+    of_object = float(overlap.own[owner] + overlap.near[owner]) / overlap.cells
+    if owner_cells < MIN_REVERSE_CELLS:
+        return of_object
+    return max(of_object, float(overlap.reverse[owner]) / owner_cells)
+
+
+def _one_to_one(values: Float64) -> list[int]:
+    """Owner of each object, -1 = none: the assignment of greatest total value."""
+    matched = [-1] * len(values)
+    if values.any():
+        for row, owner in zip(*linear_sum_assignment(values, maximize=True)):
+            if values[row, owner] > 0:
+                matched[int(row)] = int(owner)
+    return matched
