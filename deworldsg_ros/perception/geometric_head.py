@@ -161,7 +161,7 @@ def judge(layout: Layout, class_names: list[str]) -> dict[str, Float64]:
 
     # Something large and high over something large, not resting on it.
     over = _all(
-        (layout.above_share - 0.5) / 0.15,
+        (layout.deep_share - 0.5) / 0.15,
         (layout.clearance_m + 0.02) / 0.02,
         (ABOVE_MAX_M - layout.clearance_m) / ABOVE_TOLERANCE_M,
         _flag(both_furniture),

@@ -17,6 +17,8 @@ MIN_POINTS = 10
 LOW_PERCENT, HIGH_PERCENT = 4.0, 96.0
 # The surface an object rests on is looked for within this distance of its own outline.
 SUPPORT_MARGIN_M = 0.08
+# Of a cabinet one sees the front: its footprint goes on behind it.
+HIDDEN_DEPTH_M = 0.15
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Layout:
         contact_m: (n, n) distance in height from the bottom of i to the nearest surface of j
             below or around i; inf where j has nothing there.
         above_share: (n, n) share of the smaller footprint that the footprints of i and j share.
+        deep_share: the same, with every footprint grown by the depth that cannot be seen.
         gap_m: (n, n) horizontal distance between the bounds; 0 where they overlap.
         clearance_m: (n, n) height of the bottom of i over the top of j; negative = overlap.
         covered: (n, n) share of the footprint of i that lies inside that of j.
@@ -39,6 +42,7 @@ class Layout:
     high: Float64
     contact_m: Float64
     above_share: Float64
+    deep_share: Float64
     gap_m: Float64
     clearance_m: Float64
     covered: Float64
@@ -73,6 +77,14 @@ def measure_layout(
     separation = np.clip(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
     )
+    deep_low, deep_high = low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M
+    deep = (deep_high - deep_low).prod(axis=1)
+    deep_shared = np.clip(
+        np.minimum(deep_high[:, None], deep_high[None])
+        - np.maximum(deep_low[:, None], deep_low[None]),
+        0.0,
+        None,
+    ).prod(axis=2)
     footprint = np.maximum((high - low)[:, :2].prod(axis=1), 1e-6)
     shared = overlap[..., :2].prod(axis=2)
     return Layout(
@@ -81,6 +93,7 @@ def measure_layout(
         high=high,
         contact_m=_contacts(points, owners, low, high, valid, count),
         above_share=shared / np.minimum(footprint[:, None], footprint[None]),
+        deep_share=deep_shared / np.minimum(deep[:, None], deep[None]),
         gap_m=np.hypot(separation[..., 0], separation[..., 1]),
         clearance_m=low[:, None, 2] - high[None, :, 2],
         covered=shared / footprint[:, None],
