@@ -40,10 +40,11 @@ def test_latency_percentile() -> None:
 
 def test_a_drop_warns_once_and_stays_in_the_total() -> None:
     health = Health("graphs")
-    health.dropped("no_pose", 3)
+    health.dropped("no_pose", 3, "there is no pose\nand more")
     report = health.report(1.0)
     assert report.level == WARN
-    assert report.message.endswith("dropped 3 no_pose")
+    assert report.message.endswith("; dropped 3 no_pose: there is no pose")
+    assert report.values["why no_pose"] == "there is no pose"
     later = health.report(2.0)
     assert (later.level, later.values["dropped no_pose"]) == (OK, "3")
     assert health.drops == {"no_pose": 3}

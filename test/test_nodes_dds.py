@@ -199,6 +199,16 @@ def test_a_bad_parameter_ends_the_start_with_2(tmp_path: Path, argument: str, sa
     assert "Traceback" not in process.log
 
 
+def test_a_missing_parameter_file_ends_the_start_with_2(tmp_path: Path) -> None:
+    process = NodeProcess("graph_node", tmp_path, "--ros-args", "--params-file", "missing.yaml")
+    try:
+        assert process.wait(LIMIT_S) == 2
+    finally:
+        process.end()
+    assert "missing.yaml" in process.log
+    assert "Traceback" not in process.log
+
+
 def test_parameters_come_from_a_file(tmp_path: Path, root_dir: Path) -> None:
     arguments = ("--ros-args", "--params-file", str(root_dir / "config" / "paper.yaml"))
     process = NodeProcess("graph_node", tmp_path, *arguments, "-p", "use_sim_time:=true")

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from nodes_bench import (
@@ -75,24 +76,26 @@ def compressed_depth(stamp_ns: int) -> CompressedImage:
     return stamped(message, stamp_ns)
 
 
-def odometry(stamp_ns: int) -> Odometry:
+def odometry(stamp_ns: int, frame_id: str = "odom") -> Odometry:
     message = Odometry(child_frame_id="camera")
     message.pose.pose = pose(stamp_ns).pose
-    return stamped(message, stamp_ns, "odom")
+    return stamped(message, stamp_ns, frame_id)
+
+
+def send_other(at: Bench, **changes: Any) -> None:
+    """A frame in other messages than raw images and PoseStamped."""
+    others = {
+        "rgb__image_raw": None,
+        "depth__image_raw": None,
+        "rgb__image_raw__compressed": compressed_rgb,
+        "depth__image_raw__compressedDepth": compressed_depth,
+        "camera__pose": odometry,
+    }
+    send_frame(at, **{**others, **changes})
 
 
 def test_compressed_images_and_odometry_are_heard(other_camera: Bench) -> None:
-    def send() -> None:
-        send_frame(
-            other_camera,
-            rgb__image_raw=None,
-            depth__image_raw=None,
-            rgb__image_raw__compressed=compressed_rgb,
-            depth__image_raw__compressedDepth=compressed_depth,
-            camera__pose=odometry,
-        )
-
-    works(other_camera, send)
+    works(other_camera, lambda: send_other(other_camera))
     assert not other_camera.node.health.drops
 
 
@@ -173,3 +176,24 @@ def test_predictions_of_a_world_model_follow_the_pairs() -> None:
         assert at.node.more_values()["clips encoded"] == "3"
     finally:
         at.close()
+
+
+def test_diagnostics_name_what_is_missing_and_what_is_wrong(other_camera: Bench) -> None:
+    at = other_camera
+    statuses: list[DiagnosticStatus] = []
+    at.peer.node.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 10
+    )
+
+    def told(text: str) -> Callable[[], bool]:
+        def sending() -> bool:
+            send_other(at, rgb__camera_info=None)
+            at.peer.spin_for(0.1)
+            return any(text in status.message for status in statuses)
+
+        return sending
+
+    at.expect(told("no camera_info on /rgb/camera_info for 3 s"), "what is missing")
+    assert statuses[-1].level == DiagnosticStatus.WARN
+    at.send(camera__pose=odometry(at.next_stamp(), "elsewhere"))
+    at.expect(told("wrong_frame: pose is in frame 'elsewhere', expected 'odom'"), "what is wrong")

@@ -51,6 +51,7 @@ class Health:
         self._drops: Counter[str] = Counter()
         self._drops_before: Counter[str] = Counter()
         self._left_out: Counter[str] = Counter()
+        self._examples: dict[str, str] = {}
 
     def received(self, topic: str) -> None:
         """Count a message."""
@@ -64,10 +65,12 @@ class Health:
             if latency_s is not None:
                 self._latencies_ms.append(1e3 * latency_s)
 
-    def dropped(self, reason: str, number: int = 1) -> None:
-        """Count a drop."""
+    def dropped(self, reason: str, number: int = 1, example: str = "") -> None:
+        """Count a drop; the newest example of each reason is told."""
         with self._lock:
             self._drops[reason] += number
+            if example:
+                self._examples[reason] = example.splitlines()[0]
 
     def left_out(self, reasons: Mapping[str, int]) -> None:
         """Count objects that a frame went on without; every frame has some."""
@@ -104,6 +107,8 @@ class Health:
                 told["latency p95 ms"] = f"{np.percentile(latencies_ms, 95):.1f}"
             for reason, count in sorted(self._drops.items()):
                 told[f"dropped {reason}"] = str(count)
+                if reason in self._examples:
+                    told[f"why {reason}"] = self._examples[reason]
             for reason, count in sorted(self._left_out.items()):
                 told[f"objects left out {reason}"] = str(count)
             self._reported_s = now_s
@@ -122,8 +127,10 @@ class Health:
         if waiting_for:
             message = "; ".join(waiting_for)
         if serious:
-            listed = ", ".join(f"{count} {reason}" for reason, count in sorted(serious.items()))
-            message += f"; dropped {listed}"
+            message += "".join(
+                f"; dropped {count} {reason}: {told.get(f'why {reason}', 'no example')}"
+                for reason, count in sorted(serious.items())
+            )
         level = WARN if waiting_for or serious else OK
         return Report(ERROR if INTERNAL_ERROR in serious else level, message, told)
 

@@ -99,7 +99,7 @@ class StageNode(Node):  # type: ignore[misc]
 
     def drop(self, reason: str, message: str, number: int = 1) -> None:
         """Count a drop and log it, the same reason not too often."""
-        self.health.dropped(reason, number)
+        self.health.dropped(reason, number, message)
         now_s = time.monotonic()
         with self._log_lock:
             if now_s - self._logged_s.get(reason, -LOG_PERIOD_S) < LOG_PERIOD_S:
@@ -193,15 +193,20 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     # Our handlers, not rclpy's: those shut the context down while callbacks still publish.
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # a parameter file that cannot be read, a bad --ros-args
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     node = None
     try:
         node = make_node()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.get_logger().info("ready")
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=SPIN_PERIOD_S)
+        while not stop.is_set() and rclpy.ok():
+            with node.refusing():
+                executor.spin_once(timeout_sec=SPIN_PERIOD_S)
         executor.shutdown(timeout_sec=1.0)
     except ConfigurationError as error:
         print(f"error: {error}", file=sys.stderr)
