@@ -61,31 +61,38 @@ def salvage_mcap(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
             opcode, length = struct.unpack("<BQ", head) if len(head) == 9 else (0, 0)
             if opcode == DATA_END:
                 return
-            if opcode not in OPCODES or length > size - start - 9:
+            is_cut = length > size - start - 9
+            if is_cut or opcode not in OPCODES:
                 note(f"{path.name} ends or breaks at byte {start} of {size}; what follows is lost")
+            if opcode not in OPCODES or (is_cut and opcode != CHUNK):
                 return
             content = file.read(length)
             try:
                 if opcode == CHUNK:
-                    yield from _chunk_messages(content, tables)
+                    yield from _chunk_messages(content, tables, is_cut)
                 elif (message := tables.take(opcode, content)) is not None:
                     yield message
             except Exception as error:  # struct, unicode, or whatever a decompressor raises
                 note(f"{path.name}: the record at byte {start} is damaged and lost ({error})")
 
 
-def _chunk_messages(content: bytes, tables: _Tables) -> list[Message]:
+def _chunk_messages(content: bytes, tables: _Tables, is_cut: bool) -> list[Message]:
+    """Messages of a chunk; of one that the end of the file cuts, those before the cut."""
     _, _, raw_size, crc = struct.unpack_from("<QQQI", content)
     compression, offset = _string(content, 28)
     (packed_size,) = struct.unpack_from("<Q", content, offset)
     packed = content[offset + 8 : offset + 8 + packed_size]
+    if is_cut and compression:
+        return []
     raw = DECOMPRESSORS[compression](packed, raw_size)
-    if len(raw) != raw_size or (crc and zlib.crc32(raw) != crc):
+    if not is_cut and (len(raw) != raw_size or (crc and zlib.crc32(raw) != crc)):
         raise ValueError("checksum or length of the chunk is wrong")
     messages: list[Message] = []
     position = 0
     while position + 9 <= len(raw):
         opcode, length = struct.unpack_from("<BQ", raw, position)
+        if position + 9 + length > len(raw):
+            break
         message = tables.take(opcode, raw[position + 9 : position + 9 + length])
         if message is not None:
             messages.append(message)

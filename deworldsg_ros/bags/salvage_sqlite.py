@@ -8,8 +8,8 @@ from pathlib import Path
 
 Message = tuple[str, str, int, bytes]
 
-# Rows of a broken page raise one by one; after this many in a row nothing is left.
-MOST_BROKEN_ROWS = 10_000
+# Rows of a broken page raise one by one; after this many in a row the rest is taken for lost.
+MOST_BROKEN_ROWS = 200
 
 
 def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
@@ -21,6 +21,8 @@ def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]
     """
     database = sqlite3.connect(f"file:{path.resolve()}?immutable=1", uri=True)
     try:
+        # Without this SQLite refuses a file that is shorter than its header says.
+        database.execute("PRAGMA writable_schema = ON")
         topics = {
             key: (name, msgtype)
             for key, name, msgtype in database.execute("SELECT id, name, type FROM topics")
@@ -45,6 +47,8 @@ def _rows(
                 "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id",
                 (row_id,),
             ):
+                if key <= row_id:
+                    raise sqlite3.DatabaseError("rows are out of order")
                 row_id, lost, broken = key, lost + broken, 0
                 if topic in topics:
                     yield (*topics[topic], time_ns, data)

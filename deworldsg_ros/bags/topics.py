@@ -18,6 +18,7 @@ from deworldsg_ros.bags.messages import (
 from deworldsg_ros.bags.storage import Topic
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
+# Most wanted first.
 POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
 # Images that are neither colour nor depth.
 OTHER_IMAGES = ("infra", "/ir/", "instance", "label", "mask", "segment", "semantic", "mono")
@@ -127,6 +128,7 @@ def _camera_info_score(topic: Topic, rgb_name: str) -> tuple[float, ...] | None:
 
 def _pose_score(topic: Topic) -> tuple[float, ...] | None:
     name = topic.name.lower()
-    if topic.msgtype == TF_MESSAGE:
-        return None if name.endswith("tf_static") else (0, 0, 0, topic.count)
-    return (topic.msgtype == POSE_STAMPED, "camera" in name, "pose" in name, topic.count)
+    if name.endswith("tf_static"):
+        return None
+    rank = -POSES.index(topic.msgtype)
+    return (rank, "camera" in name, "pose" in name, topic.count)
