@@ -63,6 +63,8 @@ FIXED_TO = {
     "door": frozenset({"wall"}),
     "handle": frozenset({"door", "cabinet", "drawer"}),
 }
+# Where a vocabulary has "on", these would only share its probability.
+OTHER_WORDS_FOR_ON = frozenset({"standing on", "supported by", "hanging on"})
 GROUND = frozenset({"floor"})
 WALLS = frozenset({"wall"})
 
@@ -114,7 +116,7 @@ class GeometricRelationHead:
         count = len(class_names)
         result = np.full((count, count, len(self.predicates)), FLOOR_LOGIT)
         for name, values in judge(layout, class_names).items():
-            if name in self._column:
+            if name in self._column and not ("on" in self._column and name in OTHER_WORDS_FOR_ON):
                 result[..., self._column[name]] = values
         usable = layout.valid[:, None] & layout.valid[None, :] & ~np.eye(count, dtype=bool)
         result[~usable] = FLOOR_LOGIT

@@ -71,6 +71,11 @@ def measure_layout(
     for row in np.flatnonzero(valid):
         own = points[starts[row] : starts[row + 1]]
         low[row], high[row] = np.percentile(own, [LOW_PERCENT, HIGH_PERCENT], axis=0)
+        # What the percentiles cut off an evenly covered surface, given back. Not in height: most
+        # of what one sees of a plate or a table is at one height.
+        trimmed = (high[row, :2] - low[row, :2]) * LOW_PERCENT / (HIGH_PERCENT - LOW_PERCENT)
+        low[row, :2] -= trimmed
+        high[row, :2] += trimmed
     overlap = np.clip(
         np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None]), 0.0, None
     )
