@@ -8,14 +8,12 @@ objects and nodes are matched one to one, and a class that disagrees only raises
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.local import add_relations, check_fits
-from deworldsg_ros.merging.voxel_map import Int64, Overlap, VoxelMap
+from deworldsg_ros.merging.voxel_map import CellSets, VoxelMap
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
@@ -25,24 +23,10 @@ from deworldsg_ros.scene.surface import hash_each
 CLASS_AGREEMENT = 0.3
 # What agreeing classes add to the share of overlap, when several nodes could be the one.
 CLASS_BONUS = 0.5
-# A node of fewer cells than this says too little by lying within an object.
-MIN_REVERSE_CELLS = 4
 # Two nodes are one when this many objects more lay on both than saw them apart.
 JOINT_EVIDENCE = 3
 # Gaussians are weighted by their number of pixels; this many make an observation of weight 1.
 PIXELS_OF_UNIT_WEIGHT = 1000.0
-
-
-class _Candidates(NamedTuple):
-    """How well each object of a frame fits each owner (n objects, S owners).
-
-    Attributes:
-        shares: (n, S) share of overlap, in [0, 1].
-        values: (n, S) what the assignment maximises; 0 = cannot be the same.
-    """
-
-    shares: Float64
-    values: Float64
 
 
 class SurfaceMerging:
@@ -59,9 +43,9 @@ class SurfaceMerging:
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
         known = VoxelMap(self._config.cell_m)
-        cells = known.cells_of(np.zeros((1, 3), np.float32))
-        known.add(0, cells)
-        known.overlap(cells, 1)
+        sets = known.cells_of([np.zeros((1, 3), np.float32)])
+        known.add(0, sets.of(0))
+        known.shares(sets, 1)
         known.remove(0)
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
@@ -72,11 +56,11 @@ class SurfaceMerging:
         check_fits(graph, local)
         if not self._owner_of and len(graph):
             self._restore(graph)
-        cells = [self._map.cells_of(points) for points in local.surface_points_world]
-        candidates = self._candidates(graph, local, cells)
-        matched = _one_to_one(candidates.values)
+        cells = self._map.cells_of(local.surface_points_world)
+        values = self._values(graph, local, cells)
+        matched = _one_to_one(values)
         node_ids = self._place(graph, local, cells, matched)
-        self._note_joint(candidates, matched)
+        self._note_joint(values, matched)
         self._merge_grown(graph)
         self._expire(graph, local.stamp_ns)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
@@ -84,30 +68,28 @@ class SurfaceMerging:
         add_relations(graph, local, node_ids)
         return node_ids
 
-    def _candidates(self, graph: SceneGraph, local: LocalGraph, cells: list[Int64]) -> _Candidates:
-        """Shares of overlap, and values where they suffice for the classes at hand."""
-        shares = np.zeros((len(local), len(self._node_of)))
+    def _values(self, graph: SceneGraph, local: LocalGraph, cells: CellSets) -> Float64:
+        """How well each object fits each owner, (n, S); 0 where they cannot be the same."""
+        shares = self._map.shares(cells, len(self._node_of))
+        objects, owners = np.nonzero(shares)
+        node_rows = [graph.nodes.row(self._node_of[owner]) for owner in owners.tolist()]
+        agreements = np.einsum(
+            "ij,ij->i",
+            local.class_probabilities[objects],
+            graph.nodes.class_probabilities[node_rows],
+        )
+        wanted = np.where(
+            agreements > CLASS_AGREEMENT,
+            self._config.overlap_threshold,
+            self._config.overlap_threshold_other_class,
+        )
+        found = shares[objects, owners]
         values = np.zeros_like(shares)
-        for row in range(len(local)):
-            overlap = self._map.overlap(cells[row], len(self._node_of))
-            for owner in np.flatnonzero(overlap.reverse).tolist():
-                share = _share(overlap, owner, self._map.cell_count(owner))
-                node = graph.nodes.row(self._node_of[owner])
-                agreement = float(
-                    graph.nodes.class_probabilities[node] @ local.class_probabilities[row]
-                )
-                wanted = (
-                    self._config.overlap_threshold
-                    if agreement > CLASS_AGREEMENT
-                    else self._config.overlap_threshold_other_class
-                )
-                shares[row, owner] = share
-                if share >= wanted:
-                    values[row, owner] = share + CLASS_BONUS * agreement
-        return _Candidates(shares, values)
+        values[objects, owners] = np.where(found >= wanted, found + CLASS_BONUS * agreements, 0.0)
+        return values
 
     def _place(
-        self, graph: SceneGraph, local: LocalGraph, cells: list[Int64], matched: list[int]
+        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, matched: list[int]
     ) -> list[int]:
         """Fuse each object into the node of its owner, or found a tentative node."""
         surfaces = hash_each(local.surface_points_world)
@@ -128,7 +110,7 @@ class SurfaceMerging:
             else:
                 node_id = self._node_of[owner]
                 graph.observe(node_id, *observation)
-            self._map.add(owner, cells[row])
+            self._map.add(owner, cells.of(row))
             node = graph.nodes.row(node_id)
             if (
                 not graph.nodes.confirmed[node]
@@ -138,13 +120,13 @@ class SurfaceMerging:
             node_ids.append(node_id)
         return node_ids
 
-    def _note_joint(self, candidates: _Candidates, matched: list[int]) -> None:
+    def _note_joint(self, values: Float64, matched: list[int]) -> None:
         """Count where one object lay on two nodes, against where both were seen apart."""
         taken = {owner for owner in matched if owner >= 0}
         for row, owner in enumerate(matched):
             if owner < 0:
                 continue
-            for other in np.flatnonzero(candidates.values[row]).tolist():
+            for other in np.flatnonzero(values[row]).tolist():
                 if other != owner:
                     pair = (min(owner, other), max(owner, other))
                     change = -1 if other in taken else 1
@@ -173,8 +155,9 @@ class SurfaceMerging:
 
     def _restore(self, graph: SceneGraph) -> None:
         """Take the nodes of a graph that was loaded, by their surface points."""
-        for node_id, surface in zip(graph.nodes.ids.tolist(), graph.nodes.surfaces):
-            self._map.add(self._take_owner(node_id), self._map.cells_of(surface.points_world))
+        cells = self._map.cells_of([surface.points_world for surface in graph.nodes.surfaces])
+        for row, node_id in enumerate(graph.nodes.ids.tolist()):
+            self._map.add(self._take_owner(node_id), cells.of(row))
 
     def _take_owner(self, node_id: int) -> int:
         try:
@@ -191,14 +174,6 @@ class SurfaceMerging:
         self._node_of[owner] = 0
         for pair in [pair for pair in self._joint if owner in pair]:
             del self._joint[pair]
-
-
-def _share(overlap: Overlap, owner: int, owner_cells: int) -> float:
-    """Share of overlap: of the object's cells, or of the node's where the node is the smaller."""
-    of_object = float(overlap.own[owner] + overlap.near[owner]) / overlap.cells
-    if owner_cells < MIN_REVERSE_CELLS:
-        return of_object
-    return max(of_object, float(overlap.reverse[owner]) / owner_cells)
 
 
 def _one_to_one(values: Float64) -> list[int]:

@@ -1,11 +1,12 @@
 """Which nodes' surfaces pass through which cells of space: a sparse hash of small cubes.
 
-A cell knows up to four nodes ("owners") and how often each was seen in it. Everything is linear in
+A cell knows up to four nodes ("owners"). Everything is linear in
 the number of points asked about, whatever the size of the map.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,11 @@ from numpy.typing import NDArray
 Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 OWNERS = 4
+# An owner of fewer cells than this says too little by lying within a set.
+MIN_REVERSE_CELLS = 4
 _EMPTY = np.int64(-1)
 _FIRST_CAPACITY = 1 << 14
 # Cell indices lie in ±2^20: with cells of 3 cm that is 31 km around the origin.
@@ -24,20 +28,20 @@ _BIAS = 1 << 20
 _MASK = (1 << 21) - 1
 
 
-class Overlap(NamedTuple):
-    """How the cells of one observation lie on the cells of each owner (S owner indices).
+class CellSets(NamedTuple):
+    """Distinct cells of several sets of points, one after the other.
 
     Attributes:
-        cells: number of distinct cells of the observation.
-        own: (S,) int64, cells that the owner was seen in.
-        near: (S,) int64, further cells with a face next to a cell of the owner.
-        reverse: (S,) int64, distinct cells of the owner that were met on the way.
+        cells: packed cell indices; those of set k are cells[starts[k] : starts[k + 1]], ascending.
+        starts: (n + 1,) int64.
     """
 
-    cells: int
-    own: Int64
-    near: Int64
-    reverse: Int64
+    cells: Int64
+    starts: Int64
+
+    def of(self, index: int) -> Int64:
+        """Cells of one set."""
+        return self.cells[self.starts[index] : self.starts[index + 1]]
 
 
 class VoxelMap:
@@ -65,12 +69,11 @@ class VoxelMap:
         """Number of cells of an owner."""
         return self._counts_of.get(owner, 0)
 
-    def cells_of(self, points_world: Float32) -> Int64:
-        """Packed indices of the distinct cells of points (n, 3), ascending."""
-        indices = np.floor(np.asarray(points_world, np.float64) / self.cell_m).astype(np.int64)
-        inside = ((indices >= -_BIAS) & (indices < _BIAS)).all(axis=1)
-        indices = indices[inside] + _BIAS
-        return np.unique((indices[:, 0] << 42) | (indices[:, 1] << 21) | indices[:, 2])
+    def cells_of(self, point_sets: Sequence[Float32]) -> CellSets:
+        """Distinct cells of each set of points (k, 3), metres."""
+        counts = [len(points) for points in point_sets]
+        points = np.concatenate([np.zeros((0, 3), np.float32), *point_sets])
+        return CellSets(*_cells_of(points, np.array([0, *np.cumsum(counts)]), self.cell_m))
 
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
@@ -78,45 +81,53 @@ class VoxelMap:
         indices = np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=1) - _BIAS
         return ((indices + 0.5) * self.cell_m).astype(np.float32)
 
-    def add(self, owner: int, cells: Int64, times: int = 1) -> None:
+    def add(self, owner: int, cells: Int64) -> None:
         """Note that an owner was seen in these distinct cells."""
         room = self._cells_per_owner - self.cell_count(owner)
         if 2 * (self._used + len(cells)) > len(self._keys):
             self._grow(self._used + len(cells))
-        new, created = _add(self._keys, self._owners, self._seen, owner, cells, times, room)
+        new, created = _add(self._keys, self._owners, owner, cells, room)
         self._used += created
         if len(new):
             self._cells_of.setdefault(owner, []).append(new)
             self._counts_of[owner] = self.cell_count(owner) + len(new)
 
-    def overlap(self, cells: Int64, owner_count: int) -> Overlap:
-        """How these distinct cells lie on the cells of owners 0 … owner_count - 1."""
-        self._query += 1
-        own, near, reverse = _overlap(
-            self._keys, self._owners, self._touched, self._query, cells, owner_count
+    def shares(self, sets: CellSets, owner_count: int) -> Float64:
+        """How far the surface of each set coincides with that of each owner.
+
+        The share of the set's cells that the owner was seen in, or that have a face next to such a
+        cell; or the share of the owner's cells that were met on the way, where that is more: the
+        side that saw less of the object decides.
+
+        Returns:
+            (n, S) float64 in [0, 1] for n sets and owners 0 ... S - 1.
+        """
+        counts = np.array([self.cell_count(owner) for owner in range(owner_count)], np.int64)
+        shares: Float64 = _shares(
+            self._keys, self._owners, self._touched, self._query, sets.cells, sets.starts, counts
         )
-        return Overlap(len(cells), own, near, reverse)
+        self._query += len(shares)
+        return shares
 
     def remove(self, owner: int) -> Int64:
         """Forget an owner; returns the cells it had."""
         cells = np.concatenate([np.zeros(0, np.int64), *self._cells_of.pop(owner, [])])
         self._counts_of.pop(owner, None)
-        _remove(self._keys, self._owners, self._seen, owner, cells)
+        _remove(self._keys, self._owners, owner, cells)
         return cells
 
     def _allocate(self, capacity: int) -> None:
         self._keys = np.full(capacity, _EMPTY, np.int64)
         self._owners: Int32 = np.full((capacity, OWNERS), -1, np.int32)
-        self._seen: Int32 = np.zeros((capacity, OWNERS), np.int32)
         self._touched: Int64 = np.zeros((capacity, OWNERS), np.int64)
 
     def _grow(self, cells: int) -> None:
-        keys, owners, seen = self._keys, self._owners, self._seen
+        keys, owners = self._keys, self._owners
         capacity = len(keys)
         while capacity < 4 * cells:
             capacity *= 2
         self._allocate(capacity)
-        self._used = _rehash(keys, owners, seen, self._keys, self._owners, self._seen)
+        self._used = _rehash(keys, owners, self._keys, self._owners)
 
 
 @njit(cache=True, nogil=True)
@@ -131,99 +142,119 @@ def _slot(keys, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add(keys, owners, seen, owner, cells, times, room):  # type: ignore[no-untyped-def]
+def _add(keys, owners, owner, cells, room):  # type: ignore[no-untyped-def]
     new = np.empty(len(cells), np.int64)
     new_count = 0
     created = 0
     for cell in cells:
         slot = _slot(keys, cell)
+        known = False
         place = -1
-        if keys[slot] == cell:
-            for index in range(OWNERS):
-                if owners[slot, index] == owner:
-                    place = index
-                    break
-        if place >= 0:
-            seen[slot, place] += times
-            continue
-        if new_count >= room:
+        for index in range(OWNERS):
+            known = bool(known or owners[slot, index] == owner)
+            if place < 0 and owners[slot, index] < 0:
+                place = index
+        # Four nodes may know a cell; a fifth does not.
+        if known or place < 0 or new_count >= room:
             continue
         if keys[slot] != cell:
             keys[slot] = cell
             created += 1
-        for index in range(OWNERS):
-            if owners[slot, index] < 0:
-                place = index
-                break
-        if place < 0:  # four nodes know this cell already
-            continue
         owners[slot, place] = owner
-        seen[slot, place] = times
         new[new_count] = cell
         new_count += 1
     return new[:new_count].copy(), created
 
 
 @njit(cache=True, nogil=True)
-def _overlap(keys, owners, touched, query, cells, owner_count):  # type: ignore[no-untyped-def]
-    own = np.zeros(owner_count, np.int64)
-    near = np.zeros(owner_count, np.int64)
-    reverse = np.zeros(owner_count, np.int64)
-    met = np.empty(7 * OWNERS, np.int32)
-    steps = np.array([0, 1 << 42, -(1 << 42), 1 << 21, -(1 << 21), 1, -1], np.int64)
-    for cell in cells:
-        met_count = 0
-        for step_index in range(7):
-            slot = _slot(keys, cell + steps[step_index])
-            if keys[slot] == -1:
-                continue
-            for index in range(OWNERS):
-                owner = owners[slot, index]
-                if owner < 0 or owner >= owner_count:
-                    continue
-                if touched[slot, index] != query:
-                    touched[slot, index] = query
-                    reverse[owner] += 1
-                known = False
-                for other in range(met_count):
-                    if met[other] == owner:
-                        known = True
-                        break
-                if known:
-                    continue
-                met[met_count] = owner
-                met_count += 1
-                if step_index == 0:
-                    own[owner] += 1
-                else:
-                    near[owner] += 1
-    return own, near, reverse
+def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
+    cells = np.empty(len(points), np.int64)
+    new_starts = np.zeros(len(starts), np.int64)
+    kept = 0
+    for index in range(len(starts) - 1):
+        first = kept
+        for point in range(starts[index], starts[index + 1]):
+            cell = np.int64(0)
+            inside = True
+            for axis in range(3):
+                step = np.int64(np.floor(np.float64(points[point, axis]) / cell_m))
+                inside = bool(inside and -_BIAS <= step < _BIAS)
+                cell = (cell << 21) | (step + _BIAS)
+            if inside:
+                cells[kept] = cell
+                kept += 1
+        cells[first:kept].sort()
+        distinct = first
+        for place in range(first, kept):
+            if place == first or cells[place] != cells[distinct - 1]:
+                cells[distinct] = cells[place]
+                distinct += 1
+        kept = distinct
+        new_starts[index + 1] = kept
+    return cells[:kept].copy(), new_starts
 
 
 @njit(cache=True, nogil=True)
-def _remove(keys, owners, seen, owner, cells):  # type: ignore[no-untyped-def]
+def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignore[no-untyped-def]
+    shares = np.zeros((len(starts) - 1, len(counts)))
+    met = np.empty(7 * OWNERS, np.int32)
+    steps = np.array([0, 1 << 42, -(1 << 42), 1 << 21, -(1 << 21), 1, -1], np.int64)
+    for index in range(len(starts) - 1):
+        query += 1
+        on_owner = np.zeros(len(counts), np.int64)
+        of_owner = np.zeros(len(counts), np.int64)
+        for cell in cells[starts[index] : starts[index + 1]]:
+            met_count = 0
+            for step in steps:
+                slot = _slot(keys, cell + step)
+                if keys[slot] == -1:
+                    continue
+                for place in range(OWNERS):
+                    owner = owners[slot, place]
+                    if owner < 0 or owner >= len(counts):
+                        continue
+                    if touched[slot, place] != query:
+                        touched[slot, place] = query
+                        of_owner[owner] += 1
+                    known = False
+                    for other in range(met_count):
+                        known = bool(known or met[other] == owner)
+                    if not known:
+                        met[met_count] = owner
+                        met_count += 1
+                        on_owner[owner] += 1
+        cell_count = starts[index + 1] - starts[index]
+        for owner in range(len(counts)):
+            if on_owner[owner] > 0:
+                shares[index, owner] = on_owner[owner] / cell_count
+                if counts[owner] >= MIN_REVERSE_CELLS:
+                    reverse = of_owner[owner] / counts[owner]
+                    shares[index, owner] = max(shares[index, owner], reverse)
+    return shares
+
+
+@njit(cache=True, nogil=True)
+def _remove(keys, owners, owner, cells):  # type: ignore[no-untyped-def]
     for cell in cells:
         slot = _slot(keys, cell)
         for index in range(OWNERS):
             if owners[slot, index] == owner:
                 owners[slot, index] = -1
-                seen[slot, index] = 0
 
 
 @njit(cache=True, nogil=True)
-def _rehash(keys, owners, seen, new_keys, new_owners, new_seen):  # type: ignore[no-untyped-def]
+def _rehash(keys, owners, new_keys, new_owners):  # type: ignore[no-untyped-def]
     used = 0
     for slot in range(len(keys)):
         if keys[slot] == -1:
             continue
         owned = False
         for index in range(OWNERS):
-            owned = owned or owners[slot, index] >= 0
+            owned = bool(owned or owners[slot, index] >= 0)
         if owned:
             place = _slot(new_keys, keys[slot])
             new_keys[place] = keys[slot]
             for index in range(OWNERS):
                 new_owners[place, index] = owners[slot, index]
-                new_seen[place, index] = seen[slot, index]
             used += 1
     return used

@@ -1,0 +1,190 @@
+"""The surface rule on objects that a camera sees in parts, with flipping labels, side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from merging_support import VOCABULARY
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.gaussian import moments
+from deworldsg_ros.scene.graph import SceneGraph
+
+CUP, TABLE, CHAIR = 0, 1, 2
+
+
+def slab(centre: tuple[float, float, float], size: tuple[float, float, float]) -> np.ndarray:
+    """Points on the surface of a thin box, 5 mm of noise, a thousand a square metre and more."""
+    rng = np.random.default_rng(abs(hash((centre, size))) % 2**32)
+    count = int(np.clip(2000 * max(size[0] * size[1], size[1] * size[2], 0.05), 100, 4000))
+    points = rng.uniform(-0.5, 0.5, (count, 3)) * size + centre
+    return (points + rng.normal(0, 0.003, points.shape)).astype(np.float32)
+
+
+def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph:
+    """A local graph of objects given by surface points and class."""
+    count = len(objects)
+    gaussians = [moments(points, 1e-6) for points, _ in objects]
+    classes = np.full((count, 4), 0.05)
+    for row, (_, kind) in enumerate(objects):
+        classes[row, kind] = 0.85
+    fields = {
+        "stamp_ns": stamp * 10**8,
+        "frame_id": "world",
+        "width": 640,
+        "height": 480,
+        "T_world_camera": np.eye(4),
+        "vocabulary": VOCABULARY,
+        "instance_ids": np.arange(1, count + 1),
+        "boxes_xyxy": np.tile([10.0, 10, 100, 100], (count, 1)),
+        "class_probabilities": classes.reshape(count, 4),
+        "scores": np.full(count, 0.9),
+        "means_world": np.array([mean for mean, _ in gaussians]).reshape(-1, 3),
+        "covariances_world": np.array([cov for _, cov in gaussians]).reshape(-1, 3, 3),
+        "depths_m": np.full(count, 2.0),
+        "pixel_counts": np.array([len(points) for points, _ in objects], np.int64),
+        "surface_points_world": tuple(points for points, _ in objects),
+        "relations": Relations.none(len(VOCABULARY.predicates)),
+    }
+    return LocalGraph(**{**fields, **changes})
+
+
+@pytest.fixture
+def graph() -> SceneGraph:
+    return SceneGraph(VOCABULARY, "world")
+
+
+@pytest.fixture
+def merging() -> SurfaceMerging:
+    return SurfaceMerging(MergingConfig(association="surface"))
+
+
+LEFT = slab((-0.5, 0, 1), (1.2, 0.8, 0.01))
+WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))
+RIGHT = slab((0.5, 0, 1), (1.2, 0.8, 0.01))
+
+
+@pytest.mark.parametrize("parts", [(LEFT, WHOLE, RIGHT), (WHOLE, LEFT, RIGHT), (RIGHT, WHOLE)])
+def test_partial_views_are_one_object(graph, merging, parts) -> None:
+    for stamp, points in enumerate(parts):
+        assert merging.merge(graph, frame(stamp, (points, TABLE))) == [1]
+    assert len(graph) == 1
+
+
+def test_a_label_that_flips_founds_no_node(graph, merging) -> None:
+    for stamp in range(10):
+        kind = CHAIR if stamp % 5 == 3 else TABLE
+        assert merging.merge(graph, frame(stamp, (WHOLE, kind))) == [1]
+    told = graph.node_states(3)[1]
+    assert told.label == VOCABULARY.classes[TABLE]
+    assert told.classes[0].probability == pytest.approx((8 * 0.85 + 2 * 0.05) / 10)
+    assert told.classes[1].label == VOCABULARY.classes[CHAIR]  # the disagreement is visible
+
+
+def test_objects_that_touch_stay_two(graph, merging) -> None:
+    cup = slab((0.3, 0.1, 1.05), (0.08, 0.08, 0.09))
+    for stamp in range(5):
+        order = [(WHOLE, TABLE), (cup, CUP)]
+        ids = merging.merge(graph, frame(stamp, *order[:: -1 if stamp % 2 else 1]))
+        assert ids == ([2, 1] if stamp % 2 else [1, 2])
+    assert merging.merge(graph, frame(9, (cup, CUP))) == [2]
+    assert merging.merge(graph, frame(10, (WHOLE, TABLE))) == [1]
+
+
+def test_neighbours_of_one_class_stay_two_while_both_are_seen(graph, merging) -> None:
+    books = [slab((x, 0, 1), (0.04, 0.15, 0.2)) for x in (0.0, 0.045, 0.09)]
+    for stamp in range(10):
+        assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
+
+
+def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
+    gap_left, gap_right = slab((-0.7, 0, 1), (0.7, 0.8, 0.01)), slab((0.7, 0, 1), (0.7, 0.8, 0.01))
+    assert merging.merge(graph, frame(0, (gap_left, TABLE))) == [1]
+    assert merging.merge(graph, frame(1, (gap_right, TABLE))) == [2]
+    for stamp in range(2, 8):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1]
+    assert graph.take_removals() == {2: 1}
+    assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
+
+
+def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:
+    cup = slab((3, 0, 1), (0.08, 0.08, 0.09))
+    merging.merge(graph, frame(0, (WHOLE, TABLE), (cup, CUP)))
+    assert not graph.nodes.confirmed.any()
+    for stamp in (1, 2):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    assert graph.nodes.confirmed.tolist() == [True, False]
+    assert list(graph.node_states(1)) == [1]
+    merging.merge(graph, frame(100, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1, 2]  # 10 s have not quite passed
+    merging.merge(graph, frame(101, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1]
+    assert merging.merge(graph, frame(102, (cup, CUP))) == [3]
+
+
+def test_a_confirmed_node_out_of_view_stays(graph, merging) -> None:
+    for stamp in range(3):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    merging.merge(graph, frame(10_000))
+    assert graph.nodes.ids.tolist() == [1]
+
+
+def test_more_pixels_weigh_more(graph, merging) -> None:
+    few = frame(0, (LEFT, TABLE), pixel_counts=np.array([1000]))
+    many = frame(1, (WHOLE, TABLE), pixel_counts=np.array([9000]))
+    merging.merge(graph, few)
+    merging.merge(graph, many)
+    wanted = (few.means_world[0] + 9 * many.means_world[0]) / 10
+    assert graph.nodes.means[0] == pytest.approx(wanted)
+    assert graph.nodes.observations.tolist() == [2]
+
+
+def test_the_result_does_not_depend_on_the_world_frame() -> None:
+    rng = np.random.default_rng(3)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    shift = np.array([10.0, -4.0, 2.0])
+    cup = slab((0.3, 0.1, 1.05), (0.08, 0.08, 0.09))
+    views = [[(LEFT, TABLE)], [(WHOLE, TABLE), (cup, CUP)], [(cup, CHAIR), (RIGHT, TABLE)]]
+    results = []
+    for move in (False, True):
+        graph = SceneGraph(VOCABULARY, "world")
+        merging = SurfaceMerging(MergingConfig(association="surface"))
+        ids = []
+        for stamp, view in enumerate(views):
+            moved = [
+                ((points @ rotation.T + shift).astype(np.float32) if move else points, kind)
+                for points, kind in view
+            ]
+            ids.append(merging.merge(graph, frame(stamp, *moved)))
+        means = graph.nodes.means if not move else (graph.nodes.means - shift) @ rotation
+        results.append((ids, means.copy()))
+    assert results[0][0] == results[1][0] == [[1], [1, 2], [2, 1]]
+    assert results[0][1] == pytest.approx(results[1][1], abs=1e-5)
+
+
+def test_a_loaded_graph_goes_on(graph, merging, tmp_path) -> None:
+    for stamp in range(3):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    graph.save(tmp_path / "graph.npz")
+    loaded = SceneGraph.load(tmp_path / "graph.npz")
+    assert loaded.nodes.confirmed.tolist() == [True]
+    again = SurfaceMerging(MergingConfig(association="surface"))
+    assert again.merge(loaded, frame(5, (WHOLE, TABLE))) == [1]
+
+
+def test_what_does_not_fit_is_refused_and_changes_nothing(graph, merging) -> None:
+    merging.merge(graph, frame(0, (WHOLE, TABLE)))
+    revision = graph.revision
+    for changes, reason in (
+        ({"vocabulary": Vocabulary(("a", "b", "c", "d"), ("x", "y", "z"))}, "vocabulary_mismatch"),
+        ({"frame_id": "odom"}, "frame_mismatch"),
+    ):
+        with pytest.raises(RefusedInput) as refused:
+            merging.merge(graph, frame(1, (WHOLE, TABLE), **changes))
+        assert refused.value.reason == reason
+    assert graph.revision == revision

@@ -1,0 +1,95 @@
+"""The surface map against sets of cells, and what must hold of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deworldsg_ros.merging.voxel_map import MIN_REVERSE_CELLS, VoxelMap
+
+seeds = st.integers(0, 10**6)
+CELL_M = 0.05
+
+
+def cells_of(points: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(cell) for cell in np.floor(points.astype(np.float64) / CELL_M).astype(int)}
+
+
+def neighbourhood(cell: tuple[int, ...]) -> list[tuple[int, ...]]:
+    steps = [(0, 0, 0)] + [
+        tuple(sign if axis == k else 0 for k in range(3)) for axis in range(3) for sign in (1, -1)
+    ]
+    return [tuple(c + s for c, s in zip(cell, step)) for step in steps]
+
+
+def reference_share(seen: set[tuple[int, ...]], known: set[tuple[int, ...]]) -> float:
+    on_owner = sum(any(cell in known for cell in neighbourhood(c)) for c in seen)
+    met = {cell for c in seen for cell in neighbourhood(c)} & known
+    share = on_owner / len(seen) if seen else 0.0
+    if on_owner and len(known) >= MIN_REVERSE_CELLS:
+        share = max(share, len(met) / len(known))
+    return share
+
+
+def random_points(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.uniform(-0.3, 0.3, (count, 3)).astype(np.float32)
+
+
+@given(seeds)
+@settings(max_examples=30)
+def test_shares_equal_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    surfaces = VoxelMap(CELL_M)
+    known: list[set[tuple[int, ...]]] = [set() for _ in range(3)]  # a cell has room for four
+    for _ in range(8):
+        owner = int(rng.integers(3))
+        points = random_points(rng, int(rng.integers(0, 20)))
+        surfaces.add(owner, surfaces.cells_of([points]).of(0))
+        known[owner] |= cells_of(points)
+    sets = [random_points(rng, int(rng.integers(0, 30))) for _ in range(4)]
+    shares = surfaces.shares(surfaces.cells_of(sets), 3)
+    assert shares.shape == (4, 3)
+    for row, points in enumerate(sets):
+        for owner in range(3):
+            wanted = reference_share(cells_of(points), known[owner])
+            assert shares[row, owner] == pytest.approx(wanted, abs=1e-12)
+    for owner in range(3):
+        assert surfaces.cell_count(owner) == len(known[owner])
+
+
+def test_no_points_no_share() -> None:
+    surfaces = VoxelMap(CELL_M)
+    assert surfaces.shares(surfaces.cells_of([]), 0).shape == (0, 0)
+    empty = surfaces.cells_of([np.zeros((0, 3), np.float32)])
+    surfaces.add(0, empty.of(0))
+    assert surfaces.shares(empty, 1).tolist() == [[0.0]]
+
+
+def test_growing_loses_nothing_and_a_removed_owner_is_gone() -> None:
+    rng = np.random.default_rng(1)
+    surfaces = VoxelMap(0.01, cells_per_owner=100_000)
+    sets = surfaces.cells_of([rng.uniform(-5, 5, (30_000, 3)) for _ in range(2)])
+    surfaces.add(0, sets.of(0))
+    surfaces.add(1, sets.of(1))
+    assert surfaces.shares(sets, 2).diagonal().tolist() == [1.0, 1.0]
+    removed = surfaces.remove(0)
+    assert np.sort(removed).tolist() == sets.of(0).tolist()
+    assert surfaces.cell_count(0) == 0
+    after = surfaces.shares(sets, 2)
+    assert after[0, 0] == after[1, 0] == 0.0
+    assert after[1, 1] == 1.0
+
+
+def test_an_owner_has_at_most_so_many_cells() -> None:
+    surfaces = VoxelMap(0.01, cells_per_owner=50)
+    points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
+    surfaces.add(0, surfaces.cells_of([points]).of(0))
+    assert surfaces.cell_count(0) == 50
+
+
+def test_points_beyond_the_map_are_left_out() -> None:
+    surfaces = VoxelMap(0.01)
+    points = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 0]], np.float32)
+    assert len(surfaces.cells_of([points]).of(0)) == 1
