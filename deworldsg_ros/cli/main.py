@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
+from deworldsg_ros.cli.evaluate import evaluate
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
 
@@ -211,6 +212,9 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
         from deworldsg_ros.cli.configuration import described_yaml, effective_config
 
         typer.echo(described_yaml(effective_config(config, settings)), nl=False)
+
+
+app.command()(_telling_errors()(evaluate))
 
 
 def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:

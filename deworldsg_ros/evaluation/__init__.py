@@ -1,0 +1,1 @@
+"""The official protocol, the measures beside it, replayable front ends, and what they print."""

@@ -1,0 +1,255 @@
+"""Official prediction pickles, read without executing anything in them.
+
+A pickle is a program that names the functions it wants called. Here each known name of numpy is
+answered with a stand-in that only remembers what it was given, and every other name is refused;
+the arrays are made afterwards, from numbers whose type, shape and length were checked.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+
+from deworldsg_ros.evaluation.errors import EvaluationError
+
+_KINDS = frozenset("?biuf")
+
+
+class _Dtype:
+    """Stands in for numpy.dtype."""
+
+    __slots__ = ("text",)
+
+    def __init__(self, text: Any = "", *_: Any) -> None:
+        if isinstance(text, _NumpyClass):
+            text = text.name
+        if isinstance(text, bytes):
+            text = text.decode("ascii", errors="replace")
+        if not isinstance(text, str):
+            raise EvaluationError(f"pickle has a dtype {text!r}: wanted a plain number's")
+        self.text = text
+
+    def __setstate__(self, state: Any) -> None:
+        order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
+        if isinstance(order, bytes):
+            order = order.decode("ascii", errors="replace")
+        if order in ("<", ">") and self.text[:1] not in "<>=|":
+            self.text = order + self.text
+
+    def dtype(self) -> np.dtype[Any]:
+        try:
+            made = np.dtype(self.text)
+        except TypeError as error:
+            raise EvaluationError(f"pickle has a dtype '{self.text}': unknown") from error
+        if made.kind not in _KINDS and made.kind != "b":
+            raise EvaluationError(f"pickle has a dtype '{self.text}': wanted numbers")
+        return made
+
+
+class _Array:
+    """Stands in for an ndarray: built by the constructor, or filled by __setstate__."""
+
+    __slots__ = ("buffer", "dtype", "fortran", "shape", "strided")
+
+    def __init__(self, shape: Any = (0,), dtype: Any = "f8", buffer: Any = None, *rest: Any):
+        self.shape = shape
+        self.dtype = dtype
+        self.buffer = buffer
+        self.fortran = False
+        # Offsets and strides into somebody's buffer are not part of what such files hold.
+        self.strided = any(item is not None and item != 0 and item != "C" for item in rest)
+        if rest[-1:] == ("F",):
+            self.fortran, self.strided = True, False
+
+    def __setstate__(self, state: Any) -> None:
+        if not isinstance(state, tuple) or len(state) not in (4, 5):
+            raise EvaluationError("pickle has an array with an unknown state")
+        self.shape, self.dtype, fortran, self.buffer = state[-4:]
+        self.fortran = bool(fortran)
+
+    def array(self) -> np.ndarray[Any, Any]:
+        dtype = (self.dtype if isinstance(self.dtype, _Dtype) else _Dtype(self.dtype)).dtype()
+        shape = self.shape if isinstance(self.shape, tuple) else (self.shape,)
+        if not all(isinstance(side, int) and side >= 0 for side in shape) or self.strided:
+            raise EvaluationError(f"pickle has an array of shape {self.shape!r}")
+        data = self.buffer
+        if isinstance(data, str):
+            data = data.encode("latin1")
+        if data is None and math.prod(shape) == 0:
+            data = b""
+        if isinstance(data, pickle.PickleBuffer):
+            data = bytes(data)
+        if not isinstance(data, bytes | bytearray):
+            raise EvaluationError(f"pickle has an array of {type(data).__name__}: wanted bytes")
+        if len(data) != math.prod(shape) * dtype.itemsize:
+            raise EvaluationError(
+                f"pickle has an array of shape {shape} and {len(data)} bytes: wanted "
+                f"{math.prod(shape) * dtype.itemsize}"
+            )
+        made = np.frombuffer(data, dtype).reshape(shape, order="F" if self.fortran else "C")
+        return made.astype(dtype.newbyteorder("="), copy=True)
+
+
+class _Callable:
+    """A name that a pickle may call; it has no state that a pickle could change."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        raise EvaluationError("pickle sets the state of a function: refused")
+
+
+class _NumpyClass(_Callable):
+    """Names an array or number class of numpy; ndarray itself may be called."""
+
+    __slots__ = ("name",)
+
+    name: str
+
+    def __init__(self, name: str) -> None:
+        object.__setattr__(self, "name", name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise EvaluationError("pickle sets the state of a class: refused")
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self.name == "ndarray":
+            return _Array(*arguments)
+        if self.name == "dtype":
+            return _Dtype(*arguments)
+        if len(arguments) == 1 and isinstance(arguments[0], int | float):
+            return arguments[0]
+        raise EvaluationError(f"pickle calls numpy.{self.name}: refused")
+
+
+class _Reconstruct(_Callable):
+    """numpy's _reconstruct(class, shape, type code): an array to be filled."""
+
+    __slots__ = ()
+
+    def __call__(self, *_: Any) -> _Array:
+        return _Array()
+
+
+class _FromBuffer(_Callable):
+    """numpy's _frombuffer(buffer, dtype, shape, order)."""
+
+    __slots__ = ()
+
+    def __call__(self, buffer: Any, dtype: Any, shape: Any, order: Any = "C", *_: Any) -> _Array:
+        made = _Array(shape, dtype, buffer)
+        made.fortran = order == "F"
+        return made
+
+
+class _Scalar(_Callable):
+    """numpy's scalar(dtype, bytes)."""
+
+    __slots__ = ()
+
+    def __call__(self, dtype: Any, data: Any = None) -> _Array:
+        return _Array((), dtype, data)
+
+
+class _Encode(_Callable):
+    """_codecs.encode, by which old protocols spell bytes."""
+
+    __slots__ = ()
+
+    def __call__(self, text: Any, encoding: Any = "latin1") -> bytes:
+        if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+            raise EvaluationError(f"pickle encodes with {encoding!r}: refused")
+        return text.encode("latin1")
+
+
+class _EmptyBytes(_Callable):
+    """bytes(), by which old protocols spell no bytes at all."""
+
+    __slots__ = ()
+
+    def __call__(self) -> bytes:
+        return b""
+
+
+class _EmptyDict(_Callable):
+    """collections.OrderedDict, by which some keep the order."""
+
+    __slots__ = ()
+
+    def __call__(self, *arguments: Any) -> dict[Any, Any]:
+        return dict(*arguments)
+
+
+_CORE = ("numpy.core", "numpy._core")
+_NAMES: dict[tuple[str, str], _Callable] = {
+    ("_codecs", "encode"): _Encode(),
+    ("__builtin__", "bytes"): _EmptyBytes(),
+    ("builtins", "bytes"): _EmptyBytes(),
+    ("collections", "OrderedDict"): _EmptyDict(),
+    **{(f"{core}.multiarray", "_reconstruct"): _Reconstruct() for core in _CORE},
+    **{(f"{core}.multiarray", "scalar"): _Scalar() for core in _CORE},
+    **{(f"{core}.numeric", "_frombuffer"): _FromBuffer() for core in _CORE},
+    **{
+        ("numpy", name): _NumpyClass(name)
+        for name in (
+            "ndarray", "dtype", "bool", "bool_", "int8", "int16", "int32", "int64", "uint8",
+            "uint16", "uint32", "uint64", "float16", "float32", "float64",
+        )
+    },
+}  # fmt: skip
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return _NAMES[module, name]
+        except KeyError:
+            raise EvaluationError(
+                f"pickle asks for {module}.{name}: refused, it may only hold dictionaries, lists, "
+                "numbers, text and numpy arrays"
+            ) from None
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise EvaluationError("pickle refers to something outside itself: refused")
+
+
+def load_pickle(content: bytes, source: str) -> Any:
+    """Plain containers and numpy arrays of a pickle.
+
+    Args:
+        content: the file.
+        source: what to call it in errors.
+
+    Raises:
+        EvaluationError: where it names anything else than plain data, or is damaged.
+    """
+    try:
+        return _resolve(_Unpickler(io.BytesIO(content)).load(), {})
+    except EvaluationError as error:
+        raise EvaluationError(f"{source}: {error}") from error
+    # A damaged pickle raises nearly anything.
+    except Exception as error:
+        raise EvaluationError(
+            f"{source} is no readable pickle ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _resolve(value: Any, seen: dict[int, Any]) -> Any:
+    """`value` with arrays in place of their stand-ins."""
+    if isinstance(value, _Array):
+        if id(value) not in seen:
+            seen[id(value)] = value.array()
+        return seen[id(value)]
+    if isinstance(value, list):
+        return [_resolve(item, seen) for item in value]
+    if isinstance(value, tuple):
+        return tuple(_resolve(item, seen) for item in value)
+    if isinstance(value, dict):
+        return {_resolve(key, seen): _resolve(item, seen) for key, item in value.items()}
+    if value is None or isinstance(value, str | bytes | bool | int | float):
+        return value
+    raise EvaluationError(f"pickle holds a {type(value).__name__}: refused")

@@ -1,0 +1,50 @@
+"""Ranks of scores in the official order: ties go to the last position, NaN above every number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# Stored for an item without a match or an edge.
+NO_RANK = 99999
+
+
+def rank(scores: NDArray[Any], place: int) -> int:
+    """Number of scores (n,) that come before the one at `place`; 0 = it is the top.
+
+    A place beyond the scores has the rank `NO_RANK`, or their number where that is larger.
+    """
+    if not 0 <= place < len(scores):
+        return max(NO_RANK, len(scores))
+    value = scores[place]
+    later = scores[place + 1 :]
+    if scores.dtype.kind != "f":
+        return int((scores > value).sum() + (later == value).sum())
+    if np.isnan(value):
+        return int(np.isnan(later).sum())
+    # NaN compares as not less or equal.
+    return int((~(scores <= value)).sum() + (later == value).sum())
+
+
+def triple_rank(
+    subject_scores: NDArray[Any],
+    object_scores: NDArray[Any],
+    predicate_scores: NDArray[Any],
+    triple: tuple[int, int, int],
+) -> int:
+    """Rank of (subject class, object class, predicate) among all triples.
+
+    The score of a triple is (subject * object) * predicate, multiplied in this order and in the
+    arrays' own type; triples count in row-major order, the predicate fastest.
+    """
+    sizes = (len(subject_scores), len(object_scores), len(predicate_scores))
+    if not all(0 <= place < size for place, size in zip(triple, sizes)):
+        return max(NO_RANK, sizes[0] * sizes[1] * sizes[2])
+    # Overflow and NaN are the predictor's own business.
+    with np.errstate(all="ignore"):
+        ends = subject_scores[:, None] * object_scores[None, :]
+        table = ends[:, :, None] * predicate_scores[None, None, :]
+    place = (triple[0] * sizes[1] + triple[1]) * sizes[2] + triple[2]
+    return rank(table.ravel(), place)

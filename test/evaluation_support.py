@@ -1,0 +1,116 @@
+"""Tiny data sets in the official layouts, made by the tests."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+CLASSES = ("book", "chair", "table")
+PREDICATES = ("near", "on", "under")
+NAMES = {
+    "replica": (
+        "ReplicaSSG",
+        "ReplicaSSG/objects.json",
+        "ReplicaSSG/relationships.json",
+        "ReplicaSSG/replica_to_visual_genome.json",
+        ("Replica2VisualGenome", "VisualGenome_list", "VisualGenome_rel"),
+    ),
+    "3rscan": (
+        "3DSSG_subset",
+        "3DSSG/objects.json",
+        "3DSSG_subset/relationships20.json",
+        "3DSSG_subset/3dssg_to_scannet.json",
+        ("3DSSG2NYUv2", "ScanNet_list", "ScanNet_rel"),
+    ),
+}
+
+
+def write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+
+
+def write_ply(
+    path: Path, points: np.ndarray, ids: np.ndarray, form: str = "ascii", dtype: str = "float"
+) -> None:
+    """A PLY with an element before the vertices and faces with lists after them."""
+    header = (
+        f"ply\nformat {form} 1.0\ncomment made by a test\n"
+        "element sensor 1\nproperty list uchar int numbers\n"
+        f"element vertex {len(points)}\n"
+        + "".join(f"property {dtype} {axis}\n" for axis in "xyz")
+        + "property uchar red\nproperty ushort objectId\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if form == "ascii":
+        rows = [f"{x!r} {y!r} {z!r} 7 {i}" for (x, y, z), i in zip(points.tolist(), ids.tolist())]
+        path.write_text(header + "2 5 6\n" + "\n".join(rows) + "\n3 0 0 0\n")
+        return
+    order = "<" if form == "binary_little_endian" else ">"
+    kind = order + ("f4" if dtype == "float" else "f8")
+    table = np.zeros(
+        len(points), [("x", kind), ("y", kind), ("z", kind), ("red", "u1"), ("id", order + "u2")]
+    )
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    table["id"] = ids
+    before = b"\x02" + np.array([5, 6], order + "i4").tobytes()
+    after = b"\x03" + np.array([0, 0, 0], order + "i4").tobytes()
+    path.write_bytes(header.encode() + before + table.tobytes() + after)
+
+
+def write_dataset(
+    root: Path,
+    scans: Mapping[str, tuple[Sequence[tuple[str, int]], Sequence[tuple[int, int, str]]]],
+    *,
+    layout: str = "replica",
+    split_scans: Sequence[str] | None = None,
+    spacing_m: float = 1.0,
+) -> Path:
+    """Each scan is (objects (label, id), relations); an object is a line of points at x = id."""
+    lists, objects, relations, mapping, keys = NAMES[layout]
+    labels = {name: name for name in CLASSES} | {"wall": "wall"}
+    write_json(root / mapping, dict(zip(keys, (labels, CLASSES, PREDICATES))))
+    listed = [
+        {"scan": scan, "objects": [{"label": label, "id": str(i)} for label, i in content[0]]}
+        for scan, content in scans.items()
+    ]
+    write_json(root / objects, {"scans": listed})
+    # The third field of a relation is wrong on purpose: nobody may read it.
+    related = [
+        {"scan": scan, "relationships": [[s, o, 99, name] for s, o, name in content[1]]}
+        for scan, content in scans.items()
+    ]
+    write_json(root / relations, {"scans": related})
+    (root / lists).mkdir(parents=True, exist_ok=True)
+    for name in ("train", "validation", "test"):
+        chosen = split_scans if split_scans is not None else list(scans)
+        text = "\n".join(chosen if name == "test" else []) + "\n"
+        (root / lists / f"{name}_scans.txt").write_text(text)
+    for scan, content in scans.items():
+        ids = np.repeat([i for _, i in content[0]], 20)
+        points = surface(ids, spacing_m)
+        write_ply(root / "data" / scan / "labels.instances.annotated.v2.ply", points, ids)
+    return root
+
+
+def surface(ids: np.ndarray, spacing_m: float = 1.0) -> np.ndarray:
+    """Twenty points 5 cm apart along y for each object, at x = id * spacing."""
+    points = np.zeros((len(ids), 3))
+    points[:, 0] = np.asarray(ids) * spacing_m
+    points[:, 1] = 0.05 * (np.arange(len(ids)) % 20)
+    return points
+
+
+def segment(object_id: int, count: int = 10, offset: Sequence[float] = (0, 0, 0)) -> np.ndarray:
+    """Points on the surface of one object."""
+    return surface(np.repeat(object_id, 20))[:count] + np.asarray(offset, float)
+
+
+def one_hot(place: int, count: int = 3) -> list[float]:
+    return [float(index == place) for index in range(count)]
