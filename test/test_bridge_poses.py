@@ -10,8 +10,8 @@ from bridge_support import MS, T0, header, odometry, pose, tf, transform
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deworldsg_ros.bridge.jump_gate import JumpGate
 from deworldsg_ros.bridge.poses import (
-    JumpGate,
     PoseBuffer,
     PoseStream,
     pose_from_message,

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
+from deworldsg_ros.bridge.assembler import Assembler
 from deworldsg_ros.bridge.node import CHECK_PERIOD_S, StageNode
-from deworldsg_ros.bridge.streams import Assembler
-from deworldsg_ros.bridge.sync import TOPICS
+from deworldsg_ros.bridge.posed import TOPICS
 from deworldsg_ros.bridge.worker import Worker
 
 Out = TypeVar("Out")
