@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +14,9 @@ from deworldsg_ros.scene.frame_graph import Float64
 POINTS_PER_OBJECT = 256
 # An object of fewer points with depth has no place.
 MIN_POINTS = 10
-# Bounds are these percentiles: a few flying pixels must not stretch an object.
-LOW_PERCENT, HIGH_PERCENT = 4.0, 96.0
+# Bounds leave out this share of the points at either end: a few flying pixels must not stretch an
+# object.
+LOW_SHARE = 0.04
 # The surface an object rests on is looked for within this distance of its own outline.
 SUPPORT_MARGIN_M = 0.08
 # Of a cabinet one sees the front: its footprint goes on behind it.
@@ -64,16 +66,21 @@ def measure_layout(
         count: number of objects.
         up_camera: (3,) unit vector against gravity, camera frame.
     """
-    points, owners = _sample(depth_m, intrinsics, instances, count, upright_axes(up_camera))
+    pixels, owners = _sample(depth_m, instances, count, POINTS_PER_OBJECT)
+    v, u = pixels[:, 0], pixels[:, 1]
+    z = depth_m[v, u].astype(np.float64)
+    x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z
+    points = np.stack([x, y, z], axis=1) @ upright_axes(up_camera).T
     low, high = np.zeros((count, 3)), np.zeros((count, 3))
     starts = np.searchsorted(owners, np.arange(count + 1))
     valid = np.diff(starts) >= MIN_POINTS
     for row in np.flatnonzero(valid):
-        own = points[starts[row] : starts[row + 1]]
-        low[row], high[row] = np.percentile(own, [LOW_PERCENT, HIGH_PERCENT], axis=0)
-        # What the percentiles cut off an evenly covered surface, given back. Not in height: most
-        # of what one sees of a plate or a table is at one height.
-        trimmed = (high[row, :2] - low[row, :2]) * LOW_PERCENT / (HIGH_PERCENT - LOW_PERCENT)
+        own = np.sort(points[starts[row] : starts[row + 1]], axis=0)
+        low[row] = own[round(LOW_SHARE * (len(own) - 1))]
+        high[row] = own[round((1.0 - LOW_SHARE) * (len(own) - 1))]
+        # What this cuts off an evenly covered surface, given back. Not in height: most of what
+        # one sees of a plate or a table is at one height.
+        trimmed = (high[row, :2] - low[row, :2]) * LOW_SHARE / (1.0 - 2.0 * LOW_SHARE)
         low[row, :2] -= trimmed
         high[row, :2] += trimmed
     overlap = np.clip(
@@ -117,37 +124,41 @@ def upright_axes(up_camera: Float64) -> Float64:
     return np.stack([np.cross(forward, up), forward, up])
 
 
-def _sample(
-    depth_m: NDArray[np.float32],
-    intrinsics: Intrinsics,
-    instances: NDArray[np.uint16],
-    count: int,
-    axes: Float64,
-) -> tuple[Float64, NDArray[np.int64]]:
-    """Points (k, 3) in upright axes and the row of their object, in the order of the rows."""
-    rows, columns = np.nonzero(instances)
-    labels = instances[rows, columns].astype(np.int64) - 1
-    z = depth_m[rows, columns]
-    usable = (z > 0) & (labels < count)
-    rows, columns, labels, z = rows[usable], columns[usable], labels[usable], z[usable]
-    order = np.argsort(labels, kind="stable")
-    sizes = np.bincount(labels, minlength=count)
-    ends = np.cumsum(sizes)
-    chosen = np.concatenate(
-        [np.zeros(0, np.int64)]
-        + [
-            np.linspace(end - size, end - 1, min(size, POINTS_PER_OBJECT)).astype(np.int64)
-            for size, end in zip(sizes, ends, strict=True)
-            if size
-        ]
-    )
-    picked = order[chosen]
-    u, v, z = columns[picked], rows[picked], z[picked].astype(np.float64)
-    camera = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z],
-        axis=1,
-    )
-    return camera @ axes.T, labels[picked]
+@numba.njit(cache=True, nogil=True)
+def _sample(  # type: ignore[no-untyped-def]
+    depth_m, instances, count, most
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixels (k, 2) as row, column, and the row of their object, in the order of the objects.
+
+    Of an object with many pixels, `most` that are evenly spread in scan order.
+    """
+    height, width = instances.shape
+    sizes = np.zeros(count, np.int64)
+    for y in range(height):
+        for x in range(width):
+            label = instances[y, x]
+            if 0 < label <= count and 0 < depth_m[y, x] < np.inf:
+                sizes[label - 1] += 1
+    ends = np.cumsum(np.minimum(sizes, most))
+    pixels = np.empty((ends[-1], 2), np.int64)
+    owners = np.empty(ends[-1], np.int64)
+    seen = np.zeros(count, np.int64)
+    taken = np.zeros(count, np.int64)
+    for y in range(height):
+        for x in range(width):
+            label = instances[y, x]
+            if not (0 < label <= count and 0 < depth_m[y, x] < np.inf):
+                continue
+            row = label - 1
+            share = min(sizes[row], most)
+            # The n-th of `share` is the first pixel beyond n / share of the object.
+            if seen[row] * share >= taken[row] * sizes[row]:
+                place = ends[row] - share + taken[row]
+                pixels[place, 0], pixels[place, 1] = y, x
+                owners[place] = row
+                taken[row] += 1
+            seen[row] += 1
+    return pixels, owners
 
 
 def _contacts(

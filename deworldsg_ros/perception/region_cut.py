@@ -112,8 +112,7 @@ def _cut_box(  # type: ignore[no-untyped-def]
         return
     _reach_by_planes(members, distance, owner, area, lab, valid, point, normal, flatness, settings)
     _reach_by_borders(distance, owner, pairs, strength)
-    for r in members:
-        distance[r] = min(distance[r], settings.far)
+    distance = np.minimum(distance, settings.far)
     order = members[np.argsort(-distance[members], kind="mergesort")]
     free = 0.0
     for r in range(count):

@@ -108,7 +108,7 @@ class Perception:
     ) -> tuple[Detections, Counter[str]]:
         """Boxes cut to the image, best score first, at most `max_objects`."""
         boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
-        usable = ((boxes[:, 2:] - boxes[:, :2]) >= MIN_BOX_SIDE_PX).all(axis=1)
+        usable = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
         order = np.argsort(-found.scores, kind="stable")
         order = order[usable[order]]
         kept = order[: self._config.max_objects]

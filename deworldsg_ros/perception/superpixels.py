@@ -83,11 +83,12 @@ def reduce_frame(
     """The cells of a frame: mean colour, median depth, normals by plane gradients."""
     height, width = depth_m.shape[0] // stride, depth_m.shape[1] // stride
     middle = slice(stride // 2, None, stride)
-    mean = cv2.blur(rgb, (stride, stride))[middle, middle][:height, :width]
-    mean = np.ascontiguousarray(mean)
+    smooth = np.asarray(cv2.blur(rgb, (stride, stride)), dtype=np.uint8)
+    mean = np.ascontiguousarray(smooth[middle, middle][:height, :width])
     lab = cv2.cvtColor(mean, cv2.COLOR_RGB2Lab).astype(np.float32)
-    z = depth_m[middle, middle][:height, :width]
-    z = cv2.medianBlur(np.where((z > 0) & (z < MAX_DEPTH_M), z, np.float32(0)), 3)
+    sampled = depth_m[middle, middle][:height, :width]
+    valid = (sampled > 0) & (sampled < MAX_DEPTH_M)
+    z = cv2.medianBlur(np.where(valid, sampled, np.float32(0)), 3)
     columns = (np.arange(width) * stride + stride // 2 - intrinsics.cx) / intrinsics.fx
     rows = (np.arange(height) * stride + stride // 2 - intrinsics.cy) / intrinsics.fy
     points, normals = _geometry(
