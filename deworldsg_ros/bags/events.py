@@ -33,7 +33,10 @@ class Saved(msgspec.Struct, tag=True, frozen=True):
 
 
 class Finished(msgspec.Struct, tag=True, frozen=True):
-    """The end: counts, what each node told in /diagnostics, what the recording had lost."""
+    """The end: counts, what each node told in /diagnostics, what the recording had lost.
+
+    `poses` are T_world_camera of the lifted frames, 16 values each, row by row.
+    """
 
     published: int
     answered: int
@@ -42,6 +45,7 @@ class Finished(msgspec.Struct, tag=True, frozen=True):
     diagnostics: dict[str, dict[str, str]]
     drops: dict[str, int]
     losses: list[str]
+    poses: list[list[float]]
 
 
 Event = Union[Waiting, Started, Progress, Saved, Finished]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 from rich.console import Console
 
 from deworldsg_ros import __version__
@@ -27,6 +28,7 @@ from deworldsg_ros.cli.installation import find_shared, node_command
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
 from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -85,7 +87,10 @@ def run_demo(
         processes.append(replay)
         finished = _follow(replay, processes, frames, console)
     wall_s = time.perf_counter() - started_s
-    _report(out, name, kind, frames, finished, wall_s, console)
+    graph = outputs.read_graph(out)
+    poses = [np.array(values).reshape(4, 4) for values in finished.poses]
+    outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
+    _report(out, name, kind, frames, graph, finished, wall_s, console)
 
 
 def dds_environment() -> dict[str, str]:
@@ -273,12 +278,11 @@ def _report(
     name: str,
     kind: str,
     frames: int,
+    graph: wire.SceneGraphMessage,
     finished: events.Finished,
     wall_s: float,
     console: Console,
 ) -> None:
-    graph = outputs.read_graph(out)
-    outputs.show_graph(out, graph, console)
     drops = {"recording": finished.drops}
     objects: dict[str, int] = {}
     for node, values in sorted(finished.diagnostics.items()):

@@ -7,17 +7,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.up import UpEstimator
 
 GRAPH_FILE = "scene_graph.json"
 PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
 CONFIG_FILE = "config.yaml"
 REPORT_FILE = "run.json"
+# Rows of each printed table; the page shows everything.
+MOST_ROWS = 25
 
 
 def prepare_folder(out: Path, config: Config) -> None:
@@ -40,14 +45,34 @@ def read_graph(out: Path) -> wire.SceneGraphMessage:
 
 
 def show_graph(
-    out: Path, graph: wire.SceneGraphMessage, console: Console, cameras: Any = None
+    out: Path,
+    graph: wire.SceneGraphMessage,
+    console: Console,
+    T_world_cameras: Sequence[Float64],
+    world_up: str,
 ) -> None:
-    """Print the tables, draw the picture and write the page."""
+    """Print the tables, draw the picture and write the page.
+
+    Args:
+        out: folder of picture and page.
+        graph: with surface points.
+        console: for the tables.
+        T_world_cameras: poses (4, 4) of the frames that it was made of.
+        world_up: as configured: auto, z, y or -y.
+    """
+    # These load matplotlib and plotly, which takes a second.
     from deworldsg_ros.view import page, picture, table
 
-    table.print_graph(console, graph)
-    picture.draw(graph, out / PICTURE_FILE)
-    page.write(graph, out / PAGE_FILE)
+    up = UpEstimator(world_up)
+    for T_world_camera in T_world_cameras:
+        up.observe(T_world_camera)
+    path_world = np.array([T[:3, 3] for T in T_world_cameras], np.float64).reshape(-1, 3)
+    table.print_graph(console, graph, MOST_ROWS)
+    with console.status("drawing …"):
+        picture.draw(
+            graph, out / PICTURE_FILE, up_world=up.up_world(), camera_path_world=path_world
+        )
+        page.write(graph, out / PAGE_FILE, up_world=up.up_world(), camera_path_world=path_world)
 
 
 def write_report(out: Path, report: Mapping[str, Any]) -> None:

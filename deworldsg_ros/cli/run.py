@@ -20,6 +20,7 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 
 # The bar shows the number of nodes every so many frames: counting them costs something.
@@ -46,17 +47,18 @@ def run_recording(
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
         started_s = time.perf_counter()
-        processed, refused = _process(recording, pipeline, max_frames, console)
+        poses, refused = _process(recording, pipeline, max_frames, console)
         wall_s = time.perf_counter() - started_s
     finally:
         recording.close()
     drops = {"recording": dict(recording.drops), "pipeline": dict(refused)}
+    processed = len(poses)
     if not processed:
         outputs.print_drops(console, recording.losses, drops, recording.reasons)
         raise RecordingError(f"recording {path}: not one frame could be used")
     graph = pipeline.graph()
     outputs.write_graph(out, graph)
-    outputs.show_graph(out, graph, console)
+    outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
     report = {
         "program": f"deworldsg {__version__} run",
         "recording": recording.name,
@@ -80,8 +82,9 @@ def run_recording(
 
 def _process(
     recording: Recording, pipeline: Pipeline, max_frames: int, console: Console
-) -> tuple[int, Counter[str]]:
-    processed = 0
+) -> tuple[list[Float64], Counter[str]]:
+    """Poses (4, 4) of the frames that were processed, and refusals by reason."""
+    poses: list[Float64] = []
     refused: Counter[str] = Counter()
     total = min(recording.frame_count, max_frames or recording.frame_count)
     with frame_progress(console) as progress:
@@ -89,17 +92,17 @@ def _process(
         for frame in itertools.islice(recording.frames(), max_frames or None):
             try:
                 pipeline.process(frame)
-                processed += 1
+                poses.append(frame.T_world_camera)
             except RefusedInput as refusal:
                 refused[refusal.reason] += 1
                 recording.reasons.setdefault(refusal.reason, str(refusal))
             progress.advance(task)
-            if pipeline.builder is not None and processed % COUNT_EVERY == 0:
+            if pipeline.builder is not None and len(poses) % COUNT_EVERY == 0:
                 progress.update(task, note=f"{len(pipeline.builder.graph)} nodes")
         if pipeline.builder is not None:
             note = f"{len(pipeline.builder.graph)} nodes"
-            progress.update(task, note=note, total=processed + refused.total())
-    return processed, refused
+            progress.update(task, note=note, total=len(poses) + refused.total())
+    return poses, refused
 
 
 def _times_ms(times_s: dict[str, list[float]]) -> dict[str, Any]:

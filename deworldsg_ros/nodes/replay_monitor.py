@@ -47,10 +47,11 @@ EVIDENCE_QUIET_S = 3.0
 RECEIVED = re.compile(r"(\d+) in all")
 
 
-class _Stamped(msgspec.Struct):
-    """The part of a message that is read here."""
+class _LocalGraph(msgspec.Struct):
+    """The parts of a local graph that are read here."""
 
     stamp: wire.Stamp
+    T_world_camera: wire.Matrix4
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,14 @@ class PipelineMonitor:
     Attributes:
         window: frames published and answered.
         diagnostics: what each node told last, by its name.
+        poses: T_world_camera of the local graphs, 16 values each.
     """
 
     def __init__(self, node: Node, window: int) -> None:
         self._node = node
         self.window = Window(window)
         self.diagnostics: dict[str, dict[str, str]] = {}
+        self.poses: list[list[float]] = []
         self._local_graphs = self._evidence = 0
         self._refused_frames = 0
         self._complete_since_s: float | None = None
@@ -158,10 +161,11 @@ class PipelineMonitor:
         return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
 
     def _on_local(self, message: Any) -> None:
-        stamped = msgspec.json.decode(message.data, type=_Stamped)
+        local = msgspec.json.decode(message.data, type=_LocalGraph)
+        self.poses.append(local.T_world_camera)
         self._local_graphs += 1
         self._heard_s = None
-        self.window.answer(wire.ns_from_stamp(stamped.stamp))
+        self.window.answer(wire.ns_from_stamp(local.stamp))
 
     def _on_evidence(self, message: Any) -> None:
         self._evidence += 1

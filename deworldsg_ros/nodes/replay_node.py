@@ -242,6 +242,7 @@ class ReplayNode(Node):  # type: ignore[misc]
                 diagnostics=self._monitor.diagnostics,
                 drops=dict(self._source.drops),
                 losses=list(dict.fromkeys(self._source.losses)),
+                poses=self._monitor.poses,
             )
         )
         self.get_logger().info(f"done: {self._published} frames published")
