@@ -8,7 +8,8 @@ import pytest
 from rcl_interfaces.msg import ParameterDescriptor
 
 from deworldsg_ros import config as configuration
-from deworldsg_ros.bridge.parameters import NodeOptions, Parameters, descriptor, fields, resolve
+from deworldsg_ros.bridge.options import NodeOptions, Parameters
+from deworldsg_ros.bridge.parameters import descriptor, fields, resolve
 from deworldsg_ros.scene.errors import ConfigurationError
 
 FIELDS = {field.name: field for field in fields()}

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from nodes_bench import (
     CAMERA,
@@ -28,7 +28,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 
+from deworldsg_ros.bridge import inputs
 from deworldsg_ros.bridge.inputs import TFMessage
+from deworldsg_ros.bridge.node import StageNode
 from deworldsg_ros.bridge.qos import AutoSubscription, best_effort, reliable, source
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
@@ -197,3 +199,24 @@ def test_diagnostics_name_what_is_missing_and_what_is_wrong(other_camera: Bench)
     assert statuses[-1].level == DiagnosticStatus.WARN
     at.send(camera__pose=odometry(at.next_stamp(), "elsewhere"))
     at.expect(told("wrong_frame: pose is in frame 'elsewhere', expected 'odom'"), "what is wrong")
+
+
+def topics_of(node: StageNode) -> set[str]:
+    return {subscription.topic_name for subscription in node.subscriptions}
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_tf_stands_in_only_where_nobody_publishes_poses(
+    monkeypatch: pytest.MonkeyPatch, posed: bool
+) -> None:
+    # Only the topic matters here, and any message type will do.
+    monkeypatch.setattr(inputs, "TFMessage", TransformStamped)
+    monkeypatch.setattr(inputs, "TF_AFTER_S", 1.0)
+    camera = {topic: kind for topic, kind in CAMERA.items() if posed or topic != "camera/pose"}
+    at = Bench(SegmentationNode, camera)
+    try:
+        assert "/tf" not in topics_of(at.node)
+        at.peer.spin_for(2.0)
+        assert ({"/tf", "/tf_static"} <= topics_of(at.node)) == (not posed)
+    finally:
+        at.close()

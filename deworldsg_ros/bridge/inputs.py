@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -9,9 +10,9 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from deworldsg_ros.bridge.node import StageNode
+from deworldsg_ros.bridge.node import CHECK_PERIOD_S, StageNode
 from deworldsg_ros.bridge.poses import stamp_ns_of
-from deworldsg_ros.bridge.qos import Source, reliable, source
+from deworldsg_ros.bridge.qos import AutoSubscription, Source, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
 
 try:  # On a full installation of ROS, and not in its wheels.
@@ -24,6 +25,8 @@ Taker = Callable[[Any, int], None]
 # An image has to survive one look at a slow network; poses and transforms come faster.
 IMAGE_DEPTH = 10
 POSE_DEPTH = 100
+# How long poses are waited for before TF stands in for them.
+TF_AFTER_S = 3.0
 
 
 def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[Source]:
@@ -77,26 +80,47 @@ def listen_pose(node: StageNode, take: Taker, take_transforms: Callable[[Any, bo
             "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a full "
             "ROS 2 installation, or poses on camera/pose"
         )
-    if wanted in ("auto", "tf") and TFMessage is not None:
-        for topic, static in (("/tf", False), ("/tf_static", True)):
-            _listen_transforms(node, topic, static, take_transforms)
     if wanted == "tf":
+        _listen_transforms(node, take_transforms)
         return
     kinds = {"pose": [PoseStamped], "odometry": [Odometry], "auto": [PoseStamped, Odometry]}
     sources = [source("camera/pose", kind) for kind in kinds[wanted]]
     reliability = node.parameters.inputs.reliability
-    node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
+    poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
+    if wanted == "auto" and TFMessage is not None:
+        _fall_back_on_transforms(node, poses, take_transforms)
 
 
-def _listen_transforms(
-    node: StageNode, topic: str, static: bool, take: Callable[[Any, bool], None]
+def _fall_back_on_transforms(
+    node: StageNode, poses: AutoSubscription, take: Callable[[Any, bool], None]
 ) -> None:
-    def received(message: Any) -> None:
-        node.health.received(topic)
-        take(message, static)
+    """Listen to TF once nobody has offered poses for a while, and not before.
 
-    profile = reliable(POSE_DEPTH, latched=static)
-    node.create_subscription(TFMessage, topic, node.guarded(received), profile)
+    The two may be in different world frames: a graph must not begin in one and go on in the other.
+    """
+    started_s = time.monotonic()
+    listening = False
+
+    def look() -> None:
+        nonlocal listening
+        waited_s = time.monotonic() - started_s
+        if not listening and not poses.was_published and waited_s > TF_AFTER_S:
+            listening = True
+            node.get_logger().info(f"nobody publishes {poses.topic}: listening to /tf")
+            _listen_transforms(node, take)
+
+    node.every(CHECK_PERIOD_S, look)
+
+
+def _listen_transforms(node: StageNode, take: Callable[[Any, bool], None]) -> None:
+    for topic, static in (("/tf", False), ("/tf_static", True)):
+
+        def received(message: Any, topic: str = topic, static: bool = static) -> None:
+            node.health.received(topic)
+            take(message, static)
+
+        profile = reliable(POSE_DEPTH, latched=static)
+        node.create_subscription(TFMessage, topic, node.guarded(received), profile)
 
 
 def _stamped(take: Taker) -> Callable[[Any], None]:

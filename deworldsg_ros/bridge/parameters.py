@@ -6,47 +6,17 @@ import difflib
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-from deworldsg_ros.config import Config
+from deworldsg_ros.bridge.options import Parameters
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # Parameters that rclpy itself reads from the overrides.
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
 RCLPY_PREFIXES = ("qos_overrides.",)
-
-
-class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node runs, apart from what it computes."""
-
-    queue_size: Annotated[
-        int,
-        msgspec.Meta(
-            description="frames that may wait for this node's work; the oldest goes: overrun",
-            ge=1,
-            le=100000,
-        ),
-    ] = 10
-    patience_s: Annotated[
-        float,
-        msgspec.Meta(
-            description="longest time a frame waits for depth, camera_info or pose, seconds",
-            gt=0,
-            le=3600,
-        ),
-    ] = 5.0
-    save_path: Annotated[
-        str, msgspec.Meta(description="file that graph_node's service ~/save writes")
-    ] = "scene_graph.json"
-
-
-class Parameters(Config, frozen=True, forbid_unknown_fields=True):
-    """Everything that a node can be told: the configuration and how it runs."""
-
-    node: NodeOptions = NodeOptions()
 
 
 @dataclass(frozen=True)

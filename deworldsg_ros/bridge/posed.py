@@ -99,8 +99,11 @@ class PosedAssembler(Assembler[T, Out]):
 
     def add_transforms(self, message: Any, static: bool = False) -> None:
         """Keep the transforms of a TFMessage of /tf, or of /tf_static."""
+        # Many publishers share /tf, each with stamps of its own: going back means nothing here.
+        self._pose.heard()
         if not static:
-            self._hear_pose(max(map(stamp_ns_of, message.transforms), default=0))
+            stamps_ns = map(stamp_ns_of, message.transforms)
+            self._pose.newest_ns = max(self._pose.newest_ns or 0, *stamps_ns, 0)
         try:
             self._transforms.add(message, static=static)
         except RefusedInput as refusal:

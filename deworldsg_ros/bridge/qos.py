@@ -100,6 +100,9 @@ class AutoSubscription:
         callback: given each message.
         reliability: auto, reliable or best_effort.
         depth: messages that DDS keeps.
+
+    Attributes:
+        was_published: whether a publisher was ever there.
     """
 
     def __init__(
@@ -121,6 +124,7 @@ class AutoSubscription:
         self._depth = depth
         self._choice: Choice | None = None
         self._subscription: Any = None
+        self.was_published = False
         self.check()
 
     @property
@@ -132,6 +136,7 @@ class AutoSubscription:
     def check(self) -> bool:
         """Look at the publishers, subscribe anew where need be; True where it did."""
         offers = self._offers()
+        self.was_published = self.was_published or bool(offers)
         choice = choose(self._sources, offers, self._reliability)
         # When the publishers go, what they were is the best guess of what comes back.
         if choice == self._choice or (self._choice is not None and not offers):
