@@ -38,6 +38,8 @@ LONG_SIDE_IN, LEAST_SIDE_IN = 13.0, 7.0
 MARGIN_M = 0.35
 BACKGROUND, INK, FAINT = "#fbfaf7", "#2d3142", "#8d93a5"
 MOST_LABELS = 90
+# Objects seen in fewer frames are drawn paler.
+SURE_FROM = 3
 EDGES_A_NODE = 2.5
 POINTS_DRAWN = 30_000
 CURVATURE = 0.16
@@ -161,7 +163,7 @@ def _draw_ellipses(
         variances, directions = np.linalg.eigh(view.covariances[row])
         width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances[::-1], 1e-8))
         angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
-        sure = 1.0 if node.observations >= 3 else 0.45
+        sure = 1.0 if node.observations >= SURE_FROM else 0.45
         shape: dict[str, Any] = {"xy": view.means[row], "width": width, "height": height}
         fill, rim = colours[node.label], shade(colours[node.label], 0.8)
         zorder = 3 + order / (len(graph.nodes) + 1)
@@ -235,6 +237,13 @@ def _frame_px(axes: Axes) -> Float64:
     return np.array([extent.x0 + 4, extent.y0 + 4, extent.x1 - 4, extent.y1 - 4])
 
 
+def _label_style(node: wire.NodeState, label_count: int) -> dict[str, Any]:
+    """Objects that were hardly seen do not shout."""
+    if node.observations < SURE_FROM:
+        return {"fontsize": 7.0, "alpha": 0.75}
+    return {"fontsize": 9.0 if label_count <= 40 else 8.0, "fontweight": "bold"}
+
+
 def _draw_labels(
     axes: Axes, graph: wire.SceneGraphMessage, view: TopView, colours: dict[str, str]
 ) -> Placement:
@@ -242,13 +251,15 @@ def _draw_labels(
     rows = rows[:MOST_LABELS]
     if not rows:
         return Placement(np.zeros((0, 2)), np.zeros((0, 2)))
-    style: dict[str, Any] = {"fontsize": 9.0 if len(rows) <= 40 else 8.0, "fontweight": "bold"}
+    styles = [_label_style(graph.nodes[row], len(rows)) for row in rows]
     texts = [f"{graph.nodes[row].label} {graph.nodes[row].id}" for row in rows]
-    sizes = np.array([_text_size(axes, text, **style) for text in texts])
+    sizes = np.array([_text_size(axes, text, **style) for text, style in zip(texts, styles)])
     anchors = axes.transData.transform(view.means[rows])
     placed = place(anchors, sizes, _frame_px(axes))
     to_data = axes.transData.inverted()
-    for row, text, anchor, centre, box in zip(rows, texts, anchors, placed.centres, placed.boxes):
+    for row, text, style, anchor, centre, box in zip(
+        rows, texts, styles, anchors, placed.centres, placed.boxes
+    ):
         colour = shade(colours[graph.nodes[row].label], 0.62)
         near = nearest_on_box(anchor, box)
         if np.linalg.norm(near - anchor) > 14:
