@@ -16,6 +16,7 @@ from perception_support import (
     render,
 )
 
+from deworldsg_ros.perception.mask_upsampling import upsample_labels
 from deworldsg_ros.perception.rgbd_segmenter import RgbdSegmenter
 
 SEGMENTER = RgbdSegmenter()
@@ -142,3 +143,15 @@ def test_a_narrow_image():
         rgb[:100, :90], depth_m[:100, :90], INTRINSICS, np.array([[5.0, 5, 80, 90]])
     )
     assert patches[0].pixels.shape == (86, 76)
+
+
+def test_images_of_a_message_and_of_a_file_run_the_same_code():
+    rgb, depth_m, owner = render([TABLE_TOP], 0.002)
+    box = [box_of(owner == 1)]
+    compiled = len(upsample_labels.signatures)
+    (expected,) = segment(rgb, depth_m, box)
+    from_message = np.frombuffer(rgb.tobytes(), np.uint8).reshape(rgb.shape)
+    from_slice = np.repeat(depth_m, 2, axis=1)[:, ::2]
+    (found,) = segment(from_message, from_slice, box)
+    assert np.array_equal(found.pixels, expected.pixels)
+    assert len(upsample_labels.signatures) == compiled == 1

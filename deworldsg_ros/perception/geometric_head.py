@@ -79,6 +79,14 @@ class GeometricRelationHead:
     def __init__(self, predicates: tuple[str, ...]) -> None:
         self.predicates = predicates
         self._column = {name: column for column, name in enumerate(predicates)}
+        # The kernel is compiled now, and not when the first image waits.
+        measure_layout(
+            np.ones((4, 4), dtype=np.float32),
+            Intrinsics(4.0, 4.0, 2.0, 2.0, 4, 4),
+            np.ones((4, 4), dtype=np.uint16),
+            1,
+            np.array([0.0, -1.0, 0.0]),
+        )
 
     def relate(
         self,

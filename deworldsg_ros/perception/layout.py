@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.perception.arrays import read_only
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import Float64
 
@@ -66,7 +67,7 @@ def measure_layout(
         count: number of objects.
         up_camera: (3,) unit vector against gravity, camera frame.
     """
-    pixels, owners = _sample(depth_m, instances, count, POINTS_PER_OBJECT)
+    pixels, owners = _sample(read_only(depth_m), read_only(instances), count, POINTS_PER_OBJECT)
     v, u = pixels[:, 0], pixels[:, 1]
     z = depth_m[v, u].astype(np.float64)
     x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.perception.arrays import read_only
 from deworldsg_ros.perception.mask_upsampling import upsample_labels
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.region_cut import cut_boxes
@@ -19,6 +20,16 @@ TARGET_WIDTH = 213
 class RgbdSegmenter:
     """The visible surface of the object in each box, from colour and depth; all boxes jointly."""
 
+    def __init__(self) -> None:
+        # The kernels are compiled now, and not when the first image waits.
+        side = 24
+        self.segment(
+            np.zeros((side, side, 3), dtype=np.uint8),
+            np.ones((side, side), dtype=np.float32),
+            Intrinsics(side, side, side / 2, side / 2, side, side),
+            np.array([[4.0, 4.0, 16.0, 16.0]]),
+        )
+
     def segment(
         self,
         rgb: NDArray[np.uint8],
@@ -31,6 +42,7 @@ class RgbdSegmenter:
         del class_names  # The geometry decides.
         if len(boxes_xyxy) == 0:
             return []
+        rgb, depth_m = read_only(rgb), read_only(depth_m)
         height, width = depth_m.shape
         stride = max(1, round(width / TARGET_WIDTH))
         cells = reduce_frame(rgb, depth_m, intrinsics, stride)
