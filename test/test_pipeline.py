@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import msgspec
 import numpy as np
 import pytest
 
-from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.config import (
+    Config,
+    MergingConfig,
+    OutputConfig,
+    RelationsConfig,
+    load_config,
+)
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perceived
@@ -18,6 +27,9 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.replica import GraphReplica
 
+CONFIGURATIONS = Path(__file__).parents[1] / "config"
+# Every object is published as soon as it is seen, which makes for short tests.
+PAPER = load_config(CONFIGURATIONS / "paper.yaml")
 VOCABULARY = Vocabulary(("cup", "table", "chair"), ("on", "near", "under"))
 INTRINSICS = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
 # Box in the image, depth and class of each object; the cup is close to the table, the chair far.
@@ -64,7 +76,7 @@ def frame(index: int) -> RgbdFrame:
 def local_graph(index: int) -> LocalGraph:
     seen = frame(index)
     perceived = Scripted().perceive(seen)
-    return Lifting(Config().lifting).lift(
+    return Lifting(PAPER.lifting).lift(
         perceived.frame_graph,
         perceived.instances,
         seen.depth_m,
@@ -95,11 +107,11 @@ def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
 
 def test_no_graph_before_the_first_frame() -> None:
     with pytest.raises(RefusedInput, match="no frame was processed"):
-        Pipeline(Config(), Scripted()).graph()
+        Pipeline(PAPER, Scripted()).graph()
 
 
 def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
-    config = Config(relations=RelationsConfig(world_model="fake"))
+    config = msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake"))
     pipeline = Pipeline(config, Scripted(logits=(0.001, 0.0, 0.0)))
     for index in range(3):
         pipeline.process(frame(index))
@@ -117,8 +129,10 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
 
 
 def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
-    sure = Pipeline(Config(), Scripted())
-    asked = Pipeline(Config(relations=RelationsConfig(world_model="fake")), Scripted())
+    sure = Pipeline(PAPER, Scripted())
+    asked = Pipeline(
+        msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake")), Scripted()
+    )
     for index in range(3):
         sure.process(frame(index))
         asked.process(frame(index))
@@ -126,7 +140,7 @@ def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
 
 
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
-    config = Config(relations=RelationsConfig(world_model="fake"))
+    config = msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake"))
     pipeline = Pipeline(config, Scripted())
     late = GraphBuilder(config, VOCABULARY, "map")
     reasoner = RelationReasoner(config.relations, build_world_model(config.relations))
@@ -149,7 +163,7 @@ def test_evidence_that_comes_late_gives_the_same_graph() -> None:
 
 @pytest.mark.parametrize("points", [False, True])
 def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> None:
-    config = Config(output=OutputConfig(surface_points=points))
+    config = msgspec.structs.replace(PAPER, output=OutputConfig(surface_points=points))
     builder = GraphBuilder(config, VOCABULARY, "map")
     replica = GraphReplica()
     replica.reset(builder.snapshot())
@@ -167,7 +181,7 @@ def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> Non
 
 @pytest.mark.parametrize("index", [3, 2])
 def test_a_frame_that_is_not_newer_is_refused_and_changes_nothing(index: int) -> None:
-    builder = GraphBuilder(Config(), VOCABULARY, "map")
+    builder = GraphBuilder(PAPER, VOCABULARY, "map")
     builder.integrate(local_graph(3))
     before = builder.full()
     with pytest.raises(RefusedInput) as refused:
@@ -177,12 +191,12 @@ def test_a_frame_that_is_not_newer_is_refused_and_changes_nothing(index: int) ->
 
 
 def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
-    builder = GraphBuilder(Config(), VOCABULARY, "map")
-    evidence = RelationReasoner(Config().relations, None).observe(local_graph(0))
+    builder = GraphBuilder(PAPER, VOCABULARY, "map")
+    evidence = RelationReasoner(PAPER.relations, None).observe(local_graph(0))
     with pytest.raises(RefusedInput) as refused:
         builder.add_evidence(evidence)
     assert refused.value.reason == "unknown_frame"
-    other = GraphBuilder(Config(), Vocabulary(("cup",), ("on",)), "map")
+    other = GraphBuilder(PAPER, Vocabulary(("cup",), ("on",)), "map")
     with pytest.raises(RefusedInput) as refused:
         other.add_evidence(evidence)
     assert refused.value.reason == "vocabulary_mismatch"
@@ -203,3 +217,14 @@ def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
     asked.process(frame(1))
     assert len(pipeline.graph().nodes) == 3
     assert pipeline.graph().nodes == asked.graph().nodes
+
+
+def test_the_shipped_configurations_are_what_they_say() -> None:
+    assert load_config(CONFIGURATIONS / "robust.yaml") == Config()
+    robust, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
+    assert {
+        (section, field)
+        for section in robust
+        for field, value in robust[section].items()
+        if paper[section][field] != value
+    } == {("merging", "association")}
