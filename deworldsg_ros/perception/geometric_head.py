@@ -30,7 +30,7 @@ ABOVE_MAX_M, ABOVE_TOLERANCE_M = 1.2, 0.2
 NEAR_FURNITURE_M, NEAR_SMALL_M = 0.5, 0.10
 AGAINST_M = 0.05
 LEVEL_M = 0.06
-# What one hand lifts; larger is furniture.
+# Larger than what one hand lifts is furniture.
 FURNITURE_M = 0.45
 
 CONTAINERS = frozenset(
@@ -52,6 +52,17 @@ CONTAINERS = frozenset(
 )
 TABLES = frozenset({"table", "dining table", "desk", "counter", "bench"})
 SEATS = frozenset({"chair", "couch", "seat", "sofa", "stool"})
+# Furniture however little of it is seen.
+FURNITURE = (
+    TABLES
+    | SEATS
+    | frozenset(
+        [
+            "bathtub", "bed", "bookshelf", "cabinet", "curtain", "door", "oven", "refridgerator",
+            "refrigerator", "screen", "shelf", "sink", "stand", "toilet", "tv", "window",
+        ]
+    )
+)  # fmt: skip
 PLANTS = frozenset({"plant", "potted plant", "flower"})
 # Subject, objects it is fixed to: no surface of the pair shows it.
 FIXED_TO = {
@@ -135,10 +146,10 @@ def judge(layout: Layout, class_names: list[str]) -> dict[str, Float64]:
     """Logits (n, n) by predicate name, of both predicate sets."""
     size = layout.high - layout.low
     width = np.maximum(size[:, :2].max(axis=1), 1e-3)
-    is_furniture = size.max(axis=1) > FURNITURE_M
+    kind = _Kinds(class_names)
+    is_furniture = (size.max(axis=1) > FURNITURE_M) | kind.of(FURNITURE)
     both_furniture = is_furniture[:, None] & is_furniture[None, :]
     both_small = ~is_furniture[:, None] & ~is_furniture[None, :]
-    kind = _Kinds(class_names)
 
     touches = (CONTACT_M - layout.contact_m) / CONTACT_TOLERANCE_M
     # What rests on something is smaller than it and has its middle over it.
