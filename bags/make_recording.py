@@ -109,7 +109,7 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--name", default="demo_room")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--rays", type=int, default=96, help="gather rays a vertex for the light")
-    parser.add_argument("--jpeg-quality", type=int, default=80)
+    parser.add_argument("--jpeg-quality", type=int, default=75)
     parser.add_argument("--jobs", type=int, default=2, help="processes that render frames")
     parser.add_argument("--only", help="frames to render as pictures instead, e.g. 0,60,120")
     parser.add_argument("--pictures", type=Path, help="folder for PNG pictures of the frames")

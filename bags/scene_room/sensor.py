@@ -19,15 +19,15 @@ class DepthNoise:
     the matching window makes it; disparity in steps of ``disparity_step_px`` for ``baseline_m``.
     """
 
-    sigma_base_m: float = 0.0010
-    sigma_quadratic: float = 0.0016
-    correlation_px: float = 2.8
+    sigma_base_m: float = 0.0008
+    sigma_quadratic: float = 0.0013
+    correlation_px: float = 3.2
     white_share: float = 0.0
     baseline_m: float = 0.075
     disparity_step_px: float = 0.125
-    edge_jitter_px: float = 0.6
-    flying_share: float = 0.30
-    edge_hole_share: float = 0.30
+    edge_jitter_px: float = 0.4
+    flying_share: float = 0.22
+    edge_hole_share: float = 0.22
     min_cos_incidence: float = 0.20
     min_depth_m: float = 0.40
     max_depth_m: float = 4.6
@@ -44,7 +44,7 @@ def sense_depth(
     depth = frame.depth_m
     height, width = depth.shape
     jitter = [
-        cv2.GaussianBlur(rng.normal(size=depth.shape).astype(np.float32), (0, 0), 1.6)
+        cv2.GaussianBlur(rng.normal(size=depth.shape).astype(np.float32), (0, 0), 2.0)
         for _ in range(2)
     ]
     jitter = [noise.edge_jitter_px * j / j.std() for j in jitter]
@@ -57,7 +57,7 @@ def sense_depth(
     near = cv2.erode(filled, np.ones((3, 3)))
     far = cv2.dilate(np.where(sampled > 0, sampled, 0).astype(np.float32), np.ones((3, 3)))
     edge = (far - near) > np.maximum(0.03, 0.03 * near)
-    draw = _patches(rng, depth.shape, 0.9)
+    draw = _patches(rng, depth.shape, 1.4)
     share = rng.random(depth.shape) ** 1.5
     flying = edge & (draw < noise.flying_share)
     z = np.where(flying, near + share * (far - near), sampled)
