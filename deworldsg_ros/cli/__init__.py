@@ -1,5 +1,5 @@
 """The command line: `deworldsg`."""
 
-from deworldsg_ros.cli.main import main
+from deworldsg_ros.cli.app import main
 
 __all__ = ["main"]

@@ -34,8 +34,10 @@ from deworldsg_ros.scene.errors import DeWorldSGError
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 REPLAY = "replay_node"
 SHIPPED = ("bags/demo_room.mcap", "bags/demo_room")
-# Loading models and compiling kernels for the first time takes its time on a small machine.
-READY_S = 180.0
+# Loading models and compiling kernels for the first time takes minutes on a small machine.
+READY_S = 900.0
+# Before it has taken so long, nothing is said of it.
+EXPLAIN_AFTER_S = 8.0
 STALL_S = 30.0
 POLL_S = 0.2
 
@@ -192,6 +194,7 @@ def _follow(
     task = progress.add_task("replaying", total=frames, start=False, note="")
     finished: events.Finished | None = None
     saved: events.Saved | None = None
+    started_s = time.monotonic()
     try:
         while finished is None:
             _check(processes)
@@ -205,7 +208,7 @@ def _follow(
                 raise DemoFailed(_died(replay))
             event = _event(line)
             if isinstance(event, events.Waiting):
-                status.update(_waiting_text(event))
+                status.update(_waiting_text(event, time.monotonic() - started_s))
             elif isinstance(event, events.Started):
                 status.stop()
                 progress.start_task(task)
@@ -237,9 +240,11 @@ def _event(line: bytes) -> events.Event | None:
         return None  # something else that was printed
 
 
-def _waiting_text(event: events.Waiting) -> str:
-    more = f" (and {len(event.missing) - 1} more)" if len(event.missing) > 1 else ""
-    return f"starting the four nodes … waiting for {event.missing[0]}{more}"
+def _waiting_text(event: events.Waiting, since_s: float) -> str:
+    text = f"starting the four nodes … waiting for {event.missing[0]}"
+    if since_s > EXPLAIN_AFTER_S:
+        text += "\n  (the first start compiles the kernels, which takes a minute or two)"
+    return text
 
 
 def _check(processes: list[LoggedProcess]) -> None:

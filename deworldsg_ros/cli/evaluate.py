@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 from rich.console import Console
+from rich.markup import escape
+
+if TYPE_CHECKING:
+    from deworldsg_ros.datasets.annotations import Annotations
+    from deworldsg_ros.evaluation.protocol import ProtocolOptions
+    from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask
+
+EXIT_NOTHING_DONE = 1
 
 
 def evaluate(
@@ -18,6 +26,49 @@ def evaluate(
         Optional[Path],
         typer.Option("--predictions", help="predictions of a method, .json or official .pkl"),
     ] = None,
+    front_end: Annotated[
+        Optional[str],
+        typer.Option(
+            "--front-end",
+            help="run the pipeline on detections from: backend, recorded or ground-truth",
+        ),
+    ] = None,
+    flip: Annotated[
+        float, typer.Option("--flip", help="share of labels that are wrong; recorded: 0 or 0.1")
+    ] = 0.0,
+    miss: Annotated[
+        float, typer.Option("--miss", help="ground-truth: share of detections that are missing")
+    ] = 0.0,
+    jitter: Annotated[
+        float, typer.Option("--jitter", help="ground-truth: deviation of box edges, pixels")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", help="ground-truth: seed of the faults")] = 0,
+    config: Annotated[
+        Optional[Path],
+        typer.Option("--config", help="parameter file; without one config/robust.yaml"),
+    ] = None,
+    settings: Annotated[
+        Optional[list[str]],
+        typer.Option(
+            "--set", metavar="SECTION.FIELD=VALUE", help="one value of it; may be repeated"
+        ),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", help="folder of each scan's graph, and of tables and plots")
+    ] = Path("evaluation_out"),
+    scans: Annotated[
+        Optional[list[str]],
+        typer.Option("--scan", help="this scan rather than the whole split; may be repeated"),
+    ] = None,
+    depth_source: Annotated[
+        str, typer.Option("--depth-source", help="3rscan: rendered or sensor; auto = rendered")
+    ] = "auto",
+    max_frames: Annotated[
+        int, typer.Option("--max-frames", min=0, help="stop after so many frames; 0 = take all")
+    ] = 0,
+    checkpoints: Annotated[
+        int, typer.Option("--checkpoints", min=0, help="measure so many times on the way")
+    ] = 0,
     split: Annotated[str, typer.Option("--split", help="train, validation or test")] = "test",
     skip_no_rel_objects: Annotated[
         bool, typer.Option("--skip-no-rel-objects", help="only objects that occur in relations")
@@ -33,29 +84,114 @@ def evaluate(
         Optional[Path], typer.Option("--json", help="write every number by name to this file")
     ] = None,
 ) -> None:
-    """Measure scene graphs against annotations with the official protocol."""
-    from deworldsg_ros.datasets.annotations import Annotations
-    from deworldsg_ros.evaluation import report, tables
-    from deworldsg_ros.evaluation.errors import EvaluationError
-    from deworldsg_ros.evaluation.predictions import read_predictions
-    from deworldsg_ros.evaluation.protocol import ProtocolOptions, evaluate_predictions
+    """Measure scene graphs against annotations with the official protocol.
 
+    Either of --predictions FILE (of any method) or --front-end KIND (run the pipeline first).
+    """
+    from deworldsg_ros.cli.configuration import effective_config
+    from deworldsg_ros.datasets.annotations import Annotations
+    from deworldsg_ros.datasets.dataset import DatasetOptions
+    from deworldsg_ros.evaluation import report
+    from deworldsg_ros.evaluation.errors import EvaluationError
+    from deworldsg_ros.evaluation.front_ends import FrontEndChoice
+    from deworldsg_ros.evaluation.protocol import ProtocolOptions
+    from deworldsg_ros.evaluation.runner import ScanTask
+
+    if (predictions is None) == (front_end is None):
+        raise EvaluationError("give one of --predictions FILE and --front-end KIND")
+    if depth_source not in ("auto", "rendered", "sensor"):
+        raise EvaluationError(f"--depth-source {depth_source}: wanted auto, rendered or sensor")
     console = Console()
     options = ProtocolOptions(split, skip_no_rel_objects, overlap_threshold, aligned_ply)
     annotations = Annotations(dataset, layout)
-    if predictions is None:
-        raise EvaluationError("nothing to evaluate: give --predictions FILE")
-    result = evaluate_predictions(annotations, read_predictions(predictions), options)
-    title = f"{predictions.name} on {dataset.resolve().name}, {split}"
-    tables.print_protocol(console, result, title)
     values: dict[str, Any] = {
         "dataset": dataset.resolve().name,
         "layout": layout,
         "split": split,
         "skip_no_rel_objects": skip_no_rel_objects,
         "overlap_threshold_m": overlap_threshold,
-        **report.protocol_values(result),
     }
+    if predictions is not None:
+        values["predictions"] = predictions.name
+        values |= _evaluate_predictions(annotations, predictions, options, console)
+    else:
+        choice = FrontEndChoice(front_end, flip, miss, jitter, seed)  # type: ignore[arg-type]
+        values["front_end"] = choice.describe()
+        tasks = [
+            ScanTask(
+                root=dataset,
+                layout=layout,
+                scan=scan,
+                out=out,
+                config=effective_config(config, settings),
+                front_end=choice,
+                options=options,
+                dataset=DatasetOptions(depth_source=depth_source),  # type: ignore[arg-type]
+                max_frames=max_frames,
+                checkpoints=checkpoints,
+            )
+            for scan in scans or annotations.scans(split)
+        ]
+        values |= _evaluate_runs(annotations, tasks, console)
     if json_file is not None:
         report.write_json(json_file, values)
         console.print(f"numbers in {json_file}", highlight=False, soft_wrap=True)
+
+
+def _evaluate_predictions(
+    annotations: Annotations, path: Path, options: ProtocolOptions, console: Console
+) -> dict[str, Any]:
+    from deworldsg_ros.evaluation import measures, report, tables
+    from deworldsg_ros.evaluation.predictions import read_predictions
+    from deworldsg_ros.evaluation.protocol import evaluate_predictions
+
+    predictions = read_predictions(path)
+    result = evaluate_predictions(annotations, predictions, options)
+    tables.print_protocol(
+        console, result, f"{path.name} on {annotations.root.resolve().name}, {options.split}"
+    )
+    measured = {}
+    for scan in dict.fromkeys(item.scan for item in result.scans):
+        if scan in predictions:
+            points = annotations.points(scan, aligned=options.aligned_ply)
+            reference = measures.read_reference(annotations, scan, points)
+            measured[scan] = measures.measure_prediction(
+                predictions[scan], annotations.vocabulary, reference
+            )
+    pooled = measures.pool(measured.values())
+    tables.print_measures(console, {**measured, "all": pooled})
+    return {**report.protocol_values(result), "measures": pooled.numbers()}
+
+
+def _evaluate_runs(
+    annotations: Annotations, tasks: list[ScanTask], console: Console
+) -> dict[str, Any]:
+    from deworldsg_ros.evaluation import measures, protocol, report, tables
+    from deworldsg_ros.evaluation.runner import evaluate_scan
+    from deworldsg_ros.scene.errors import DeWorldSGError
+
+    outcomes: list[ScanOutcome] = []
+    failures: dict[str, str] = {}
+    for number, task in enumerate(tasks, start=1):
+        with console.status(f"scan {number} of {len(tasks)}: {task.scan} …"):
+            try:
+                outcomes.append(evaluate_scan(task))
+            except DeWorldSGError as error:
+                failures[task.scan] = str(error)
+    for scan, reason in failures.items():
+        console.print(f"[red]failed:[/] {scan}: {escape(reason)}", highlight=False, soft_wrap=True)
+    if not outcomes:
+        raise typer.Exit(EXIT_NOTHING_DONE)
+    result = protocol.pool([outcome.result for outcome in outcomes], annotations.vocabulary)
+    name = tasks[0].front_end.describe()
+    tables.print_protocol(console, result, f"{name} on {annotations.root.resolve().name}")
+    pooled = measures.pool(outcome.measures for outcome in outcomes)
+    tables.print_measures(
+        console, {**{outcome.scan: outcome.measures for outcome in outcomes}, "all": pooled}
+    )
+    return {
+        **report.protocol_values(result),
+        "measures": pooled.numbers(),
+        "scans": [report.outcome_values(outcome) for outcome in outcomes],
+        "failed": failures,
+    }

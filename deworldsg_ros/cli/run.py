@@ -25,6 +25,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 
 # The bar shows the number of nodes every so many frames: counting them costs something.
 COUNT_EVERY = 5
+LOADING = "loading the models … (the first time kernels are compiled, which takes a minute or two)"
 
 
 def run_recording(
@@ -43,7 +44,7 @@ def run_recording(
     recording = open_recording(path, config.inputs, topics=topics, options=options)
     try:
         outputs.prepare_folder(out, config)
-        with console.status("loading the models …"):
+        with console.status(LOADING):
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
         started_s = time.perf_counter()

@@ -44,6 +44,8 @@ BETWEEN = {
 SETTLE_S = 1.0
 # How long evidence may lag behind the last local graph before it is taken to be all.
 EVIDENCE_QUIET_S = 3.0
+# How long the first answer of all may take.
+FIRST_ANSWER_S = 300.0
 RECEIVED = re.compile(r"(\d+) in all")
 
 
@@ -124,6 +126,9 @@ class PipelineMonitor:
 
     def give_up_after(self, stall_s: float, now_s: float) -> None:
         """Stop waiting for frames in flight where nobody has answered for so long."""
+        if not self.window.answered:
+            # Kernels may still be compiled for the first frame.
+            stall_s = max(stall_s, FIRST_ANSWER_S)
         if self.silent_for(now_s) > stall_s:
             self._node.get_logger().warning(
                 f"no local graph for {stall_s:g} s: {self.window.in_flight} frames are given up"

@@ -168,7 +168,11 @@ def demo(
 @app.command()
 def convert(
     kind: Annotated[
-        str, typer.Argument(metavar="FORMAT", help="7scenes, tum, rosbag2, or auto = by looking")
+        str,
+        typer.Argument(
+            metavar="FORMAT",
+            help="name of a data set (7scenes, tum, …), rosbag2, or auto = by looking",
+        ),
     ],
     source: Annotated[Path, typer.Argument(metavar="SRC", help="folder or bag")],
     output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="file to write")],

@@ -1,0 +1,111 @@
+"""Processes of the demo: logs, exit codes, and that they end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from deworldsg_ros.cli import processes
+from deworldsg_ros.cli.demo import dds_environment
+from deworldsg_ros.cli.installation import find_shared, node_command
+from deworldsg_ros.cli.processes import LoggedProcess, end_all
+
+GENTLE = """
+import signal, sys, time
+signal.signal(signal.SIGINT, lambda *_: sys.exit(0))
+print("ready", flush=True)
+time.sleep(60)
+"""
+STUBBORN = """
+import signal, time
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def start(tmp_path, name, code, **options):
+    command = [sys.executable, "-c", code]
+    return LoggedProcess(name, command, os.environ, tmp_path / f"{name}.log", **options)
+
+
+def wait_for_log(process, text):
+    end_s = time.monotonic() + 20
+    while text not in process.log.read_text():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
+
+
+def test_nothing_to_end():
+    assert end_all([]) == {}
+
+
+def test_int_is_enough_for_the_gentle_and_kill_for_the_stubborn(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        processes,
+        "GRACE_S",
+        ((signal.SIGINT, 5.0), (signal.SIGTERM, 0.3), (signal.SIGKILL, 5.0)),
+    )
+    gentle = start(tmp_path, "gentle", GENTLE)
+    wait_for_log(gentle, "ready")
+    assert gentle.exit_code is None
+    assert end_all([gentle]) == {"gentle": 0}
+    monkeypatch.setattr(
+        processes,
+        "GRACE_S",
+        ((signal.SIGINT, 0.3), (signal.SIGTERM, 0.3), (signal.SIGKILL, 5.0)),
+    )
+    stubborn = start(tmp_path, "stubborn", STUBBORN)
+    wait_for_log(stubborn, "ready")
+    ended = start(tmp_path, "ended", "import sys; sys.exit(3)")
+    assert ended.wait(20) == 3
+    assert end_all([stubborn, ended]) == {"stubborn": -signal.SIGKILL, "ended": 3}
+
+
+def test_the_log_holds_both_outputs_and_its_end_is_told(tmp_path):
+    code = "import sys; [print(i, file=sys.stderr) for i in range(100)]; print('out')"
+    process = start(tmp_path, "talker", code)
+    assert process.wait(20) == 0
+    assert process.last_lines(3).splitlines()[-1] in ("out", "99")
+    assert len(process.last_lines(3).splitlines()) == 3
+
+
+def test_output_that_is_read_stays_out_of_the_log(tmp_path):
+    process = start(tmp_path, "teller", "print('hello')", read_output=True)
+    assert process.output.read() == b"hello\n"
+    assert process.wait(20) == 0
+    assert process.log.read_text() == ""
+
+
+def test_a_terminal_s_ctrl_c_does_not_reach_it(tmp_path):
+    process = start(tmp_path, "apart", GENTLE)
+    wait_for_log(process, "ready")
+    assert os.getpgid(process._process.pid) != os.getpgid(0)
+    end_all([process])
+
+
+def test_files_of_the_package_are_found():
+    assert find_shared("config/robust.yaml").is_file()
+    assert find_shared("config/fastdds.xml").is_file()
+    assert find_shared("config/no_such_file.yaml") is None
+    assert node_command("graph_node")[-1].endswith("graph_node")
+
+
+@pytest.mark.parametrize("given", [{}, {"ROS_DOMAIN_ID": "77"}])
+def test_the_demo_has_a_domain_of_its_own_unless_one_is_set(monkeypatch, given):
+    monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    environment = dds_environment()
+    domain = int(environment["ROS_DOMAIN_ID"])
+    assert domain == int(given.get("ROS_DOMAIN_ID", domain))
+    assert 1 <= domain <= 101
+    assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
+    assert environment["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
