@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import cv2
 import numpy as np
@@ -28,10 +28,13 @@ class DatasetOptions:
     Attributes:
         rate_hz: frames a second; 0 = as the data set has it.
         intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = as the data set has them.
+        depth_source: ``rendered`` from the mesh or from the ``sensor``, where a data set has both;
+            ``auto`` = what the compared numbers use.
     """
 
     rate_hz: float = 0.0
     intrinsics: tuple[float, float, float, float] | None = None
+    depth_source: Literal["auto", "rendered", "sensor"] = "auto"
 
 
 class Dataset(ABC):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import importlib
 import pkgutil
+from inspect import isabstract
 from pathlib import Path
 
 from deworldsg_ros.bags.errors import RecordingError
@@ -21,7 +22,7 @@ def _datasets() -> dict[str, type[Dataset]]:
     for module in pkgutil.iter_modules(package.__path__):
         content = vars(importlib.import_module(f"{package.__name__}.{module.name}"))
         for item in content.values():
-            if isinstance(item, type) and issubclass(item, Dataset) and item is not Dataset:
+            if isinstance(item, type) and issubclass(item, Dataset) and not isabstract(item):
                 found[item.kind] = item
     return dict(sorted(found.items()))
 

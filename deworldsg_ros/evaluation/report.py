@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from deworldsg_ros.evaluation.protocol import Count, ProtocolResult, ScanResult
+from deworldsg_ros.evaluation.runner import ScanOutcome
 
 
 def protocol_values(result: ProtocolResult) -> dict[str, Any]:
@@ -40,6 +42,20 @@ def scan_values(scan: ScanResult) -> dict[str, Any]:
         "relationships": _ranks_values(scan.relationship_ranks),
         "predictions": len(scan.matching.supports),
         "void_predictions": sum(support is None for support in scan.matching.supports),
+    }
+
+
+def outcome_values(outcome: ScanOutcome) -> dict[str, Any]:
+    """Plain values of one scan's run: what it cost, what was dropped, how it became right."""
+    return {
+        **scan_values(outcome.result),
+        "frames": outcome.frames,
+        "nodes": outcome.nodes,
+        "edges": outcome.edges,
+        "times_ms": outcome.times_ms,
+        "drops": outcome.drops,
+        "measures": outcome.measures.numbers(),
+        "over_time": [asdict(item) for item in outcome.over_time],
     }
 
 

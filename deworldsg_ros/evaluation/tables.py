@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from rich.console import Console
 from rich.table import Table
 
+from deworldsg_ros.evaluation.measures import Measures
 from deworldsg_ros.evaluation.protocol import Count, ProtocolResult
 
 
@@ -33,6 +34,36 @@ def print_protocol(console: Console, result: ProtocolResult, title: str) -> None
     _print_classes(console, "predicates", result.predicate_classes)
     for note in dict.fromkeys(result.notes):
         console.print(f"[yellow]note:[/] {note}", highlight=False, soft_wrap=True)
+
+
+def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
+    """What recall leaves out, a line a scan (or method)."""
+    table = Table(title="beside recall")
+    columns = (
+        ("objects", "objects", 0),
+        ("nodes", "nodes", 0),
+        ("found", "found", 0),
+        ("duplicates", "duplicates", 0),
+        ("wrong class", "wrong_class", 0),
+        ("stray", "stray", 0),
+        ("precision, %", "node_precision", 100),
+        ("F1, %", "f1", 100),
+        ("centroid, cm", "centroid_error_main_median_m", 100),
+        ("extent, cm", "extent_error_median_m", 100),
+        ("edge precision, %", "edge_precision", 100),
+        ("edge ECE, %", "edge_calibration_error", 100),
+    )
+    table.add_column("")
+    for heading, _, _ in columns:
+        table.add_column(heading, justify="right")
+    for name, item in measures.items():
+        numbers = item.numbers()
+        cells = [
+            percent(numbers[key] * factor / 100) if factor else f"{numbers[key]:.0f}"
+            for _, key, factor in columns
+        ]
+        table.add_row(name, *cells)
+    console.print(table)
 
 
 def _print_classes(console: Console, title: str, counts: Mapping[str, Count]) -> None:

@@ -1,0 +1,8 @@
+"""Stage a from something else than a network: recorded, or from ground truth.
+
+Each is a `pipeline.Perceiver`, so that lifting and merging are compared on identical input.
+"""
+
+from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+
+__all__ = ["FrontEndChoice", "build_front_end"]

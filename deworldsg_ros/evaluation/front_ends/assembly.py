@@ -1,0 +1,117 @@
+"""Detections put together into what stage a hands on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Vocabulary
+
+# Probabilities are kept this far from 0 and 1 before they become logits.
+LOGIT_MARGIN = 1e-6
+
+
+@dataclass(frozen=True)
+class Detection:
+    """One object in the image, before selection.
+
+    Attributes:
+        box_xyxy: (4,) pixels.
+        class_probabilities: (C,) float64, sums to one.
+        score: the detector's.
+        instance: its value in the frame's instance image.
+    """
+
+    box_xyxy: Float64
+    class_probabilities: Float64
+    score: float
+    instance: int
+
+
+@dataclass(frozen=True)
+class Relation:
+    """One relation between two detections, by their place.
+
+    Attributes:
+        probabilities: (R,) float64 of every predicate.
+    """
+
+    subject: int
+    object: int
+    score: float
+    probabilities: Float64
+
+
+def logits(probabilities: Float64) -> Float64:
+    """log(p / (1 - p)) of each, with p kept `LOGIT_MARGIN` away from 0 and 1."""
+    inside = np.clip(probabilities, LOGIT_MARGIN, 1.0 - LOGIT_MARGIN)
+    return np.asarray(np.log(inside / (1.0 - inside)))
+
+
+def spread(stated: Mapping[int, float], count: int) -> Float64:
+    """Distribution (count,) with stated probabilities; what they leave is spread evenly."""
+    others = count - len(stated)
+    left = max(0.0, 1.0 - sum(stated.values()))
+    distribution = np.full(count, left / others if others else 0.0)
+    for place, probability in stated.items():
+        distribution[place] = probability
+    return np.asarray(distribution / distribution.sum())
+
+
+def assemble(
+    frame: RgbdFrame,
+    vocabulary: Vocabulary,
+    detections: Sequence[Detection],
+    relations: Sequence[Relation],
+    instance_image: NDArray[np.uint16],
+    top_relations: int,
+) -> Perceived:
+    """A frame graph and its label image.
+
+    A mask is the pixels of the instance image with the object's value, cut to the box. Detections
+    are ordered by score, and of the relations the best `top_relations` are kept.
+    """
+    order = sorted(range(len(detections)), key=lambda place: -detections[place].score)
+    row_of = {place: row for row, place in enumerate(order)}
+    chosen = [detections[place] for place in order]
+    width, height = frame.intrinsics.width, frame.intrinsics.height
+    boxes = np.array([item.box_xyxy for item in chosen], np.float64).reshape(-1, 4)
+    boxes = np.clip(boxes, 0.0, [width - 1.0, height - 1.0] * 2)
+    classes = np.array([item.class_probabilities for item in chosen], np.float64)
+    classes = classes.reshape(-1, len(vocabulary.classes))
+    scores = np.array([item.score for item in chosen], np.float64)
+    masks = [_cut(instance_image, item.instance, box) for item, box in zip(chosen, boxes)]
+    kept = sorted(relations, key=lambda item: -item.score)[:top_relations]
+    pairs = [(row_of[item.subject], row_of[item.object]) for item in kept]
+    predicates = np.array([item.probabilities for item in kept], np.float64)
+    graph = FrameGraph(
+        stamp_ns=frame.stamp_ns,
+        frame_id="camera_rgb_optical_frame",
+        width=width,
+        height=height,
+        vocabulary=vocabulary,
+        boxes_xyxy=boxes,
+        class_probabilities=classes,
+        scores=scores,
+        relations=Relations(
+            np.array(pairs, np.int64).reshape(-1, 2),
+            logits(predicates.reshape(-1, len(vocabulary.predicates))),
+            np.array([item.score for item in kept], np.float64),
+        ),
+    )
+    instances = label_image(masks, classes.argmax(axis=1), scores, (height, width))
+    empty = sum(not mask.pixels.any() for mask in masks)
+    return Perceived(graph, instances, {"empty_mask": empty} if empty else {})
+
+
+def _cut(instance_image: NDArray[np.uint16], value: int, box_xyxy: Float64) -> MaskPatch:
+    left, top, right, bottom = np.rint(box_xyxy).astype(int).tolist()
+    patch = instance_image[top : bottom + 1, left : right + 1]
+    return MaskPatch(top, left, patch == value)

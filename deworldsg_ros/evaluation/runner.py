@@ -1,0 +1,219 @@
+"""One scan of a data set through the pipeline and against its annotations.
+
+`evaluate_scan` is a pure function of a picklable task, so that scans can be mapped over processes
+or a cluster. Its only effect is the folder of its results.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from deworldsg_ros.bags.recording import Recording, open_source
+from deworldsg_ros.config import Config, to_yaml
+from deworldsg_ros.datasets.annotations import Annotations
+from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.datasets.sequence import SequenceDataset
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
+from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
+from deworldsg_ros.evaluation.scene_graphs import to_prediction
+from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.errors import RefusedInput
+
+GRAPH_FILE = "scene_graph.json"
+CONFIG_FILE = "config.yaml"
+
+
+@dataclass(frozen=True)
+class ScanTask:
+    """What `evaluate_scan` needs to know.
+
+    Attributes:
+        root: folder of the data set.
+        layout: ``replica`` or ``3rscan``.
+        scan: id of the scan.
+        out: folder of all results; the scan's own is below it.
+        config: of the pipeline.
+        front_end: where detections come from.
+        options: of the protocol.
+        dataset: of the data set folder.
+        max_frames: stop after so many; 0 = take all.
+        checkpoints: how many times, evenly over the frames, the graph so far is measured.
+    """
+
+    root: Path
+    layout: str
+    scan: str
+    out: Path
+    config: Config
+    front_end: FrontEndChoice
+    options: ProtocolOptions
+    dataset: DatasetOptions = DatasetOptions()
+    max_frames: int = 0
+    checkpoints: int = 0
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Right items after so many frames."""
+
+    frames: int
+    stamp_s: float
+    nodes: int
+    object_recall: float
+    predicate_recall: float
+    relationship_recall: float
+
+
+@dataclass(frozen=True)
+class ScanOutcome:
+    """What became of a scan.
+
+    Attributes:
+        scan: its id.
+        result: the protocol's items.
+        measures: what the protocol leaves out.
+        frames: processed.
+        nodes, edges: of the graph.
+        times_ms: median milliseconds of each stage.
+        drops: frames and objects left out, by reason.
+        over_time: the graph as it became right.
+        graph_path: the graph.
+    """
+
+    scan: str
+    result: ScanResult
+    measures: Measures
+    frames: int
+    nodes: int
+    edges: int
+    times_ms: dict[str, float]
+    drops: dict[str, int]
+    over_time: list[Checkpoint] = field(default_factory=list)
+    graph_path: Path | None = None
+
+
+def evaluate_scan(task: ScanTask) -> ScanOutcome:
+    """Run one scan and measure its graph; the graph is left in ``out/SCAN/scene_graph.json``.
+
+    Raises:
+        DeWorldSGError: where the scan cannot be read or evaluated.
+    """
+    annotations = Annotations(task.root, task.layout)
+    annotation = annotations.scan(task.scan)
+    points = annotations.points(task.scan, aligned=task.options.aligned_ply)
+    reference = read_reference(annotations, task.scan, points)
+    dataset = _open(annotations, task)
+    pipeline = Pipeline(
+        task.config, build_front_end(task.front_end, annotations, dataset, task.config)
+    )
+    recording = Recording(dataset, task.config.inputs)
+    total = min(recording.frame_count, task.max_frames or recording.frame_count)
+    marks = {round(total * (i + 1) / task.checkpoints) for i in range(task.checkpoints)}
+    refused: Counter[str] = Counter()
+    over_time: list[Checkpoint] = []
+    frames = 0
+    started_ns: int | None = None
+    for frame in _first(recording.frames(), total):
+        started_ns = frame.stamp_ns if started_ns is None else started_ns
+        try:
+            pipeline.process(frame)
+        except RefusedInput as refusal:
+            refused[refusal.reason] += 1
+            continue
+        frames += 1
+        if frames in marks:
+            result = score_scan(
+                annotation,
+                points,
+                to_prediction(pipeline.graph(), annotations.vocabulary),
+                task.options,
+            )
+            over_time.append(_checkpoint(frames, 1e-9 * (frame.stamp_ns - started_ns), result))
+    if not frames:
+        raise EvaluationError(f"scan {task.scan}: not one frame could be used: {refused}")
+    graph = pipeline.graph()
+    path = _write(task, graph)
+    return ScanOutcome(
+        scan=task.scan,
+        result=score_scan(
+            annotation, points, to_prediction(graph, annotations.vocabulary), task.options
+        ),
+        measures=measure(graph, reference),
+        frames=frames,
+        nodes=len(graph.nodes),
+        edges=len(graph.edges),
+        times_ms={
+            stage: 1e3 * float(np.median(times)) for stage, times in pipeline.times_s.items()
+        },
+        drops=dict(recording.drops + refused + pipeline.drops),
+        over_time=over_time,
+        graph_path=path,
+    )
+
+
+def evaluate_graph(
+    annotations: Annotations, scan: str, graph: wire.SceneGraphMessage, options: ProtocolOptions
+) -> tuple[ScanResult, Measures]:
+    """Measure a graph that was made before."""
+    points = annotations.points(scan, aligned=options.aligned_ply)
+    prediction = to_prediction(graph, annotations.vocabulary)
+    reference: ReferenceScene = read_reference(annotations, scan, points)
+    result = score_scan(annotations.scan(scan), points, prediction, options)
+    return result, measure(graph, reference)
+
+
+def _open(annotations: Annotations, task: ScanTask) -> SequenceDataset:
+    source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
+    if not isinstance(source, SequenceDataset):
+        raise EvaluationError(
+            f"{annotations.scan_folder(task.scan)} is a {source.kind} recording: wanted a scan in "
+            "3RScan's layout"
+        )
+    return source
+
+
+def _first(frames: Iterator[RgbdFrame], count: int) -> Iterator[RgbdFrame]:
+    for _, frame in zip(range(count), frames):
+        yield frame
+
+
+def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:
+    def recall(ranks: list[int]) -> float:
+        return sum(ranked == 0 for ranked in ranks) / len(ranks) if ranks else float("nan")
+
+    return Checkpoint(
+        frames,
+        stamp_s,
+        len(result.matching.supports),
+        recall(result.object_ranks),
+        recall(result.predicate_ranks),
+        recall(result.relationship_ranks),
+    )
+
+
+def _write(task: ScanTask, graph: wire.SceneGraphMessage) -> Path:
+    folder = task.out / task.scan
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / GRAPH_FILE).write_text(wire.encode(graph), encoding="utf-8")
+        (folder / CONFIG_FILE).write_text(to_yaml(task.config), encoding="utf-8")
+    except OSError as error:
+        raise EvaluationError(f"--out {task.out}: cannot be written ({error.strerror})") from error
+    return folder / GRAPH_FILE
+
+
+def read_graph(path: Path) -> wire.SceneGraphMessage:
+    """Read a scene graph's file; raises EvaluationError, RefusedInput."""
+    try:
+        return wire.decode(path.read_bytes(), wire.SceneGraphMessage)
+    except OSError as error:
+        raise EvaluationError(f"scene graph {path} cannot be read ({error.strerror})") from error
