@@ -200,7 +200,11 @@ def judge(layout: Layout, class_names: list[str]) -> dict[str, Float64]:
     leans = _unless(leans, supported, supported.T, fixed, fixed.T)
     level = np.abs(layout.low[:, None, 2] - layout.low[None, :, 2])
     beside = np.maximum(
-        _all((NEAR_FURNITURE_M - layout.gap_m) / 0.1, _flag(both_furniture)),
+        _all(
+            (NEAR_FURNITURE_M - layout.gap_m) / 0.1,
+            (NEAR_FURNITURE_M - np.maximum(layout.clearance_m, layout.clearance_m.T)) / 0.1,
+            _flag(both_furniture),
+        ),
         _all(
             (NEAR_SMALL_M - layout.gap_m) / 0.03,
             (LEVEL_M - level) / 0.03,
