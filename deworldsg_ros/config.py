@@ -64,6 +64,10 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     surface_points: Annotated[
         int, _number("surface points sampled an object and frame", ge=0, le=4096)
     ] = 200
+    depth_grid_stride_px: Annotated[
+        int,
+        _number("pixels between depth samples that tell what was seen through; 0 = none", ge=0),
+    ] = 8
 
 
 class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,6 +102,14 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     expire_tentative_s: Annotated[
         float, _number("time unseen after which a tentative node goes (surface rule)", gt=0)
     ] = 10.0
+    absent_frames: Annotated[
+        int,
+        _number("frames that see through a node before it is gone; 0 = never (surface rule)", ge=0),
+    ] = 5
+    lost_s: Annotated[
+        float,
+        _number("time in which a moved object may take up its id again (surface rule)", ge=0),
+    ] = 30.0
     surface_points: Annotated[int, _number("surface points kept a node", ge=0, le=100000)] = 512
 
 

@@ -76,6 +76,8 @@ def examples() -> dict[str, wire.Message]:
             ],
             relations=relations,
             drops={"few_mask_pixels": 1},
+            # As coarse as can be: one sample, 1.85 m, in the middle of the image.
+            depth_grid=wire.DepthGridState(640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07"),
         ),
         "relation_evidence": wire.RelationEvidenceMessage(
             **head["relation_evidence"],

@@ -132,7 +132,7 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
         elif action == "observe":
             graph.observe(int(rng.choice(live)), *gaussian, stamp_ns, points)
         elif action == "confirm":
-            graph.confirm_node(int(rng.choice(live)))
+            graph.set_confirmed(int(rng.choice(live)), True)
         elif action == "merge":
             graph.merge_nodes(*rng.choice(live, 2, replace=False).tolist())
         elif action == "remove" and rng.random() < 0.5:

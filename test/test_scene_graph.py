@@ -186,7 +186,7 @@ def test_tentative_nodes_are_told_only_on_request() -> None:
         (2, False),
         (3, False),
     ]
-    graph.confirm_node(3)
+    graph.set_confirmed(3, True)
     assert list(graph.node_states(2)) == [1, 3]
     assert graph.node_states(2)[3].confirmed
     assert graph.merge_nodes(2, 3) == 2  # what was sure of one is sure of both

@@ -21,6 +21,7 @@ from merging_support import (
 )
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.codec import (
     evidence_from_message,
     evidence_to_message,
@@ -31,6 +32,7 @@ from deworldsg_ros.scene.codec import (
 )
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
+    DepthGrid,
     FrameGraph,
     LocalGraph,
     RelationEvidence,
@@ -62,6 +64,15 @@ def random_frame_graph(rng: np.random.Generator) -> FrameGraph:
     )
 
 
+def random_depth_grid(rng: np.random.Generator) -> DepthGrid | None:
+    stride_px = int(rng.integers(0, 100))
+    if stride_px == 0:
+        return None
+    shape = [len(range(stride_px // 2, size, stride_px)) for size in (480, 640)]
+    depth_mm = rng.integers(0, 2**16, shape).astype(np.uint16)
+    return DepthGrid(depth_mm, stride_px, Intrinsics(*rng.uniform(1, 900, 4).tolist(), 640, 480))
+
+
 def random_local_graph(rng: np.random.Generator) -> LocalGraph:
     count = int(rng.integers(0, 5))
     return LocalGraph(
@@ -84,6 +95,7 @@ def random_local_graph(rng: np.random.Generator) -> LocalGraph:
         ),
         relations=random_relations(rng, count),
         drops={"too_few_pixels": 2},
+        depth_grid=random_depth_grid(rng),
     )
 
 

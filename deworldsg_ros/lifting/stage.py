@@ -14,7 +14,13 @@ from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
 from deworldsg_ros.lifting.spatial import spatial_inliers
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import (
+    DepthGrid,
+    FrameGraph,
+    LocalGraph,
+    Relations,
+    Vocabulary,
+)
 
 
 class Lifting:
@@ -81,6 +87,7 @@ class Lifting:
             ),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
+            depth_grid=_depth_grid(depth_m, intrinsics, self.config.depth_grid_stride_px),
         )
 
     def warm_up(self) -> None:
@@ -167,6 +174,17 @@ def _surface_points(
     )
     points = back_project(sample, intrinsics, T_world_camera).astype(np.float32)
     return tuple(np.split(points, np.cumsum(numbers)[:-1]))
+
+
+def _depth_grid(
+    depth_m: NDArray[np.float32], intrinsics: Intrinsics, stride_px: int
+) -> DepthGrid | None:
+    """Valid depth on every n-th pixel, in whole millimetres; None where n is 0."""
+    if stride_px == 0:
+        return None
+    samples_mm = np.rint(depth_m[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px] * 1000.0)
+    samples_mm = np.minimum(samples_mm, np.iinfo(np.uint16).max).astype(np.uint16)
+    return DepthGrid(samples_mm, stride_px, intrinsics)
 
 
 def _kept_relations(relations: Relations, rows: NDArray[np.int64], count: int) -> Relations:

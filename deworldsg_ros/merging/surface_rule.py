@@ -12,9 +12,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging.absence import look
 from deworldsg_ros.merging.local import add_relations, check_fits
+from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.voxel_map import CellSets, VoxelMap
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.surface import hash_each
@@ -25,6 +28,8 @@ CLASS_AGREEMENT = 0.3
 CLASS_BONUS = 0.5
 # Two nodes are one when this many objects more lay on both than saw them apart.
 JOINT_EVIDENCE = 3
+# Surface points of a node that the depth image is compared with.
+SAMPLED_POINTS = 48
 # Gaussians are weighted by their number of pixels; this many make an observation of weight 1.
 PIXELS_OF_UNIT_WEIGHT = 1000.0
 
@@ -39,6 +44,11 @@ class SurfaceMerging:
         self._owner_of: dict[int, int] = {}
         self._node_of: list[int] = []
         self._joint: dict[tuple[int, int], int] = {}
+        # A few surface points of each owner, and the frames in a row that saw through them.
+        self._samples = np.zeros((0, SAMPLED_POINTS, 3), np.float32)
+        self._sample_counts = np.zeros(0, np.int64)
+        self._absent_frames = np.zeros(0, np.int64)
+        self._lost = LostNodes(config.lost_s)
 
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
@@ -47,6 +57,8 @@ class SurfaceMerging:
         known.add(0, sets.of(0))
         known.shares(sets, 1)
         known.remove(0)
+        grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
+        look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
@@ -62,6 +74,7 @@ class SurfaceMerging:
         node_ids = self._place(graph, local, cells, matched)
         self._note_joint(values, matched)
         self._merge_grown(graph)
+        self._look_for_absent(graph, local, node_ids)
         self._expire(graph, local.stamp_ns)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         graph.remember_frame(local.stamp_ns, node_ids)
@@ -111,14 +124,66 @@ class SurfaceMerging:
                 node_id = self._node_of[owner]
                 graph.observe(node_id, *observation)
             self._map.add(owner, cells.of(row))
+            self._sample_surface(graph, node_id)
             node = graph.nodes.row(node_id)
             if (
                 not graph.nodes.confirmed[node]
                 and graph.nodes.observations[node] >= self._config.confirm_observations
             ):
-                graph.confirm_node(node_id)
+                graph.set_confirmed(node_id, True)
+                lost_id = self._lost.match(graph, node_id)
+                if lost_id is not None:
+                    self._lost.found(lost_id)
+                    self._move(graph, lost_id, node_id)
+                    node_id = lost_id
             node_ids.append(node_id)
         return node_ids
+
+    def _sample_surface(self, graph: SceneGraph, node_id: int) -> None:
+        """Renew a node's few surface points, often at first and then now and again."""
+        row, owner = graph.nodes.row(node_id), self._owner_of[node_id]
+        seen = int(graph.nodes.observations[row])
+        if seen > 4 and seen % 8:
+            return
+        points = graph.nodes.surfaces[row].points_world[:SAMPLED_POINTS]
+        self._samples[owner, : len(points)] = points
+        self._sample_counts[owner] = len(points)
+
+    def _look_for_absent(self, graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
+        """Lose the nodes through whose place the camera has looked for some frames in a row."""
+        if local.depth_grid is None or not self._config.absent_frames:
+            return
+        seen_through, present = look(
+            self._samples, self._sample_counts, local.T_world_camera, local.depth_grid
+        )
+        for node_id in node_ids:
+            present[self._owner_of[graph.resolve(node_id)]] = True
+        self._absent_frames[seen_through] += 1
+        self._absent_frames[present] = 0
+        gone = np.flatnonzero(self._absent_frames >= self._config.absent_frames)
+        for node_id in [self._node_of[owner] for owner in gone.tolist()]:
+            self._lose(graph, node_id, local.stamp_ns)
+
+    def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
+        """Take a node from its place; its id may turn up elsewhere, now or soon."""
+        self._map.remove(self._owner_of[node_id])
+        self._free_owner(node_id)
+        if not graph.nodes.confirmed[graph.nodes.row(node_id)]:
+            graph.remove_node(node_id)
+            return
+        graph.set_confirmed(node_id, False)
+        found_id = alike_elsewhere(graph, node_id)
+        if found_id is None:
+            self._lost.add(node_id, stamp_ns)
+        else:
+            self._move(graph, node_id, found_id)
+
+    def _move(self, graph: SceneGraph, old_id: int, new_id: int) -> None:
+        """Let the id of a lost node stand for the node that its object has become."""
+        graph.take_over(old_id, new_id)
+        owner = self._owner_of.pop(new_id)
+        self._node_of[owner] = old_id
+        self._owner_of[old_id] = owner
 
     def _note_joint(self, values: Float64, matched: list[int]) -> None:
         """Count where one object lay on two nodes, against where both were seen apart."""
@@ -145,19 +210,23 @@ class SurfaceMerging:
             self._free_owner(gone)
 
     def _expire(self, graph: SceneGraph, stamp_ns: int) -> None:
-        """Remove tentative nodes that have not been seen for long."""
+        """Remove tentative nodes that have not been seen for long, and what was lost for good."""
         nodes = graph.nodes
         oldest_ns = stamp_ns - int(self._config.expire_tentative_s * 1e9)
-        for node_id in nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist():
+        old = nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist()
+        for node_id in [node_id for node_id in old if node_id not in self._lost]:
             graph.remove_node(node_id)
             self._map.remove(self._owner_of[node_id])
             self._free_owner(node_id)
+        for node_id in self._lost.take_expired(stamp_ns):
+            graph.remove_node(node_id)
 
     def _restore(self, graph: SceneGraph) -> None:
         """Take the nodes of a graph that was loaded, by their surface points."""
         cells = self._map.cells_of([surface.points_world for surface in graph.nodes.surfaces])
         for row, node_id in enumerate(graph.nodes.ids.tolist()):
             self._map.add(self._take_owner(node_id), cells.of(row))
+            self._sample_surface(graph, node_id)
 
     def _take_owner(self, node_id: int) -> int:
         try:
@@ -166,12 +235,18 @@ class SurfaceMerging:
         except ValueError:
             owner = len(self._node_of)
             self._node_of.append(node_id)
+            if owner == len(self._samples):
+                more = max(64, owner)
+                self._samples = np.pad(self._samples, ((0, more), (0, 0), (0, 0)))
+                self._sample_counts = np.pad(self._sample_counts, (0, more))
+                self._absent_frames = np.pad(self._absent_frames, (0, more))
         self._owner_of[node_id] = owner
         return owner
 
     def _free_owner(self, node_id: int) -> None:
         owner = self._owner_of.pop(node_id)
         self._node_of[owner] = 0
+        self._sample_counts[owner] = self._absent_frames[owner] = 0
         for pair in [pair for pair in self._joint if owner in pair]:
             del self._joint[pair]
 

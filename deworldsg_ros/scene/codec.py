@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
+    DepthGrid,
     Float64,
     FrameGraph,
     LocalGraph,
@@ -114,6 +116,7 @@ def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
         ],
         relations=_relations_to_wire(graph.relations),
         drops=dict(graph.drops),
+        depth_grid=_depth_grid_to_wire(graph.depth_grid),
     )
 
 
@@ -147,9 +150,36 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             ),
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             drops=message.drops,
+            depth_grid=_depth_grid_from_wire(message),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"local graph: {error}") from error
+
+
+def _depth_grid_to_wire(grid: DepthGrid | None) -> wire.DepthGridState | None:
+    if grid is None:
+        return None
+    camera = grid.intrinsics
+    return wire.DepthGridState(
+        stride_px=grid.stride_px,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        depth_mm=grid.depth_mm.astype("<u2").tobytes(),
+    )
+
+
+def _depth_grid_from_wire(message: wire.LocalGraphMessage) -> DepthGrid | None:
+    state = message.depth_grid
+    if state is None:
+        return None
+    columns = len(range(state.stride_px // 2, message.width, state.stride_px))
+    return DepthGrid(
+        np.frombuffer(state.depth_mm, "<u2").reshape(-1, columns).astype(np.uint16),
+        state.stride_px,
+        Intrinsics(state.fx, state.fy, state.cx, state.cy, message.width, message.height),
+    )
 
 
 def evidence_to_message(evidence: RelationEvidence, frame_id: str) -> wire.RelationEvidenceMessage:

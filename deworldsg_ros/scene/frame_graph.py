@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.gaussian import log_determinant
 
 Float64 = NDArray[np.float64]
@@ -87,6 +88,32 @@ class FrameGraph:
 
 
 @dataclass(frozen=True)
+class DepthGrid:
+    """The depth image on every n-th pixel: what the camera saw, and saw through.
+
+    Attributes:
+        depth_mm: (h, w) uint16, millimetres along the optical axis; 0 = invalid. Row r, column c
+            is the pixel (stride_px // 2 + c * stride_px, stride_px // 2 + r * stride_px).
+        stride_px: pixels between samples.
+        intrinsics: of the whole image.
+    """
+
+    depth_mm: NDArray[np.uint16]
+    stride_px: int
+    intrinsics: Intrinsics
+
+    def __post_init__(self) -> None:
+        if self.stride_px < 1:
+            raise ValueError(f"stride of the depth grid is {self.stride_px}: wanted >= 1")
+        first = self.stride_px // 2
+        shape = tuple(
+            len(range(first, size, self.stride_px))
+            for size in (self.intrinsics.height, self.intrinsics.width)
+        )
+        _check("depth grid", self.depth_mm, shape)
+
+
+@dataclass(frozen=True)
 class LocalGraph:
     """The local 3D scene graph of one frame, world frame (n lifted objects).
 
@@ -107,6 +134,7 @@ class LocalGraph:
         surface_points_world: n arrays (k, 3) float32, a deterministic sample of the inliers.
         relations: visual relations between rows.
         drops: number of objects not lifted, by reason.
+        depth_grid: what the camera saw of everything, objects or not; None = not told.
     """
 
     stamp_ns: int
@@ -126,6 +154,7 @@ class LocalGraph:
     surface_points_world: tuple[NDArray[np.float32], ...]
     relations: Relations
     drops: dict[str, int] = field(default_factory=dict)
+    depth_grid: DepthGrid | None = None
 
     def __post_init__(self) -> None:
         count = len(self.means_world)

@@ -155,12 +155,38 @@ class SceneGraph:
         self._forget(gone_id, keep_id)
         return keep_id
 
-    def confirm_node(self, node_id: int) -> None:
-        """Note that a tentative node is sure to be an object."""
+    def set_confirmed(self, node_id: int, confirmed: bool) -> None:
+        """Note that a node is sure to be an object, or no longer sure."""
         row = self.nodes.row(node_id)
-        if not self.nodes.confirmed[row]:
-            self.nodes.confirmed[row] = True
+        if self.nodes.confirmed[row] != confirmed:
+            self.nodes.confirmed[row] = confirmed
             self.nodes.revisions[row] = self._changed()
+
+    def take_over(self, old_id: int, new_id: int) -> None:
+        """Let an older node's id stand for a newer node: its object was moved, and found again.
+
+        Place, shape, surface and edges are the newer node's; class distributions average by their
+        numbers of observations.
+        """
+        nodes = self.nodes
+        old, new = nodes.row(old_id), nodes.row(new_id)
+        seen = nodes.observations[[old, new]]
+        classes = seen @ nodes.class_probabilities[[old, new]] / seen.sum()
+        nodes.put(
+            old,
+            nodes.means[new].copy(),
+            nodes.covariances[new].copy(),
+            classes,
+            float(nodes.weights[new]),
+            int(seen.sum()),
+        )
+        nodes.surfaces[old] = nodes.surfaces[new]
+        nodes.confirmed[old] = nodes.confirmed[new]
+        nodes.last_seen_ns[old] = nodes.last_seen_ns[new]
+        nodes.revisions[old] = self._changed()
+        self._edges.drop(old_id)
+        self._edges.repoint(new_id, old_id, self.revision)
+        self._forget(new_id, old_id)
 
     def remove_node(self, node_id: int) -> None:
         """Remove a live node and its edges; nothing takes its place."""

@@ -103,6 +103,19 @@ class LiftedObject(msgspec.Struct):
     surface_points_m: list[Vector3]
 
 
+class DepthGridState(msgspec.Struct, frozen=True):
+    """The depth image on every n-th pixel, from pixel n // 2 on."""
+
+    stride_px: Annotated[int, msgspec.Meta(ge=1)]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth_mm: Annotated[
+        bytes, msgspec.Meta(description="row by row, uint16 little-endian, base64; 0 = invalid")
+    ]
+
+
 class LocalGraphMessage(Message, kw_only=True):
     """deworldsg/local_graph: the local 3D graph of one frame; frame_id is the world's."""
 
@@ -114,6 +127,7 @@ class LocalGraphMessage(Message, kw_only=True):
     objects: list[LiftedObject]
     relations: list[RelationLogits]
     drops: dict[str, int] = {}
+    depth_grid: Union[DepthGridState, None] = None
 
 
 class PairEvidence(msgspec.Struct):

@@ -1,0 +1,102 @@
+"""Negative evidence: a depth image that looks through the place where a node should be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.frame_graph import DepthGrid, Float64
+
+Float32 = NDArray[np.float32]
+Int64 = NDArray[np.int64]
+
+# A surface this far, and this share of its depth, in front of what was measured was seen through:
+# well beyond the noise of depth cameras, poses and the grid's step at an edge.
+THROUGH_M = 0.08
+THROUGH_SHARE = 0.03
+# Fewer visible points than this say nothing, nor does a node of which less than this is visible.
+MIN_VISIBLE_POINTS = 6
+MIN_VISIBLE_SHARE = 0.5
+# This share of the visible points has to be seen through, or to be there.
+DECISIVE_SHARE = 0.7
+
+
+def look(
+    points_world: Float32, point_counts: Int64, T_world_camera: Float64, grid: DepthGrid
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which nodes' surfaces were seen through, and which were there.
+
+    Args:
+        points_world: (S, K, 3) float32 surface points of S nodes, metres.
+        point_counts: (S,) how many of the K are filled.
+        T_world_camera: (4, 4) pose of the depth image.
+        grid: the depth image.
+
+    Returns:
+        seen_through (S,) and present (S,) bool; both false where too little was visible, because
+        it is out of view, occluded or without valid depth.
+    """
+    camera = grid.intrinsics
+    through, there = _count(
+        points_world,
+        point_counts,
+        invert_pose(T_world_camera),
+        grid.depth_mm,
+        grid.stride_px,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+    )
+    visible = through + there
+    enough = (visible >= MIN_VISIBLE_POINTS) & (visible >= MIN_VISIBLE_SHARE * point_counts)
+    return enough & (through >= DECISIVE_SHARE * visible), enough & (
+        there >= DECISIVE_SHARE * visible
+    )
+
+
+@njit(cache=True, nogil=True)
+def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+    through = np.zeros(len(points), np.int64)
+    there = np.zeros(len(points), np.int64)
+    rows, columns = depth_mm.shape
+    for node in range(len(points)):
+        for index in range(counts[node]):
+            x = np.float64(points[node, index, 0])
+            y = np.float64(points[node, index, 1])
+            z = np.float64(points[node, index, 2])
+            z_camera = (
+                T_camera_world[2, 0] * x
+                + T_camera_world[2, 1] * y
+                + T_camera_world[2, 2] * z
+                + T_camera_world[2, 3]
+            )
+            if z_camera < 0.1:
+                continue
+            x_camera = (
+                T_camera_world[0, 0] * x
+                + T_camera_world[0, 1] * y
+                + T_camera_world[0, 2] * z
+                + T_camera_world[0, 3]
+            )
+            y_camera = (
+                T_camera_world[1, 0] * x
+                + T_camera_world[1, 1] * y
+                + T_camera_world[1, 2] * z
+                + T_camera_world[1, 3]
+            )
+            column = int(np.floor((fx * x_camera / z_camera + cx) / stride))
+            row = int(np.floor((fy * y_camera / z_camera + cy) / stride))
+            if column < 0 or row < 0 or column >= columns or row >= rows:
+                continue
+            measured_m = depth_mm[row, column] * 0.001
+            if measured_m == 0.0:
+                continue
+            tolerance_m = THROUGH_M + THROUGH_SHARE * z_camera
+            if measured_m > z_camera + tolerance_m:
+                through[node] += 1
+            elif measured_m > z_camera - tolerance_m:
+                there[node] += 1
+    return through, there
