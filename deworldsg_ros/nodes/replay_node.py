@@ -64,6 +64,7 @@ CLASSES = {
 }
 PUBLISHER_DEPTH = 10
 TELL_PERIOD_S = 0.2
+DISCOVERY_S = 1.5
 # The longest that a signal waits to be noticed.
 SPIN_PERIOD_S = 0.1
 EXIT_CONFIGURATION = 2
@@ -111,6 +112,8 @@ class ReplayNode(Node):  # type: ignore[misc]
     def replay(self) -> None:
         """Wait, publish everything, wait until it is worked off; raises NotReady or Stopped."""
         alone = not self._wait_for_pipeline()
+        if alone:
+            self._wait_to_be_found()
         self._tell(events.Started(self._source.frame_count))
         for message in self._source.raw_messages():
             self._wait_until_due(message, alone)
@@ -194,6 +197,12 @@ class ReplayNode(Node):  # type: ignore[misc]
                 f"replaying at its own pace, after {wait_s:g} s without: {'; '.join(missing)}"
             )
         return False
+
+    def _wait_to_be_found(self) -> None:
+        """Give whoever listens the time to discover the topics."""
+        end_s = time.monotonic() + DISCOVERY_S
+        while time.monotonic() < end_s:
+            self._spin(end_s - time.monotonic())
 
     def _wait_until_due(self, message: RawRoleMessage, alone: bool) -> None:
         now_s = time.monotonic()
