@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -68,17 +68,22 @@ class Dataset(ABC):
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """The same, serialized."""
-        for item in self.messages():
-            yield RawRoleMessage(
-                item.role,
-                item.msgtype,
-                item.stamp_ns,
-                item.stamp_ns,
-                encode(item.message, item.msgtype),
-            )
+        return serialized(self.messages())
 
     def close(self) -> None:  # noqa: B027
         """Nothing is held open."""
+
+
+def serialized(messages: Iterable[RoleMessage]) -> Iterator[RawRoleMessage]:
+    """Messages as CDR bytes, recorded when they were stamped."""
+    for item in messages:
+        yield RawRoleMessage(
+            item.role,
+            item.msgtype,
+            item.stamp_ns,
+            item.stamp_ns,
+            encode(item.message, item.msgtype),
+        )
 
 
 def read_file(path: Path) -> bytes:
@@ -104,9 +109,15 @@ def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:
     return pixels
 
 
-def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """PNG file of BGR or grey pixels; fast rather than small."""
-    return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], *, stored: bool = False) -> bytes:
+    """PNG file of BGR or grey pixels; fast rather than small, `stored` = not compressed at all."""
+    if not stored:
+        return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
+    parameters = [cv2.IMWRITE_PNG_COMPRESSION, 0]
+    # OpenCV 4 cannot choose: its filters cost more than the rest and gain nothing here.
+    if hasattr(cv2, "IMWRITE_PNG_FILTER"):
+        parameters += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+    return bytes(cv2.imencode(".png", pixels, parameters)[1])
 
 
 def image_format(path: Path) -> str:

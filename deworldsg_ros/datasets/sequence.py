@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.bags import messages as ros
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import Role, RoleMessage
-from deworldsg_ros.bags.source import UsedTopic
+from deworldsg_ros.bags.source import RawRoleMessage, UsedTopic
 from deworldsg_ros.datasets.dataset import (
     CAMERA_FRAME,
     WORLD_FRAME,
@@ -26,6 +26,7 @@ from deworldsg_ros.datasets.dataset import (
     image_format,
     image_size,
     read_file,
+    serialized,
 )
 from deworldsg_ros.scene.camera import (
     Float64,
@@ -131,6 +132,14 @@ class SequenceDataset(Dataset):
 
     def messages(self) -> Iterator[RoleMessage]:
         """camera_info, pose, depth and RGB of each frame; frames without a valid pose are left."""
+        # What is decoded at once is not worth compressing: half of the time of reading a frame.
+        return self._messages(stored=True)
+
+    def raw_messages(self) -> Iterator[RawRoleMessage]:
+        """The same, serialized and compressed."""
+        return serialized(self._messages(stored=False))
+
+    def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
         for number, color_path in self._colors.items():
             depth_path = self.file(number, self.depth_suffix)
             pose_path = self.file(number, self.pose_suffix)
@@ -146,7 +155,7 @@ class SequenceDataset(Dataset):
                 continue
             try:
                 yield from self._frame(
-                    self._stamps_ns[number], color_path, depth_path, T_world_camera
+                    self._stamps_ns[number], color_path, depth_path, T_world_camera, stored
                 )
             except RecordingError as error:
                 self.drops["decode_failed"] += 1
@@ -170,13 +179,19 @@ class SequenceDataset(Dataset):
         return ".depth.pgm"
 
     def _frame(
-        self, stamp_ns: int, color_path: Path, depth_path: Path, T_world_camera: Float64
+        self,
+        stamp_ns: int,
+        color_path: Path,
+        depth_path: Path,
+        T_world_camera: Float64,
+        stored: bool,
     ) -> list[RoleMessage]:
         color, color_format = read_file(color_path), image_format(color_path)
         depth_mm = self._depth_mm(depth_path)
         if self.turned:
             bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
-            color = encode_png(np.asarray(cv2.rotate(bgr, cv2.ROTATE_90_CLOCKWISE), np.uint8))
+            bgr = np.asarray(cv2.rotate(bgr, cv2.ROTATE_90_CLOCKWISE), np.uint8)
+            color = encode_png(bgr, stored=stored)
             color_format = "png"
             depth_mm = np.asarray(cv2.rotate(depth_mm, cv2.ROTATE_90_CLOCKWISE), np.uint16)
             T_world_camera = turned_pose(T_world_camera)
@@ -188,7 +203,7 @@ class SequenceDataset(Dataset):
                 T_world_camera[:3, 3],
                 quaternion_from_rotation(T_world_camera[:3, :3]),
             ),
-            ros.compressed_depth(stamp_ns, CAMERA_FRAME, encode_png(depth_mm)),
+            ros.compressed_depth(stamp_ns, CAMERA_FRAME, encode_png(depth_mm, stored=stored)),
             ros.compressed_image(stamp_ns, CAMERA_FRAME, color, color_format),
         ]
 
