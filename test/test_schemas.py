@@ -10,7 +10,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.scene import codec, wire
 from deworldsg_ros.scene.errors import RefusedInput
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,6 +49,20 @@ def test_examples_fit_and_decode(name):
     assert json.loads(wire.encode(message)) == example
 
 
+@pytest.mark.parametrize(
+    ("name", "to_noun", "to_message"),
+    [
+        ("frame_graph", codec.frame_graph_from_message, codec.frame_graph_to_message),
+        ("local_graph", codec.local_graph_from_message, codec.local_graph_to_message),
+    ],
+)
+def test_examples_are_graphs_that_hold_together(name, to_noun, to_message):
+    text = (FOLDER / f"{name}.example.json").read_text(encoding="utf-8")
+    message = to_message(to_noun(wire.decode(text, wire.MESSAGES[name])))
+    assert to_message(to_noun(message)) == message
+    assert len(message.objects) == 2
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_message_without_contents_fits(name):
     empty = {
@@ -82,6 +96,7 @@ def broken_examples():
     yield "local_graph", ("objects", 1, "covariance_m2"), [1.0] * 6
     yield "local_graph", ("objects", 0, "mean_m", 1), "0.1"
     yield "local_graph", ("drops", "few_mask_pixels"), "many"
+    yield "local_graph", ("depth_grid", "stride_px"), 0
     yield "relation_evidence", ("pairs", 0, "geo_cost"), None
     yield "relation_evidence", ("source",), DELETED
     yield "scene_graph", ("nodes", 0, "id"), 0
