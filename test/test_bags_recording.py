@@ -119,6 +119,23 @@ def test_tf_is_taken_where_odometry_is_of_another_frame(tmp_path):
     chosen.close()
 
 
+def test_the_configuration_decides_between_poses_odometry_and_tf(tmp_path):
+    items = camera_items(COUNT) + tf_items([stamp_ns(i) for i in range(COUNT)])
+    items += [("/odom", ros.ODOMETRY, stamp_ns(i), odometry(i)) for i in range(COUNT)]
+    bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
+    for pose_source, topic in (
+        ("auto", "/camera/pose"),
+        ("pose", "/camera/pose"),
+        ("odometry", "/odom"),
+        ("tf", "/tf"),
+    ):
+        frames, recording = frames_of(bag, inputs=InputsConfig(pose_source=pose_source))
+        assert recording.source.topics[Role.POSE].name == topic
+        assert_whole(frames)
+    with pytest.raises(RecordingError, match="no rgb topic"):
+        open_recording(bag, InputsConfig(transport="raw"))
+
+
 def test_tf_that_does_not_reach_the_camera_drops_frames_with_a_reason(tmp_path):
     items = camera_items(COUNT, with_pose=False)
     elsewhere = [

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from deworldsg_ros.cli import processes
+from deworldsg_ros.cli import installation, processes
 from deworldsg_ros.cli.demo import dds_environment
 from deworldsg_ros.cli.installation import find_shared, node_command
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
@@ -109,3 +109,16 @@ def test_the_demo_has_a_domain_of_its_own_unless_one_is_set(monkeypatch, given):
     assert 1 <= domain <= 101
     assert environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert environment["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
+
+
+def test_installed_executables_are_preferred_where_this_is_no_checkout(tmp_path, monkeypatch):
+    executable = tmp_path / "lib" / "deworldsg_ros" / "graph_node"
+    executable.parent.mkdir(parents=True)
+    executable.write_text("#!/bin/sh\n")
+    monkeypatch.setattr(installation, "checkout", lambda: None)
+    monkeypatch.setattr(installation, "prefixes", lambda: [tmp_path])
+    module = [sys.executable, "-m", "deworldsg_ros.nodes.graph_node"]
+    assert node_command("graph_node") == module  # it cannot be executed
+    executable.chmod(0o755)
+    assert node_command("graph_node") == [str(executable)]
+    assert node_command("lifting_node")[:2] == module[:2]

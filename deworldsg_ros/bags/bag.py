@@ -53,7 +53,7 @@ class BagSource:
         self.losses = self._bag.losses
         self.drops: Counter[str] = Counter()
         try:
-            found = find_topics(self._bag.topics, choice, str(path))
+            found = find_topics(self._bag.topics, choice, str(path), self._inputs)
             self._prefer_tf(found, choice)
         except RecordingError:
             self._bag.close()
@@ -99,7 +99,8 @@ class BagSource:
     def _prefer_tf(self, found: dict[Role, Topic], choice: TopicChoice) -> None:
         """Take TF instead of the odometry of a frame that is not the camera's."""
         tf = next((t for t in self._bag.topics if t.msgtype == TF_MESSAGE and t.count), None)
-        if choice.pose or tf is None or found[Role.POSE].msgtype != ODOMETRY:
+        is_told = choice.pose or self._inputs.pose_source != "auto"
+        if is_told or tf is None or found[Role.POSE].msgtype != ODOMETRY:
             return
         camera = self._first(found[Role.RGB]).header.frame_id
         child = self._first(found[Role.POSE]).child_frame_id

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from deworldsg_ros.bags.bag import BagSource
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import Role
@@ -37,7 +39,8 @@ class Recording:
         self.source = source
         self.reasons: dict[str, str] = {}
         self._assembler = FrameAssembler(
-            inputs or InputsConfig(),
+            # Whatever the recording has, its source gives poses.
+            msgspec.structs.replace(inputs or InputsConfig(), pose_source="auto"),
             topics={role.value: topic.name for role, topic in source.topics.items()},
             on_drop=self._remember,
         )

@@ -16,6 +16,11 @@ from deworldsg_ros.bags.messages import (
     Role,
 )
 from deworldsg_ros.bags.storage import Topic
+from deworldsg_ros.config import InputsConfig
+
+Types = tuple[str, ...]
+# Higher is better; None = not this role.
+Score = Callable[[Topic], "tuple[float, ...] | None"]
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 # Most wanted first.
@@ -28,6 +33,17 @@ TYPES = {
     Role.DEPTH: IMAGES,
     Role.CAMERA_INFO: (CAMERA_INFO,),
     Role.POSE: POSES,
+}
+TRANSPORTS: dict[str, Types] = {
+    "auto": IMAGES,
+    "raw": (IMAGE,),
+    "compressed": (COMPRESSED_IMAGE,),
+}
+POSE_SOURCES: dict[str, Types] = {
+    "auto": POSES,
+    "pose": (POSE_STAMPED,),
+    "odometry": (ODOMETRY,),
+    "tf": (TF_MESSAGE,),
 }
 WANTED = {
     Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
@@ -47,31 +63,50 @@ class TopicChoice:
     pose: str = ""
 
 
-def find_topics(topics: Sequence[Topic], choice: TopicChoice, recording: str) -> dict[Role, Topic]:
+def find_topics(
+    topics: Sequence[Topic],
+    choice: TopicChoice,
+    recording: str,
+    inputs: InputsConfig | None = None,
+) -> dict[Role, Topic]:
     """The topic of each role.
+
+    Args:
+        topics: of the bag.
+        choice: what the user named; that need not be of a type that `inputs` asks for.
+        recording: what to call the bag in an error.
+        inputs: ``transport`` and ``pose_source`` narrow the types down.
 
     Raises:
         RecordingError: names the role, the topics seen and what was wanted.
     """
+    inputs = inputs or InputsConfig()
+    images = TRANSPORTS[inputs.transport]
     filled = [topic for topic in topics if topic.count]
-    rgb = _find(Role.RGB, filled, choice.rgb, _rgb_score, recording)
-    depth = _find(Role.DEPTH, filled, choice.depth, _depth_score, recording)
-    camera_info = _find(
-        Role.CAMERA_INFO,
-        filled,
-        choice.camera_info,
-        lambda topic: _camera_info_score(topic, rgb.name),
-        recording,
-    )
-    pose = _find(Role.POSE, filled, choice.pose, _pose_score, recording)
-    return {Role.RGB: rgb, Role.DEPTH: depth, Role.CAMERA_INFO: camera_info, Role.POSE: pose}
+
+    def find(role: Role, chosen: str, types: Types, score: Score) -> Topic:
+        return _find(role, filled, chosen, types, score, recording)
+
+    rgb = find(Role.RGB, choice.rgb, images, _rgb_score)
+    return {
+        Role.RGB: rgb,
+        Role.DEPTH: find(Role.DEPTH, choice.depth, images, _depth_score),
+        Role.CAMERA_INFO: find(
+            Role.CAMERA_INFO,
+            choice.camera_info,
+            (CAMERA_INFO,),
+            lambda topic: _camera_info_score(topic, rgb.name),
+        ),
+        Role.POSE: find(Role.POSE, choice.pose, POSE_SOURCES[inputs.pose_source], _pose_score),
+    }
 
 
 def _find(
     role: Role,
     topics: Sequence[Topic],
     chosen: str,
-    score: Callable[[Topic], tuple[float, ...] | None],
+    types: Types,
+    score: Score,
     recording: str,
 ) -> Topic:
     option = "--" + role.value.replace("_", "-")
@@ -84,7 +119,7 @@ def _find(
         scored = [
             (value, topic)
             for topic in topics
-            if topic.msgtype in TYPES[role] and (value := score(topic)) is not None
+            if topic.msgtype in types and (value := score(topic)) is not None
         ]
         if scored:
             # The best; among equals the one that sorts first.

@@ -72,6 +72,8 @@ def run_demo(
     started_s = time.perf_counter()
     with _one_interrupt(), _processes(console) as processes:
         parameters = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]
+        # Whatever the recording has, the replay publishes poses.
+        parameters += ["-p", "inputs.pose_source:=auto"]
         environment = dds_environment()
         for node in NODES:
             command = [*node_command(node), *parameters]
@@ -241,7 +243,9 @@ def _event(line: bytes) -> events.Event | None:
 
 
 def _waiting_text(event: events.Waiting, since_s: float) -> str:
-    text = f"starting the four nodes … waiting for {event.missing[0]}"
+    words = [words[0] for item in event.missing if (words := item.split())[0] in NODES]
+    names = ", ".join(dict.fromkeys(words)) or event.missing[0]
+    text = f"starting the four nodes … waiting for {names}"
     if since_s > EXPLAIN_AFTER_S:
         text += "\n  (the first start compiles the kernels, which takes a minute or two)"
     return text
