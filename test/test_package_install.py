@@ -18,7 +18,7 @@ from ament_index_python.packages import (
 )
 
 PACKAGE = "deworldsg_ros"
-EXECUTABLES = {"segmentation_node", "lifting_node", "relation_node", "graph_node", "replay"}
+EXECUTABLES = {"segmentation_node", "lifting_node", "relation_node", "graph_node", "replay_node"}
 SOURCES = (
     *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "requirements.txt", "LICENSE"),
     *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),
@@ -165,7 +165,7 @@ def test_executable_starts_its_node(install: Install, tmp_path: Path, executable
     )
     assert done.returncode == 2, done.stderr
     # The replay misses its recording before it minds anything else.
-    assert ("recording" if executable == "replay" else "no_such_thing") in done.stderr
+    assert ("recording" if executable == "replay_node" else "no_such_thing") in done.stderr
 
 
 def test_deworldsg_tells_how_to_use_it(install: Install, tmp_path: Path) -> None:
