@@ -112,6 +112,8 @@ def assemble(
 
 
 def _cut(instance_image: NDArray[np.uint16], value: int, box_xyxy: Float64) -> MaskPatch:
-    left, top, right, bottom = np.rint(box_xyxy).astype(int).tolist()
+    # Every pixel that the box touches.
+    left, top = np.floor(box_xyxy[:2]).astype(int).tolist()
+    right, bottom = np.ceil(box_xyxy[2:]).astype(int).tolist()
     patch = instance_image[top : bottom + 1, left : right + 1]
     return MaskPatch(top, left, patch == value)
