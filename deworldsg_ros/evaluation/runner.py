@@ -113,7 +113,7 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     reference = read_reference(annotations, task.scan, points)
     dataset = _open(annotations, task)
     pipeline = Pipeline(
-        task.config, build_front_end(task.front_end, annotations, dataset, task.config)
+        task.config, build_front_end(task.front_end, annotations, task.scan, dataset, task.config)
     )
     recording = Recording(dataset, task.config.inputs)
     total = min(recording.frame_count, task.max_frames or recording.frame_count)

@@ -9,6 +9,7 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.sequence import SequenceDataset
 from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.front_ends.ground_truth import GroundTruthFrontEnd
 from deworldsg_ros.evaluation.front_ends.recorded import RecordedFrontEnd
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import Perceiver
@@ -52,7 +53,11 @@ class FrontEndChoice:
 
 
 def build_front_end(
-    choice: FrontEndChoice, annotations: Annotations, dataset: SequenceDataset, config: Config
+    choice: FrontEndChoice,
+    annotations: Annotations,
+    scan: str,
+    dataset: SequenceDataset,
+    config: Config,
 ) -> Perceiver:
     """The chosen front end for one scan; raises EvaluationError, RecordingError."""
     if choice.kind == "backend":
@@ -65,4 +70,14 @@ def build_front_end(
             flip=choice.flip,
             top_relations=config.perception.top_relations,
         )
-    raise EvaluationError(f"--front-end {choice.kind}: not built")
+    return GroundTruthFrontEnd(
+        dataset,
+        annotations.scan(scan),
+        annotations.points(scan),
+        annotations.vocabulary,
+        miss=choice.miss,
+        jitter_px=choice.jitter_px,
+        flip=choice.flip,
+        seed=choice.seed,
+        top_relations=config.perception.top_relations,
+    )
