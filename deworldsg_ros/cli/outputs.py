@@ -101,7 +101,10 @@ def print_drops(
     drops: Mapping[str, Mapping[str, int]],
     reasons: Mapping[str, str],
 ) -> None:
-    """Say what was lost and left out: by who and reason, with an example where one is known."""
+    """Say what was lost and left out: by who and reason, with an example where one is known.
+
+    Images that belonged to a frame that was left out, or to none, are in run.json only.
+    """
     shown = list(dict.fromkeys(losses))
     for loss in shown[:5]:
         console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
@@ -109,6 +112,8 @@ def print_drops(
         console.print(f"[yellow]lost:[/] … and {len(shown) - 5} more")
     for owner, counts in drops.items():
         for reason, count in sorted(counts.items()):
+            if reason.startswith("unmatched_"):
+                continue
             example = f" ({reasons[reason]})" if reason in reasons else ""
             console.print(
                 f"[yellow]left out[/] by {owner}: {count} {reason}{example}",
