@@ -11,9 +11,12 @@ import numpy as np
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.merging.stage import build_merging
+from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Float64, check_pose
+from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.errors import RefusedInput
@@ -78,6 +81,30 @@ class GraphBuilder:
         # Its pair is named as a neighbour by a message of its own.
         for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
             self.graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
+
+    def apply_correction(self, T_correction: Float64, since_ns: int) -> list[int]:
+        """Move what was first seen since a stamp along with the poses, after a loop closure.
+
+        Nodes known before stay, also where they were seen again since: see `scene.correction`.
+        Frames still to come have to carry corrected poses.
+
+        Args:
+            T_correction: (4, 4), takes points of the world as it was into the world as it is.
+            since_ns: stamp of the first pose that was corrected.
+
+        Returns:
+            The ids of the nodes that moved.
+
+        Raises:
+            RefusedInput: ``invalid_pose`` where it is no rigid transform.
+        """
+        check_pose(T_correction)
+        node_ids = nodes_since(self.graph, since_ns)
+        for node_id in node_ids:
+            self.graph.move_node(node_id, T_correction)
+        if isinstance(self._merging, SurfaceMerging):
+            self._merging.moved(self.graph, node_ids, T_correction)
+        return node_ids
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """What changed since this was last called; None where nothing did."""

@@ -44,6 +44,7 @@ REASONS: dict[str, str] = {
     "nodes with one configuration",
     "out_of_order": "a local graph is older than one that is merged already; restart graph_node "
     "after starting a recording again",
+    "no_graph": "a pose correction came before the first local graph: there is nothing to correct",
     "unknown_frame": "relation evidence speaks of a frame that the graph does not remember",
     "invalid_prediction": "a world model's answer is no distribution",
     # Neither

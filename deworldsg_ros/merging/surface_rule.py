@@ -81,6 +81,22 @@ class SurfaceMerging:
         add_relations(graph, local, node_ids)
         return node_ids
 
+    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+        """Follow nodes that a correction (4, 4) has moved in the graph."""
+        for node_id in node_ids:
+            owner = self._owner_of.get(node_id)
+            if owner is None:  # lost: it is in no cell
+                continue
+            centres = self._map.centres(owner).astype(np.float64)
+            centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
+            points = graph.nodes.surfaces[graph.nodes.row(node_id)].points_world
+            cells = self._map.cells_of([np.concatenate((centres.astype(np.float32), points))])
+            self._map.remove(owner)
+            self._map.add(owner, cells.of(0))
+            self._absent_frames[owner] = 0
+            self._sample_counts[owner] = len(points[:SAMPLED_POINTS])
+            self._samples[owner, : self._sample_counts[owner]] = points[:SAMPLED_POINTS]
+
     def _values(self, graph: SceneGraph, local: LocalGraph, cells: CellSets) -> Float64:
         """How well each object fits each owner, (n, S); 0 where they cannot be the same."""
         shares = self._map.shares(cells, len(self._node_of))

@@ -8,20 +8,24 @@ from pathlib import Path
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from deworldsg_ros.bridge.markers import marker_array
 from deworldsg_ros.bridge.node import StageNode, run
 from deworldsg_ros.bridge.pending import PendingEvidence
+from deworldsg_ros.bridge.poses import pose_from_message, stamp_ns_of
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.view.markers import markers
 
 SILENCE_S = 2.0
+CORRECTION_TOPIC = "deworldsg/pose_correction"
 
 
 class GraphNode(StageNode):
@@ -46,6 +50,10 @@ class GraphNode(StageNode):
         self.listen_json(
             "deworldsg/relation_evidence", wire.RelationEvidenceMessage, self._add_evidence, 50
         )
+        self._corrections = self._corrected_nodes = 0
+        self.create_subscription(
+            PoseStamped, CORRECTION_TOPIC, self.guarded(self._correct), reliable(10)
+        )
         self.every(1.0 / self.parameters.output.rate_hz, self._publish)
 
     def _integrate(self, message: wire.LocalGraphMessage) -> None:
@@ -66,6 +74,23 @@ class GraphNode(StageNode):
             self._pending.add(evidence)
             return
         self._builder.add_evidence(evidence)
+        self._note_change()
+
+    def _correct(self, message: Any) -> None:
+        """Move what was first seen since the stamp by the pose, a correction in the world frame."""
+        self.health.received(CORRECTION_TOPIC)
+        T_correction, frame_id = pose_from_message(message)
+        if self._builder is None:
+            raise RefusedInput("no_graph", "pose correction: no local graph has come yet")
+        if frame_id != self._builder.graph.frame_id:
+            raise RefusedInput(
+                "wrong_frame",
+                f"pose correction is in frame '{frame_id}', expected "
+                f"'{self._builder.graph.frame_id}'",
+            )
+        moved = self._builder.apply_correction(T_correction, stamp_ns_of(message))
+        self._corrections += 1
+        self._corrected_nodes += len(moved)
         self._note_change()
 
     def _note_change(self) -> None:
@@ -124,6 +149,8 @@ class GraphNode(StageNode):
             "edges": str(len(snapshot.edges)),
             "sequence": str(snapshot.sequence),
             "evidence waiting": str(len(self._pending)),
+            "pose corrections": str(self._corrections),
+            "nodes moved by them": str(self._corrected_nodes),
         }
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from deworldsg_ros.scene import storage, wire
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, fuse
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints
+from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, SurfaceReservoir, hash_each
 
 
 class SceneGraph:
@@ -187,6 +189,28 @@ class SceneGraph:
         self._edges.drop(old_id)
         self._edges.repoint(new_id, old_id, self.revision)
         self._forget(new_id, old_id)
+
+    def move_node(self, node_id: int, T_correction: Float64) -> None:
+        """Move a live node with its surface: its pose was wrong by a rigid transform (4, 4).
+
+        The transform takes points of the world as it was into the world as it is.
+        """
+        nodes, row = self.nodes, self.nodes.row(node_id)
+        rotation, translation = T_correction[:3, :3], T_correction[:3, 3]
+        covariance = rotation @ nodes.covariances[row] @ rotation.T
+        nodes.put(
+            row,
+            rotation @ nodes.means[row] + translation,
+            (covariance + covariance.T) / 2,
+            nodes.class_probabilities[row].copy(),
+            float(nodes.weights[row]),
+            int(nodes.observations[row]),
+        )
+        points = nodes.surfaces[row].points_world.astype(np.float64) @ rotation.T + translation
+        moved = SurfaceReservoir(self.surface_point_capacity)
+        moved.add(hash_each((points.astype(np.float32),))[0])
+        nodes.surfaces[row] = moved
+        nodes.revisions[row] = self._changed()
 
     def remove_node(self, node_id: int) -> None:
         """Remove a live node and its edges; nothing takes its place."""
