@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask
 
 EXIT_NOTHING_DONE = 1
+DEFAULT_OUT = Path("evaluation_out")
 
 
 def evaluate(
@@ -54,8 +55,9 @@ def evaluate(
         ),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", help="folder of each scan's graph, and of tables and plots")
-    ] = Path("evaluation_out"),
+        Optional[Path],
+        typer.Option("--out", help="folder of each scan's graph, and of tables and plots"),
+    ] = None,
     scans: Annotated[
         Optional[list[str]],
         typer.Option("--scan", help="this scan rather than the whole split; may be repeated"),
@@ -67,8 +69,9 @@ def evaluate(
         int, typer.Option("--max-frames", min=0, help="stop after so many frames; 0 = take all")
     ] = 0,
     checkpoints: Annotated[
-        int, typer.Option("--checkpoints", min=0, help="measure so many times on the way")
-    ] = 0,
+        int,
+        typer.Option("--checkpoints", min=0, help="how often to measure on the way, for a plot"),
+    ] = 8,
     split: Annotated[str, typer.Option("--split", help="train, validation or test")] = "test",
     skip_no_rel_objects: Annotated[
         bool, typer.Option("--skip-no-rel-objects", help="only objects that occur in relations")
@@ -113,7 +116,7 @@ def evaluate(
     }
     if predictions is not None:
         values["predictions"] = predictions.name
-        values |= _evaluate_predictions(annotations, predictions, options, console)
+        values |= _evaluate_predictions(annotations, predictions, options, out, console)
     else:
         choice = FrontEndChoice(front_end, flip, miss, jitter, seed)  # type: ignore[arg-type]
         values["front_end"] = choice.describe()
@@ -122,7 +125,7 @@ def evaluate(
                 root=dataset,
                 layout=layout,
                 scan=scan,
-                out=out,
+                out=out or DEFAULT_OUT,
                 config=effective_config(config, settings),
                 front_end=choice,
                 options=options,
@@ -139,9 +142,13 @@ def evaluate(
 
 
 def _evaluate_predictions(
-    annotations: Annotations, path: Path, options: ProtocolOptions, console: Console
+    annotations: Annotations,
+    path: Path,
+    options: ProtocolOptions,
+    out: Path | None,
+    console: Console,
 ) -> dict[str, Any]:
-    from deworldsg_ros.evaluation import measures, report, tables
+    from deworldsg_ros.evaluation import measures, report, results, tables
     from deworldsg_ros.evaluation.predictions import read_predictions
     from deworldsg_ros.evaluation.protocol import evaluate_predictions
 
@@ -160,13 +167,16 @@ def _evaluate_predictions(
             )
     pooled = measures.pool(measured.values())
     tables.print_measures(console, {**measured, "all": pooled})
+    if out is not None:
+        written = results.write_results(out, annotations, result, measured, pooled, path.name)
+        _print_files(written, console)
     return {**report.protocol_values(result), "measures": pooled.numbers()}
 
 
 def _evaluate_runs(
     annotations: Annotations, tasks: list[ScanTask], console: Console
 ) -> dict[str, Any]:
-    from deworldsg_ros.evaluation import measures, protocol, report, tables
+    from deworldsg_ros.evaluation import measures, protocol, report, results, tables
     from deworldsg_ros.evaluation.runner import evaluate_scan
     from deworldsg_ros.scene.errors import DeWorldSGError
 
@@ -186,12 +196,21 @@ def _evaluate_runs(
     name = tasks[0].front_end.describe()
     tables.print_protocol(console, result, f"{name} on {annotations.root.resolve().name}")
     pooled = measures.pool(outcome.measures for outcome in outcomes)
-    tables.print_measures(
-        console, {**{outcome.scan: outcome.measures for outcome in outcomes}, "all": pooled}
+    measured = {outcome.scan: outcome.measures for outcome in outcomes}
+    tables.print_measures(console, {**measured, "all": pooled})
+    over_time = {outcome.scan: outcome.over_time for outcome in outcomes}
+    written = results.write_results(
+        tasks[0].out, annotations, result, measured, pooled, name, over_time
     )
+    _print_files(written, console)
     return {
         **report.protocol_values(result),
         "measures": pooled.numbers(),
         "scans": [report.outcome_values(outcome) for outcome in outcomes],
         "failed": failures,
     }
+
+
+def _print_files(written: list[Path], console: Console) -> None:
+    names = ", ".join(path.name for path in written)
+    console.print(f"in {written[0].parent}: {names}", highlight=False, soft_wrap=True)

@@ -159,7 +159,10 @@ class GroundTruthFrontEnd:
         coarse = np.zeros(depth_m.shape, np.uint16)
         coarse[rows[near], columns[near]] = self._point_ids[nearest[near]]
         fine = coarse.repeat(PIXEL_STRIDE, axis=0).repeat(PIXEL_STRIDE, axis=1)
-        return np.where(frame.depth_m > 0, fine[: labels.shape[0], : labels.shape[1]], labels)
+        height, width = frame.depth_m.shape
+        labels[:] = fine[:height, :width]
+        labels[~(frame.depth_m > 0)] = 0
+        return labels
 
 
 def visible_box(instances: NDArray[np.uint16], object_id: int) -> Float64 | None:
