@@ -10,9 +10,17 @@ import importlib
 import pkgutil
 from inspect import isabstract
 from pathlib import Path
+from types import GenericAlias
+from typing import Any, TypeGuard
 
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.datasets.dataset import Dataset, DatasetOptions
+
+
+def _is_dataset(item: Any) -> TypeGuard[type[Dataset]]:
+    # Python 3.10 takes an alias such as list[int] for a type, and issubclass() then refuses it.
+    is_class = isinstance(item, type) and not isinstance(item, GenericAlias)
+    return is_class and issubclass(item, Dataset) and not isabstract(item)
 
 
 @functools.lru_cache(maxsize=1)
@@ -22,7 +30,7 @@ def _datasets() -> dict[str, type[Dataset]]:
     for module in pkgutil.iter_modules(package.__path__):
         content = vars(importlib.import_module(f"{package.__name__}.{module.name}"))
         for item in content.values():
-            if isinstance(item, type) and issubclass(item, Dataset) and not isabstract(item):
+            if _is_dataset(item):
                 found[item.kind] = item
     return dict(sorted(found.items()))
 

@@ -102,6 +102,9 @@ class SevenScenes(Dataset):
     @staticmethod
     def looks_like(path: Path) -> bool:
         """Whether there are files named frame-NNNNNN.color.*, here or one level below."""
+        # Data sets in 3RScan's layout name theirs alike, and have this besides.
+        if (path / "_info.txt").exists():
+            return False
         return any(True for _ in path.glob("frame-*.color.*")) or any(
             True for _ in path.glob("seq-*/frame-*.color.*")
         )
