@@ -229,6 +229,40 @@ def load_config(path: Union[str, Path]) -> Config:
         if isinstance(content, dict) and key in content:
             content = content[key]
     content = {} if content is None else content
+class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Poses out of the images alone: odometry_node, `deworldsg run --odometry`."""
+
+    method: Annotated[
+        Literal["rgbd", "depth"],
+        _number("align colour and depth, or depth alone (twice as fast, drifts more)"),
+    ] = "rgbd"
+    max_depth_m: Annotated[
+        float, _number("depth beyond which is not aligned, metres", gt=0, le=100)
+    ] = 4.0
+    max_step_m: Annotated[
+        float, _number("camera movement between frames above which it is lost, metres", gt=0, le=10)
+    ] = 0.3
+    max_rotation_deg: Annotated[
+        float, _number("rotation between frames above which it is lost, degrees", gt=0, le=180)
+    ] = 30.0
+    min_fit: Annotated[
+        float, _number("share of the depth that has to fit, or the frame is lost", ge=0, le=1)
+    ] = 0.6
+    keyframe_m: Annotated[
+        float, _number("movement up to which the same frame stays the reference, metres", ge=0)
+    ] = 0.02
+    keyframe_deg: Annotated[
+        float, _number("rotation up to which the same frame stays the reference, degrees", ge=0)
+    ] = 1.0
+    restart_after: Annotated[
+        int, _number("lost frames before it starts anew at the last known pose", ge=1, le=100000)
+    ] = 15
+    frame_id: Annotated[str, _number("world frame of the poses, where nothing gives one")] = "odom"
+    publish_tf: Annotated[
+        bool, _number("also publish the camera frame below it on /tf, where tf2_msgs is installed")
+    ] = False
+
+
     if isinstance(content, dict):
         content.pop("use_sim_time", None)
     return from_mapping(content, str(path))
@@ -246,6 +280,7 @@ def to_mapping(config: Config) -> dict[str, Any]:
     """Nested plain values of a configuration, as they stand in a file."""
     mapping: dict[str, Any] = msgspec.to_builtins(config)
     return mapping
+    odometry: OdometryConfig = OdometryConfig()
 
 
 def to_yaml(config: Config) -> str:

@@ -15,7 +15,16 @@ from deworldsg_ros.bridge.reasons import REASONS  # noqa: E402
 
 PAGE = ROOT / "docs" / "nodes.md"
 # What the nodes run.
-PACKAGES = ("bridge", "nodes", "perception", "lifting", "merging", "relations", "graph_builder.py")
+PACKAGES = (
+    "bridge",
+    "nodes",
+    "poses",
+    "perception",
+    "lifting",
+    "merging",
+    "relations",
+    "graph_builder.py",
+)
 SCENE = ("camera.py", "codec.py", "wire.py")
 
 

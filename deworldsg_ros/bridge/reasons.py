@@ -19,6 +19,10 @@ REASONS: dict[str, str] = {
     "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames; believed "
     "after five frames at the new place",
     "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
+    "odometry_lost": "a frame fits none before it: blocked, blank or too fast; it gets no pose",
+    # Models
+    "detector_error": "the detector failed on the image; the log has the first traceback, other "
+    "frames go on. Out of memory: a smaller checkpoint, or a free device",
     # Joining
     "no_depth": "no depth image within `inputs.slop_s` of the RGB image",
     "no_camera_info": "no usable camera_info came while the frame waited (`patience_s`)",

@@ -1,0 +1,214 @@
+"""RGB-D odometry: the pose of each frame out of the images alone, for robots without SLAM.
+
+Each frame is aligned to a reference frame by OpenCV's RGB-D odometry (photometric and point-to-
+plane residuals on an image pyramid). The reference is the frame before it, or an older one while
+the camera has hardly moved since: a camera that stands still does not drift. Nothing closes loops.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import OdometryConfig
+from deworldsg_ros.scene.camera import (
+    Float64,
+    Intrinsics,
+    check_pose,
+    interpolate_pose,
+    invert_pose,
+)
+from deworldsg_ros.scene.errors import RefusedInput
+
+# Where the first camera is when nobody says: at the origin, looking along x, z up (REP 103).
+LEVEL_CAMERA = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+# An alignment is believed where the points of the reference, moved by it, lie on the new depth.
+GRID_STEP_PX = 8
+FIT_M = 0.03
+FIT_SHARE = 0.02
+LEAST_POINTS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A frame prepared for alignment, and its pose."""
+
+    frame: Any
+    depth_m: NDArray[np.float32]
+    T_world_camera: Float64
+
+
+class RgbdOdometry:
+    """Tracks a camera from frame to frame.
+
+    Args:
+        config: method and limits.
+        T_world_start: (4, 4) pose of the first frame; None = level, at the origin, looking along x.
+
+    Attributes:
+        tracked: frames that were given a pose.
+        lost: frames that were not.
+        restarts: times that tracking began anew at the last known pose.
+    """
+
+    def __init__(self, config: OdometryConfig, T_world_start: Float64 | None = None) -> None:
+        self._config = config
+        self._T_world_start = LEVEL_CAMERA if T_world_start is None else T_world_start
+        check_pose(self._T_world_start)
+        self._intrinsics: Intrinsics | None = None
+        self._odometry: Any = None
+        self._reference: _View | None = None
+        self._newest: _View | None = None
+        self._lost_in_a_row = 0
+        self.tracked = self.lost = self.restarts = 0
+
+    def track(
+        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], intrinsics: Intrinsics
+    ) -> Float64:
+        """T_world_camera (4, 4) of the next frame.
+
+        Args:
+            rgb: (H, W, 3) uint8, RGB order.
+            depth_m: (H, W) float32, metres; 0 = invalid.
+            intrinsics: of both.
+
+        Raises:
+            RefusedInput: ``odometry_lost`` where the frame fits none before it. The reference is
+                kept for the next one; after `restart_after` such frames the next that has depth
+                becomes the reference, with the last known pose.
+        """
+        if intrinsics != self._intrinsics:
+            self._begin(intrinsics)
+        depth_m = np.where((depth_m > 0) & (depth_m <= self._config.max_depth_m), depth_m, 0)
+        if np.count_nonzero(_grid(depth_m)) < LEAST_POINTS:
+            raise self._lose(f"fewer than {LEAST_POINTS} of its pixels on the grid have depth")
+        frame = self._prepare(rgb, depth_m)
+        if self._newest is None or self._reference is None:
+            return self._accept(_View(frame, depth_m, self._T_world_start), restart=True)
+        complaints = []
+        for view in dict.fromkeys((self._reference, self._newest)):
+            T_camera_view, complaint = self._align(view, frame, depth_m, intrinsics)
+            if T_camera_view is not None:
+                T_world_camera = _rigid(view.T_world_camera @ invert_pose(T_camera_view))
+                return self._accept(_View(frame, depth_m, T_world_camera))
+            complaints.append(complaint)
+        if self._lost_in_a_row >= self._config.restart_after:
+            self.restarts += 1
+            return self._accept(_View(frame, depth_m, self._newest.T_world_camera), restart=True)
+        raise self._lose(complaints[-1])
+
+    def _begin(self, intrinsics: Intrinsics) -> None:
+        """Set up the alignment; with other intrinsics, go on from the last known pose."""
+        if self._newest is not None:
+            self._T_world_start = self._newest.T_world_camera
+            self.restarts += 1
+        self._intrinsics = intrinsics
+        self._reference = self._newest = None
+        settings = cv2.OdometrySettings()
+        settings.setCameraMatrix(intrinsics.matrix.astype(np.float32))
+        settings.setMaxDepth(self._config.max_depth_m)
+        settings.setMaxTranslation(self._config.max_step_m)
+        settings.setMaxRotation(self._config.max_rotation_deg)
+        kind = (
+            cv2.OdometryType_DEPTH if self._config.method == "depth" else cv2.OdometryType_RGB_DEPTH
+        )
+        self._odometry = cv2.Odometry(kind, settings, cv2.OdometryAlgoType_COMMON)
+
+    def _prepare(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Any:
+        holes = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32)
+        frame = cv2.OdometryFrame(holes, np.ascontiguousarray(rgb[:, :, ::-1]))
+        self._odometry.prepareFrame(frame)
+        return frame
+
+    def _align(
+        self, view: _View, frame: Any, depth_m: NDArray[np.float32], intrinsics: Intrinsics
+    ) -> tuple[Float64 | None, str]:
+        """T_camera_view, or None and why it is not believed."""
+        found, T_camera_view = self._odometry.compute(view.frame, frame)
+        if not found or not np.isfinite(T_camera_view).all():
+            return None, "no alignment was found"
+        T_camera_view = np.asarray(T_camera_view, np.float64)
+        step_m = float(np.linalg.norm(T_camera_view[:3, 3]))
+        if step_m > self._config.max_step_m:
+            return None, f"the camera would have moved {step_m:.2f} m (odometry.max_step_m)"
+        share = fit_share(view.depth_m, depth_m, T_camera_view, intrinsics)
+        if share < self._config.min_fit:
+            return None, f"{share:.0%} of the depth fits (odometry.min_fit)"
+        return T_camera_view, ""
+
+    def _accept(self, view: _View, *, restart: bool = False) -> Float64:
+        self._newest = view
+        if restart or self._reference is None or self._moved(self._reference, view):
+            self._reference = view
+        self._lost_in_a_row = 0
+        self.tracked += 1
+        return view.T_world_camera
+
+    def _moved(self, a: _View, b: _View) -> bool:
+        T_a_b = invert_pose(a.T_world_camera) @ b.T_world_camera
+        return (
+            float(np.linalg.norm(T_a_b[:3, 3])) > self._config.keyframe_m
+            or rotation_angle_deg(T_a_b[:3, :3]) > self._config.keyframe_deg
+        )
+
+    def _lose(self, why: str) -> RefusedInput:
+        self.lost += 1
+        self._lost_in_a_row += 1
+        return RefusedInput(
+            "odometry_lost",
+            f"odometry lost the camera: {why}; frame {self._lost_in_a_row} in a row, of "
+            f"{self._config.restart_after} before it starts anew at the last known pose",
+        )
+
+
+def fit_share(
+    depth_a_m: NDArray[np.float32],
+    depth_b_m: NDArray[np.float32],
+    T_b_a: Float64,
+    intrinsics: Intrinsics,
+) -> float:
+    """Share of the points of depth image a that lie on depth image b, of those that b sees.
+
+    On a grid of pixels; 0 where too few can be compared.
+    """
+    grid = _grid(depth_a_m)
+    rows, columns = np.nonzero(grid)
+    z = grid[rows, columns].astype(np.float64)
+    u, v = columns * GRID_STEP_PX, rows * GRID_STEP_PX
+    points = np.stack(
+        [(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z], 1
+    )
+    moved = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+    moved = moved[moved[:, 2] > 1e-3]
+    column = np.rint(intrinsics.fx * moved[:, 0] / moved[:, 2] + intrinsics.cx).astype(np.int64)
+    row = np.rint(intrinsics.fy * moved[:, 1] / moved[:, 2] + intrinsics.cy).astype(np.int64)
+    height, width = depth_b_m.shape
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    seen_m = np.zeros(len(moved))
+    seen_m[inside] = depth_b_m[row[inside], column[inside]]
+    valid = seen_m > 0
+    if np.count_nonzero(valid) < max(LEAST_POINTS, len(points) // 8):
+        return 0.0
+    gap_m = np.abs(seen_m[valid] - moved[valid, 2])
+    return float(np.mean(gap_m < FIT_M + FIT_SHARE * seen_m[valid]))
+
+
+def rotation_angle_deg(rotation: Float64) -> float:
+    """Angle of a rotation matrix (3, 3), degrees."""
+    return math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
+
+
+def _grid(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    return depth_m[::GRID_STEP_PX, ::GRID_STEP_PX]
+
+
+def _rigid(T: Float64) -> Float64:
+    """The same transform with a rotation that is exactly one: errors of products add up."""
+    return interpolate_pose(T, T, 0.0)

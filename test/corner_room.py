@@ -1,0 +1,67 @@
+"""A made-up corner of a room, seen from anywhere: three textured walls, rendered exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+
+INTRINSICS = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
+# Looks along +x at a wall 3 m away, level; a floor below and a wall to the left.
+LEVEL = np.array(
+    [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+# Axis and place of each wall.
+WALLS = ((0, 3.0), (1, 1.2), (2, -0.7))
+
+
+def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
+    """What the camera sees."""
+    v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
+    rays = np.stack(
+        [
+            (u - INTRINSICS.cx) / INTRINSICS.fx,
+            (v - INTRINSICS.cy) / INTRINSICS.fy,
+            np.ones(u.shape),
+        ],
+        axis=-1,
+    )
+    directions = rays @ T_world_camera[:3, :3].T
+    depth = np.full(u.shape, np.inf)
+    for axis, place in WALLS:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            hit = (place - T_world_camera[axis, 3]) / directions[..., axis]
+        depth = np.where((hit > 0.1) & (hit < depth), hit, depth)
+    points = T_world_camera[:3, 3] + depth[..., None] * directions
+    waves = [np.sin(points @ direction + phase) for direction, phase in WAVES]
+    rgb = np.stack([127 + 40 * (waves[i] + waves[i + 1] + waves[i + 2]) for i in range(3)], -1)
+    return RgbdFrame(
+        stamp_ns,
+        np.clip(rgb, 0, 255).astype(np.uint8),
+        depth.astype(np.float32),
+        INTRINSICS,
+        T_world_camera,
+        "map",
+    )
+
+
+def turned(yaw_deg: float, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> np.ndarray:
+    """The level camera, turned to the left and moved."""
+    angle = np.radians(yaw_deg)
+    T = np.eye(4)
+    T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    T[:3, 3] = x_m, y_m, z_m
+    return T @ LEVEL
+
+
+def walk(count: int) -> list[np.ndarray]:
+    """Poses of a camera that walks forward and looks around, 2-3 cm and about 1 degree a frame."""
+    steps = np.arange(count)
+    return [
+        turned(8 * np.sin(0.15 * k), 0.02 * k, 0.05 * np.sin(0.3 * k), 0.01 * np.sin(0.5 * k))
+        for k in steps
+    ]
+
+
+_rng = np.random.default_rng(7)
+WAVES = [(_rng.normal(0, 9, 3), _rng.uniform(0, 6)) for _ in range(5)]
