@@ -45,6 +45,12 @@ def test_each_folder_is_recognised(tmp_path: Path) -> None:
         assert open_source(folder / "sequence").name == folder.name
 
 
+def test_a_whole_data_set_is_no_recording(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "rooms")
+    with pytest.raises(RecordingError, match=r"with the scans room_0; name one.*data/room_0"):
+        open_source(root)
+
+
 def test_frames_of_a_room(tmp_path: Path) -> None:
     recording = open_recording(write_room(tmp_path) / "data" / "room_0")
     frames = list(recording.frames())

@@ -6,9 +6,10 @@ import json
 import pickle
 from pathlib import Path
 
+import msgspec
 import pytest
-from evaluation_support import write_json
-from sequence_support import write_room
+from evaluation_support import write_dataset, write_json
+from sequence_support import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
 from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
@@ -17,6 +18,7 @@ from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.files import latex_rows, latex_text
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
+from deworldsg_ros.evaluation.labels import translate, translation
 from deworldsg_ros.evaluation.predictions import read_predictions, write_predictions
 from deworldsg_ros.evaluation.protocol import ProtocolOptions, evaluate_predictions
 from deworldsg_ros.evaluation.runner import (
@@ -28,6 +30,7 @@ from deworldsg_ros.evaluation.runner import (
 )
 from deworldsg_ros.evaluation.scene_graphs import to_prediction
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.wire import Belief
 
 
 def task(root: Path, out: Path, **changes: object) -> ScanTask:
@@ -83,6 +86,45 @@ def test_a_graph_of_another_vocabulary_is_refused(tmp_path: Path) -> None:
     graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
     with pytest.raises(EvaluationError, match="another vocabulary"):
         to_prediction(graph, Vocabulary(("bed",), ("near",)))
+
+
+def test_labels_of_a_detector_become_classes(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    mapping = root / "ReplicaSSG" / "replica_to_visual_genome.json"
+    content = json.loads(mapping.read_text())
+    content["Replica2VisualGenome"] |= {"stool": "chair", "sofa": "chair", "mat": "unknown"}
+    mapping.write_text(json.dumps(content))
+    annotations = Annotations(root, "replica")
+    names = translation(annotations)
+    assert names == {"stool": "chair", "sofa": "chair", "couch": "chair", "dining table": "table"}
+    evaluate_scan(task(root, tmp_path / "out"))
+    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    beliefs = [Belief("couch", 0.3), Belief("mat", 0.3), Belief("stool", 0.2), Belief("book", 0.1)]
+    node = msgspec.structs.replace(graph.nodes[0], classes=beliefs, label="couch")
+    foreign = msgspec.structs.replace(graph, nodes=[node], edges=[])
+    translated = translate(foreign, annotations)
+    assert translated.nodes[0].label == "chair"
+    scores = to_prediction(translated, annotations.vocabulary).class_scores
+    # book, chair, table; the rest is spread over what is not stated.
+    assert scores[0].tolist() == pytest.approx([0.1, 0.5, 0.1])
+    assert translate(graph, annotations) is graph
+
+
+def test_a_scan_of_3rscan_is_turned_and_found(tmp_path: Path) -> None:
+    objects = [(name, number) for number, name, _, _ in BLOCKS]
+    root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
+    write_surface(write_sequence(root / "data" / "a"))
+    outcome = evaluate_scan(
+        task(
+            root,
+            tmp_path / "out",
+            layout="3rscan",
+            scan="a",
+            front_end=FrontEndChoice("ground-truth"),
+        )
+    )
+    assert outcome.result.object_ranks == [0, 0, 0]
+    assert outcome.result.relationship_ranks == [0, 0]
 
 
 def invoke(*arguments: object) -> tuple[int, str]:

@@ -35,7 +35,8 @@ RecordingPath = Annotated[
     Path,
     typer.Argument(
         metavar="RECORDING",
-        help="rosbag2 folder, .mcap or .db3 file, 7-Scenes or TUM RGB-D folder",
+        help="rosbag2 folder, .mcap or .db3 file, or folder of 7-Scenes, TUM RGB-D, 3RScan, "
+        "ReplicaSSG",
     ),
 ]
 OutFolder = Annotated[Path, typer.Option("--out", help="folder for the results; made if need be")]

@@ -41,7 +41,18 @@ def dataset_names() -> list[str]:
 
 
 def detect_dataset(path: Path) -> str | None:
-    """Name of the data set that a folder looks like; None for none of them."""
+    """Name of the data set that a folder looks like; None for none of them.
+
+    Raises:
+        RecordingError: for a whole data set of many scans, which is no recording.
+    """
+    scans = sorted(folder.parent.name for folder in path.glob("data/*/sequence"))
+    if scans:
+        shown = ", ".join(scans[:3]) + (", …" if len(scans) > 3 else "")
+        raise RecordingError(
+            f"recording {path}: it is a data set with the scans {shown}; name one of them, e.g. "
+            f"{path / 'data' / scans[0]}"
+        )
     return next((name for name, kind in _datasets().items() if kind.looks_like(path)), None)
 
 

@@ -20,6 +20,7 @@ from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.datasets.sequence import SequenceDataset
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.labels import translate
 from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
 from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.scene_graphs import to_prediction
@@ -120,6 +121,11 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     marks = {round(total * (i + 1) / task.checkpoints) for i in range(task.checkpoints)}
     refused: Counter[str] = Counter()
     over_time: list[Checkpoint] = []
+
+    def score(graph: wire.SceneGraphMessage) -> ScanResult:
+        prediction = to_prediction(translate(graph, annotations), annotations.vocabulary)
+        return score_scan(annotation, points, prediction, task.options)
+
     frames = 0
     started_ns: int | None = None
     for frame in _first(recording.frames(), total):
@@ -131,12 +137,7 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
             continue
         frames += 1
         if frames in marks:
-            result = score_scan(
-                annotation,
-                points,
-                to_prediction(pipeline.graph(), annotations.vocabulary),
-                task.options,
-            )
+            result = score(pipeline.graph())
             over_time.append(_checkpoint(frames, 1e-9 * (frame.stamp_ns - started_ns), result))
     if not frames:
         raise EvaluationError(f"scan {task.scan}: not one frame could be used: {refused}")
@@ -144,10 +145,8 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     path = _write(task, graph)
     return ScanOutcome(
         scan=task.scan,
-        result=score_scan(
-            annotation, points, to_prediction(graph, annotations.vocabulary), task.options
-        ),
-        measures=measure(graph, reference),
+        result=score(graph),
+        measures=measure(translate(graph, annotations), reference),
         frames=frames,
         nodes=len(graph.nodes),
         edges=len(graph.edges),
@@ -165,6 +164,7 @@ def evaluate_graph(
 ) -> tuple[ScanResult, Measures]:
     """Measure a graph that was made before."""
     points = annotations.points(scan, aligned=options.aligned_ply)
+    graph = translate(graph, annotations)
     prediction = to_prediction(graph, annotations.vocabulary)
     reference: ReferenceScene = read_reference(annotations, scan, points)
     result = score_scan(annotations.scan(scan), points, prediction, options)

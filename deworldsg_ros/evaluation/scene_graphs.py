@@ -23,17 +23,23 @@ def to_prediction(graph: wire.SceneGraphMessage, vocabulary: Vocabulary) -> Scan
     first `POINTS_PER_OBSERVATION` of it count once for each frame in which the node was seen.
 
     A graph tells the k most probable labels: the rest of the probability is spread evenly over
-    the other labels.
+    the other labels. Classes outside the vocabulary (see `labels`) are left out.
 
     Raises:
-        EvaluationError: for a label that is not in the vocabulary.
+        EvaluationError: where no class, or some predicate, is in the vocabulary.
     """
     classes = {name: place for place, name in enumerate(vocabulary.classes)}
     predicates = {name: place for place, name in enumerate(vocabulary.predicates)}
     place_of = {node.id: place for place, node in enumerate(graph.nodes)}
     points = tuple(_segment(node) for node in graph.nodes)
-    class_scores = [_expand(node.classes, classes, "class") for node in graph.nodes]
-    edge_scores = [_expand(edge.predicates, predicates, "predicate") for edge in graph.edges]
+    labels = {belief.label for node in graph.nodes for belief in node.classes}
+    if labels and not labels & set(classes):
+        raise _foreign("class", labels)
+    unknown = {belief.label for edge in graph.edges for belief in edge.predicates} - set(predicates)
+    if unknown:
+        raise _foreign("predicate", unknown)
+    class_scores = [_expand(node.classes, classes) for node in graph.nodes]
+    edge_scores = [_expand(edge.predicates, predicates) for edge in graph.edges]
     edges = [(place_of[edge.subject], place_of[edge.object]) for edge in graph.edges]
     return ScanPrediction(
         points,
@@ -50,16 +56,18 @@ def _segment(node: wire.NodeState) -> Float64:
     return np.tile(sample, (node.observations, 1))
 
 
-def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int], kind: str) -> Float64:
-    unknown = [belief.label for belief in beliefs if belief.label not in places]
-    if unknown:
-        raise EvaluationError(
-            f"scene graph has the {kind} '{unknown[0]}', which the data set does not: was it made "
-            "with another vocabulary?"
-        )
-    others = len(places) - len(beliefs)
+def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int]) -> Float64:
+    others = len(places) - sum(belief.label in places for belief in beliefs)
     left = max(0.0, 1.0 - sum(belief.probability for belief in beliefs))
     scores = np.full(len(places), left / others if others else 0.0)
     for belief in beliefs:
-        scores[places[belief.label]] = belief.probability
+        if belief.label in places:
+            scores[places[belief.label]] = belief.probability
     return scores
+
+
+def _foreign(kind: str, labels: set[str]) -> EvaluationError:
+    return EvaluationError(
+        f"scene graph has the {kind} '{min(labels)}', which the data set does not: was it made "
+        "with another vocabulary?"
+    )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import msgspec
+
 from deworldsg_ros.config import Config
 from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.sequence import SequenceDataset
@@ -12,6 +14,7 @@ from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.ground_truth import GroundTruthFrontEnd
 from deworldsg_ros.evaluation.front_ends.recorded import RecordedFrontEnd
 from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.pipeline import Perceiver
 
 Kind = Literal["backend", "recorded", "ground-truth"]
@@ -61,7 +64,13 @@ def build_front_end(
 ) -> Perceiver:
     """The chosen front end for one scan; raises EvaluationError, RecordingError."""
     if choice.kind == "backend":
-        return build_perception(config.perception, world_up=config.inputs.world_up)
+        # Predicates are the data set's, whatever the configuration says.
+        names = {predicates: name for name, predicates in PREDICATE_SETS.items()}
+        predicate_set = names.get(annotations.vocabulary.predicates)
+        perception = config.perception
+        if predicate_set is not None:
+            perception = msgspec.structs.replace(perception, predicate_set=predicate_set)
+        return build_perception(perception, world_up=config.inputs.world_up)
     if choice.kind == "recorded":
         return RecordedFrontEnd(
             dataset.sequence,

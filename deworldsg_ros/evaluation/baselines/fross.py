@@ -1,0 +1,139 @@
+"""FROSS (Hou et al., ICCV 2025): boxes lifted at their centre, merged by class and distance.
+
+Written from the description in words (docs/evaluation.md tells it, and where it leaves a choice).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.evaluation.baselines.graph import BaselineNode, fuse_nodes
+from deworldsg_ros.evaluation.baselines.lifting import Lifted, back_project
+from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.frame_graph import FrameGraph
+from deworldsg_ros.scene.gaussian import hellinger_distance, transform
+
+HELLINGER_THRESHOLD = 0.85
+# Evaluation points: a grid so wide, in the central half of the box.
+GRID_PX = 50
+
+
+class Fross:
+    """Stages b and c of FROSS."""
+
+    name = "FROSS"
+
+    def lift(
+        self,
+        frame_graph: FrameGraph,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        T_world_camera: Float64,
+    ) -> Lifted:
+        """The objects that have depth at the centre of their box.
+
+        Drops: ``no_centre_depth``, ``empty_box`` where a side is shorter than a pixel.
+        """
+        nodes, rows, drops = [], [], Counter[str]()
+        for row, box in enumerate(frame_graph.boxes_xyxy):
+            u, v, width, height = whole_box(box)
+            if width < 1 or height < 1:
+                drops["empty_box"] += 1
+                continue
+            depth = float(depth_m[v, u])
+            if not 0.0 < depth < np.inf:
+                drops["no_centre_depth"] += 1
+                continue
+            centre = back_project(np.array([[u, v]]), np.array([depth]), intrinsics)[0]
+            mean, covariance = transform(
+                centre, box_covariance(u, v, width, height, depth, intrinsics), T_world_camera
+            )
+            points = evaluation_points(u, v, width, height, depth_m, intrinsics, T_world_camera)
+            rows.append(row)
+            nodes.append(
+                BaselineNode(
+                    mean,
+                    covariance,
+                    frame_graph.class_probabilities[row],
+                    float(len(points)),
+                    points,
+                    frame_graph.stamp_ns,
+                    frame_graph.stamp_ns,
+                )
+            )
+        return Lifted(nodes, rows, drops)
+
+    def choose(self, node: BaselineNode, others: Sequence[BaselineNode]) -> int | None:
+        """The nearest by Hellinger distance of those with the same best class, if near enough.
+
+        As released, two equal Gaussians give NaN and never merge; here the Bhattacharyya
+        distance is clamped at 0 (`scene.gaussian`).
+        """
+        places = [place for place, other in enumerate(others) if other.label == node.label]
+        if not places:
+            return None
+        distances = hellinger_distance(
+            node.mean_world,
+            node.covariance_world,
+            np.array([others[place].mean_world for place in places]),
+            np.array([others[place].covariance_world for place in places]),
+        )
+        nearest = int(distances.argmin())
+        return places[nearest] if distances[nearest] < HELLINGER_THRESHOLD else None
+
+    def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
+        """Moments and class distributions weighted by the numbers of evaluation points."""
+        weights = np.array([keeper.weight, other.weight])
+        weights = weights / weights.sum() if weights.sum() > 0 else np.array([0.5, 0.5])
+        scores = weights[0] * keeper.class_scores + weights[1] * other.class_scores
+        return fuse_nodes(keeper, other, scores)
+
+
+def whole_box(box_xyxy: Float64) -> tuple[int, int, int, int]:
+    """Centre column, centre row, width and height, each cut to whole pixels."""
+    x1, y1, x2, y2 = box_xyxy.tolist()
+    return int((x1 + x2) / 2), int((y1 + y2) / 2), int(x2 - x1), int(y2 - y1)
+
+
+def box_covariance(
+    u: int, v: int, width: int, height: int, depth_m: float, intrinsics: Intrinsics
+) -> Float64:
+    """Covariance of a box's object in the camera frame, (3, 3) square metres.
+
+    The box as a uniform distribution, diag(w², h²) / 12, through the pseudo-inverse of the
+    projection's Jacobian J = [[fx/Z, 0, -x fx/Z²], [0, fy/Z, -y fy/Z²]] with x, y the normalised
+    image coordinates, as released; z gets the mean of the other two variances on top.
+    """
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    fx, fy = intrinsics.fx / depth_m, intrinsics.fy / depth_m
+    jacobian = np.array([[fx, 0.0, -x * fx / depth_m], [0.0, fy, -y * fy / depth_m]])
+    inverse = np.linalg.pinv(jacobian)
+    covariance = inverse @ np.diag([width**2 / 12.0, height**2 / 12.0]) @ inverse.T
+    covariance[2, 2] += (covariance[0, 0] + covariance[1, 1]) / 2
+    return np.asarray(covariance, np.float64)
+
+
+def evaluation_points(
+    u: int,
+    v: int,
+    width: int,
+    height: int,
+    depth_m: NDArray[np.float32],
+    intrinsics: Intrinsics,
+    T_world_camera: Float64,
+) -> Float64:
+    """Points (n, 3) of a 50-pixel grid in the central half of the box, world frame."""
+    columns = np.arange(u - width // 4, u + width // 4 + 1, GRID_PX)
+    rows = np.arange(v - height // 4, v + height // 4 + 1, GRID_PX)
+    columns = columns[(columns >= 0) & (columns < intrinsics.width)]
+    rows = rows[(rows >= 0) & (rows < intrinsics.height)]
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    depths = depth_m[pixels[:, 1], pixels[:, 0]]
+    valid = (depths > 0) & np.isfinite(depths)
+    points = back_project(pixels[valid], depths[valid], intrinsics)
+    return np.asarray(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])

@@ -1,0 +1,122 @@
+"""A baseline in place of the pipeline: the same detections, depth and poses in, a graph out."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode
+from deworldsg_ros.evaluation.baselines.lifting import Lifted
+from deworldsg_ros.evaluation.predictions import ScanPrediction
+from deworldsg_ros.pipeline import Perceiver
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations
+
+
+class Baseline(Protocol):
+    """Lifting and association of a baseline."""
+
+    name: str
+
+    def lift(
+        self,
+        frame_graph: FrameGraph,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        T_world_camera: Float64,
+    ) -> Lifted:
+        """Nodes of one frame."""
+        ...
+
+    def choose(self, node: BaselineNode, others: Sequence[BaselineNode]) -> int | None:
+        """Place of the node that absorbs `node`; None = none does."""
+        ...
+
+    def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
+        """Both in one."""
+        ...
+
+
+class BaselinePipeline:
+    """perceive → lift → merge, a frame at a time.
+
+    Args:
+        baseline: how to lift and merge.
+        perceiver: where detections and relations come from.
+
+    Attributes:
+        drops: what was left out so far, by reason.
+        times_s: seconds spent in each stage, a list entry a frame.
+    """
+
+    def __init__(self, baseline: Baseline, perceiver: Perceiver) -> None:
+        self.drops: Counter[str] = Counter()
+        self.times_s: dict[str, list[float]] = {
+            name: [] for name in ("perception", "lifting", "merging")
+        }
+        self._baseline = baseline
+        self._perceiver = perceiver
+        self._graph: BaselineGraph | None = None
+
+    def process(self, frame: RgbdFrame) -> list[int]:
+        """Take one frame into the graph; returns the node id of each lifted object."""
+        with self._timed("perception"):
+            perceived = self._perceiver.perceive(frame)
+        seen = perceived.frame_graph
+        with self._timed("lifting"):
+            lifted = self._baseline.lift(
+                seen, frame.rgb, frame.depth_m, frame.intrinsics, frame.T_world_camera
+            )
+        if self._graph is None:
+            self._graph = BaselineGraph(
+                seen.vocabulary, frame.frame_id, self._baseline.choose, self._baseline.fuse
+            )
+        with self._timed("merging"):
+            node_ids = self._graph.integrate(
+                lifted.nodes, between(seen.relations, lifted.rows), frame.stamp_ns
+            )
+        self.drops.update(perceived.drops)
+        self.drops.update(lifted.drops)
+        return node_ids
+
+    def graph(self) -> wire.SceneGraphMessage:
+        """The whole graph so far; raises RefusedInput ``no_frames`` before the first frame."""
+        return self._known().message()
+
+    def prediction(self) -> ScanPrediction:
+        """The same as the protocol takes it; raises RefusedInput ``no_frames``."""
+        return self._known().prediction()
+
+    def _known(self) -> BaselineGraph:
+        if self._graph is None:
+            raise RefusedInput("no_frames", "no frame was processed: there is no graph")
+        return self._graph
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.times_s[stage].append(time.perf_counter() - start)
+
+
+def between(relations: Relations, rows: Sequence[int]) -> Relations:
+    """Relations whose ends are both among these rows, with places in place of rows."""
+    place_of = {row: place for place, row in enumerate(rows)}
+    kept = [
+        number
+        for number, (subject, object_) in enumerate(relations.pairs.tolist())
+        if subject in place_of and object_ in place_of
+    ]
+    pairs = [[place_of[end] for end in pair] for pair in relations.pairs[kept].tolist()]
+    return Relations(
+        np.array(pairs, np.int64).reshape(-1, 2), relations.logits[kept], relations.scores[kept]
+    )
