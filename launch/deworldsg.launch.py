@@ -1,12 +1,15 @@
 """The four nodes of deworldsg_ros: RGB, depth, camera info and pose in, /scene_graph out.
 
 ros2 launch deworldsg_ros deworldsg.launch.py rgb:=/my/rgb depth:=/my/depth_registered ...
+
+A robot without SLAM or odometry adds odometry:=true: then odometry_node makes the poses.
 """
 
 from __future__ import annotations
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
+from launch.conditions import IfCondition
 from launch.substitutions import (
     EnvironmentVariable,
     LaunchConfiguration,
@@ -34,7 +37,7 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "params_file",
             default_value=PathJoinSubstitution([share, "config", "robust.yaml"]),
-            description="ROS parameter file for all four nodes",
+            description="ROS parameter file for all nodes",
         ),
         DeclareLaunchArgument(
             "use_sim_time",
@@ -42,23 +45,32 @@ def generate_launch_description() -> LaunchDescription:
             choices=["true", "false"],
             description="take the time from /clock, as with ros2 bag play --clock",
         ),
+        DeclareLaunchArgument(
+            "odometry",
+            default_value="false",
+            choices=["true", "false"],
+            description="start odometry_node, which makes the poses out of the images",
+        ),
         *(
             DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {what}")
             for name, topic, what in INPUTS
         ),
     ]
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
-    nodes = [
-        Node(
+
+    def node(name: str, **options: IfCondition) -> Node:
+        return Node(
             package=PACKAGE,
             executable=name,
             name=name,
             output="screen",
             parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
             remappings=[(topic, LaunchConfiguration(argument)) for argument, topic, _ in INPUTS],
+            **options,
         )
-        for name in NODES
-    ]
+
+    nodes = [node(name) for name in NODES]
+    nodes.append(node("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))))
     # Images between processes need the larger shared-memory segment; a profile that is set already
     # is the user's.
     profile = SetEnvironmentVariable(

@@ -1,7 +1,7 @@
 """deworldsg_ros on an Intel RealSense: its topic names, everything else as in deworldsg.launch.py.
 
 Start the camera with depth aligned to colour (align_depth.enable:=true). The pose comes from your
-odometry or SLAM: from TF, or pose:=/my/odometry.
+odometry or SLAM: from TF, or pose:=/my/odometry. Without either, odometry:=true makes it.
 """
 
 from __future__ import annotations
@@ -27,6 +27,12 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "pose", default_value="camera/pose", description="topic of the poses; or use TF"
         ),
+        DeclareLaunchArgument(
+            "odometry",
+            default_value="false",
+            choices=["true", "false"],
+            description="start odometry_node, which makes the poses out of the images",
+        ),
         *(
             DeclareLaunchArgument(name, default_value=topic, description=f"the camera's {topic}")
             for name, topic in CAMERA_TOPICS.items()
@@ -34,6 +40,8 @@ def generate_launch_description() -> LaunchDescription:
     ]
     nodes = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(launch_file),
-        launch_arguments=[(name, LaunchConfiguration(name)) for name in ("pose", *CAMERA_TOPICS)],
+        launch_arguments=[
+            (name, LaunchConfiguration(name)) for name in ("pose", "odometry", *CAMERA_TOPICS)
+        ],
     )
     return LaunchDescription([*arguments, nodes])

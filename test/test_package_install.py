@@ -18,7 +18,10 @@ from ament_index_python.packages import (
 )
 
 PACKAGE = "deworldsg_ros"
-EXECUTABLES = {"segmentation_node", "lifting_node", "relation_node", "graph_node", "replay_node"}
+EXECUTABLES = {
+    *("segmentation_node", "lifting_node", "relation_node", "graph_node"),
+    *("odometry_node", "replay_node"),
+}
 SOURCES = (
     *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "requirements.txt", "LICENSE"),
     *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),

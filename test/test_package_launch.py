@@ -31,6 +31,7 @@ CLASSES = {
         "IncludeLaunchDescription",
         "SetEnvironmentVariable",
     ),
+    "launch.conditions": ("IfCondition",),
     "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
     "launch.substitutions": ("EnvironmentVariable", "LaunchConfiguration", "PathJoinSubstitution"),
     "launch_ros": (),
@@ -58,13 +59,17 @@ def describe(path: Path, classes: dict[str, type[Kept]], kind: str) -> list[Kept
     return [entity for entity in description if isinstance(entity, classes[kind])]
 
 
-def test_four_nodes_take_the_parameter_file_and_the_inputs(
+def test_the_nodes_take_the_parameter_file_and_the_inputs(
     root_dir: Path, launch_classes: dict[str, type[Kept]]
 ) -> None:
     path = root_dir / "launch" / "deworldsg.launch.py"
     nodes = describe(path, launch_classes, "Node")
     names = [node.kwargs["executable"] for node in nodes]
-    assert names == ["segmentation_node", "lifting_node", "relation_node", "graph_node"]
+    always = ["segmentation_node", "lifting_node", "relation_node", "graph_node"]
+    assert names == [*always, "odometry_node"]
+    conditions = [node.kwargs.get("condition") for node in nodes]
+    assert conditions[:4] == [None] * 4
+    assert conditions[4].args[0].args == ("odometry",)
     assert all((root_dir / "scripts" / "ros" / name).is_file() for name in names)
     for node in nodes:
         assert node.kwargs["package"] == "deworldsg_ros"
@@ -86,7 +91,10 @@ def test_every_launch_configuration_is_a_declared_argument(
     declared = {
         entity.args[0] for entity in describe(path, launch_classes, "DeclareLaunchArgument")
     }
-    assert declared == {"params_file", "use_sim_time", "rgb", "camera_info", "depth", "pose"}
+    assert declared == {
+        *("params_file", "use_sim_time", "odometry"),
+        *("rgb", "camera_info", "depth", "pose"),
+    }
 
 
 def test_realsense_passes_its_topics_on(
