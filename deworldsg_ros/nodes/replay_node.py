@@ -34,7 +34,7 @@ from deworldsg_ros.bags.writer import topic_of
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.datasets.dataset import DatasetOptions
-from deworldsg_ros.nodes.replay_monitor import Endpoint, PipelineMonitor
+from deworldsg_ros.nodes.replay_monitor import SETTLE_S, Endpoint, PipelineMonitor
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 PARAMETERS: dict[str, tuple[Any, str]] = {
@@ -42,6 +42,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "rate": (1.0, "pace: 1 = as recorded, 0 = as fast as the pipeline keeps up"),
     "window": (4, "most frames that wait for their local graph; 0 = never wait"),
     "wait_s": (10.0, "how long to wait for the four nodes, seconds; 0 = not at all"),
+    "listener_s": (4.0, "without the four nodes: how long to wait for any listener, seconds"),
     "required": (False, "whether to end with an error where they do not come"),
     "stall_s": (20.0, "after so long without an answer, frames in flight are given up, seconds"),
     "clock": (False, "publish the recorded time on /clock, for use_sim_time"),
@@ -64,7 +65,6 @@ CLASSES = {
 }
 PUBLISHER_DEPTH = 10
 TELL_PERIOD_S = 0.2
-DISCOVERY_S = 1.5
 # The longest that a signal waits to be noticed.
 SPIN_PERIOD_S = 0.1
 EXIT_CONFIGURATION = 2
@@ -200,9 +200,12 @@ class ReplayNode(Node):  # type: ignore[misc]
 
     def _wait_to_be_found(self) -> None:
         """Give whoever listens the time to discover the topics."""
-        end_s = time.monotonic() + DISCOVERY_S
+        end_s = time.monotonic() + float(self._settings["listener_s"])
+        while time.monotonic() < end_s and not self._outputs[Role.RGB].get_subscription_count():
+            self._spin(SPIN_PERIOD_S)
+        end_s = time.monotonic() + SETTLE_S
         while time.monotonic() < end_s:
-            self._spin(end_s - time.monotonic())
+            self._spin(SPIN_PERIOD_S)
 
     def _wait_until_due(self, message: RawRoleMessage, alone: bool) -> None:
         now_s = time.monotonic()
