@@ -128,8 +128,8 @@ def evaluation_points(
     T_world_camera: Float64,
 ) -> Float64:
     """Points (n, 3) of a 50-pixel grid in the central half of the box, world frame."""
-    columns = np.arange(u - width // 4, u + width // 4 + 1, GRID_PX)
-    rows = np.arange(v - height // 4, v + height // 4 + 1, GRID_PX)
+    columns = np.arange(u - width // 4, u + width // 4, GRID_PX)
+    rows = np.arange(v - height // 4, v + height // 4, GRID_PX)
     columns = columns[(columns >= 0) & (columns < intrinsics.width)]
     rows = rows[(rows >= 0) & (rows < intrinsics.height)]
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)

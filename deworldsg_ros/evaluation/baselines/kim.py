@@ -93,8 +93,7 @@ class Kim:
     def similarities(self, node: BaselineNode, others: Sequence[BaselineNode]) -> Float64:
         """0.5 class + 0.4 position + 0.1 colour of each other node, (n,)."""
         top = top_classes(node.class_scores)
-        common = [len(top & top_classes(other.class_scores)) for other in others]
-        classes = np.array([CLASS_SIMILARITIES[number] for number in common])
+        classes = np.array([class_similarity(top, top_classes(o.class_scores)) for o in others])
         means = np.array([other.mean_world for other in others])
         colour = densest_colour(node.colours)
         distances = [math.dist(colour, densest_colour(other.colours)) for other in others]
@@ -142,9 +141,16 @@ def without_outliers(points: Float64) -> Float64:
 
 
 def top_classes(class_scores: Float64) -> frozenset[int]:
-    """The three best classes; a class without any score is none."""
-    best = np.argsort(-class_scores, kind="stable")[:3].tolist()
-    return frozenset(place for place in best if class_scores[place] > 0)
+    """The three best classes; not those that only an even spread of the rest put there."""
+    order = np.argsort(-class_scores, kind="stable").tolist()
+    fourth = class_scores[order[3]] if len(order) > 3 else 0.0
+    return frozenset(place for place in order[:3] if class_scores[place] > fourth)
+
+
+def class_similarity(a: frozenset[int], b: frozenset[int]) -> float:
+    """By the number of common members; what neither list names counts as common."""
+    common = len(a & b)
+    return CLASS_SIMILARITIES[common + 3 - max(len(a), len(b)) if common else 0]
 
 
 def position_similarities(mean: Float64, means: Float64) -> Float64:
@@ -173,6 +179,8 @@ def _named_colour(bin_number: int) -> tuple[int, int, int]:
     width = 256 // COLOUR_BINS
     channels = np.array([bin_number // COLOUR_BINS**2, bin_number // COLOUR_BINS, bin_number])
     colour = (channels % COLOUR_BINS) * width + width / 2
-    named = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in CSS4_COLORS.values()])
+    named = np.array(
+        [[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in map(str, CSS4_COLORS.values())]
+    )
     red, green, blue = named[np.linalg.norm(named - colour, axis=1).argmin()].tolist()
     return red, green, blue
