@@ -201,11 +201,14 @@ class ReplayNode(Node):  # type: ignore[misc]
     def _wait_to_be_found(self) -> None:
         """Give whoever listens the time to discover the topics."""
         end_s = time.monotonic() + float(self._settings["listener_s"])
-        while time.monotonic() < end_s and not self._outputs[Role.RGB].get_subscription_count():
+        while time.monotonic() < end_s and not self._has_listener():
             self._spin(SPIN_PERIOD_S)
         end_s = time.monotonic() + SETTLE_S
         while time.monotonic() < end_s:
             self._spin(SPIN_PERIOD_S)
+
+    def _has_listener(self) -> bool:
+        return any(output.get_subscription_count() for output in self._outputs.values())
 
     def _wait_until_due(self, message: RawRoleMessage, alone: bool) -> None:
         now_s = time.monotonic()
