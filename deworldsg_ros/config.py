@@ -27,8 +27,11 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     segmenter: Annotated[str, _number("box-conditioned segmenter backend")] = "rgbd"
     relation_head: Annotated[str, _number("relation head backend")] = "geometric"
     predicate_set: Annotated[
-        Literal["replica_ssg", "3dssg"],
-        _number("predicates of the graph: ReplicaSSG (Visual Genome, 50) or 3DSSG (7)"),
+        Literal["replica_ssg", "3dssg", "checkpoint"],
+        _number(
+            "predicates of the graph: ReplicaSSG (Visual Genome, 50), 3DSSG (7), or those of the "
+            "relation head's checkpoint"
+        ),
     ] = "replica_ssg"
     score_threshold: Annotated[
         float,
@@ -39,6 +42,41 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_objects: Annotated[int, _number("most objects kept a frame, best first", ge=1, le=300)] = 50
     top_relations: Annotated[int, _number("relations kept a frame", ge=0, le=1000)] = 10
     threads: Annotated[int, _number("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
+    detector_path: Annotated[
+        str, _number("checkpoint of the detector rtdetr: a folder, or a hub id")
+    ] = ""
+    segmenter_path: Annotated[
+        str, _number("checkpoint of the segmenter sam2 or sam: a folder, or a hub id")
+    ] = ""
+    relation_head_path: Annotated[
+        str, _number("checkpoint of the relation head egtr; empty = the detector's")
+    ] = ""
+    local_files_only: Annotated[
+        bool, _number("take a hub id from the local cache only, never from the network")
+    ] = True
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"],
+        _number("where rtdetr, egtr, sam2 and sam run; auto = CUDA where there is one"),
+    ] = "auto"
+    class_scores: Annotated[
+        Literal["auto", "softmax", "sigmoid"],
+        _number("how rtdetr's class logits are read; auto = as the checkpoint's card says"),
+    ] = "auto"
+    class_temperature: Annotated[
+        float,
+        _number("temperature of rtdetr's class distribution; 0 = the checkpoint's", ge=0, le=100),
+    ] = 0.0
+    decoder_layers: Annotated[
+        int,
+        _number("layers of rtdetr's decoder that are run; 0 = the checkpoint's", ge=0, le=64),
+    ] = 0
+    sam_image_size: Annotated[
+        int,
+        _number("edge of sam2's square input, pixels, by 32; 0 = the checkpoint's", ge=0, le=4096),
+    ] = 0
+    sam_box_batch: Annotated[
+        int, _number("boxes that sam2 and sam decode at once", ge=1, le=1024)
+    ] = 16
 
 
 class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -191,44 +229,6 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_depth_m: Annotated[float, _number("depth beyond which is invalid, metres", gt=0)] = 10.0
 
 
-class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What goes out on /scene_graph."""
-
-    rate_hz: Annotated[float, _number("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
-    top_k: Annotated[int, _number("classes or predicates told a node or edge", ge=1, le=1000)] = 5
-    tentative_nodes: Annotated[
-        bool, _number("also nodes that were seen too rarely to be sure of (paper: there are none)")
-    ] = False
-    surface_points: Annotated[
-        bool, _number("surface points of each node in /scene_graph (large)")
-    ] = False
-
-
-class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole configuration."""
-
-    inputs: InputsConfig = InputsConfig()
-    perception: PerceptionConfig = PerceptionConfig()
-    lifting: LiftingConfig = LiftingConfig()
-    merging: MergingConfig = MergingConfig()
-    relations: RelationsConfig = RelationsConfig()
-    output: OutputConfig = OutputConfig()
-
-
-def load_config(path: Union[str, Path]) -> Config:
-    """Read a ROS parameter file, or the bare sections.
-
-    Raises:
-        ConfigurationError: with the file, the field, what was seen and what was wanted.
-    """
-    try:
-        content = msgspec.yaml.decode(Path(path).read_bytes())
-    except (OSError, msgspec.MsgspecError) as error:
-        raise ConfigurationError(f"configuration {path}: {error}") from error
-    for key in ("/**", "ros__parameters"):
-        if isinstance(content, dict) and key in content:
-            content = content[key]
-    content = {} if content is None else content
 class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Poses out of the images alone: odometry_node, `deworldsg run --odometry`."""
 
@@ -263,6 +263,45 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = False
 
 
+class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What goes out on /scene_graph."""
+
+    rate_hz: Annotated[float, _number("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
+    top_k: Annotated[int, _number("classes or predicates told a node or edge", ge=1, le=1000)] = 5
+    tentative_nodes: Annotated[
+        bool, _number("also nodes that were seen too rarely to be sure of (paper: there are none)")
+    ] = False
+    surface_points: Annotated[
+        bool, _number("surface points of each node in /scene_graph (large)")
+    ] = False
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole configuration."""
+
+    inputs: InputsConfig = InputsConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    perception: PerceptionConfig = PerceptionConfig()
+    lifting: LiftingConfig = LiftingConfig()
+    merging: MergingConfig = MergingConfig()
+    relations: RelationsConfig = RelationsConfig()
+    output: OutputConfig = OutputConfig()
+
+
+def load_config(path: Union[str, Path]) -> Config:
+    """Read a ROS parameter file, or the bare sections.
+
+    Raises:
+        ConfigurationError: with the file, the field, what was seen and what was wanted.
+    """
+    try:
+        content = msgspec.yaml.decode(Path(path).read_bytes())
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ConfigurationError(f"configuration {path}: {error}") from error
+    for key in ("/**", "ros__parameters"):
+        if isinstance(content, dict) and key in content:
+            content = content[key]
+    content = {} if content is None else content
     if isinstance(content, dict):
         content.pop("use_sim_time", None)
     return from_mapping(content, str(path))
@@ -280,7 +319,6 @@ def to_mapping(config: Config) -> dict[str, Any]:
     """Nested plain values of a configuration, as they stand in a file."""
     mapping: dict[str, Any] = msgspec.to_builtins(config)
     return mapping
-    odometry: OdometryConfig = OdometryConfig()
 
 
 def to_yaml(config: Config) -> str:

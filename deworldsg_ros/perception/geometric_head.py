@@ -109,6 +109,7 @@ class GeometricRelationHead:
         instances: NDArray[np.uint16],
         up_camera: Float64 | None,
         top_relations: int,
+        features: NDArray[np.float32] | None = None,
     ) -> Relations:
         """The best ordered pairs; see `RelationHead`."""
         count = len(boxes_xyxy)

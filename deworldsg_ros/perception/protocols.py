@@ -20,11 +20,14 @@ class Detections:
         boxes_xyxy: (n, 4) float64 pixels, corners x1, y1, x2, y2; pixel centres at integers.
         class_probabilities: (n, C) float64, calibrated, rows sum to one.
         scores: (n,) float64 in [0, 1], the detector's own score.
+        features: (n, …) float32, what the detector knows of each object besides, for a relation
+            head that was made for it; None = nothing.
     """
 
     boxes_xyxy: Float64
     class_probabilities: Float64
     scores: Float64
+    features: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         count = len(self.scores)
@@ -33,13 +36,20 @@ class Detections:
                 f"{count} scores, boxes of shape {self.boxes_xyxy.shape}, class probabilities of "
                 f"shape {self.class_probabilities.shape}: wanted one row an object"
             )
+        if self.features is not None and len(self.features) != count:
+            raise ValueError(f"{count} scores, {len(self.features)} features: wanted one a score")
 
     def __len__(self) -> int:
         return len(self.scores)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detections:
         """The objects of `rows`, in that order."""
-        return Detections(self.boxes_xyxy[rows], self.class_probabilities[rows], self.scores[rows])
+        return Detections(
+            self.boxes_xyxy[rows],
+            self.class_probabilities[rows],
+            self.scores[rows],
+            None if self.features is None else self.features[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -128,6 +138,7 @@ class RelationHead(Protocol):
         instances: NDArray[np.uint16],
         up_camera: Float64 | None,
         top_relations: int,
+        features: NDArray[np.float32] | None = None,
     ) -> Relations:
         """The `top_relations` best ordered pairs of the frame, best first.
 
@@ -140,4 +151,5 @@ class RelationHead(Protocol):
             instances: (H, W) uint16; k + 1 on the pixels of row k, 0 on nothing.
             up_camera: (3,) unit vector against gravity in the camera frame; None = unknown.
             top_relations: most pairs returned.
+            features: (n, …) the `Detections.features` of the objects.
         """

@@ -5,7 +5,8 @@ A backend's module is imported only when it is chosen, so that nobody pays for w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TypeVar
 
 from deworldsg_ros.config import PerceptionConfig
@@ -23,21 +24,65 @@ def _nanodet(config: PerceptionConfig) -> Detector:
     return NanoDetDetector(threads=config.threads)
 
 
+def _rtdetr(config: PerceptionConfig) -> Detector:
+    with _torch("perception.detector", config.detector, config):
+        from deworldsg_ros.perception.rtdetr import RtDetrDetector
+
+    return RtDetrDetector(config)
+
+
 def _rgbd(config: PerceptionConfig) -> Segmenter:
     from deworldsg_ros.perception.rgbd_segmenter import RgbdSegmenter
 
     return RgbdSegmenter()
 
 
-def _geometric(config: PerceptionConfig) -> RelationHead:
+def _sam2(config: PerceptionConfig) -> Segmenter:
+    with _torch("perception.segmenter", config.segmenter, config):
+        from deworldsg_ros.perception.sam2 import Sam2Segmenter
+
+    return Sam2Segmenter(config)
+
+
+def _sam(config: PerceptionConfig) -> Segmenter:
+    with _torch("perception.segmenter", config.segmenter, config):
+        from deworldsg_ros.perception.sam import SamSegmenter
+
+    return SamSegmenter(config)
+
+
+def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
     from deworldsg_ros.perception.geometric_head import GeometricRelationHead
 
+    if config.predicate_set == "checkpoint":
+        raise ConfigurationError(
+            "perception.predicate_set is 'checkpoint' and the relation head 'geometric' has none: "
+            f"wanted one of {', '.join(PREDICATE_SETS)}"
+        )
     return GeometricRelationHead(PREDICATE_SETS[config.predicate_set])
 
 
-DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {"nanodet": _nanodet}
-SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {"rgbd": _rgbd}
-RELATION_HEADS: dict[str, Callable[[PerceptionConfig], RelationHead]] = {"geometric": _geometric}
+def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
+    with _torch("perception.relation_head", config.relation_head, config):
+        from deworldsg_ros.perception.egtr import EgtrRelationHead
+
+    return EgtrRelationHead(config, detector)
+
+
+DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
+    "nanodet": _nanodet,
+    "rtdetr": _rtdetr,
+}
+SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
+    "rgbd": _rgbd,
+    "sam2": _sam2,
+    "sam": _sam,
+}
+# A head may read what the detector knows of its objects.
+RELATION_HEADS: dict[str, Callable[[PerceptionConfig, Detector], RelationHead]] = {
+    "geometric": _geometric,
+    "egtr": _egtr,
+}
 
 
 def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Perception:
@@ -48,15 +93,32 @@ def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Per
         world_up: axis of the world frame that points up: auto, z, y or -y.
 
     Raises:
-        ConfigurationError: a backend or an axis that does not exist, with those that do.
+        ConfigurationError: a backend or an axis that does not exist, with those that do; a
+            checkpoint that cannot be used.
     """
-    return Perception(
-        _choose("perception.detector", config.detector, DETECTORS)(config),
-        _choose("perception.segmenter", config.segmenter, SEGMENTERS)(config),
-        _choose("perception.relation_head", config.relation_head, RELATION_HEADS)(config),
-        config,
-        world_up=world_up,
-    )
+    # All names before the first checkpoint is loaded.
+    make_detector = _choose("perception.detector", config.detector, DETECTORS)
+    make_segmenter = _choose("perception.segmenter", config.segmenter, SEGMENTERS)
+    make_head = _choose("perception.relation_head", config.relation_head, RELATION_HEADS)
+    detector = make_detector(config)
+    head = make_head(config, detector)
+    return Perception(detector, make_segmenter(config), head, config, world_up=world_up)
+
+
+@contextmanager
+def _torch(parameter: str, name: str, config: PerceptionConfig) -> Iterator[None]:
+    """Import a backend on torch, which need not be installed; then give it its threads."""
+    try:
+        yield
+    except ImportError as error:
+        raise ConfigurationError(
+            f"{parameter} is '{name}', which needs torch, transformers and safetensors ({error}): "
+            "pip install 'deworldsg_ros[models]'"
+        ) from error
+    if config.threads:
+        import torch
+
+        torch.set_num_threads(config.threads)
 
 
 def _choose(parameter: str, name: str, known: Mapping[str, Made]) -> Made:

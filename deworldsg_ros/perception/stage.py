@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.label_image import label_image
-from deworldsg_ros.perception.protocols import Detections, Detector, RelationHead, Segmenter
+from deworldsg_ros.perception.protocols import (
+    Detections,
+    Detector,
+    MaskPatch,
+    RelationHead,
+    Segmenter,
+)
 from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.up import UpEstimator
+
+logger = logging.getLogger(__name__)
 
 # Below this a box has no inside to segment.
 MIN_BOX_SIDE_PX = 2.0
@@ -27,7 +37,8 @@ class Perceived:
         frame_graph: objects, best score first, and the relations between them.
         instances: (H, W) uint16; k + 1 on the pixels of the k-th object, 0 on nothing.
         drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
-            image), ``over_max_objects``.
+            image), ``over_max_objects``, ``segmenter_error`` (all of the frame); and
+            ``relation_head_error`` for those that went on without relations.
     """
 
     frame_graph: FrameGraph
@@ -58,6 +69,7 @@ class Perception:
         self._relation_head = relation_head
         self._config = config
         self._up = UpEstimator(world_up)
+        self._failed: set[str] = set()
         self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
         self.score_threshold = (
             detector.default_score_threshold
@@ -66,30 +78,31 @@ class Perception:
         )
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
-        """The 2D scene graph and the instance labels of `frame`."""
+        """The 2D scene graph and the instance labels of `frame`.
+
+        A backend that fails costs what it would have given, not the frame: see `drops`.
+
+        Raises:
+            RefusedInput: ``detector_error``.
+        """
         intrinsics = frame.intrinsics
         shape = (intrinsics.height, intrinsics.width)
-        found = self._detector.detect(frame.rgb, self.score_threshold)
-        objects, drops = self._select(found, intrinsics.width, intrinsics.height)
-        classes = objects.class_probabilities.argmax(axis=1)
-        names = [self.vocabulary.classes[index] for index in classes]
-        masks = self._segmenter.segment(
-            frame.rgb, frame.depth_m, intrinsics, objects.boxes_xyxy, names
-        )
-        instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
         up_camera = self._up_camera(frame.T_world_camera)
+        found = self._detect(frame)
+        objects, drops = self._select(found, intrinsics.width, intrinsics.height)
+        masks = self._segment(frame, objects)
+        if masks is None:
+            drops["segmenter_error"] = len(objects)
+            objects, masks = objects.take(slice(0)), []
+        classes = objects.class_probabilities.argmax(axis=1)
+        instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
         relations = Relations.none(len(self.vocabulary.predicates))
         if len(objects) > 1 and self._config.top_relations:
-            relations = self._relation_head.relate(
-                frame.depth_m,
-                intrinsics,
-                objects.boxes_xyxy,
-                names,
-                objects.scores,
-                instances,
-                up_camera,
-                self._config.top_relations,
-            )
+            related = self._relate(frame, objects, instances, up_camera)
+            if related is None:
+                drops["relation_head_error"] = len(objects)
+            else:
+                relations = related
         frame_graph = FrameGraph(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
@@ -102,6 +115,66 @@ class Perception:
             relations=relations,
         )
         return Perceived(frame_graph, instances, dict(drops))
+
+    def _detect(self, frame: RgbdFrame) -> Detections:
+        try:
+            return self._detector.detect(frame.rgb, self.score_threshold)
+        except Exception as error:  # a model can fail in more ways than can be listed
+            self._log_failure("detector", error)
+            raise RefusedInput("detector_error", f"the detector failed: {error}") from error
+
+    def _segment(self, frame: RgbdFrame, objects: Detections) -> list[MaskPatch] | None:
+        """A mask for each object; None where the segmenter failed."""
+        try:
+            return self._segmenter.segment(
+                frame.rgb,
+                frame.depth_m,
+                frame.intrinsics,
+                objects.boxes_xyxy,
+                self._likeliest_names(objects),
+            )
+        except Exception as error:  # see _detect
+            self._log_failure("segmenter", error)
+            return None
+
+    def _relate(
+        self,
+        frame: RgbdFrame,
+        objects: Detections,
+        instances: NDArray[np.uint16],
+        up_camera: Float64,
+    ) -> Relations | None:
+        """The best relations between the objects; None where the relation head failed."""
+        try:
+            return self._relation_head.relate(
+                frame.depth_m,
+                frame.intrinsics,
+                objects.boxes_xyxy,
+                self._likeliest_names(objects),
+                objects.scores,
+                instances,
+                up_camera,
+                self._config.top_relations,
+                objects.features,
+            )
+        except Exception as error:  # see _detect
+            self._log_failure("relation head", error)
+            return None
+
+    def _likeliest_names(self, objects: Detections) -> list[str]:
+        return [self.vocabulary.classes[c] for c in objects.class_probabilities.argmax(axis=1)]
+
+    def _log_failure(self, backend: str, error: Exception) -> None:
+        """Log a backend's first failure with its traceback; afterwards they are only counted."""
+        if backend not in self._failed:
+            self._failed.add(backend)
+            logger.error(
+                "the %s failed; the run goes on without what it would have found, and further "
+                "failures are counted: %s",
+                backend,
+                error,
+                exc_info=error,
+            )
 
     def _select(
         self, found: Detections, width: int, height: int
@@ -117,7 +190,7 @@ class Perception:
             drops["box_too_small"] = int((~usable).sum())
         if len(order) > len(kept):
             drops["over_max_objects"] = len(order) - len(kept)
-        return Detections(boxes, found.class_probabilities, found.scores).take(kept), drops
+        return replace(found, boxes_xyxy=boxes).take(kept), drops
 
     def _up_camera(self, T_world_camera: Float64) -> Float64:
         """Direction against gravity in the camera frame, (3,) unit vector."""

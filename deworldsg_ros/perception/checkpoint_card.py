@@ -1,0 +1,51 @@
+"""What a detector's checkpoint has to tell besides its weights: `deworldsg.json` in its folder."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Union
+
+import msgspec
+
+from deworldsg_ros.scene.errors import ConfigurationError
+
+CARD_FILE = "deworldsg.json"
+# The paper's threshold is one for softmax scores; sigmoid scores of RT-DETR are lower.
+DEFAULT_SCORE_THRESHOLD = {"softmax": 0.7, "sigmoid": 0.5}
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class CheckpointCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a checkpoint is meant to be read; a checkpoint without a card is a public RT-DETR.
+
+    Attributes:
+        class_scores: ``softmax`` over the classes (the paper), or independent ``sigmoid``s.
+        temperature: of the softmax that makes the class distribution; below 1 sharpens.
+        score_threshold: the least score of an object; None = 0.7 for softmax, 0.5 for sigmoid.
+        decoder_layers: layers of the decoder that are run; 0 = all.
+        classes: names of the classes; empty = the `id2label` of config.json.
+        predicates: names of the predicates of the relation head beside the detector, if any.
+        frequency_bias: whether the relation head adds its class-pair statistics.
+    """
+
+    class_scores: Literal["softmax", "sigmoid"] = "sigmoid"
+    temperature: Positive = 1.0
+    score_threshold: Union[Annotated[float, msgspec.Meta(ge=0, le=1)], None] = None
+    decoder_layers: Annotated[int, msgspec.Meta(ge=0)] = 0
+    classes: tuple[str, ...] = ()
+    predicates: tuple[str, ...] = ()
+    frequency_bias: bool = False
+
+
+def read_card(path: Union[Path, None]) -> CheckpointCard:
+    """The card in a file, or the default where there is none; raises ConfigurationError."""
+    if path is None:
+        return CheckpointCard()
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=CheckpointCard)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ConfigurationError(f"checkpoint card {path}: {error}") from error
+
+
+def write_card(path: Path, card: CheckpointCard) -> None:
+    """Write a card, for people to read, too."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
