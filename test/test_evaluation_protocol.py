@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evaluation_support import one_hot, segment, surface, write_dataset, write_json, write_ply
+from hypothesis import given
+from hypothesis import strategies as st
 
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.datasets.annotations import Annotations
@@ -174,6 +176,39 @@ def test_most_points_win_and_the_first_of_equals() -> None:
     segments = [segment(1, 6), segment(1, 8), segment(1, 8)]
     ids = np.repeat(1, 20)
     assert match([1], surface(ids), ids, segments).prediction_of == {1: 1}
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_matching_against_looking_at_every_pair(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    surface_points = generator.uniform(0, 0.5, (40, 3))
+    ids = generator.integers(0, 5, 40)
+    wanted_ids = [1, 2, 4]
+    segments = [generator.uniform(0, 0.5, (n, 3)) for n in generator.integers(0, 12, 6)]
+    supports = []
+    for points in segments:
+        votes = dict.fromkeys(wanted_ids, 0)
+        for x, y, z in points.tolist():
+            listed = [
+                ((x - a) * (x - a) + (y - b) * (y - b) + (z - c) * (z - c), number)
+                for (a, b, c), number in zip(surface_points.tolist(), ids.tolist())
+                if number in wanted_ids
+            ]
+            squared, number = min(listed, default=(1.0, 0))
+            if squared < 0.1 * 0.1:
+                votes[number] += 1
+        first, second = sorted(votes.values())[:-3:-1]
+        void = not first or first / len(points) < 0.5
+        if void or (second / len(points)) / (first / len(points)) > 0.75:
+            supports.append(None)
+        else:
+            supports.append((max(votes, key=lambda number: votes[number]), first))
+    matching = match(wanted_ids, surface_points, ids, segments)
+    assert [s and (s.object_id, s.points) for s in matching.supports] == supports
+    for number in wanted_ids:
+        rows = [row for row, support in enumerate(supports) if support and support[0] == number]
+        best = max(rows, key=lambda row: supports[row][1], default=None)
+        assert matching.prediction_of.get(number) == best
 
 
 def test_points_that_are_not_finite_do_not_vote_but_count() -> None:

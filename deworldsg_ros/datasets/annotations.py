@@ -134,8 +134,8 @@ class Annotations:
                 f"{root / self.layout.mapping}: wanted the keys {self.layout.label_map}, "
                 f"{self.layout.classes} and {self.layout.predicates}"
             ) from error
-        self._objects = self._entries(self.layout.objects, "objects")
-        self._relations = self._entries(self.layout.relations, "relationships")
+        self._objects = self._entries(self.layout.objects)
+        self._relations = self._entries(self.layout.relations)
 
     def scans(self, split: str = "test") -> list[str]:
         """Ids of the scans of a split, in file order; a scan written twice is given twice."""
@@ -172,11 +172,11 @@ class Annotations:
         if scan not in self._objects:
             notes.append(f"{scan} is not in {self.layout.objects}: it has no objects")
             return {}
-        place = {name: index for index, name in enumerate(self.vocabulary.classes)}
+        place = _places(self.vocabulary.classes)
         objects: dict[int, int] = {}
         try:
             # The last entry of a scan replaces the others.
-            for item in self._objects[scan][-1]:
+            for item in self._objects[scan][-1]["objects"]:
                 label = item["label"]
                 if label not in self.class_of_label and self.layout.name == "3rscan":
                     notes.append(f"{scan}: label '{label}' is not in the mapping: left out")
@@ -194,17 +194,18 @@ class Annotations:
         self, scan: str, objects: dict[int, int], notes: list[str]
     ) -> tuple[list[tuple[int, int, int]], frozenset[int] | None]:
         entries = self._relations.get(scan, [])
-        place = {name: index for index, name in enumerate(self.vocabulary.predicates)}
+        place = _places(self.vocabulary.predicates)
         relations: list[tuple[int, int, int]] = []
         related_ids: frozenset[int] | None = None
         try:
             for entry in entries:
-                related_ids = frozenset(int(end) for line in entry for end in line[:2])
-                for subject, object_, _, name in entry:
+                lines = entry["relationships"]
+                related_ids = frozenset(int(end) for line in lines for end in line[:2])
+                for subject, object_, _, name in lines:
                     relations.append((int(subject), int(object_), place.get(name, -1)))
                     if name not in place:
                         notes.append(f"{scan}: predicate '{name}' is in no list: never right")
-        except (TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{self.root / self.layout.relations}, scan {scan}: wanted relationships "
                 "[subject, object, number, name]"
@@ -217,16 +218,14 @@ class Annotations:
             )
         return relations, related_ids
 
-    def _entries(self, name: str, key: str) -> dict[str, list[Any]]:
+    def _entries(self, name: str) -> dict[str, list[Any]]:
         content = self._read_json(name)
         entries: dict[str, list[Any]] = {}
         try:
             for entry in content["scans"]:
-                entries.setdefault(str(entry["scan"]), []).append(entry[key])
+                entries.setdefault(str(entry["scan"]), []).append(entry)
         except (KeyError, TypeError) as error:
-            raise RecordingError(
-                f"{self.root / name}: wanted scans, each with scan and {key}"
-            ) from error
+            raise RecordingError(f"{self.root / name}: wanted scans, each with a scan") from error
         return entries
 
     def _read_json(self, name: str) -> Any:
@@ -243,3 +242,11 @@ class Annotations:
                 f"{self.layout.how_to_get}"
             )
         return read_file(path)
+
+
+def _places(names: tuple[str, ...]) -> dict[str, int]:
+    """Place of each name; the first one of a name that is listed twice."""
+    places: dict[str, int] = {}
+    for place, name in enumerate(names):
+        places.setdefault(name, place)
+    return places
