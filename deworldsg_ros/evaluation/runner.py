@@ -18,19 +18,21 @@ from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.datasets.sequence import SequenceDataset
+from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.labels import translate
 from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
 from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.scene_graphs import to_prediction
-from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 
 GRAPH_FILE = "scene_graph.json"
 CONFIG_FILE = "config.yaml"
+PIPELINE = "deworldsg"
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class ScanTask:
         dataset: of the data set folder.
         max_frames: stop after so many; 0 = take all.
         checkpoints: how many times, evenly over the frames, the graph so far is measured.
+        method: the pipeline, or a baseline by its name.
     """
 
     root: Path
@@ -60,6 +63,7 @@ class ScanTask:
     dataset: DatasetOptions = DatasetOptions()
     max_frames: int = 0
     checkpoints: int = 0
+    method: str = PIPELINE
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,8 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     points = annotations.points(task.scan, aligned=task.options.aligned_ply)
     reference = read_reference(annotations, task.scan, points)
     dataset = _open(annotations, task)
-    pipeline = Pipeline(
-        task.config, build_front_end(task.front_end, annotations, task.scan, dataset, task.config)
-    )
+    front_end = build_front_end(task.front_end, annotations, task.scan, dataset, task.config)
+    pipeline = build_method(task.method, task.config, front_end)
     recording = Recording(dataset, task.config.inputs)
     total = min(recording.frame_count, task.max_frames or recording.frame_count)
     marks = {round(total * (i + 1) / task.checkpoints) for i in range(task.checkpoints)}
@@ -123,7 +126,11 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     over_time: list[Checkpoint] = []
 
     def score(graph: wire.SceneGraphMessage) -> ScanResult:
-        prediction = to_prediction(translate(graph, annotations), annotations.vocabulary)
+        prediction = to_prediction(
+            translate(graph, annotations),
+            annotations.vocabulary,
+            sampled=task.method not in BASELINES,
+        )
         return score_scan(annotation, points, prediction, task.options)
 
     frames = 0
@@ -157,6 +164,13 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
         over_time=over_time,
         graph_path=path,
     )
+
+
+def build_method(method: str, config: Config, front_end: Perceiver) -> Pipeline | BaselinePipeline:
+    """The pipeline, or a baseline on the same detections; raises EvaluationError."""
+    if method == PIPELINE:
+        return Pipeline(config, front_end)
+    return BaselinePipeline(build_baseline(method), front_end)
 
 
 def evaluate_graph(

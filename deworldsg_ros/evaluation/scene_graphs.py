@@ -15,12 +15,15 @@ from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
 POINTS_PER_OBSERVATION = 64
 
 
-def to_prediction(graph: wire.SceneGraphMessage, vocabulary: Vocabulary) -> ScanPrediction:
+def to_prediction(
+    graph: wire.SceneGraphMessage, vocabulary: Vocabulary, *, sampled: bool = True
+) -> ScanPrediction:
     """Nodes with their surface points, edges with their predicate distributions, in graph order.
 
     The protocol prefers the prediction with more points, so that of several nodes on one object
     the one that was seen most stands for it. A graph keeps a bounded sample of the surface: the
     first `POINTS_PER_OBSERVATION` of it count once for each frame in which the node was seen.
+    Where the points are not `sampled` but all that there are, each counts once.
 
     A graph tells the k most probable labels: the rest of the probability is spread evenly over
     the other labels. Classes outside the vocabulary (see `labels`) are left out.
@@ -31,7 +34,7 @@ def to_prediction(graph: wire.SceneGraphMessage, vocabulary: Vocabulary) -> Scan
     classes = {name: place for place, name in enumerate(vocabulary.classes)}
     predicates = {name: place for place, name in enumerate(vocabulary.predicates)}
     place_of = {node.id: place for place, node in enumerate(graph.nodes)}
-    points = tuple(_segment(node) for node in graph.nodes)
+    points = tuple(_segment(node) if sampled else _points(node) for node in graph.nodes)
     labels = {belief.label for node in graph.nodes for belief in node.classes}
     if labels and not labels & set(classes):
         raise _foreign("class", labels)
@@ -50,10 +53,13 @@ def to_prediction(graph: wire.SceneGraphMessage, vocabulary: Vocabulary) -> Scan
     )
 
 
+def _points(node: wire.NodeState) -> Float64:
+    return np.array(node.surface_points_m, np.float64).reshape(-1, 3)
+
+
 def _segment(node: wire.NodeState) -> Float64:
     """Points (n, 3) of a node; the sample is in random order, so its beginning is a sample too."""
-    sample = np.array(node.surface_points_m[:POINTS_PER_OBSERVATION], np.float64).reshape(-1, 3)
-    return np.tile(sample, (node.observations, 1))
+    return np.tile(_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
 
 
 def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int]) -> Float64:

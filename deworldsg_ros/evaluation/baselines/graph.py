@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import Float64, Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import fuse
@@ -175,21 +174,6 @@ class BaselineGraph:
             sequence=0,
             nodes=[self._node_state(node_id, node) for node_id, node in self.nodes.items()],
             edges=[self._edge_state(pair) for pair in sorted(self.counts)],
-        )
-
-    def prediction(self) -> ScanPrediction:
-        """The graph as the protocol takes it, with all its points and scores."""
-        places = {node_id: place for place, node_id in enumerate(self.nodes)}
-        pairs = sorted(self.counts)
-        return ScanPrediction(
-            tuple(node.points_world for node in self.nodes.values()),
-            np.array([_shares(node.class_scores) for node in self.nodes.values()]).reshape(
-                -1, len(self.vocabulary.classes)
-            ),
-            np.array([(places[s], places[o]) for s, o in pairs], np.int64).reshape(-1, 2),
-            np.array([_shares(self.counts[pair]) for pair in pairs]).reshape(
-                -1, len(self.vocabulary.predicates)
-            ),
         )
 
     def _node_state(self, node_id: int, node: BaselineNode) -> wire.NodeState:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode
 from deworldsg_ros.evaluation.baselines.lifting import Lifted
-from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.pipeline import Perceiver
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
@@ -90,16 +89,9 @@ class BaselinePipeline:
 
     def graph(self) -> wire.SceneGraphMessage:
         """The whole graph so far; raises RefusedInput ``no_frames`` before the first frame."""
-        return self._known().message()
-
-    def prediction(self) -> ScanPrediction:
-        """The same as the protocol takes it; raises RefusedInput ``no_frames``."""
-        return self._known().prediction()
-
-    def _known(self) -> BaselineGraph:
         if self._graph is None:
             raise RefusedInput("no_frames", "no frame was processed: there is no graph")
-        return self._graph
+        return self._graph.message()
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
