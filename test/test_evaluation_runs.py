@@ -156,6 +156,22 @@ def test_command_on_a_data_set(tmp_path: Path) -> None:
     assert first.startswith("room_0,1.0")
 
 
+def test_command_on_graphs(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    outcome = evaluate_scan(task(root, tmp_path / "out"))
+    json_file = tmp_path / "numbers.json"
+    arguments = ("--layout", "replica", root, "--graphs", tmp_path / "out", "--json", json_file)
+    code, text = invoke(*arguments)
+    assert code == 0, text
+    values = json.loads(json_file.read_text())
+    assert values["object_recall"] == 1.0
+    assert values["measures"]["nodes"] == outcome.nodes
+    (tmp_path / "out" / "room_0" / "scene_graph.json").unlink()
+    code, text = invoke(*arguments)
+    assert code == 2
+    assert "cannot be read" in text
+
+
 def test_command_on_predictions(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     graph = {"nodes": [], "edges": []}

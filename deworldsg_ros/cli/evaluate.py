@@ -27,6 +27,10 @@ def evaluate(
         Optional[Path],
         typer.Option("--predictions", help="predictions of a method, .json or official .pkl"),
     ] = None,
+    graphs: Annotated[
+        Optional[Path],
+        typer.Option("--graphs", help="folder with SCAN/scene_graph.json, made before"),
+    ] = None,
     front_end: Annotated[
         Optional[str],
         typer.Option(
@@ -89,7 +93,8 @@ def evaluate(
 ) -> None:
     """Measure scene graphs against annotations with the official protocol.
 
-    Either of --predictions FILE (of any method) or --front-end KIND (run the pipeline first).
+    One of --predictions FILE (of any method), --graphs DIR (of this package, made before), or
+    --front-end KIND (run the pipeline first).
     """
     from deworldsg_ros.cli.configuration import effective_config
     from deworldsg_ros.datasets.annotations import Annotations
@@ -100,8 +105,8 @@ def evaluate(
     from deworldsg_ros.evaluation.protocol import ProtocolOptions
     from deworldsg_ros.evaluation.runner import ScanTask
 
-    if (predictions is None) == (front_end is None):
-        raise EvaluationError("give one of --predictions FILE and --front-end KIND")
+    if sum(given is not None for given in (predictions, graphs, front_end)) != 1:
+        raise EvaluationError("give one of --predictions FILE, --graphs DIR and --front-end KIND")
     if depth_source not in ("auto", "rendered", "sensor"):
         raise EvaluationError(f"--depth-source {depth_source}: wanted auto, rendered or sensor")
     console = Console()
@@ -117,6 +122,8 @@ def evaluate(
     if predictions is not None:
         values["predictions"] = predictions.name
         values |= _evaluate_predictions(annotations, predictions, options, out, console)
+    elif graphs is not None:
+        values |= _evaluate_graphs(annotations, graphs, options, scans, out, console)
     else:
         choice = FrontEndChoice(front_end, flip, miss, jitter, seed)  # type: ignore[arg-type]
         values["front_end"] = choice.describe()
@@ -169,6 +176,34 @@ def _evaluate_predictions(
     tables.print_measures(console, {**measured, "all": pooled})
     if out is not None:
         written = results.write_results(out, annotations, result, measured, pooled, path.name)
+        _print_files(written, console)
+    return {**report.protocol_values(result), "measures": pooled.numbers()}
+
+
+def _evaluate_graphs(
+    annotations: Annotations,
+    folder: Path,
+    options: ProtocolOptions,
+    scans: list[str] | None,
+    out: Path | None,
+    console: Console,
+) -> dict[str, Any]:
+    from deworldsg_ros.evaluation import measures, protocol, report, results, tables
+    from deworldsg_ros.evaluation.runner import GRAPH_FILE, evaluate_graph, read_graph
+
+    chosen = scans or annotations.scans(options.split)
+    evaluated = {
+        scan: evaluate_graph(annotations, scan, read_graph(folder / scan / GRAPH_FILE), options)
+        for scan in dict.fromkeys(chosen)
+    }
+    result = protocol.pool([evaluated[scan][0] for scan in chosen], annotations.vocabulary)
+    measured = {scan: item[1] for scan, item in evaluated.items()}
+    pooled = measures.pool(measured.values())
+    name = folder.resolve().name
+    tables.print_protocol(console, result, f"graphs of {name}")
+    tables.print_measures(console, {**measured, "all": pooled})
+    if out is not None:
+        written = results.write_results(out, annotations, result, measured, pooled, name)
         _print_files(written, console)
     return {**report.protocol_values(result), "measures": pooled.numbers()}
 
