@@ -158,15 +158,16 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
 def measure_prediction(
     prediction: ScanPrediction, vocabulary: Vocabulary, reference: ReferenceScene
 ) -> Measures:
-    """The same for a prediction: a node's mean is that of its points, its weight their number.
+    """The same for a prediction: a node is at the median of its points, its weight their number.
 
+    The median, because a few wild points among them are common and must not move it.
     Nodes without a finite point are nowhere: they count, as stray ones.
     """
     nodes = []
     for place, points in enumerate(prediction.points_world):
         surface = np.asarray(points, np.float64)
         surface = surface[np.isfinite(surface).all(axis=1)]
-        mean = surface.mean(axis=0) if len(surface) else np.full(3, np.nan)
+        mean = np.median(surface, axis=0) if len(surface) else np.full(3, np.nan)
         label, probability = _top(prediction.class_scores[place], vocabulary.classes)
         nodes.append(NodeView(place, label, probability, mean, surface, len(surface)))
     edges = []

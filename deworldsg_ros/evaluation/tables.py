@@ -36,34 +36,41 @@ def print_protocol(console: Console, result: ProtocolResult, title: str) -> None
         console.print(f"[yellow]note:[/] {note}", highlight=False, soft_wrap=True)
 
 
+# What is printed of the measures: heading, name, factor (0 = a count).
+MEASURE_ROWS = (
+    ("objects", "objects", 0),
+    ("nodes", "nodes", 0),
+    ("objects found", "found", 0),
+    ("duplicates", "duplicates", 0),
+    ("nodes of a wrong class", "wrong_class", 0),
+    ("stray nodes", "stray", 0),
+    ("node precision, %", "node_precision", 100),
+    ("F1, %", "f1", 100),
+    ("centroid error, cm (median)", "centroid_error_main_median_m", 100),
+    ("extent error, cm (median)", "extent_error_median_m", 100),
+    ("edges", "edges", 0),
+    ("edge precision, %", "edge_precision", 100),
+    ("edge calibration error, %", "edge_calibration_error", 100),
+)
+# More columns than this do not fit a terminal; the files have all.
+MOST_COLUMNS = 4
+
+
 def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
-    """What recall leaves out, a line a scan (or method)."""
+    """What recall leaves out, a column a scan; of many scans only the last column, their pool."""
+    shown = dict(list(measures.items())[-1:]) if len(measures) > MOST_COLUMNS else measures
     table = Table(title="beside recall")
-    columns = (
-        ("objects", "objects", 0),
-        ("nodes", "nodes", 0),
-        ("found", "found", 0),
-        ("duplicates", "duplicates", 0),
-        ("wrong class", "wrong_class", 0),
-        ("stray", "stray", 0),
-        ("precision, %", "node_precision", 100),
-        ("F1, %", "f1", 100),
-        ("centroid, cm", "centroid_error_main_median_m", 100),
-        ("extent, cm", "extent_error_median_m", 100),
-        ("edge precision, %", "edge_precision", 100),
-        ("edge ECE, %", "edge_calibration_error", 100),
-    )
     table.add_column("")
-    for heading, _, _ in columns:
-        table.add_column(heading, justify="right")
-    for name, item in measures.items():
-        numbers = item.numbers()
-        cells = [
-            percent(numbers[key] * factor / 100) if factor else f"{numbers[key]:.0f}"
-            for _, key, factor in columns
-        ]
-        table.add_row(name, *cells)
+    for name in shown:
+        table.add_column(name, justify="right", overflow="fold")
+    numbers = [item.numbers() for item in shown.values()]
+    for heading, key, factor in MEASURE_ROWS:
+        table.add_row(heading, *(_cell(item[key], factor) for item in numbers))
     console.print(table)
+
+
+def _cell(value: float, factor: float) -> str:
+    return percent(value * factor / 100) if factor else f"{value:.0f}"
 
 
 def _print_classes(console: Console, title: str, counts: Mapping[str, Count]) -> None:
