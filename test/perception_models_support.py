@@ -117,7 +117,7 @@ def save_sam2(folder, seed=0, video=False):
         "embed_dim_per_stage": [12, 24, 48, 96],
         "num_attention_heads_per_stage": [1, 2, 4, 8],
         "blocks_per_stage": [1, 1, 2, 1],
-        "global_attention_blocks": [2],
+        "global_attention_blocks": [3],
         "window_positional_embedding_background_size": [4, 4],
     }
     vision = transformers.Sam2VisionConfig(
@@ -160,6 +160,7 @@ def save_sam(folder, seed=0):
         vision_config={
             "hidden_size": 24,
             "output_channels": 32,
+            "num_pos_feats": 16,
             "num_hidden_layers": 2,
             "num_attention_heads": 2,
             "image_size": 128,
