@@ -106,6 +106,11 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         int,
         _number("pixels between depth samples that tell what was seen through; 0 = none", ge=0),
     ] = 8
+    regions: Annotated[
+        Literal["masks", "boxes"],
+        _number("pixels that are an object's: of its mask, or of its box (ablation)"),
+    ] = "masks"
+    refine: Annotated[bool, _number("refine depth by Eq. 1 and 2; false is an ablation")] = True
 
 
 class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -11,6 +11,7 @@ from deworldsg_ros.config import LiftingConfig
 from deworldsg_ros.lifting.depth_layer import dominant_layer
 from deworldsg_ros.lifting.moments import Float64, back_project, estimate_gaussians
 from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
+from deworldsg_ros.lifting.regions import box_pixels, mask_pixels, smooth_pixels, valid_pixels
 from deworldsg_ros.lifting.spatial import spatial_inliers
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -60,7 +61,7 @@ class Lifting:
         _check_grids(frame_graph, instances, depth_m, intrinsics)
         check_pose(T_world_camera)
         depth_m = valid_depth(depth_m)
-        refined, drops = self._refine(depth_m, instances, len(frame_graph))
+        refined, drops = self._refine(depth_m, instances, frame_graph)
 
         rows = np.array(sorted(refined), np.int64)
         objects = [refined[row] for row in rows]
@@ -105,26 +106,33 @@ class Lifting:
         Lifting(LiftingConfig()).lift(graph, instances, depth_m, intrinsics, np.eye(4), "")
 
     def _refine(
-        self, depth_m: NDArray[np.float32], instances: NDArray[np.uint16], count: int
+        self, depth_m: NDArray[np.float32], instances: NDArray[np.uint16], frame_graph: FrameGraph
     ) -> tuple[dict[int, Pixels], dict[str, int]]:
         """Final inliers by object (row of the frame graph), and the drops by reason."""
         config = self.config
-        valid_counts = valid_pixel_counts(depth_m, instances, count)
+        valid_counts = valid_pixel_counts(depth_m, instances, len(frame_graph))
         if valid_counts[0]:
             raise RefusedInput(
                 "unknown_instance",
                 f"{valid_counts[0]} pixels of the instance image, up to {instances.max()}: "
-                f"wanted values up to {count}, the number of objects in the frame graph",
+                f"wanted values up to {len(frame_graph)}, the number of objects in the frame graph",
             )
-        spatial = spatial_inliers(depth_m, instances, valid_counts, config.tau, config.epsilon_m)
+        if config.regions == "boxes":
+            valid = box_pixels(depth_m, valid_pixels(depth_m), frame_graph.boxes_xyxy)
+            valid_counts = np.array([0, *map(len, valid)], np.int64)
         refined: dict[int, Pixels] = {}
         drops: Counter[str] = Counter()
-        for row, pixels in enumerate(spatial):
+        for row, pixels in enumerate(
+            self._spatial(depth_m, instances, valid_counts, frame_graph.boxes_xyxy)
+        ):
             if valid_counts[row + 1] < config.min_pixels:
                 drops["few_mask_pixels"] += 1
                 continue
             if len(pixels) < config.min_pixels:
                 drops["few_spatial_inliers"] += 1
+                continue
+            if not config.refine:
+                refined[row] = pixels
                 continue
             layer_m = dominant_layer(
                 pixels.depths_m, config.gamma_base_m, config.alpha, config.beta
@@ -135,6 +143,22 @@ class Lifting:
                 continue
             refined[row] = kept
         return refined, dict(drops)
+
+    def _spatial(
+        self,
+        depth_m: NDArray[np.float32],
+        instances: NDArray[np.uint16],
+        valid_counts: NDArray[np.int64],
+        boxes_xyxy: Float64,
+    ) -> list[Pixels]:
+        """Pixels of each object, of its mask or box, after Eq. 1 or without it."""
+        tau, epsilon_m, refine = self.config.tau, self.config.epsilon_m, self.config.refine
+        if self.config.regions == "boxes":
+            kept = smooth_pixels(depth_m, tau, epsilon_m) if refine else valid_pixels(depth_m)
+            return box_pixels(depth_m, kept, boxes_xyxy)
+        if not refine:
+            return mask_pixels(depth_m, instances, valid_counts)
+        return spatial_inliers(depth_m, instances, valid_counts, tau, epsilon_m)
 
 
 def _check_grids(
