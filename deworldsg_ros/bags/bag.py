@@ -36,6 +36,7 @@ class BagSource:
         path: folder, .mcap or .db3 file.
         choice: topics named by the user.
         inputs: ``world_frame`` and ``pose_slop_s`` are used, for poses from TF.
+        need_pose: whether a bag without poses is refused.
 
     Raises:
         RecordingError: where it cannot be read, or a topic is missing.
@@ -44,7 +45,12 @@ class BagSource:
     kind: ClassVar[str] = "rosbag2"
 
     def __init__(
-        self, path: Path, choice: TopicChoice | None = None, inputs: InputsConfig | None = None
+        self,
+        path: Path,
+        choice: TopicChoice | None = None,
+        inputs: InputsConfig | None = None,
+        *,
+        need_pose: bool = True,
     ) -> None:
         choice = choice or TopicChoice()
         self.name = path.name
@@ -53,8 +59,11 @@ class BagSource:
         self.losses = self._bag.losses
         self.drops: Counter[str] = Counter()
         try:
-            found = find_topics(self._bag.topics, choice, str(path), self._inputs)
-            self._prefer_tf(found, choice)
+            found = find_topics(
+                self._bag.topics, choice, str(path), self._inputs, need_pose=need_pose
+            )
+            if Role.POSE in found:
+                self._prefer_tf(found, choice)
         except RecordingError:
             self._bag.close()
             raise
@@ -67,7 +76,7 @@ class BagSource:
         """Serialized messages in the order in which they were recorded."""
         roles = {topic.name: role for role, topic in self.topics.items()}
         poses = None
-        if self.topics[Role.POSE].msgtype == TF_MESSAGE:
+        if Role.POSE in self.topics and self.topics[Role.POSE].msgtype == TF_MESSAGE:
             del roles[self.topics[Role.POSE].name]
             poses = _TfPoses(self._bag, self._inputs)
         for raw in self._bag.messages(roles):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,7 @@ def open_source(
     topics: TopicChoice | None = None,
     inputs: InputsConfig | None = None,
     options: DatasetOptions | None = None,
+    need_poses: bool = True,
 ) -> Source:
     """Open a bag or a data set folder.
 
@@ -102,6 +104,8 @@ def open_source(
         topics: of a bag, where they are not to be found by name.
         inputs: world frame and pose slop for poses from TF.
         options: of a data set folder.
+        need_poses: whether what has no poses is refused or left out; False where they come from
+            elsewhere.
 
     Raises:
         RecordingError: says what was looked for and where.
@@ -109,7 +113,9 @@ def open_source(
     if kind == "auto":
         kind = detect_kind(path)
     if kind == "rosbag2":
-        return BagSource(path, topics, inputs)
+        return BagSource(path, topics, inputs, need_pose=need_poses)
+    if not need_poses:
+        options = replace(options or DatasetOptions(), poses_needed=False)
     return open_dataset(kind, path, options)
 
 

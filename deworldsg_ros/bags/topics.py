@@ -68,6 +68,8 @@ def find_topics(
     choice: TopicChoice,
     recording: str,
     inputs: InputsConfig | None = None,
+    *,
+    need_pose: bool = True,
 ) -> dict[Role, Topic]:
     """The topic of each role.
 
@@ -76,6 +78,7 @@ def find_topics(
         choice: what the user named; that need not be of a type that `inputs` asks for.
         recording: what to call the bag in an error.
         inputs: ``transport`` and ``pose_source`` narrow the types down.
+        need_pose: whether a bag without poses is refused; otherwise it has no such role.
 
     Raises:
         RecordingError: names the role, the topics seen and what was wanted.
@@ -88,7 +91,7 @@ def find_topics(
         return _find(role, filled, chosen, types, score, recording)
 
     rgb = find(Role.RGB, choice.rgb, images, _rgb_score)
-    return {
+    found = {
         Role.RGB: rgb,
         Role.DEPTH: find(Role.DEPTH, choice.depth, images, _depth_score),
         Role.CAMERA_INFO: find(
@@ -97,8 +100,12 @@ def find_topics(
             (CAMERA_INFO,),
             lambda topic: _camera_info_score(topic, rgb.name),
         ),
-        Role.POSE: find(Role.POSE, choice.pose, POSE_SOURCES[inputs.pose_source], _pose_score),
     }
+    types = POSE_SOURCES[inputs.pose_source]
+    posed = any(topic.msgtype in types and _pose_score(topic) is not None for topic in filled)
+    if need_pose or posed or choice.pose:
+        found[Role.POSE] = find(Role.POSE, choice.pose, types, _pose_score)
+    return found
 
 
 def _find(

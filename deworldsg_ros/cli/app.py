@@ -67,6 +67,38 @@ CameraIntrinsics = Annotated[
     str,
     typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="of a folder that does not tell"),
 ]
+Poses = Annotated[
+    Optional[Path],
+    typer.Option(
+        "--poses",
+        metavar="FILE",
+        help="poses of this trajectory rather than the recording's: TUM or KITTI file, or folder "
+        "of frame-NNNNNN.pose.txt or .slam.pose.txt",
+    ),
+]
+PoseFormat = Annotated[
+    str, typer.Option("--pose-format", help="tum, kitti, 3rscan or slam; auto = by looking")
+]
+OdometryPoses = Annotated[
+    bool, typer.Option("--odometry", help="poses out of the images, by RGB-D odometry")
+]
+PoseNoiseText = Annotated[
+    str,
+    typer.Option(
+        "--pose-noise",
+        metavar="NAME=NUMBER,…",
+        help="make poses worse: jitter_m, jitter_deg, drift_m_per_m, drift_deg_per_m, "
+        "jump_probability, jump_m, seed",
+    ),
+]
+SaveTrajectory = Annotated[
+    Optional[Path],
+    typer.Option("--save-trajectory", metavar="FILE", help="write the poses used, as TUM"),
+]
+Temporal = Annotated[
+    bool,
+    typer.Option("--temporal", help="measure how steady the graph was, into run.json"),
+]
 
 
 @contextmanager
@@ -111,10 +143,18 @@ def run(
     pose: PoseTopic = "",
     rate: FrameRate = 0.0,
     intrinsics: CameraIntrinsics = "",
+    poses: Poses = None,
+    pose_format: PoseFormat = "auto",
+    odometry: OdometryPoses = False,
+    pose_noise: PoseNoiseText = "",
+    save_trajectory: SaveTrajectory = None,
+    temporal: Temporal = False,
 ) -> None:
     """Make a recording's scene graph in one process."""
     with _telling_errors():
+        from deworldsg_ros.bags.posing import PoseChoice
         from deworldsg_ros.cli.run import run_recording
+        from deworldsg_ros.poses.perturbation import parse_noise
 
         run_recording(
             recording,
@@ -124,6 +164,9 @@ def run(
             max_frames=max_frames,
             topics=TopicChoice(rgb, depth, camera_info, pose),
             options=_dataset_options(rate, intrinsics),
+            poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
+            temporal=temporal,
+            trajectory_out=save_trajectory,
             console=Console(),
         )
 

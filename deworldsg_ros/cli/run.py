@@ -13,13 +13,17 @@ from rich.console import Console
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.recording import Recording, open_recording
+from deworldsg_ros.bags.messages import Role
+from deworldsg_ros.bags.posing import PoseChoice, PosedSource, choose_poses, posed_frames
+from deworldsg_ros.bags.recording import Recording, open_source
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.evaluation.temporal import UpdateLog
 from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.poses.trajectory import write_tum
 from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -37,33 +41,48 @@ def run_recording(
     max_frames: int,
     topics: TopicChoice,
     options: DatasetOptions,
+    poses: PoseChoice,
+    temporal: bool,
+    trajectory_out: Path | None,
     console: Console,
 ) -> None:
     """Run, write the results and print them; raises DeWorldSGError."""
     config = effective_config(config_path, settings)
-    recording = open_recording(path, config.inputs, topics=topics, options=options)
+    source = open_source(
+        path,
+        topics=topics,
+        inputs=config.inputs,
+        options=options,
+        need_poses=poses.need_poses,
+    )
     try:
+        recording = Recording(choose_poses(source, poses, config), config.inputs)
         outputs.prepare_folder(out, config)
         with console.status(LOADING):
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
         started_s = time.perf_counter()
-        poses, refused = _process(recording, pipeline, max_frames, console)
+        updates = UpdateLog(config.output.rate_hz) if temporal else None
+        path_taken, refused = _process(recording, pipeline, poses, max_frames, console, updates)
         wall_s = time.perf_counter() - started_s
     finally:
-        recording.close()
+        source.close()
     drops = {"recording": dict(recording.drops), "pipeline": dict(refused)}
-    processed = len(poses)
+    processed = len(path_taken)
     if not processed:
         outputs.print_drops(console, recording.losses, drops, recording.reasons)
         raise RecordingError(f"recording {path}: not one frame could be used")
     graph = pipeline.graph()
     outputs.write_graph(out, graph)
-    outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
+    T_world_cameras = list(path_taken.values())
+    outputs.show_graph(out, graph, console, T_world_cameras, config.inputs.world_up)
+    if trajectory_out is not None:
+        write_tum(trajectory_out, list(path_taken), T_world_cameras)
     report = {
         "program": f"deworldsg {__version__} run",
         "recording": recording.name,
         "kind": recording.source.kind,
+        "poses": recording.source.topics[Role.POSE].name,
         "frames": {"images": recording.frame_count, "processed": processed},
         "drops": {**drops, "objects": dict(pipeline.drops)},
         "losses": recording.losses,
@@ -73,6 +92,8 @@ def run_recording(
         "frames_per_s": round(processed / wall_s, 2),
         "times_ms": _times_ms(pipeline.times_s),
     }
+    if updates is not None:
+        report["temporal"] = updates.quality().numbers()
     outputs.write_report(out, report)
     outputs.print_drops(console, recording.losses, drops, recording.reasons)
     console.print(
@@ -82,21 +103,36 @@ def run_recording(
 
 
 def _process(
-    recording: Recording, pipeline: Pipeline, max_frames: int, console: Console
-) -> tuple[list[Float64], Counter[str]]:
-    """Poses (4, 4) of the frames that were processed, and refusals by reason."""
-    poses: list[Float64] = []
+    recording: Recording,
+    pipeline: Pipeline,
+    choice: PoseChoice,
+    max_frames: int,
+    console: Console,
+    updates: UpdateLog | None,
+) -> tuple[dict[int, Float64], Counter[str]]:
+    """Poses (4, 4) of the frames that were processed, by stamp, and refusals by reason."""
+    poses: dict[int, Float64] = {}
     refused: Counter[str] = Counter()
+
+    def refuse(refusal: RefusedInput) -> None:
+        refused[refusal.reason] += 1
+        recording.reasons.setdefault(refusal.reason, str(refusal))
+
     total = min(recording.frame_count, max_frames or recording.frame_count)
     with frame_progress(console) as progress:
         task = progress.add_task("building the graph", total=total, note="")
-        for frame in itertools.islice(recording.frames(), max_frames or None):
+        frames = posed_frames(recording, choice, pipeline.config, refuse)
+        for frame in itertools.islice(frames, max_frames or None):
             try:
-                pipeline.process(frame)
-                poses.append(frame.T_world_camera)
+                result = pipeline.process(frame)
+                poses[frame.stamp_ns] = frame.T_world_camera
             except RefusedInput as refusal:
-                refused[refusal.reason] += 1
-                recording.reasons.setdefault(refusal.reason, str(refusal))
+                refuse(refusal)
+            else:
+                if updates is not None and pipeline.builder is not None:
+                    source = recording.source
+                    truth = source.original if isinstance(source, PosedSource) else source
+                    updates.note(pipeline.builder, truth, result)
             progress.advance(task)
             if pipeline.builder is not None and len(poses) % COUNT_EVERY == 0:
                 progress.update(task, note=f"{len(pipeline.builder.graph)} nodes")

@@ -30,11 +30,14 @@ class DatasetOptions:
         intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = as the data set has them.
         depth_source: ``rendered`` from the mesh or from the ``sensor``, where a data set has both;
             ``auto`` = what the compared numbers use.
+        poses_needed: whether a frame without a valid pose file is left out; otherwise it comes
+            without a pose.
     """
 
     rate_hz: float = 0.0
     intrinsics: tuple[float, float, float, float] | None = None
     depth_source: Literal["auto", "rendered", "sensor"] = "auto"
+    poses_needed: bool = True
 
 
 class Dataset(ABC):

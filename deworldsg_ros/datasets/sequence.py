@@ -143,23 +143,34 @@ class SequenceDataset(Dataset):
         for number, color_path in self._colors.items():
             depth_path = self.file(number, self.depth_suffix)
             pose_path = self.file(number, self.pose_suffix)
-            missing = next((file for file in (depth_path, pose_path) if not file.exists()), None)
+            wanted = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
+            missing = next((file for file in wanted if not file.exists()), None)
             if missing is not None:
                 self.drops["missing_file"] += 1
                 self.losses.append(f"{missing.name} is missing: its frame is left out")
                 continue
+            T_world_camera = None
             try:
                 T_world_camera = read_pose(pose_path)
             except RefusedInput as refusal:
-                self.drops[refusal.reason] += 1
-                continue
+                if self.options.poses_needed:
+                    self.drops[refusal.reason] += 1
+                    continue
             try:
-                yield from self._frame(
-                    self._stamps_ns[number], color_path, depth_path, T_world_camera, stored
+                messages = self._frame(
+                    self._stamps_ns[number],
+                    color_path,
+                    depth_path,
+                    np.eye(4) if T_world_camera is None else T_world_camera,
+                    stored,
                 )
             except RecordingError as error:
                 self.drops["decode_failed"] += 1
                 self.losses.append(f"{error}: its frame is left out")
+                continue
+            for message in messages:
+                if T_world_camera is not None or message.role is not Role.POSE:
+                    yield message
 
     def file(self, number: int, suffix: str) -> Path:
         """File of a frame."""

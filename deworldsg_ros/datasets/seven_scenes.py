@@ -58,6 +58,9 @@ BASELINE_M = 0.026
 class SevenScenes(Dataset):
     """One sequence folder of 7-Scenes, see the module.
 
+    Attributes:
+        frame_numbers: number of the frame in its file names, by its stamp in nanoseconds.
+
     Raises:
         RecordingError: names the file that was expected.
     """
@@ -84,6 +87,9 @@ class SevenScenes(Dataset):
         self.intrinsics = Intrinsics(*fx_fy_cx_cy, *size)
         self._depth_camera = Intrinsics(*DEPTH_FX_FY_CX_CY, *size)
         self.frame_count = len(self._colors)
+        self.frame_numbers = {
+            self._stamp_ns(place, index): index for place, index in enumerate(self._colors)
+        }
         first = next(iter(self._colors.values()))
         self.topics = {
             Role.RGB: UsedTopic(f"frame-*.color{first.suffix}", ros.COMPRESSED_IMAGE, len(self)),
@@ -115,23 +121,33 @@ class SevenScenes(Dataset):
             stem = color_path.name[: color_path.name.index(".")]
             depth_path = self.path / f"{stem}.depth.png"
             pose_path = self.path / f"{stem}.pose.txt"
-            missing = next((file for file in (depth_path, pose_path) if not file.exists()), None)
+            wanted = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
+            missing = next((file for file in wanted if not file.exists()), None)
             if missing is not None:
                 self.drops["missing_file"] += 1
                 self.losses.append(f"{missing.name} is missing: its frame is left out")
                 continue
+            T_world_camera = None
             try:
                 T_world_camera = _read_pose(pose_path)
             except RefusedInput as refusal:
-                self.drops[refusal.reason] += 1
-                continue
+                if self.options.poses_needed:
+                    self.drops[refusal.reason] += 1
+                    continue
             try:
-                yield from self._frame(
-                    self._stamp_ns(place, index), color_path, depth_path, T_world_camera
+                messages = self._frame(
+                    self._stamp_ns(place, index),
+                    color_path,
+                    depth_path,
+                    np.eye(4) if T_world_camera is None else T_world_camera,
                 )
             except RecordingError as error:
                 self.drops["decode_failed"] += 1
                 self.losses.append(f"{error}: its frame is left out")
+                continue
+            for message in messages:
+                if T_world_camera is not None or message.role is not Role.POSE:
+                    yield message
 
     def _stamp_ns(self, place: int, index: int) -> int:
         if self.options.rate_hz:

@@ -1,0 +1,130 @@
+"""Poses made worse on purpose, seeded: drift, jitter and jumps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from deworldsg_ros.scene.camera import Float64, RgbdFrame, invert_pose
+from deworldsg_ros.scene.errors import ConfigurationError
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """How poses are made worse.
+
+    Attributes:
+        jitter_m: standard deviation of each axis of the position, independent each frame.
+        jitter_deg: standard deviation of the rotation about each axis, independent each frame.
+        drift_m_per_m: translation error that a metre of the path adds, in a direction of the
+            camera that stays the same, as of a wrong scale or calibration.
+        drift_deg_per_m: rotation error that a metre of the path adds, about such an axis.
+        jump_probability: share of frames whose pose is somewhere else for that frame alone.
+        jump_m: how far such a frame is off.
+        seed: of all of it.
+
+    Raises:
+        ConfigurationError: for what is negative, not finite, or a probability above 1.
+    """
+
+    jitter_m: float = 0.0
+    jitter_deg: float = 0.0
+    drift_m_per_m: float = 0.0
+    drift_deg_per_m: float = 0.0
+    jump_probability: float = 0.0
+    jump_m: float = 3.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not math.isfinite(value) or value < 0:
+                raise ConfigurationError(f"pose noise {field.name} is {value}: wanted >= 0")
+        if self.jump_probability > 1:
+            raise ConfigurationError(
+                f"pose noise jump_probability is {self.jump_probability}: wanted at most 1"
+            )
+
+
+def parse_noise(text: str) -> PoseNoise:
+    """Noise of ``name=value,name=value,…``; raises ConfigurationError."""
+    names = [field.name for field in fields(PoseNoise)]
+    values: dict[str, float] = {}
+    for word in filter(None, text.split(",")):
+        name, equals, number = word.partition("=")
+        try:
+            if not equals or name.strip() not in names:
+                raise ValueError
+            values[name.strip()] = float(number)
+        except ValueError as error:
+            raise ConfigurationError(
+                f"pose noise '{word}': wanted NAME=NUMBER, NAME one of {', '.join(names)}"
+            ) from error
+    seed = int(values.pop("seed", 0))
+    return PoseNoise(**values, seed=seed)
+
+
+def perturb_poses(frames: Iterable[RgbdFrame], noise: PoseNoise) -> Iterator[RgbdFrame]:
+    """The frames with worse poses; the same noise and frames give the same poses."""
+    perturbation = Perturbation(noise)
+    for frame in frames:
+        yield replace(frame, T_world_camera=perturbation.apply(frame.T_world_camera))
+
+
+class Perturbation:
+    """Makes one pose after another worse.
+
+    Args:
+        noise: how much.
+    """
+
+    def __init__(self, noise: PoseNoise) -> None:
+        self._noise = noise
+        rng = self._rng = np.random.default_rng(noise.seed)
+        self._drift_direction = _unit(rng.normal(size=3))
+        self._drift_axis = _unit(rng.normal(size=3))
+        self._before: Float64 | None = None
+        self._drifted = np.eye(4)
+
+    def apply(self, T_world_camera: Float64) -> Float64:
+        """The next pose (4, 4), made worse; the first one only jitters."""
+        noise, rng = self._noise, self._rng
+        if self._before is None:
+            self._drifted = T_world_camera
+        else:
+            step = invert_pose(self._before) @ T_world_camera
+            length_m = float(np.linalg.norm(step[:3, 3]))
+            error = _motion(
+                noise.drift_m_per_m * length_m * self._drift_direction,
+                np.radians(noise.drift_deg_per_m * length_m) * self._drift_axis,
+            )
+            self._drifted = self._drifted @ step @ error
+        self._before = T_world_camera
+        # All numbers are drawn every time, so that one kind of noise does not change another.
+        jitter = _motion(
+            noise.jitter_m * rng.normal(size=3), np.radians(noise.jitter_deg) * rng.normal(size=3)
+        )
+        jumps, direction = rng.random() < noise.jump_probability, _unit(rng.normal(size=3))
+        T = self._drifted @ jitter
+        if jumps:
+            T[:3, 3] += noise.jump_m * direction
+        return T
+
+
+def _motion(translation_m: Float64, rotation_vector: Float64) -> Float64:
+    """Rigid transform of a translation and a rotation vector, radians (Rodrigues)."""
+    T = np.eye(4)
+    T[:3, 3] = translation_m
+    angle = float(np.linalg.norm(rotation_vector))
+    if angle > 0:
+        x, y, z = rotation_vector / angle
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        T[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return T
+
+
+def _unit(vector: Float64) -> Float64:
+    return np.asarray(vector / np.linalg.norm(vector))

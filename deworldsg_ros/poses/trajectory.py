@@ -1,0 +1,238 @@
+"""Trajectory files: TUM, KITTI, and a folder of pose files a frame (3RScan, ORB-SLAM3 on it).
+
+All of them are poses of the colour camera, camera to world, metres. TUM has stamps, at which poses
+are interpolated; KITTI has one line an image, in order; pose files have the frame's number.
+"""
+
+from __future__ import annotations
+
+import re
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from deworldsg_ros.scene.camera import (
+    Float64,
+    check_pose,
+    interpolate_pose,
+    invert_pose,
+    pose_from_quaternion,
+    quaternion_from_rotation,
+)
+from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
+
+FORMATS = ("tum", "kitti", "3rscan", "slam")
+SUFFIXES = {"3rscan": ".pose.txt", "slam": ".slam.pose.txt"}
+FRAME_NAME = re.compile(r"frame-(\d+)(\.slam)?\.pose\.txt$")
+COLUMNS = {8: "tum", 12: "kitti"}
+
+
+class TrajectoryError(DeWorldSGError):
+    """A trajectory file cannot be used."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses by stamp, by frame number or by place in the sequence.
+
+    Attributes:
+        kind: the format it was read from.
+        keys: ascending; nanoseconds (TUM), frame numbers (pose files) or places from 0 (KITTI).
+        T_world_cameras: (n, 4, 4) float64.
+        missing: frames that the file lists without a valid pose, as trackers do when lost.
+    """
+
+    kind: str
+    keys: tuple[int, ...]
+    T_world_cameras: Float64
+    missing: int = 0
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def at(self, stamp_ns: int, number: int, place: int, slop_ns: int) -> Float64 | None:
+        """The pose (4, 4) of an image, None where there is none.
+
+        Args:
+            stamp_ns: of the image.
+            number: of its frame, in file names.
+            place: in the sequence, from 0.
+            slop_ns: most time to a pose that stands for it, on both sides to interpolate.
+        """
+        if self.kind == "tum":
+            return self._at_stamp(stamp_ns, slop_ns)
+        key = place if self.kind == "kitti" else number
+        row = bisect_left(self.keys, key)
+        return self.T_world_cameras[row] if self.keys[row : row + 1] == (key,) else None
+
+    def starting_at(self, T_world_first: Float64) -> Trajectory:
+        """The same motion, with this (4, 4) as the first pose: a tracker's world made another's."""
+        moved = T_world_first @ invert_pose(self.T_world_cameras[0]) @ self.T_world_cameras
+        return replace(self, T_world_cameras=moved)
+
+    def _at_stamp(self, stamp_ns: int, slop_ns: int) -> Float64 | None:
+        keys, poses = self.keys, self.T_world_cameras
+        row = bisect_left(keys, stamp_ns)
+        after_ns = keys[row] - stamp_ns if row < len(keys) else slop_ns + 1
+        if after_ns == 0:
+            return poses[row]
+        before_ns = stamp_ns - keys[row - 1] if row else slop_ns + 1
+        if before_ns <= slop_ns and after_ns <= slop_ns:
+            fraction = before_ns / (before_ns + after_ns)
+            return interpolate_pose(poses[row - 1], poses[row], fraction)
+        if min(before_ns, after_ns) > slop_ns:
+            return None
+        return poses[row - 1] if before_ns <= slop_ns else poses[row]
+
+
+def read_trajectory(path: Path, kind: str = "auto") -> Trajectory:
+    """Read a trajectory.
+
+    Args:
+        path: file, or folder of frame-NNNNNN.pose.txt or .slam.pose.txt.
+        kind: tum, kitti, 3rscan, slam, or auto = by looking.
+
+    Raises:
+        TrajectoryError: names the file, the line, what was seen and what was wanted.
+    """
+    if kind not in ("auto", *FORMATS):
+        raise TrajectoryError(f"trajectory format '{kind}': wanted auto, {', '.join(FORMATS)}")
+    if path.is_dir():
+        if kind not in ("auto", *SUFFIXES):
+            raise TrajectoryError(f"trajectory {path} is a folder: wanted a file for {kind}")
+        return _read_folder(path, kind)
+    if kind in SUFFIXES:
+        raise TrajectoryError(
+            f"trajectory {path}: wanted the folder that holds frame-NNNNNN{SUFFIXES[kind]}"
+        )
+    lines = _lines(path)
+    if kind == "auto":
+        number, words = lines[0]
+        if len(words) not in COLUMNS:
+            raise TrajectoryError(
+                f"{path}, line {number} has {len(words)} values: wanted 8 (TUM: stamp tx ty tz qx "
+                "qy qz qw) or 12 (KITTI: 3x4 matrix, row by row)"
+            )
+        kind = COLUMNS[len(words)]
+    return _read_tum(path, lines) if kind == "tum" else _read_kitti(path, lines)
+
+
+def write_tum(path: Path, stamps_ns: Sequence[int], T_world_cameras: Sequence[Float64]) -> None:
+    """Write poses (4, 4) as a TUM file; raises TrajectoryError where it cannot be written."""
+    rows = ["# stamp tx ty tz qx qy qz qw: colour camera to world, metres"]
+    for stamp_ns, T in zip(stamps_ns, T_world_cameras):
+        numbers = [*T[:3, 3].tolist(), *quaternion_from_rotation(T[:3, :3]).tolist()]
+        seconds, rest = divmod(stamp_ns, 10**9)
+        rows.append(" ".join([f"{seconds}.{rest:09d}", *(f"{value:.9g}" for value in numbers)]))
+    try:
+        path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise TrajectoryError(f"trajectory {path}: cannot be written ({error.strerror})") from error
+
+
+Line = tuple[int, list[str]]
+
+
+def _lines(path: Path) -> list[Line]:
+    """Numbers and words of the lines that are no comments."""
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise TrajectoryError(f"trajectory {path}: cannot be read ({error.strerror})") from error
+    lines = [
+        (number, words)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if (words := line.split("#")[0].replace(",", " ").split())
+    ]
+    if not lines:
+        raise TrajectoryError(f"trajectory {path} lists nothing: wanted a pose a line")
+    return lines
+
+
+def _pose(path: Path, line: Line, wanted: str, make: Callable[[Float64], Float64]) -> Float64:
+    """The pose of a line's numbers; raises TrajectoryError."""
+    number, words = line
+    try:
+        return make(np.array(words, np.float64))
+    except (ValueError, RefusedInput) as error:
+        raise TrajectoryError(
+            f"{path}, line {number}: '{' '.join(words)}': {error}; wanted {wanted}"
+        ) from error
+
+
+def _read_tum(path: Path, lines: list[Line]) -> Trajectory:
+    wanted = "stamp tx ty tz qx qy qz qw, seconds and metres, with a unit quaternion"
+    keys: list[int] = []
+    poses = []
+    for number, words in lines:
+        try:
+            stamp_ns = int(Decimal(words[0]) * 10**9)
+        except (InvalidOperation, ValueError, OverflowError) as error:
+            raise TrajectoryError(
+                f"{path}, line {number}: '{words[0]}' is no stamp: wanted {wanted}"
+            ) from error
+        _check_count(path, (number, words), 8, wanted)
+        if keys and stamp_ns <= keys[-1]:
+            raise TrajectoryError(
+                f"{path}, line {number}: stamp {words[0]} is not later than the one before: "
+                "wanted ascending stamps"
+            )
+        keys.append(stamp_ns)
+        poses.append(
+            _pose(path, (number, words[1:]), wanted, lambda v: pose_from_quaternion(v[:3], v[3:]))
+        )
+    return Trajectory("tum", tuple(keys), np.array(poses))
+
+
+def _read_kitti(path: Path, lines: list[Line]) -> Trajectory:
+    wanted = "12 numbers, the 3x4 matrix of a rigid transform row by row"
+    poses = []
+    for line in lines:
+        _check_count(path, line, 12, wanted)
+        poses.append(_pose(path, line, wanted, _matrix))
+    return Trajectory("kitti", tuple(range(len(poses))), np.array(poses))
+
+
+def _check_count(path: Path, line: Line, count: int, wanted: str) -> None:
+    number, words = line
+    if len(words) != count:
+        raise TrajectoryError(f"{path}, line {number} has {len(words)} values: wanted {wanted}")
+
+
+def _matrix(values: Float64) -> Float64:
+    """A rigid transform of 12 or 16 numbers, with a rotation that is exactly one."""
+    T = np.eye(4)
+    T[:3] = values.reshape(-1, 4)[:3]
+    check_pose(T)
+    return pose_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+
+
+def _read_folder(path: Path, kind: str) -> Trajectory:
+    found = [(file, match) for file in path.iterdir() if (match := FRAME_NAME.match(file.name))]
+    if kind == "auto":
+        kind = "slam" if any(match[2] for _, match in found) else "3rscan"
+    files = sorted((int(m[1]), file) for file, m in found if bool(m[2]) == (kind == "slam"))
+    if not files:
+        raise TrajectoryError(
+            f"trajectory {path}: no frame-NNNNNN{SUFFIXES[kind]} in it: wanted one a frame"
+        )
+    keys, poses, missing = [], [], 0
+    for number, file in files:
+        words = [word for _, line in _lines(file) for word in line]
+        if len(words) != 16:
+            raise TrajectoryError(f"{file} has {len(words)} values: wanted a 4x4 matrix")
+        try:
+            poses.append(_matrix(np.array(words, np.float64)))
+        except ValueError as error:
+            raise TrajectoryError(f"{file}: {error}; wanted a 4x4 matrix") from error
+        except RefusedInput:  # -inf or NaN: the tracker was lost
+            missing += 1
+            continue
+        keys.append(number)
+    if not keys:
+        raise TrajectoryError(f"trajectory {path}: not one of its {missing} poses is valid")
+    return Trajectory(kind, tuple(keys), np.array(poses), missing)
