@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
+from deworldsg_ros.cli import models
 from deworldsg_ros.cli.evaluate import evaluate
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
@@ -263,6 +264,7 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
 
 
 app.command()(_telling_errors()(evaluate))
+app.add_typer(models.app)
 
 
 def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:

@@ -88,9 +88,9 @@ class Perception:
         intrinsics = frame.intrinsics
         shape = (intrinsics.height, intrinsics.width)
         up_camera = self._up_camera(frame.T_world_camera)
-        found = self._detect(frame)
+        found = self.detect(frame)
         objects, drops = self._select(found, intrinsics.width, intrinsics.height)
-        masks = self._segment(frame, objects)
+        masks = self.segment(frame, objects)
         if masks is None:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
@@ -98,7 +98,7 @@ class Perception:
         instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
         relations = Relations.none(len(self.vocabulary.predicates))
         if len(objects) > 1 and self._config.top_relations:
-            related = self._relate(frame, objects, instances, up_camera)
+            related = self.relate(frame, objects, instances, up_camera)
             if related is None:
                 drops["relation_head_error"] = len(objects)
             else:
@@ -116,14 +116,15 @@ class Perception:
         )
         return Perceived(frame_graph, instances, dict(drops))
 
-    def _detect(self, frame: RgbdFrame) -> Detections:
+    def detect(self, frame: RgbdFrame) -> Detections:
+        """Objects of the image; raises RefusedInput ``detector_error``."""
         try:
             return self._detector.detect(frame.rgb, self.score_threshold)
         except Exception as error:  # a model can fail in more ways than can be listed
             self._log_failure("detector", error)
             raise RefusedInput("detector_error", f"the detector failed: {error}") from error
 
-    def _segment(self, frame: RgbdFrame, objects: Detections) -> list[MaskPatch] | None:
+    def segment(self, frame: RgbdFrame, objects: Detections) -> list[MaskPatch] | None:
         """A mask for each object; None where the segmenter failed."""
         try:
             return self._segmenter.segment(
@@ -133,11 +134,11 @@ class Perception:
                 objects.boxes_xyxy,
                 self._likeliest_names(objects),
             )
-        except Exception as error:  # see _detect
+        except Exception as error:  # see detect
             self._log_failure("segmenter", error)
             return None
 
-    def _relate(
+    def relate(
         self,
         frame: RgbdFrame,
         objects: Detections,
@@ -157,7 +158,7 @@ class Perception:
                 self._config.top_relations,
                 objects.features,
             )
-        except Exception as error:  # see _detect
+        except Exception as error:  # see detect
             self._log_failure("relation head", error)
             return None
 

@@ -1,0 +1,88 @@
+"""`deworldsg models`: published checkpoints made ready for use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Optional
+
+import msgspec
+import typer
+from rich.console import Console
+
+from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+
+EXIT_USAGE = 2
+
+app = typer.Typer(name="models", help="Make published checkpoints ready for use.")
+
+
+@app.callback()
+def _models() -> None:
+    """Make published checkpoints ready for use."""
+
+
+@app.command("import-fross")
+def import_fross(
+    checkpoint: Annotated[
+        Path,
+        typer.Argument(
+            metavar="CHECKPOINT", help="FROSS's .ckpt file, or the folder above checkpoints/"
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write")],
+    names: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--names",
+            metavar="FILE",
+            help='JSON with "classes" and "predicates", where they are neither Visual Genome\'s '
+            "nor 3DSSG's",
+        ),
+    ] = None,
+    frequency_bias: Annotated[
+        Optional[bool],
+        typer.Option(
+            "--frequency-bias/--no-frequency-bias",
+            help="add the class-pair statistics; without it as FROSS's config.json says",
+        ),
+    ] = None,
+) -> None:
+    """Turn a checkpoint of FROSS (RT-DETR with EGTR) into a folder that loads by name."""
+    console = Console(highlight=False, soft_wrap=True)
+    try:
+        made = _import(checkpoint, out, names, frequency_bias)
+    except DeWorldSGError as error:
+        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(f"error: {error}")
+        raise typer.Exit(EXIT_USAGE) from error
+    console.print(made, markup=False)
+    console.print(
+        f"use it: --set perception.detector=rtdetr --set perception.detector_path={out} "
+        "--set perception.relation_head=egtr",
+        markup=False,
+    )
+
+
+def _import(
+    checkpoint: Path, out: Path, names_file: Path | None, frequency_bias: bool | None
+) -> str:
+    try:
+        from deworldsg_ros.perception.fross_checkpoint import Names, import_checkpoint
+    except ImportError as error:
+        raise ConfigurationError(
+            f"importing a checkpoint needs torch, transformers and safetensors ({error}): pip "
+            "install 'deworldsg_ros[models]'"
+        ) from error
+    names = None
+    if names_file is not None:
+        try:
+            names = msgspec.json.decode(names_file.read_bytes(), type=Names)
+        except (OSError, msgspec.MsgspecError) as error:
+            raise ConfigurationError(f"names {names_file}: {error}") from error
+    made = import_checkpoint(checkpoint, out, names=names, frequency_bias=frequency_bias)
+    card = made.card
+    return (
+        f"{out}: {made.architecture}, {made.parameters / 1e6:.1f} million values, "
+        f"{len(card.classes)} classes, {len(card.predicates)} predicates, "
+        f"{card.decoder_layers or made.layers} of {made.layers} decoder layers used, class-pair "
+        f"statistics {'on' if card.frequency_bias else 'off'}"
+    )
