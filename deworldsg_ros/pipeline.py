@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,13 +10,17 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.registry import build_perception
-from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.timing import timed, watch
+
+# Methods of perception that are timed, and what the time is called.
+PERCEPTION_PARTS = {"detect": "detection", "segment": "masks", "relate": "relation_inference"}
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class Pipeline:
     Attributes:
         builder: holds the global graph; None before the first frame, whose world frame it takes.
         drops: what was left out so far, by reason.
-        times_s: seconds spent in each stage, a list entry a frame.
+        times_s: seconds spent in each stage, a list entry a frame; of perception also in its
+            parts.
     """
 
     def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
@@ -70,6 +72,9 @@ class Pipeline:
         self.times_s: dict[str, list[float]] = {
             name: [] for name in ("perception", "lifting", "merging", "relations")
         }
+        if isinstance(self.perception, Perception):
+            for method, name in PERCEPTION_PARTS.items():
+                watch(self.perception, method, self.times_s.setdefault(name, []))
 
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take one frame into the graph.
@@ -77,9 +82,9 @@ class Pipeline:
         Raises:
             RefusedInput: where the frame does not fit those before it; the graph is unchanged.
         """
-        with self._timed("perception"):
+        with timed(self.times_s["perception"]):
             perceived = self.perception.perceive(frame)
-        with self._timed("lifting"):
+        with timed(self.times_s["lifting"]):
             local = self.lifting.lift(
                 perceived.frame_graph,
                 perceived.instances,
@@ -90,9 +95,9 @@ class Pipeline:
             )
         if self.builder is None:
             self.builder = GraphBuilder(self.config, local.vocabulary, local.frame_id)
-        with self._timed("merging"):
+        with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
-        with self._timed("relations"):
+        with timed(self.times_s["relations"]):
             self.builder.add_evidence(self.relations.observe(local, frame.rgb))
             for evidence in self.relations.drain():
                 self.builder.add_evidence(evidence)
@@ -109,9 +114,3 @@ class Pipeline:
         if self.builder is None:
             raise RefusedInput("no_frames", "no frame was processed: there is no graph")
         return self.builder.full()
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.times_s[stage].append(time.perf_counter() - start)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +16,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations
+from deworldsg_ros.timing import timed
 
 
 class Baseline(Protocol):
@@ -68,10 +67,10 @@ class BaselinePipeline:
 
     def process(self, frame: RgbdFrame) -> list[int]:
         """Take one frame into the graph; returns the node id of each lifted object."""
-        with self._timed("perception"):
+        with timed(self.times_s["perception"]):
             perceived = self._perceiver.perceive(frame)
         seen = perceived.frame_graph
-        with self._timed("lifting"):
+        with timed(self.times_s["lifting"]):
             lifted = self._baseline.lift(
                 seen, frame.rgb, frame.depth_m, frame.intrinsics, frame.T_world_camera
             )
@@ -79,7 +78,7 @@ class BaselinePipeline:
             self._graph = BaselineGraph(
                 seen.vocabulary, frame.frame_id, self._baseline.choose, self._baseline.fuse
             )
-        with self._timed("merging"):
+        with timed(self.times_s["merging"]):
             node_ids = self._graph.integrate(
                 lifted.nodes, between(seen.relations, lifted.rows), frame.stamp_ns
             )
@@ -92,12 +91,6 @@ class BaselinePipeline:
         if self._graph is None:
             raise RefusedInput("no_frames", "no frame was processed: there is no graph")
         return self._graph.message()
-
-    @contextmanager
-    def _timed(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.times_s[stage].append(time.perf_counter() - start)
 
 
 def between(relations: Relations, rows: Sequence[int]) -> Relations:
