@@ -23,6 +23,10 @@ REASONS: dict[str, str] = {
     # Models
     "detector_error": "the detector failed on the image; the log has the first traceback, other "
     "frames go on. Out of memory: a smaller checkpoint, or a free device",
+    "segmenter_error": "the segmenter failed on the image: its frame graph is empty; see "
+    "`detector_error`",
+    "relation_head_error": "the relation head failed on the image: its objects go on without "
+    "relations; see `detector_error`",
     # Joining
     "no_depth": "no depth image within `inputs.slop_s` of the RGB image",
     "no_camera_info": "no usable camera_info came while the frame waited (`patience_s`)",

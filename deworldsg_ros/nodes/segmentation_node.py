@@ -47,6 +47,8 @@ class SegmentationNode(JoiningNode[RgbdFrame]):
         graph = replace(perceived.frame_graph, frame_id=camera_frame)
         self._publish_graph(frame_graph_to_message(graph))
         self.health.left_out(perceived.drops)
+        for reason, message in perceived.failures.items():
+            self.drop(reason, message)
 
 
 def main(args: list[str] | None = None) -> int:

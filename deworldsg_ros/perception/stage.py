@@ -39,11 +39,13 @@ class Perceived:
         drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
             image), ``over_max_objects``, ``segmenter_error`` (all of the frame); and
             ``relation_head_error`` for those that went on without relations.
+        failures: what a backend said when it failed on this frame, by those reasons.
     """
 
     frame_graph: FrameGraph
     instances: NDArray[np.uint16]
     drops: dict[str, int] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
 
 
 class Perception:
@@ -69,7 +71,8 @@ class Perception:
         self._relation_head = relation_head
         self._config = config
         self._up = UpEstimator(world_up)
-        self._failed: set[str] = set()
+        self._failures: dict[str, str] = {}
+        self._logged: set[str] = set()
         self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
         self.score_threshold = (
             detector.default_score_threshold
@@ -88,6 +91,7 @@ class Perception:
         intrinsics = frame.intrinsics
         shape = (intrinsics.height, intrinsics.width)
         up_camera = self._up_camera(frame.T_world_camera)
+        self._failures = {}
         found = self.detect(frame)
         objects, drops = self._select(found, intrinsics.width, intrinsics.height)
         masks = self.segment(frame, objects)
@@ -114,15 +118,15 @@ class Perception:
             scores=objects.scores,
             relations=relations,
         )
-        return Perceived(frame_graph, instances, dict(drops))
+        return Perceived(frame_graph, instances, dict(drops), self._failures)
 
     def detect(self, frame: RgbdFrame) -> Detections:
         """Objects of the image; raises RefusedInput ``detector_error``."""
         try:
             return self._detector.detect(frame.rgb, self.score_threshold)
         except Exception as error:  # a model can fail in more ways than can be listed
-            self._log_failure("detector", error)
-            raise RefusedInput("detector_error", f"the detector failed: {error}") from error
+            message = self._note_failure("detector", "detector_error", error)
+            raise RefusedInput("detector_error", message) from error
 
     def segment(self, frame: RgbdFrame, objects: Detections) -> list[MaskPatch] | None:
         """A mask for each object; None where the segmenter failed."""
@@ -135,7 +139,7 @@ class Perception:
                 self._likeliest_names(objects),
             )
         except Exception as error:  # see detect
-            self._log_failure("segmenter", error)
+            self._note_failure("segmenter", "segmenter_error", error)
             return None
 
     def relate(
@@ -159,23 +163,24 @@ class Perception:
                 objects.features,
             )
         except Exception as error:  # see detect
-            self._log_failure("relation head", error)
+            self._note_failure("relation head", "relation_head_error", error)
             return None
 
     def _likeliest_names(self, objects: Detections) -> list[str]:
         return [self.vocabulary.classes[c] for c in objects.class_probabilities.argmax(axis=1)]
 
-    def _log_failure(self, backend: str, error: Exception) -> None:
-        """Log a backend's first failure with its traceback; afterwards they are only counted."""
-        if backend not in self._failed:
-            self._failed.add(backend)
+    def _note_failure(self, backend: str, reason: str, error: Exception) -> str:
+        """Log a backend's first failure with its traceback; the others are only counted."""
+        message = self._failures[reason] = f"the {backend} failed: {error}"
+        if reason not in self._logged:
+            self._logged.add(reason)
             logger.error(
-                "the %s failed; the run goes on without what it would have found, and further "
-                "failures are counted: %s",
-                backend,
-                error,
+                "%s; the run goes on without what it would have found, and further failures are "
+                "counted",
+                message,
                 exc_info=error,
             )
+        return message
 
     def _select(
         self, found: Detections, width: int, height: int
