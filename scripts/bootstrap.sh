@@ -111,12 +111,16 @@ make_venv() {
 pip_install() { "$venv/bin/python" -m pip install --no-input --prefer-binary \
   --disable-pip-version-check "$@"; }
 
-# The requirement files of a profile (run or test); with a sourced ROS without the ROS wheels, and
-# with the numpy generation that its message types were compiled against.
+# The requirement files of a profile (run or test; with DEWORLDSG_TEST_MODELS set test has those of
+# the models on torch, too); with a sourced ROS without the ROS wheels, and with the numpy
+# generation that its message types were compiled against.
 install_requirements() {
   local ros=$1 profile=$2 file arguments=() files=(requirements-build.txt requirements.txt)
   [ "$ros" = sourced ] || files+=(requirements-ros.txt)
   [ "$profile" = run ] || files+=(requirements-test.txt)
+  if [ "$profile" = test ] && [ -n "${DEWORLDSG_TEST_MODELS:-}" ]; then
+    files+=(requirements-models.txt)
+  fi
   local wanted
   wanted=$(hash_of "${files[@]}")
   is_current "$profile" "$wanted" && return
