@@ -24,8 +24,16 @@ def evaluate(
     ],
     layout: Annotated[str, typer.Option("--layout", help="replica or 3rscan")],
     predictions: Annotated[
-        Optional[Path],
-        typer.Option("--predictions", help="predictions of a method, .json or official .pkl"),
+        Optional[list[str]],
+        typer.Option(
+            "--predictions",
+            metavar="[NAME=]FILE",
+            help="predictions of a method, .json or official .pkl; with --table a row each",
+        ),
+    ] = None,
+    table: Annotated[
+        Optional[str],
+        typer.Option("--table", help="the method against others: main, pose, ablation or runtime"),
     ] = None,
     graphs: Annotated[
         Optional[Path],
@@ -87,6 +95,28 @@ def evaluate(
     aligned_ply: Annotated[
         bool, typer.Option("--aligned-ply", help="3rscan: take the aligned point cloud")
     ] = False,
+    poses: Annotated[
+        Optional[list[str]],
+        typer.Option(
+            "--poses",
+            help="with --table: ground-truth, slam, odometry or worse; several for the pose table",
+        ),
+    ] = None,
+    pose_noise: Annotated[
+        Optional[str],
+        typer.Option(
+            "--pose-noise", metavar="NAME=NUMBER,…", help="of --poses worse, e.g. jitter_m=0.01"
+        ),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="with --table: processes; 0 = one a core")
+    ] = 0,
+    scheduler: Annotated[
+        str, typer.Option("--scheduler", help="with --table: address of a dask scheduler")
+    ] = "",
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="with --table: run again what was finished before")
+    ] = False,
     json_file: Annotated[
         Optional[Path], typer.Option("--json", help="write every number by name to this file")
     ] = None,
@@ -94,9 +124,10 @@ def evaluate(
     """Measure scene graphs against annotations with the official protocol.
 
     One of --predictions FILE (of any method), --graphs DIR (of this package, made before), or
-    --front-end KIND (run the pipeline first).
+    --front-end KIND (run the pipeline first); or --table KIND, which compares methods.
     """
     from deworldsg_ros.cli.configuration import effective_config
+    from deworldsg_ros.config import Config
     from deworldsg_ros.datasets.annotations import Annotations
     from deworldsg_ros.datasets.dataset import DatasetOptions
     from deworldsg_ros.evaluation import report
@@ -105,8 +136,13 @@ def evaluate(
     from deworldsg_ros.evaluation.protocol import ProtocolOptions
     from deworldsg_ros.evaluation.runner import ScanTask
 
-    if sum(given is not None for given in (predictions, graphs, front_end)) != 1:
-        raise EvaluationError("give one of --predictions FILE, --graphs DIR and --front-end KIND")
+    given = [bool(predictions), graphs is not None, front_end is not None]
+    if table is None and sum(given) != 1:
+        raise EvaluationError(
+            "give one of --predictions FILE, --graphs DIR and --front-end KIND, or --table KIND"
+        )
+    if table is None and len(predictions or []) > 1:
+        raise EvaluationError("several --predictions are rows of a table: give --table, too")
     if depth_source not in ("auto", "rendered", "sensor"):
         raise EvaluationError(f"--depth-source {depth_source}: wanted auto, rendered or sensor")
     console = Console()
@@ -119,13 +155,14 @@ def evaluate(
         "skip_no_rel_objects": skip_no_rel_objects,
         "overlap_threshold_m": overlap_threshold,
     }
-    if predictions is not None:
-        values["predictions"] = predictions.name
-        values |= _evaluate_predictions(annotations, predictions, options, out, console)
-    elif graphs is not None:
+    if predictions and table is None:
+        file = Path(predictions[0])
+        values["predictions"] = file.name
+        values |= _evaluate_predictions(annotations, file, options, out, console)
+    elif graphs is not None and table is None:
         values |= _evaluate_graphs(annotations, graphs, options, scans, out, console)
     else:
-        choice = FrontEndChoice(front_end, flip, miss, jitter, seed)  # type: ignore[arg-type]
+        choice = FrontEndChoice(front_end or "backend", flip, miss, jitter, seed)  # type: ignore[arg-type]
         values["front_end"] = choice.describe()
         tasks = [
             ScanTask(
@@ -133,7 +170,7 @@ def evaluate(
                 layout=layout,
                 scan=scan,
                 out=out or DEFAULT_OUT,
-                config=effective_config(config, settings),
+                config=Config() if table else effective_config(config, settings),
                 front_end=choice,
                 options=options,
                 dataset=DatasetOptions(depth_source=depth_source),  # type: ignore[arg-type]
@@ -142,7 +179,24 @@ def evaluate(
             )
             for scan in scans or annotations.scans(split)
         ]
-        values |= _evaluate_runs(annotations, tasks, console)
+        if table is None:
+            values |= _evaluate_runs(annotations, tasks, console)
+        else:
+            from deworldsg_ros.cli.tables import evaluate_table, pose_choices
+
+            values |= evaluate_table(
+                annotations,
+                table,
+                tasks,
+                config_path=config,
+                settings=settings or [],
+                predictions=predictions or [],
+                poses=pose_choices(table, poses or [], pose_noise or ""),
+                workers=workers,
+                scheduler=scheduler,
+                fresh=fresh,
+                console=console,
+            )
     if json_file is not None:
         report.write_json(json_file, values)
         console.print(f"numbers in {json_file}", highlight=False, soft_wrap=True)

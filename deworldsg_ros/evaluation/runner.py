@@ -23,6 +23,7 @@ from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.labels import translate
 from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
+from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
 from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.scene_graphs import to_prediction
 from deworldsg_ros.pipeline import Perceiver, Pipeline
@@ -51,6 +52,7 @@ class ScanTask:
         max_frames: stop after so many; 0 = take all.
         checkpoints: how many times, evenly over the frames, the graph so far is measured.
         method: the pipeline, or a baseline by its name.
+        poses: where they come from.
     """
 
     root: Path
@@ -64,6 +66,7 @@ class ScanTask:
     max_frames: int = 0
     checkpoints: int = 0
     method: str = PIPELINE
+    poses: PoseChoice = PoseChoice()
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,7 @@ class ScanOutcome:
         frames: processed.
         nodes, edges: of the graph.
         times_ms: median milliseconds of each stage.
+        total_ms: milliseconds of each stage in all frames together.
         drops: frames and objects left out, by reason.
         over_time: the graph as it became right.
         graph_path: the graph.
@@ -104,6 +108,7 @@ class ScanOutcome:
     drops: dict[str, int]
     over_time: list[Checkpoint] = field(default_factory=list)
     graph_path: Path | None = None
+    total_ms: dict[str, float] = field(default_factory=dict)
 
 
 def evaluate_scan(task: ScanTask) -> ScanOutcome:
@@ -135,7 +140,8 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
 
     frames = 0
     started_ns: int | None = None
-    for frame in _first(recording.frames(), total):
+    frames_of_scan = _first(recording.frames(), total)
+    for frame in repose(frames_of_scan, task.poses, dataset, task.config.odometry, refused):
         started_ns = frame.stamp_ns if started_ns is None else started_ns
         try:
             pipeline.process(frame)
@@ -158,11 +164,14 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
         nodes=len(graph.nodes),
         edges=len(graph.edges),
         times_ms={
-            stage: 1e3 * float(np.median(times)) for stage, times in pipeline.times_s.items()
+            stage: 1e3 * float(np.median(times))
+            for stage, times in pipeline.times_s.items()
+            if times
         },
         drops=dict(recording.drops + refused + pipeline.drops),
         over_time=over_time,
         graph_path=path,
+        total_ms={stage: 1e3 * sum(times) for stage, times in pipeline.times_s.items()},
     )
 
 
