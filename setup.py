@@ -48,7 +48,10 @@ setup(
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed", "**/weights/*", "**/assets/*"]},
     install_requires=read_requirements(),
-    extras_require={"models": ["torch>=2.5,<3", "transformers>=5.0,<6", "safetensors>=0.4.5,<1"]},
+    extras_require={
+        "models": ["torch>=2.5,<3", "transformers>=5.0,<6", "safetensors>=0.4.5,<1"],
+        "cluster": ["distributed>=2024.8"],
+    },
     # Executables: see the shim itself for how it finds its Python.
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

@@ -9,7 +9,7 @@ from itertools import chain
 from typing import Literal
 
 from deworldsg_ros.config import OdometryConfig
-from deworldsg_ros.datasets.sequence import SequenceDataset
+from deworldsg_ros.datasets.sequence import SequenceDataset, turned_pose
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
@@ -81,6 +81,8 @@ def _of_slam(
         if T_slam_camera is None:
             drops["no_slam_pose"] += 1
             continue
+        # Trackers see the images as they are stored.
+        T_slam_camera = turned_pose(T_slam_camera) if dataset.turned else T_slam_camera
         if T_truth_slam is None:
             # Its world is where it began: that is put where the camera truly was.
             T_truth_slam = frame.T_world_camera @ invert_pose(T_slam_camera)
