@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import functools
+import platform
+import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+# In the order in which a frame passes them; the first three are parts of perception, and relations
+# is the refinement by a world model.
+STAGES = ("detection", "masks", "relation_inference", "lifting", "merging", "relations")
 
 
 @contextmanager
@@ -27,3 +34,29 @@ def watch(owner: object, method: str, times_s: list[float]) -> None:
             return inner(*args, **kwargs)
 
     setattr(owner, method, outer)
+
+
+def total_ms(times_s: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """Milliseconds of each part that ran, all calls together."""
+    return {name: 1e3 * sum(times) for name, times in times_s.items() if times}
+
+
+def device_name() -> str:
+    """What the times are taken on: the processor, and the accelerator where models use one."""
+    names = [_processor_name()]
+    # Whoever computes on an accelerator has imported this; nobody else shall have to.
+    torch: Any = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_initialized():
+        names.append(torch.cuda.get_device_name())
+    return ", ".join(names)
+
+
+def _processor_name() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    if names:
+        return f"{names[0]} ({len(names)} cores)"
+    return platform.processor() or platform.machine()

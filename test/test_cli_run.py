@@ -19,6 +19,7 @@ def test_a_run_leaves_everything_it_names(tmp_path):
     told = deworldsg(
         tmp_path,
         *("run", DEMO_ROOM, "--out", "out", "--max-frames", 12, "--set", "output.top_k=3"),
+        "--timings",
         limit_s=360,
     )
     assert told.returncode == 0, told.stderr
@@ -36,6 +37,8 @@ def test_a_run_leaves_everything_it_names(tmp_path):
     assert report["nodes"] == len(graph.nodes)
     assert set(report["times_ms"]) >= {"perception", "masks", "lifting", "merging", "relations"}
     assert "12/12" in told.stdout
+    assert "relation inference" in told.stdout
+    assert report["device"]
     for name in ("scene_graph.html", "scene_graph.png", "scene_graph.json", "run.json"):
         assert name in told.stdout
 

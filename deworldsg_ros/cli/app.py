@@ -101,6 +101,8 @@ Temporal = Annotated[
     typer.Option("--temporal", help="measure how steady the graph was, into run.json"),
 ]
 
+Timings = Annotated[bool, typer.Option("--timings", help="print how long each stage takes")]
+
 
 @contextmanager
 def _telling_errors() -> Iterator[None]:
@@ -150,6 +152,7 @@ def run(
     pose_noise: PoseNoiseText = "",
     save_trajectory: SaveTrajectory = None,
     temporal: Temporal = False,
+    timings: Timings = False,
 ) -> None:
     """Make a recording's scene graph in one process."""
     with _telling_errors():
@@ -168,6 +171,7 @@ def run(
             poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
             temporal=temporal,
             trajectory_out=save_trajectory,
+            timings=timings,
             console=Console(),
         )
 

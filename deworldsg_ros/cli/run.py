@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.table import Table
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.errors import RecordingError
@@ -26,6 +27,7 @@ from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.poses.trajectory import write_tum
 from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.timing import STAGES, device_name, total_ms
 
 # The bar shows the number of nodes every so many frames: counting them costs something.
 COUNT_EVERY = 5
@@ -44,6 +46,7 @@ def run_recording(
     poses: PoseChoice,
     temporal: bool,
     trajectory_out: Path | None,
+    timings: bool = False,
     console: Console,
 ) -> None:
     """Run, write the results and print them; raises DeWorldSGError."""
@@ -91,6 +94,7 @@ def run_recording(
         "wall_s": round(wall_s, 3),
         "frames_per_s": round(processed / wall_s, 2),
         "times_ms": _times_ms(pipeline.times_s),
+        "device": device_name(),
     }
     if updates is not None:
         report["temporal"] = updates.quality().numbers()
@@ -99,6 +103,8 @@ def run_recording(
     console.print(
         f"{processed} frames in {wall_s:.1f} s ({processed / wall_s:.1f} a second)", highlight=False
     )
+    if timings:
+        _print_timings(console, pipeline.times_s, processed)
     outputs.print_files(console, out)
 
 
@@ -143,12 +149,29 @@ def _process(
 
 
 def _times_ms(times_s: dict[str, list[float]]) -> dict[str, Any]:
-    """Median and 95th percentile of each stage."""
+    """Mean, median and 95th percentile of each stage."""
     return {
         stage: {
+            "mean": round(1e3 * float(np.mean(values)), 3),
             "median": round(1e3 * float(np.median(values)), 3),
             "p95": round(1e3 * float(np.percentile(values, 95)), 3),
         }
         for stage, values in times_s.items()
         if values
     }
+
+
+def _print_timings(console: Console, times_s: dict[str, list[float]], frames: int) -> None:
+    """Mean milliseconds a frame of each stage, and what one call of it took."""
+    times_ms, totals_ms = _times_ms(times_s), total_ms(times_s)
+    table = Table(title=f"milliseconds a frame on {device_name()}")
+    table.add_column("stage")
+    for heading in ("mean", "median", "95 %"):
+        table.add_column(heading, justify="right")
+    for stage in (*(stage for stage in STAGES if stage in times_ms), "perception"):
+        numbers = (totals_ms[stage] / frames, times_ms[stage]["median"], times_ms[stage]["p95"])
+        name = "perception, all of it" if stage == "perception" else stage.replace("_", " ")
+        table.add_row(name, *(f"{number:.2f}" for number in numbers))
+    whole = ("perception", "lifting", "merging", "relations")
+    table.add_row("frame", f"{sum(totals_ms[stage] for stage in whole) / frames:.2f}", "", "")
+    console.print(table)

@@ -30,6 +30,7 @@ from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.timing import device_name, total_ms
 
 GRAPH_FILE = "scene_graph.json"
 CONFIG_FILE = "config.yaml"
@@ -93,6 +94,7 @@ class ScanOutcome:
         nodes, edges: of the graph.
         times_ms: median milliseconds of each stage.
         total_ms: milliseconds of each stage in all frames together.
+        device: that they were taken on.
         drops: frames and objects left out, by reason.
         over_time: the graph as it became right.
         graph_path: the graph.
@@ -109,6 +111,7 @@ class ScanOutcome:
     over_time: list[Checkpoint] = field(default_factory=list)
     graph_path: Path | None = None
     total_ms: dict[str, float] = field(default_factory=dict)
+    device: str = ""
 
 
 def evaluate_scan(task: ScanTask) -> ScanOutcome:
@@ -171,7 +174,8 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
         drops=dict(recording.drops + refused + pipeline.drops),
         over_time=over_time,
         graph_path=path,
-        total_ms={stage: 1e3 * sum(times) for stage, times in pipeline.times_s.items()},
+        total_ms=total_ms(pipeline.times_s),
+        device=device_name(),
     )
 
 

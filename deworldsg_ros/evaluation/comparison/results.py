@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,8 +21,6 @@ from deworldsg_ros.evaluation.protocol import ProtocolResult
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 CSV_FILE, LATEX_FILE = "table.csv", "table.tex"
-# In the order in which a frame passes them; relations is the world model's share.
-STAGES = ("detection", "masks", "relation_inference", "lifting", "merging", "relations")
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ def run_row(
         False,
         all_numbers(pooled, together),
         times_ms,
-        device_name(),
+        "; ".join(dict.fromkeys(outcome.device for outcome in outcomes)),
         len(outcomes),
         failures,
         {"frames": frames, "scans": [report.outcome_values(outcome) for outcome in outcomes]},
@@ -133,17 +130,6 @@ def total_ms(times_ms: Mapping[str, float]) -> float:
         return times_ms["total"]
     stages = ("perception", "lifting", "merging", "relations")
     return sum(times_ms.get(stage, 0.0) for stage in stages)
-
-
-def device_name() -> str:
-    """What the numbers were taken on."""
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return model
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0]} ({len(names)} cores)" if names else model
 
 
 def write_table(out: Path, rows: Sequence[TableRow]) -> list[Path]:

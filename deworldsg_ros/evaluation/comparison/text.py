@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from deworldsg_ros.evaluation.comparison.results import STAGES, TableRow, total_ms
+from deworldsg_ros.evaluation.comparison.results import TableRow, total_ms
+from deworldsg_ros.timing import STAGES
 
 # Heading, number, factor, decimals.
 RECALL_COLUMNS = (
