@@ -22,6 +22,9 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 
 Float64 = NDArray[np.float64]
 
+# What the optional world models are made with; the package's own extra installs them.
+MODEL_LIBRARIES = ("torch", "transformers", "safetensors")
+
 
 @dataclass(frozen=True)
 class PairContext:
@@ -99,6 +102,14 @@ def build_world_model(config: RelationsConfig) -> WorldModel | None:
             f"relations.world_model is '{config.world_model}': "
             f"wanted one of {', '.join(world_model_names())}"
         )
-    module = importlib.import_module(f"{world_models.__name__}.{config.world_model}")
+    try:
+        module = importlib.import_module(f"{world_models.__name__}.{config.world_model}")
+    except ImportError as error:
+        if (error.name or "").split(".")[0] not in MODEL_LIBRARIES:
+            raise
+        raise ConfigurationError(
+            f"world model '{config.world_model}' needs {' and '.join(MODEL_LIBRARIES)}: "
+            f"pip install 'deworldsg_ros[models]' ({error})"
+        ) from error
     model: WorldModel | None = module.build(config)
     return model
