@@ -131,30 +131,40 @@ class RelationReasoner:
             the predictions of both directions of its pair, rows of the local graph with that
             stamp.
         """
+        return next(iter(self.work_batch(1)), None)
+
+    def work_batch(self, size: int | None = None) -> list[RelationEvidence]:
+        """Encode the first queued clips that can be, at once; empty when the queue is.
+
+        Args:
+            size: most clips; default: `relations.batch_size`.
+
+        Returns:
+            one for each clip that the world model answered, as from `work`.
+        """
+        size = self._config.batch_size if size is None else size
         while True:
-            with self._lock:
-                item = self._queue.pop()
-                if item is None:
-                    return None
-                images = self._frames.images(item.frame_stamps_ns)
-                if images is None:
-                    self._dropped["stale"] += 1
-                    continue
+            batch = self._take(size)
+            if not batch:
+                return []
             # The model takes its time: outside of the lock.
-            evidence = self._encode(item, images)
+            evidence = self._encode_batch(batch)
             with self._lock:
-                if evidence is None:
-                    self._dropped["world_model_error"] += 1
-                    continue
-                self._encoded += 1
-            return evidence
+                self._encoded += len(evidence)
+                if len(evidence) < len(batch):
+                    self._dropped["world_model_error"] += len(batch) - len(evidence)
+            if evidence:
+                return evidence
 
     def drain(self) -> list[RelationEvidence]:
         """Encode everything that is queued, first to last.
 
         After each `observe`, this makes a run in one thread deterministic.
         """
-        return list(iter(self.work, None))
+        drained: list[RelationEvidence] = []
+        while evidence := self.work_batch():
+            drained += evidence
+        return drained
 
     def clear(self) -> None:
         """Forget images and queued clips: time has jumped, or the end has come."""
@@ -207,19 +217,44 @@ class RelationReasoner:
                 if self._queue.put(item) is not None:
                     self._dropped["queue_full"] += 1
 
-    def _encode(self, item: QueuedClip, images: list[Rgb]) -> RelationEvidence | None:
-        """Predictions of both directions of a clip; None where the world model failed."""
+    def _take(self, size: int) -> list[tuple[QueuedClip, list[Rgb]]]:
+        """The first clips whose frames are still here, and these frames."""
+        batch: list[tuple[QueuedClip, list[Rgb]]] = []
+        with self._lock:
+            while len(batch) < size and (item := self._queue.pop()) is not None:
+                images = self._frames.images(item.frame_stamps_ns)
+                if images is None:
+                    self._dropped["stale"] += 1
+                else:
+                    batch.append((item, images))
+        return batch
+
+    def _encode_batch(self, batch: list[tuple[QueuedClip, list[Rgb]]]) -> list[RelationEvidence]:
+        """Predictions of both directions of each clip; without those that the model failed on."""
         model = self._world_model
         assert model is not None  # nothing is queued without one
-        request = _request_of(item, images, self._config.clip_length)
+        requests = [_request_of(item, images, self._config.clip_length) for item, images in batch]
         try:
-            answers = model.predict_batch([request])
-            if len(answers) != 1:
-                raise ValueError(f"{len(answers)} answers for one clip")
-            predictions = _checked(answers[0], len(request.pairs), len(item.vocabulary.predicates))
+            answers = model.predict_batch(requests)
+            if len(answers) != len(batch):
+                wanted = "one clip" if len(batch) == 1 else f"{len(batch)} clips"
+                raise ValueError(f"{len(answers)} answers for {wanted}")
+            predictions = [
+                _checked(answer, len(request.pairs), len(request.vocabulary.predicates))
+                for answer, request in zip(answers, requests)
+            ]
         except Exception as error:  # whatever a backend raises, the other stages go on
             self._report_once(f"world model '{model.name}' failed: {type(error).__name__}: {error}")
-            return None
+            if len(batch) == 1:
+                return []
+            # One clip must not cost the others, and alone each needs less memory.
+            return [evidence for clip in batch for evidence in self._encode_batch([clip])]
+        return [
+            self._evidence(item, distributions)
+            for (item, _), distributions in zip(batch, predictions)
+        ]
+
+    def _evidence(self, item: QueuedClip, predictions: Float64) -> RelationEvidence:
         i, j = item.rows
         return RelationEvidence(
             stamp_ns=item.stamp_ns,

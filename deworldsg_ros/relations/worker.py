@@ -82,9 +82,12 @@ class EvidenceWorker:
                 if self._stopping:
                     return
                 self._busy = True
-            evidence = self.reasoner.work()
-            if evidence is None or self._stopping:
-                continue
+            self._deliver_all(self.reasoner.work_batch())
+
+    def _deliver_all(self, batch: list[RelationEvidence]) -> None:
+        for evidence in batch:
+            if self._stopping:
+                return
             try:
                 self._deliver(evidence)
             except Exception as error:  # the receiver's fault must not end the world model
