@@ -20,12 +20,13 @@ RECALL_COLUMNS = (
     ("mObj", "object_mean_recall", 100, 1),
     ("mPred", "predicate_mean_recall", 100, 1),
 )
+BESIDE_TITLE = "beside recall (%; cm = median centroid error of main nodes)"
 BESIDE_COLUMNS = (
-    ("nodes/object", "nodes_per_object", 1, 2),
-    ("found %", "node_recall", 100, 1),
-    ("precise %", "node_precision", 100, 1),
-    ("duplicates", "duplicates", 1, 0),
-    ("centroid cm", "centroid_error_main_median_m", 100, 1),
+    ("nodes/obj.", "nodes_per_object", 1, 2),
+    ("found", "node_recall", 100, 1),
+    ("precise", "node_precision", 100, 1),
+    ("dupl.", "duplicates", 1, 0),
+    ("cm", "centroid_error_main_median_m", 100, 1),
 )
 
 
@@ -38,7 +39,7 @@ def print_table(console: Console, rows: Sequence[TableRow], title: str) -> None:
         last = bool(printed) and row is printed[-1]
         table.add_row(name, *_numbers(row, RECALL_COLUMNS), end_section=last)
     console.print(table)
-    beside = _table("beside recall", BESIDE_COLUMNS)
+    beside = _table(BESIDE_TITLE, BESIDE_COLUMNS)
     for row in rows:
         if not row.printed:
             beside.add_row(row.title, *_numbers(row, BESIDE_COLUMNS))
