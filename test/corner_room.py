@@ -12,7 +12,7 @@ LEVEL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 # Axis and place of each wall.
-WALLS = ((0, 3.0), (1, 1.2), (2, -0.7))
+WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
 def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:

@@ -9,7 +9,9 @@ import pytest
 from corner_room import INTRINSICS, LEVEL, corner_frame, turned, walk
 
 from deworldsg_ros.config import OdometryConfig
-from deworldsg_ros.poses.odometry import LEVEL_CAMERA, RgbdOdometry, fit_share, rotation_angle_deg
+from deworldsg_ros.poses.depth_alignment import fit_share, points_of, refine, surface_of
+from deworldsg_ros.poses.motion import rigid_motion, rotation_angle_deg
+from deworldsg_ros.poses.odometry import LEVEL_CAMERA, RgbdOdometry
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, check_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -103,11 +105,40 @@ def test_other_intrinsics_go_on_from_the_last_pose() -> None:
 
 def test_depth_fits_itself_and_not_what_is_elsewhere() -> None:
     depth_m = corner_frame(LEVEL).depth_m
-    assert fit_share(depth_m, depth_m, np.eye(4), INTRINSICS) == 1.0
+    points = points_of(depth_m, INTRINSICS)
+    assert fit_share(points, depth_m, np.eye(4), INTRINSICS) == 1.0
     T = turned(3.0, 0.1)
     moved = corner_frame(T).depth_m
-    assert fit_share(depth_m, moved, invert_pose(T) @ LEVEL, INTRINSICS) > 0.95
-    assert fit_share(depth_m, moved, np.eye(4), INTRINSICS) < 0.6
-    assert fit_share(depth_m, np.zeros_like(depth_m), np.eye(4), INTRINSICS) == 0.0
+    assert fit_share(points, moved, invert_pose(T) @ LEVEL, INTRINSICS) > 0.95
+    assert fit_share(points, moved, np.eye(4), INTRINSICS) < 0.6
+    assert fit_share(points, np.zeros_like(depth_m), np.eye(4), INTRINSICS) == 0.0
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert fit_share(depth_m, depth_m, behind, INTRINSICS) == 0.0
+    assert fit_share(points, depth_m, behind, INTRINSICS) == 0.0
+
+
+def test_a_guess_that_is_off_is_refined_to_the_truth() -> None:
+    start, T = turned(20.0, 1.2, -0.8), turned(26.0, 1.28, -0.83)
+    truth = invert_pose(T) @ start
+    points = points_of(corner_frame(start).depth_m, INTRINSICS)
+    surface = surface_of(corner_frame(T).depth_m, INTRINSICS)
+    guess = rigid_motion(np.array([0.06, -0.05, 0.04]), np.radians([1.0, -2.0, 1.0])) @ truth
+    error = invert_pose(truth) @ refine(points, surface, guess, INTRINSICS)
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+    assert rotation_angle_deg(error[:3, :3]) < 0.3
+
+
+def test_a_refinement_without_surfaces_keeps_the_guess() -> None:
+    depth_m = corner_frame(LEVEL).depth_m
+    points = points_of(depth_m, INTRINSICS)
+    nothing = surface_of(np.zeros_like(depth_m), INTRINSICS)
+    guess = turned(2.0, 0.1)
+    np.testing.assert_array_equal(refine(points, nothing, guess, INTRINSICS), guess)
+
+
+def test_a_camera_that_turns_fast_is_followed() -> None:
+    poses = [turned(9.0 * k, 1.2 + 0.03 * k, -0.8 - 0.02 * k) for k in range(5)]
+    odometry = RgbdOdometry(CONFIG, poses[0])
+    for T in poses:
+        error = invert_pose(T) @ track(odometry, corner_frame(T))
+        assert np.linalg.norm(error[:3, 3]) < 0.03
+        assert rotation_angle_deg(error[:3, :3]) < 1.0

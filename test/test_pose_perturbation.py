@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from deworldsg_ros.bags.posing import gate_jumps
 from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.frames import track_poses
-from deworldsg_ros.poses.odometry import rotation_angle_deg
+from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.poses.perturbation import (
     Perturbation,
     PoseNoise,

@@ -1,13 +1,14 @@
 """RGB-D odometry: the pose of each frame out of the images alone, for robots without SLAM.
 
 Each frame is aligned to a reference frame by OpenCV's RGB-D odometry (photometric and point-to-
-plane residuals on an image pyramid). The reference is the frame before it, or an older one while
-the camera has hardly moved since: a camera that stands still does not drift. Nothing closes loops.
+plane residuals on an image pyramid). Where the depth then does not fit, that alignment and the
+motion so far are refined on the depth (`depth_alignment`): a camera that turns fast leaves the
+pyramid's reach. The reference is the frame before, or an older one while the camera has hardly
+moved since: a camera that stands still does not drift. Nothing closes loops.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.config import OdometryConfig
+from deworldsg_ros.poses.depth_alignment import (
+    LEAST_POINTS,
+    fit_share,
+    points_of,
+    refine,
+    surface_of,
+)
+from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.scene.camera import (
     Float64,
     Intrinsics,
@@ -29,19 +38,17 @@ from deworldsg_ros.scene.errors import RefusedInput
 LEVEL_CAMERA = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-# An alignment is believed where the points of the reference, moved by it, lie on the new depth.
-GRID_STEP_PX = 8
-FIT_M = 0.03
-FIT_SHARE = 0.02
-LEAST_POINTS = 50
+# An alignment of which less than this fits is tried to be refined; it is, by this much more.
+GOOD_FIT = 0.97
+BETTER_BY = 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A frame prepared for alignment, and its pose."""
+    """A frame prepared for alignment, some of its points, and its pose."""
 
     frame: Any
-    depth_m: NDArray[np.float32]
+    points: Float64
     T_world_camera: Float64
 
 
@@ -66,6 +73,8 @@ class RgbdOdometry:
         self._odometry: Any = None
         self._reference: _View | None = None
         self._newest: _View | None = None
+        # Of the newest camera, since the one before it.
+        self._motion = np.eye(4)
         self._lost_in_a_row = 0
         self.tracked = self.lost = self.restarts = 0
 
@@ -87,21 +96,22 @@ class RgbdOdometry:
         if intrinsics != self._intrinsics:
             self._begin(intrinsics)
         depth_m = np.where((depth_m > 0) & (depth_m <= self._config.max_depth_m), depth_m, 0)
-        if np.count_nonzero(_grid(depth_m)) < LEAST_POINTS:
+        points = points_of(depth_m, intrinsics)
+        if len(points) < LEAST_POINTS:
             raise self._lose(f"fewer than {LEAST_POINTS} of its pixels on the grid have depth")
         frame = self._prepare(rgb, depth_m)
         if self._newest is None or self._reference is None:
-            return self._accept(_View(frame, depth_m, self._T_world_start), restart=True)
+            return self._accept(_View(frame, points, self._T_world_start), restart=True)
         complaints = []
         for view in dict.fromkeys((self._reference, self._newest)):
             T_camera_view, complaint = self._align(view, frame, depth_m, intrinsics)
             if T_camera_view is not None:
                 T_world_camera = _rigid(view.T_world_camera @ invert_pose(T_camera_view))
-                return self._accept(_View(frame, depth_m, T_world_camera))
+                return self._accept(_View(frame, points, T_world_camera))
             complaints.append(complaint)
         if self._lost_in_a_row >= self._config.restart_after:
             self.restarts += 1
-            return self._accept(_View(frame, depth_m, self._newest.T_world_camera), restart=True)
+            return self._accept(_View(frame, points, self._newest.T_world_camera), restart=True)
         raise self._lose(complaints[-1])
 
     def _begin(self, intrinsics: Intrinsics) -> None:
@@ -132,18 +142,49 @@ class RgbdOdometry:
     ) -> tuple[Float64 | None, str]:
         """T_camera_view, or None and why it is not believed."""
         found, T_camera_view = self._odometry.compute(view.frame, frame)
-        if not found or not np.isfinite(T_camera_view).all():
-            return None, "no alignment was found"
-        T_camera_view = np.asarray(T_camera_view, np.float64)
-        step_m = float(np.linalg.norm(T_camera_view[:3, 3]))
-        if step_m > self._config.max_step_m:
-            return None, f"the camera would have moved {step_m:.2f} m (odometry.max_step_m)"
-        share = fit_share(view.depth_m, depth_m, T_camera_view, intrinsics)
+        guesses = [self._predicted(view)]
+        if found and np.isfinite(T_camera_view).all():
+            guesses.insert(0, np.asarray(T_camera_view, np.float64))
+        best, share = self._best(view.points, depth_m, guesses, intrinsics)
+        step_m = float(np.linalg.norm(best[:3, 3]))
         if share < self._config.min_fit:
             return None, f"{share:.0%} of the depth fits (odometry.min_fit)"
-        return T_camera_view, ""
+        if step_m > self._config.max_step_m:
+            return None, f"the camera would have moved {step_m:.2f} m (odometry.max_step_m)"
+        if rotation_angle_deg(best[:3, :3]) > self._config.max_rotation_deg:
+            return None, "the camera would have turned too far (odometry.max_rotation_deg)"
+        return best, ""
+
+    def _predicted(self, view: _View) -> Float64:
+        """T_camera_view if the camera goes on moving as it did."""
+        assert self._newest is not None
+        T_world_camera = self._newest.T_world_camera @ self._motion
+        return invert_pose(T_world_camera) @ view.T_world_camera
+
+    @staticmethod
+    def _best(
+        points: Float64,
+        depth_m: NDArray[np.float32],
+        guesses: list[Float64],
+        intrinsics: Intrinsics,
+    ) -> tuple[Float64, float]:
+        """The first guess, or what a refinement of any of them makes better; and how it fits."""
+        best, share = guesses[0], fit_share(points, depth_m, guesses[0], intrinsics)
+        if share >= GOOD_FIT:
+            return best, share
+        surface = surface_of(depth_m, intrinsics)
+        for guess in guesses:
+            refined = refine(points, surface, guess, intrinsics)
+            refined_share = fit_share(points, depth_m, refined, intrinsics)
+            if refined_share > share + BETTER_BY:
+                best, share = refined, refined_share
+        return best, share
 
     def _accept(self, view: _View, *, restart: bool = False) -> Float64:
+        if restart or self._newest is None:
+            self._motion = np.eye(4)
+        else:
+            self._motion = invert_pose(self._newest.T_world_camera) @ view.T_world_camera
         self._newest = view
         if restart or self._reference is None or self._moved(self._reference, view):
             self._reference = view
@@ -166,47 +207,6 @@ class RgbdOdometry:
             f"odometry lost the camera: {why}; frame {self._lost_in_a_row} in a row, of "
             f"{self._config.restart_after} before it starts anew at the last known pose",
         )
-
-
-def fit_share(
-    depth_a_m: NDArray[np.float32],
-    depth_b_m: NDArray[np.float32],
-    T_b_a: Float64,
-    intrinsics: Intrinsics,
-) -> float:
-    """Share of the points of depth image a that lie on depth image b, of those that b sees.
-
-    On a grid of pixels; 0 where too few can be compared.
-    """
-    grid = _grid(depth_a_m)
-    rows, columns = np.nonzero(grid)
-    z = grid[rows, columns].astype(np.float64)
-    u, v = columns * GRID_STEP_PX, rows * GRID_STEP_PX
-    points = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z, z], 1
-    )
-    moved = points @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    moved = moved[moved[:, 2] > 1e-3]
-    column = np.rint(intrinsics.fx * moved[:, 0] / moved[:, 2] + intrinsics.cx).astype(np.int64)
-    row = np.rint(intrinsics.fy * moved[:, 1] / moved[:, 2] + intrinsics.cy).astype(np.int64)
-    height, width = depth_b_m.shape
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    seen_m = np.zeros(len(moved))
-    seen_m[inside] = depth_b_m[row[inside], column[inside]]
-    valid = seen_m > 0
-    if np.count_nonzero(valid) < max(LEAST_POINTS, len(points) // 8):
-        return 0.0
-    gap_m = np.abs(seen_m[valid] - moved[valid, 2])
-    return float(np.mean(gap_m < FIT_M + FIT_SHARE * seen_m[valid]))
-
-
-def rotation_angle_deg(rotation: Float64) -> float:
-    """Angle of a rotation matrix (3, 3), degrees."""
-    return math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
-
-
-def _grid(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    return depth_m[::GRID_STEP_PX, ::GRID_STEP_PX]
 
 
 def _rigid(T: Float64) -> Float64:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from deworldsg_ros.poses.motion import rigid_motion
 from deworldsg_ros.scene.camera import Float64, RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -97,14 +98,14 @@ class Perturbation:
         else:
             step = invert_pose(self._before) @ T_world_camera
             length_m = float(np.linalg.norm(step[:3, 3]))
-            error = _motion(
+            error = rigid_motion(
                 noise.drift_m_per_m * length_m * self._drift_direction,
                 np.radians(noise.drift_deg_per_m * length_m) * self._drift_axis,
             )
             self._drifted = self._drifted @ step @ error
         self._before = T_world_camera
         # All numbers are drawn every time, so that one kind of noise does not change another.
-        jitter = _motion(
+        jitter = rigid_motion(
             noise.jitter_m * rng.normal(size=3), np.radians(noise.jitter_deg) * rng.normal(size=3)
         )
         jumps, direction = rng.random() < noise.jump_probability, _unit(rng.normal(size=3))
@@ -112,18 +113,6 @@ class Perturbation:
         if jumps:
             T[:3, 3] += noise.jump_m * direction
         return T
-
-
-def _motion(translation_m: Float64, rotation_vector: Float64) -> Float64:
-    """Rigid transform of a translation and a rotation vector, radians (Rodrigues)."""
-    T = np.eye(4)
-    T[:3, 3] = translation_m
-    angle = float(np.linalg.norm(rotation_vector))
-    if angle > 0:
-        x, y, z = rotation_vector / angle
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        T[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return T
 
 
 def _unit(vector: Float64) -> Float64:
