@@ -72,9 +72,7 @@ class Pipeline:
         self.times_s: dict[str, list[float]] = {
             name: [] for name in ("perception", "lifting", "merging", "relations")
         }
-        if isinstance(self.perception, Perception):
-            for method, name in PERCEPTION_PARTS.items():
-                watch(self.perception, method, self.times_s.setdefault(name, []))
+        watch_parts(self.perception, self.times_s)
 
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take one frame into the graph.
@@ -114,3 +112,10 @@ class Pipeline:
         if self.builder is None:
             raise RefusedInput("no_frames", "no frame was processed: there is no graph")
         return self.builder.full()
+
+
+def watch_parts(perceiver: Perceiver, times_s: dict[str, list[float]]) -> None:
+    """Time the parts of perception from now on, where it is made of them."""
+    if isinstance(perceiver, Perception):
+        for method, name in PERCEPTION_PARTS.items():
+            watch(perceiver, method, times_s.setdefault(name, []))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode
 from deworldsg_ros.evaluation.baselines.lifting import Lifted
-from deworldsg_ros.pipeline import Perceiver
+from deworldsg_ros.pipeline import Perceiver, watch_parts
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
@@ -61,6 +61,7 @@ class BaselinePipeline:
         self.times_s: dict[str, list[float]] = {
             name: [] for name in ("perception", "lifting", "merging")
         }
+        watch_parts(perceiver, self.times_s)
         self._baseline = baseline
         self._perceiver = perceiver
         self._graph: BaselineGraph | None = None
