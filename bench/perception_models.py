@@ -1,0 +1,164 @@
+"""What the paper's detector, relation head and segmenters cost a frame: published sizes, random
+weights, through the package's own backends, on a CPU or on CUDA.
+
+    python bench/perception_models.py [--device auto|cpu|cuda] [--only NAME …] [--repeat N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import transformers
+from safetensors.torch import save_file
+
+from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.perception.checkpoint_card import CARD_FILE, CheckpointCard, write_card
+from deworldsg_ros.perception.egtr import HEAD_FILE, EgtrRelationHead
+from deworldsg_ros.perception.egtr_network import EgtrNetwork
+from deworldsg_ros.perception.rtdetr import RtDetrDetector
+from deworldsg_ros.perception.sam import SamSegmenter
+from deworldsg_ros.perception.sam2 import Sam2Segmenter
+from deworldsg_ros.perception.vocabularies import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
+from deworldsg_ros.scene.camera import Intrinsics
+
+WIDTH, HEIGHT, OBJECTS = 640, 480, 12
+INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)
+RNG = np.random.default_rng(0)
+RGB = RNG.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+DEPTH_M = np.ones((HEIGHT, WIDTH), np.float32)
+CORNERS = np.sort(RNG.uniform(0, [[WIDTH], [HEIGHT]], (OBJECTS, 2, 2)), axis=2)
+BOXES = CORNERS.transpose(0, 2, 1).reshape(OBJECTS, 4)
+R18 = {"hidden_sizes": [64, 128, 256, 512], "depths": [2, 2, 2, 2], "layer_type": "basic"}
+
+Frame = Callable[[], Any]
+
+
+def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
+    """A detector of Visual Genome's classes, with a relation head beside it."""
+    backbone = changes.pop("backbone", {})
+    config = transformers.RTDetrConfig(
+        backbone_config=transformers.RTDetrResNetConfig(
+            **backbone, out_features=["stage2", "stage3", "stage4"]
+        ),
+        id2label=dict(enumerate(VISUAL_GENOME_CLASSES)),
+        **changes,
+    )
+    transformers.RTDetrForObjectDetection(config).save_pretrained(folder)
+    card = CheckpointCard(class_scores="softmax", predicates=REPLICA_SSG_PREDICATES)
+    write_card(folder / CARD_FILE, card)
+    head = EgtrNetwork(config.d_model, config.decoder_layers, len(REPLICA_SSG_PREDICATES))
+    save_file(head.state_dict(), folder / HEAD_FILE)
+    return RtDetrDetector(PerceptionConfig(detector_path=str(folder), device=device, threads=0))
+
+
+def detecting(**changes: Any) -> Callable[[Path, str], Frame]:
+    """One image through an RT-DETR."""
+
+    def build(folder: Path, device: str) -> Frame:
+        detector = rtdetr(folder, device, **changes)
+        return lambda: detector.detect(RGB, 0.0)
+
+    return build
+
+
+def relating(folder: Path, device: str) -> Frame:
+    """The relation head on the queries of 12 objects."""
+    detector = rtdetr(folder, device)
+    head = EgtrRelationHead(PerceptionConfig(), detector)
+    kept = detector.detect(RGB, 0.0).take(slice(OBJECTS))
+    names = [VISUAL_GENOME_CLASSES[0]] * OBJECTS
+    none = np.zeros((HEIGHT, WIDTH), np.uint16)
+    return lambda: head.relate(
+        DEPTH_M, INTRINSICS, kept.boxes_xyxy, names, kept.scores, none, None, 10, kept.features
+    )
+
+
+def segmenting(
+    make: Callable[[], Any], backend: Any, image_size: int = 0
+) -> Callable[[Path, str], Frame]:
+    """One image and the masks of 12 boxes."""
+
+    def build(folder: Path, device: str) -> Frame:
+        make().save_pretrained(folder)
+        segmenter = backend(
+            PerceptionConfig(
+                segmenter_path=str(folder), device=device, sam_image_size=image_size, threads=0
+            )
+        )
+        return lambda: segmenter.segment(RGB, DEPTH_M, INTRINSICS, BOXES)
+
+    return build
+
+
+def sam2_tiny() -> Any:
+    """SAM 2.1 tiny, as transformers' defaults have it."""
+    return transformers.Sam2Model(transformers.Sam2Config())
+
+
+def sam_base() -> Any:
+    """SAM with ViT-B, as transformers' defaults have it."""
+    return transformers.SamModel(transformers.SamConfig())
+
+
+R18_DETECTOR = {
+    "backbone": R18,
+    "encoder_in_channels": [128, 256, 512],
+    "hidden_expansion": 0.5,
+    "decoder_layers": 3,
+}
+# Each makes, in an empty folder, a checkpoint, and from it what is timed: one frame.
+BUILDERS: dict[str, Callable[[Path, str], Frame]] = {
+    "RT-DETR r18, 640": detecting(**R18_DETECTOR),
+    "RT-DETR r50, 640": detecting(),
+    "RT-DETR r50m, 3 of 6 layers, 640": detecting(hidden_expansion=0.5, decoder_layers=3),
+    "EGTR head, 12 objects": relating,
+    "SAM 2.1 tiny, 1024, 12 boxes": segmenting(sam2_tiny, Sam2Segmenter),
+    "SAM 2.1 tiny, 512, 12 boxes": segmenting(sam2_tiny, Sam2Segmenter, 512),
+    "SAM ViT-B, 1024, 12 boxes": segmenting(sam_base, SamSegmenter),
+}
+
+
+def time_ms(frame: Frame, repeat: int) -> tuple[float, float]:
+    """Medians of wall and processor time; what the backends return is back on the CPU."""
+    wall, processor = [], []
+    for _ in range(repeat):
+        started, used = time.perf_counter(), time.process_time()
+        frame()
+        wall.append(time.perf_counter() - started)
+        processor.append(time.process_time() - used)
+    return 1e3 * float(np.median(wall)), 1e3 * float(np.median(processor))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
+    parser.add_argument("--only", nargs="*", default=[], help="models whose names hold this")
+    parser.add_argument("--repeat", type=int, default=5)
+    arguments = parser.parse_args()
+    transformers.utils.logging.disable_progress_bar()
+    torch.manual_seed(0)
+    # Random weights lead to numbers so small that a CPU slows down; trained ones do not.
+    torch.set_flush_denormal(True)
+    on_cuda = torch.cuda.is_available() and arguments.device != "cpu"
+    device = torch.cuda.get_device_name() if on_cuda else f"CPU, {torch.get_num_threads()} threads"
+    print(f"torch {torch.__version__}, {device}")
+    print(f"{'':36} {'wall ms':>9} {'cpu ms':>9}")
+    for name, build in BUILDERS.items():
+        if arguments.only and not any(part in name for part in arguments.only):
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            frame = build(Path(folder), arguments.device)
+            frame()
+            wall_ms, processor_ms = time_ms(frame, arguments.repeat)
+        print(f"{name:36} {wall_ms:9.1f} {processor_ms:9.1f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
