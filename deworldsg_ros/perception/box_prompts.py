@@ -88,7 +88,8 @@ class BoxPromptedSegmenter(ABC):
         height, width = rgb.shape[:2]
         scale = np.tile(self._scale(height, width), 2)
         boxes = torch.from_numpy((boxes_xyxy * scale).astype(np.float32))
-        boxes = boxes.to(self.device, self.dtype)
+        # Half precision would round coordinates to half a pixel.
+        boxes = boxes.to(self.device)
         embeddings = self.model.get_image_embeddings(self._input(rgb))
         masks = []
         for start in range(0, len(boxes), self._chunk):
