@@ -50,7 +50,7 @@ setup(
     install_requires=read_requirements(),
     extras_require={
         "models": ["torch>=2.5,<3", "transformers>=5.0,<6", "safetensors>=0.4.5,<1"],
-        "cluster": ["distributed>=2024.8"],
+        "cluster": ["distributed>=2024.8,<2027"],
     },
     # Executables: see the shim itself for how it finds its Python.
     data_files=[
