@@ -6,6 +6,7 @@ python scripts/make_schemas.py [FOLDER]
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from pathlib import Path
@@ -28,6 +29,9 @@ def message_schema(name: str) -> dict[str, Any]:
     """JSON Schema of a message, which says the name that it must carry."""
     schema = wire.json_schema(wire.MESSAGES[name])
     definition = schema["$defs"][wire.MESSAGES[name].__name__]
+    for described in schema["$defs"].values():
+        if "description" in described:  # A docstring, which Python 3.13 strips of its indentation.
+            described["description"] = inspect.cleandoc(described["description"])
     definition["properties"]["schema"] = {
         "allOf": [
             {"$ref": "#/$defs/Schema"},
