@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
-from deworldsg_ros.cli import models
+from deworldsg_ros.cli import models, probe
 from deworldsg_ros.cli.evaluate import evaluate
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
@@ -269,6 +269,8 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
 
 app.command()(_telling_errors()(evaluate))
 app.add_typer(models.app)
+app.command("train-probe")(_telling_errors()(probe.train_probe))
+app.command("import-probe")(_telling_errors()(probe.import_probe))
 
 
 def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:

@@ -8,8 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.scene.errors import ConfigurationError
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 CARD_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -123,6 +128,15 @@ def write_card(folder: Path, card: ProbeCard) -> None:
     """Write `config.json` of a probe's folder."""
     path = folder / CARD_FILE
     path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+
+
+def relative_box_pair(
+    subject_box_xyxy: Float64, object_box_xyxy: Float64, width: int, height: int
+) -> Float32:
+    """(8,) float32: corners of both boxes as shares of a crop's width and height."""
+    both = np.concatenate([subject_box_xyxy, object_box_xyxy])
+    shares: Float32 = np.clip(both / np.array([width, height] * 4), 0, 1).astype(np.float32)
+    return shares
 
 
 def _some(names: list[str], most: int = 5) -> str:

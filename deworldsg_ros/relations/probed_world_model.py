@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.backbone import FrozenBackbone
+from deworldsg_ros.relations.probe import relative_box_pair
 from deworldsg_ros.relations.probe_network import Probe, load_probe
 from deworldsg_ros.relations.world_model import ClipRequest
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -63,15 +64,6 @@ def relative_boxes(request: ClipRequest) -> Float32:
         for pair in request.pairs
     ]
     return np.array(rows, np.float32).reshape(len(rows), 8)
-
-
-def relative_box_pair(
-    subject_box_xyxy: Float64, object_box_xyxy: Float64, width: int, height: int
-) -> Float32:
-    """(8,) float32: corners of both boxes as shares of a crop's width and height."""
-    both = np.concatenate([subject_box_xyxy, object_box_xyxy])
-    shares: Float32 = np.clip(both / np.array([width, height] * 4), 0, 1).astype(np.float32)
-    return shares
 
 
 def build_probed(

@@ -1,0 +1,165 @@
+"""Does a probe learn, and do its priors help ambiguous edges? On drawn rooms, held out by room.
+
+    python bench/probe.py [--rooms 16] [--pairs 30] [--out FOLDER]
+
+The backbones are tiny and randomly initialised, so that anyone can run this: random features. The
+rooms are those of `test/pair_rooms.py`. Nothing here says how good the published models are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+
+from models_support import save_dinov2, save_vjepa2
+from pair_rooms import CLASSES, PREDICATES, PairClip, render_room
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations import ClassPairPrior, build_world_model, fuse_edges, union_box
+from deworldsg_ros.relations.probe import relative_box_pair
+from deworldsg_ros.relations.training.labelled_clips import LabelledClip
+from deworldsg_ros.relations.training.train import TrainingOptions, train_probe
+from deworldsg_ros.relations.world_model import ClipRequest, PairContext
+from deworldsg_ros.relations.world_models import dinov2, vjepa2
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
+VOCABULARY = Vocabulary(CLASSES, PREDICATES)
+DEFAULTS = RelationsConfig()
+
+
+def request_of(pair: PairClip) -> ClipRequest:
+    """The pair as the stage asks for it: union crop, both directions."""
+    height, width = pair.frames.shape[1:3]
+    x1, y1, x2, y2 = union_box(*pair.boxes_xyxy, width, height)
+    boxes = [box - np.array([x1, y1, x1, y1]) for box in pair.boxes_xyxy]
+    names = pair.subject_class, pair.object_class
+    contexts = tuple(
+        PairContext(boxes[s], boxes[o], *(CLASSES.index(names[end]) for end in (s, o)), *ends)
+        for s, o, ends in ((0, 1, names), (1, 0, names[::-1]))
+    )
+    return ClipRequest(pair.frames[:, y1:y2, x1:x2], contexts, VOCABULARY)
+
+
+def labelled(pair: PairClip, number: int) -> LabelledClip:
+    request = request_of(pair)
+    height, width = request.clip.shape[1:3]
+    context = request.pairs[0]
+    boxes = relative_box_pair(context.subject_box_xyxy, context.object_box_xyxy, width, height)
+    name = f"{pair.room} {number}"
+    return LabelledClip(name, pair.room, name, pair.predicate, boxes, lambda: request.clip)
+
+
+def ambiguous_logits(truth: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Logits whose softmax is uncertain (> 1 nat), with a slight lean to the truth."""
+    rows = []
+    for true in truth:
+        while True:
+            logits = generator.normal(0, 0.7, len(PREDICATES))
+            logits[true] += 0.5
+            shares = np.exp(logits) / np.exp(logits).sum()
+            if -(shares * np.log(shares)).sum() > DEFAULTS.entropy_threshold_nats:
+                rows.append(logits)
+                break
+    return np.array(rows)
+
+
+def on_and_off(model, pairs: list[PairClip], seed: int) -> dict[str, float]:
+    """Edges of held-out pairs with the world model off and on, by Eq. 9 and 10."""
+    generator = np.random.default_rng(seed)
+    prior = ClassPairPrior(len(CLASSES), len(PREDICATES))
+    classes = []
+    for pair in pairs:
+        request = request_of(pair)
+        (answer,) = model.predict_batch([request])
+        rows = [(context.subject_class, context.object_class) for context in request.pairs]
+        prior.update(np.array(rows), answer)
+        classes.append(rows[0])
+    truth = np.array([PREDICATES.index(pair.predicate) for pair in pairs])
+    logits = ambiguous_logits(truth, generator)
+    priors, has_prior = prior.lookup(np.array(classes))
+    seen = np.ones(len(pairs), bool)
+    results = {}
+    for name, active in (("off", np.zeros_like(has_prior)), ("on", has_prior)):
+        edges = fuse_edges(
+            logits, seen, priors, active, DEFAULTS.fusion_alpha, DEFAULTS.entropy_threshold_nats
+        ).probabilities
+        right = edges.argmax(axis=1) == truth
+        results[name] = float(right.mean())
+        results[f"probability {name}"] = float(edges[np.arange(len(truth)), truth].mean())
+        results[f"_{name}"] = right
+    off, on = results.pop("_off"), results.pop("_on")
+    return {
+        **results,
+        "to right": int((on & ~off).sum()),
+        "to wrong": int((off & ~on).sum()),
+        "edges": len(pairs),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rooms", type=int, default=16)
+    parser.add_argument("--pairs", type=int, default=30)
+    parser.add_argument("--held-out", type=int, default=4)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    out = options.out or Path(tempfile.mkdtemp())
+
+    pairs = [pair for room in range(options.rooms) for pair in render_room(room, options.pairs)]
+    clips = [labelled(pair, number) for number, pair in enumerate(pairs)]
+    held = tuple(f"room {room}" for room in range(options.held_out))
+    held_pairs = [pair for pair in pairs if pair.room in held]
+    print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of held-out rooms")
+    backbones = {
+        "vjepa2": (vjepa2.load_backbone, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
+        "dinov2": (dinov2.load_backbone, save_dinov2, {"image_size": 56, "hidden_size": 96}),
+    }
+    for family, (load, save, sizes) in backbones.items():
+        folder = save(out / family / "backbone", **sizes)
+        image_size = sizes.get("image_size", 0)
+        config = RelationsConfig(
+            world_model=family, model_path=str(folder), image_size=image_size, device="cpu"
+        )
+        backbone = load(config)
+        for inputs in ("clip", "clip_and_boxes"):
+            start = time.perf_counter()
+            probe_folder = out / family / inputs
+            metrics = train_probe(
+                backbone,
+                clips,
+                PREDICATES,
+                probe_folder,
+                TrainingOptions(inputs=inputs, held_out_groups=held, batch_size=16),
+                cache=out / family / "features",
+            )["held_out"]
+            print(
+                f"{family}, {inputs}: held-out macro {metrics['macro_accuracy']:.3f} (chance "
+                f"{metrics['chance_macro']:.3f}), micro {metrics['micro_accuracy']:.3f}; "
+                f"{time.perf_counter() - start:.0f} s"
+            )
+            chosen = RelationsConfig(
+                world_model=family,
+                model_path=str(folder),
+                probe_path=str(probe_folder),
+                image_size=image_size,
+                device="cpu",
+            )
+            edges = on_and_off(build_world_model(chosen), held_pairs, seed=5)
+            print(
+                f"  ambiguous edges: right {edges['off']:.3f} off, {edges['on']:.3f} on; "
+                f"probability of the truth {edges['probability off']:.3f} off, "
+                f"{edges['probability on']:.3f} on; {edges['to right']} became right, "
+                f"{edges['to wrong']} wrong, of {edges['edges']}"
+            )
+
+
+if __name__ == "__main__":
+    main()
