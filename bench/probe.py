@@ -12,6 +12,7 @@ import argparse
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +24,11 @@ from models_support import save_dinov2, save_vjepa2
 from pair_rooms import CLASSES, PREDICATES, PairClip, render_room
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations import ClassPairPrior, build_world_model, fuse_edges, union_box
-from deworldsg_ros.relations.probe import relative_box_pair
+from deworldsg_ros.relations import ClassPairPrior, fuse_edges, union_box
+from deworldsg_ros.relations.backbone import FrozenBackbone
+from deworldsg_ros.relations.probe import BackboneIdentity, relative_box_pair
+from deworldsg_ros.relations.probe_network import load_probe
+from deworldsg_ros.relations.probed_world_model import ProbedWorldModel
 from deworldsg_ros.relations.training.labelled_clips import LabelledClip
 from deworldsg_ros.relations.training.train import TrainingOptions, train_probe
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
@@ -104,6 +108,14 @@ def on_and_off(model, pairs: list[PairClip], seed: int) -> dict[str, float]:
     }
 
 
+def blind(backbone: FrozenBackbone) -> FrozenBackbone:
+    """A backbone that sees nothing: what the boxes alone are worth."""
+    identity = BackboneIdentity("blind", 1, backbone.identity.image_size, DEFAULTS.clip_length)
+    return replace(
+        backbone, identity=identity, features=lambda videos: videos.new_zeros((len(videos), 1))
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rooms", type=int, default=16)
@@ -118,41 +130,40 @@ def main() -> None:
     held = tuple(f"room {room}" for room in range(options.held_out))
     held_pairs = [pair for pair in pairs if pair.room in held]
     print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of held-out rooms")
-    backbones = {
+    loaders = {
         "vjepa2": (vjepa2.load_backbone, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
         "dinov2": (dinov2.load_backbone, save_dinov2, {"image_size": 56, "hidden_size": 96}),
     }
-    for family, (load, save, sizes) in backbones.items():
-        folder = save(out / family / "backbone", **sizes)
-        image_size = sizes.get("image_size", 0)
+    backbones = {}
+    for family, (load, save, sizes) in loaders.items():
         config = RelationsConfig(
-            world_model=family, model_path=str(folder), image_size=image_size, device="cpu"
+            world_model=family,
+            model_path=str(save(out / family, **sizes)),
+            image_size=sizes.get("image_size", 0),
+            device="cpu",
         )
-        backbone = load(config)
+        backbones[family] = load(config)
+    backbones["boxes alone"] = blind(backbones["dinov2"])
+    for family, backbone in backbones.items():
         for inputs in ("clip", "clip_and_boxes"):
+            if backbone.identity.family == "blind" and inputs == "clip":
+                continue
             start = time.perf_counter()
-            probe_folder = out / family / inputs
+            folder = out / f"probe {family} {inputs}"
             metrics = train_probe(
                 backbone,
                 clips,
                 PREDICATES,
-                probe_folder,
+                folder,
                 TrainingOptions(inputs=inputs, held_out_groups=held, batch_size=16),
-                cache=out / family / "features",
+                cache=out / "features",
             )["held_out"]
             print(
                 f"{family}, {inputs}: held-out macro {metrics['macro_accuracy']:.3f} (chance "
                 f"{metrics['chance_macro']:.3f}), micro {metrics['micro_accuracy']:.3f}; "
                 f"{time.perf_counter() - start:.0f} s"
             )
-            chosen = RelationsConfig(
-                world_model=family,
-                model_path=str(folder),
-                probe_path=str(probe_folder),
-                image_size=image_size,
-                device="cpu",
-            )
-            edges = on_and_off(build_world_model(chosen), held_pairs, seed=5)
+            edges = on_and_off(ProbedWorldModel(backbone, load_probe(folder)), held_pairs, seed=5)
             print(
                 f"  ambiguous edges: right {edges['off']:.3f} off, {edges['on']:.3f} on; "
                 f"probability of the truth {edges['probability off']:.3f} off, "
