@@ -12,7 +12,7 @@ from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.relations.world_model import build_world_model, require_predicates
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
@@ -62,11 +62,16 @@ class Pipeline:
 
     def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
         self.config = config
-        self.perception = perceiver or build_perception(
-            config.perception, world_up=config.inputs.world_up
-        )
+        world_model = build_world_model(config.relations)
+        self.perception: Perceiver
+        if perceiver is None:
+            perception = build_perception(config.perception, world_up=config.inputs.world_up)
+            require_predicates(world_model, perception.vocabulary.predicates)
+            self.perception = perception
+        else:  # recorded detections bring their vocabulary with each frame
+            self.perception = perceiver
         self.lifting = Lifting(config.lifting)
-        self.relations = RelationReasoner(config.relations, build_world_model(config.relations))
+        self.relations = RelationReasoner(config.relations, world_model)
         self.builder: GraphBuilder | None = None
         self.drops: Counter[str] = Counter()
         self.times_s: dict[str, list[float]] = {

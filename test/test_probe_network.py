@@ -30,6 +30,7 @@ from deworldsg_ros.relations.probe_network import (  # noqa: E402
     load_probe,
     save_probe,
 )
+from deworldsg_ros.relations.world_model import require_predicates  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 BACKBONE = BackboneIdentity("vjepa2", 48, 32, 4, "0123456789abcdef")
@@ -203,11 +204,15 @@ def test_a_world_model_refuses_what_does_not_fit(tmp_path):
         build_world_model(config_of("dinov2", folder, probe_path=str(probe_folder)))
 
 
-def test_other_predicates_in_the_middle_of_a_run_are_refused(tmp_path):
+def test_other_predicates_are_refused_at_the_start_and_in_the_middle_of_a_run(tmp_path):
     folder = save_vjepa2(tmp_path / "backbone")
     unknown = msgspec.structs.replace(BACKBONE, fingerprint="")
     probe_folder = save_random_probe(tmp_path / "probe", unknown)
     model = build_world_model(config_of("vjepa2", folder, probe_path=str(probe_folder)))
+    require_predicates(model, VOCABULARY.predicates)
+    require_predicates(None, ("on",))
+    with pytest.raises(ConfigurationError, match="trained for 4 predicates and the graph has 1"):
+        require_predicates(model, ("on",))
     asked = request()
     other = type(VOCABULARY)(VOCABULARY.classes, ("on", "near"))
     with pytest.raises(ConfigurationError, match="trained for 4 predicates and the graph has 2"):

@@ -9,9 +9,10 @@ from deworldsg_ros.bridge.inputs import listen_rgb
 from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import run
 from deworldsg_ros.bridge.sync import PairingFrame, RelationAssembler
+from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
-from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.relations.world_model import build_world_model, require_predicates
 from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 from deworldsg_ros.scene.wire import LocalGraphMessage
@@ -24,7 +25,9 @@ class RelationNode(JoiningNode[PairingFrame]):
         super().__init__("relation_node", "evidence messages", **options)
         config = self.parameters.relations
         report = self.get_logger().warning
-        self._reasoner = RelationReasoner(config, build_world_model(config), report)
+        world_model = build_world_model(config)
+        require_predicates(world_model, PREDICATE_SETS[self.parameters.perception.predicate_set])
+        self._reasoner = RelationReasoner(config, world_model, report)
         self._world_frame = ""
         self._publish = self.json_publisher("deworldsg/relation_evidence", 50)
         self._world_model = EvidenceWorker(self._reasoner, self._deliver, report)

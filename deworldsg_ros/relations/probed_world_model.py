@@ -39,6 +39,10 @@ class ProbedWorldModel:
         self._backbone = backbone
         self._probe = probe
 
+    def require_predicates(self, predicates: tuple[str, ...]) -> None:
+        """Raise ConfigurationError unless the probe answers over just these predicates."""
+        self._probe.card.require_predicates(predicates)
+
     def predict_batch(self, requests: Sequence[ClipRequest]) -> list[Float64]:
         """(pairs, R) float64 for each request; all clips are encoded at once.
 
@@ -46,7 +50,7 @@ class ProbedWorldModel:
             ConfigurationError: where a vocabulary has other predicates than the probe.
         """
         for request in requests:
-            self._probe.card.require_predicates(request.vocabulary.predicates)
+            self.require_predicates(request.vocabulary.predicates)
         features = self._backbone.encode([request.clip for request in requests])
         answers = []
         for feature, request in zip(features, requests):

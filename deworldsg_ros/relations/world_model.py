@@ -84,6 +84,19 @@ class WorldModel(Protocol):
         ...
 
 
+def require_predicates(model: WorldModel | None, predicates: tuple[str, ...]) -> None:
+    """Refuse at the start a world model that answers over other predicates than the graph's.
+
+    A world model that is bound to its predicates says so by a method `require_predicates`.
+
+    Raises:
+        ConfigurationError: where it does not fit.
+    """
+    check = getattr(model, "require_predicates", None)
+    if check is not None:
+        check(predicates)
+
+
 def world_model_names() -> tuple[str, ...]:
     """Names of the world models that can be chosen."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(world_models.__path__)))
