@@ -254,7 +254,7 @@ def test_another_vocabulary_or_frame_is_refused() -> None:
     merging = PaperMerging(MergingConfig())
     with pytest.raises(RefusedInput, match="wanted 'world'") as refused:
         merging.merge(graph, frame_of(1, frame_id="map"))
-    assert refused.value.reason == "frame_mismatch"
+    assert refused.value.reason == "wrong_frame"
     other = local_graph(
         1,
         np.zeros((0, 3)),

@@ -182,7 +182,7 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(graph, merging) -> Non
     revision = graph.revision
     for changes, reason in (
         ({"vocabulary": Vocabulary(("a", "b", "c", "d"), ("x", "y", "z"))}, "vocabulary_mismatch"),
-        ({"frame_id": "odom"}, "frame_mismatch"),
+        ({"frame_id": "odom"}, "wrong_frame"),
     ):
         with pytest.raises(RefusedInput) as refused:
             merging.merge(graph, frame(1, (WHOLE, TABLE), **changes))

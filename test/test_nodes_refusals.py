@@ -222,7 +222,7 @@ def send_graph(at: Bench, make: Callable[[int], Any] = local_graph) -> None:
 
 
 GRAPH_CASES = {
-    "frame_mismatch": changed(local_graph, frame_id="odom"),
+    "wrong_frame": changed(local_graph, frame_id="odom"),
     "vocabulary_mismatch": changed(local_graph, predicates=["on", "under"]),
     "out_of_order": lambda stamp_ns: local_graph(stamp_ns - 2 * STEP_NS),
     "invalid_message": changed(local_graph, T_world_camera=[0.0] * 15),

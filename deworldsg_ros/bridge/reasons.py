@@ -15,7 +15,7 @@ REASONS: dict[str, str] = {
     # Poses
     "invalid_pose": "a pose holds NaN, infinity, or a quaternion that is not of length 1",
     "wrong_frame": "a pose is in another world frame than the first one, or than "
-    "`inputs.world_frame`",
+    "`inputs.world_frame`; or a local graph in another than the graph",
     "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames; believed "
     "after five frames at the new place",
     "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
@@ -47,7 +47,6 @@ REASONS: dict[str, str] = {
     "invalid_message": "a JSON message does not fit its schema; the log line names the field",
     "unknown_schema": "a JSON message is another one, or of a later version",
     "unknown_instance": "the instance image holds a value beyond the frame graph's objects",
-    "frame_mismatch": "a local graph is in another world frame than the graph",
     "vocabulary_mismatch": "a message has other classes or predicates than the graph; run all "
     "nodes with one configuration",
     "out_of_order": "a local graph is older than one that is merged already; restart graph_node "

@@ -19,7 +19,7 @@ def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
         )
     if local.frame_id != graph.frame_id:
         raise RefusedInput(
-            "frame_mismatch",
+            "wrong_frame",
             f"local graph is in frame {local.frame_id!r}: wanted {graph.frame_id!r}",
         )
 

@@ -33,7 +33,7 @@ class PaperMerging:
             The id of the node that each row became, after all merges of this frame.
 
         Raises:
-            RefusedInput: ``vocabulary_mismatch`` or ``frame_mismatch`` where the local graph
+            RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` where the local graph
                 does not speak of the same classes and predicates, or the same world frame.
         """
         check_fits(graph, local)
