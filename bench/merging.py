@@ -12,13 +12,14 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging import PaperMerging
+from deworldsg_ros.merging import build_merging
 from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
@@ -159,22 +160,24 @@ def bench_search(count: int, rounds: int) -> None:
     )
 
 
-def bench_stage(count: int, rounds: int = 300) -> None:
+def bench_stage(association: Literal["paper", "surface"], count: int, rounds: int = 300) -> None:
     world = World(count)
     frames = frames_of(world, rounds)
     tracemalloc.start()
     graph = graph_of(world)
-    merging = PaperMerging(MergingConfig())
+    config = MergingConfig(association=association)
+    merging = build_merging(config)
     for local in frames:
         merging.merge(graph, local)
     held, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     graph = graph_of(world)
     before = len(graph)
+    merging = build_merging(config)
     times = [milliseconds(lambda frame=local: merging.merge(graph, frame)) for local in frames]
     dense = count**2 * PREDICATES * 8
     print(
-        f"stage {LOCAL_NODES} x {before:6d} nodes, {len(graph.edges)} edges: "
+        f"{association} stage {LOCAL_NODES} x {before:6d} nodes, {len(graph.edges)} edges: "
         f"median {statistics.median(times):6.3f} ms, 95 % {sorted(times)[int(0.95 * rounds)]:6.3f} "
         f"ms a frame; graph holds {held / 1e6:.1f} MB, peak {peak / 1e6:.1f} MB "
         f"(a dense relation array would be {dense / 1e6:.0f} MB)"
@@ -185,8 +188,10 @@ def main() -> None:
     warm_up()
     for count, rounds in ((100, 200), (1000, 40), (10_000, 8)):
         bench_search(count, rounds)
-    for count in (300, 1000):
-        bench_stage(count)
+    for association in ("paper", "surface"):
+        build_merging(MergingConfig(association=association)).warm_up()
+        for count in (300, 1000):
+            bench_stage(association, count)
 
 
 if __name__ == "__main__":
