@@ -1,0 +1,154 @@
+"""Nodes that are seen through go; a moved object keeps its id; what is hidden or away stays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from merging_support import VOCABULARY
+from test_merging_surface import CHAIR, CUP, TABLE, WHOLE, frame, slab
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.merging.absence import look
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import DepthGrid
+from deworldsg_ros.scene.graph import SceneGraph
+
+CAMERA = Intrinsics(300.0, 300.0, 319.5, 239.5, 640, 480)
+WALL_M = 1.0  # the table top, seen from in front; cups float before it
+HERE = slab((0.3, 0.1, 0.7), (0.08, 0.08, 0.06))
+THERE = slab((-0.4, -0.1, 0.7), (0.08, 0.08, 0.06))
+
+
+def depth_grid(*surfaces: np.ndarray, background_m: float = WALL_M) -> DepthGrid:
+    """What a camera at the origin that looks along z sees of points before a wall."""
+    depth_mm = np.full((60, 80), background_m * 1000, np.uint16)
+    for points in surfaces:
+        columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)
+        rows = np.floor((300 * points[:, 1] / points[:, 2] + 239.5) / 8).astype(int)
+        np.minimum.at(depth_mm, (rows, columns), (points[:, 2] * 1000).astype(np.uint16))
+    return DepthGrid(depth_mm, 8, CAMERA)
+
+
+class Scene:
+    """A graph, its rule, and a clock."""
+
+    def __init__(self, **config: float) -> None:
+        self.graph = SceneGraph(VOCABULARY, "world")
+        self.merging = SurfaceMerging(MergingConfig(association="surface", **config))
+        self.stamp = 0
+
+    def see(self, *objects: tuple[np.ndarray, int], grid: DepthGrid | None = None) -> list[int]:
+        """One frame of the objects; without a grid, of the depth that they and the wall give."""
+        self.stamp += 1
+        grid = depth_grid(*(p for p, kind in objects if kind != TABLE)) if grid is None else grid
+        return self.merging.merge(self.graph, frame(self.stamp, *objects, depth_grid=grid))
+
+    def told(self) -> dict[int, str]:
+        return {node_id: node.label for node_id, node in self.graph.node_states(1).items()}
+
+
+@pytest.fixture
+def scene() -> Scene:
+    scene = Scene()
+    for _ in range(4):
+        scene.see((WHOLE, TABLE), (HERE, CUP))
+    assert scene.told() == {1: "table", 2: "cup"}
+    return scene
+
+
+def test_what_is_seen_through_goes_after_some_frames_in_a_row(scene) -> None:
+    for _ in range(4):
+        scene.see((WHOLE, TABLE))
+    assert scene.told() == {1: "table", 2: "cup"}
+    scene.see((WHOLE, TABLE))
+    assert scene.told() == {1: "table"}
+
+
+def test_an_object_that_is_there_but_not_detected_stays(scene) -> None:
+    for _ in range(50):
+        scene.see((WHOLE, TABLE), grid=depth_grid(HERE))
+    assert scene.told() == {1: "table", 2: "cup"}
+
+
+def test_frames_that_see_through_count_only_in_a_row(scene) -> None:
+    for index in range(20):
+        scene.see((WHOLE, TABLE), grid=depth_grid(*([HERE] if index % 4 == 3 else [])))
+    assert scene.told() == {1: "table", 2: "cup"}
+
+
+def test_what_is_hidden_has_no_depth_or_is_out_of_view_stays(scene) -> None:
+    hidden = depth_grid(background_m=0.4)
+    blind = DepthGrid(np.zeros((60, 80), np.uint16), 8, CAMERA)
+    for _ in range(10):
+        scene.see(grid=hidden)
+        scene.see(grid=blind)
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])  # half a turn about y
+    for stamp in range(100, 110):
+        local = frame(stamp, T_world_camera=turned, depth_grid=depth_grid(background_m=4.0))
+        scene.merging.merge(scene.graph, local)
+    assert scene.told() == {1: "table", 2: "cup"}
+
+
+def test_a_moved_object_keeps_its_id(scene) -> None:
+    for _ in range(8):
+        ids = scene.see((WHOLE, TABLE), (THERE, CUP))
+    assert ids == [1, 2]
+    assert scene.told() == {1: "table", 2: "cup"}
+    row = scene.graph.nodes.row(2)
+    assert scene.graph.nodes.means[row] == pytest.approx(THERE.mean(axis=0), abs=1e-3)
+    assert scene.graph.nodes.observations[row] == 12
+    assert scene.see((THERE, CUP)) == [2]
+    assert scene.graph.take_removals() == {3: 2}
+
+
+def test_an_object_that_was_away_for_a_while_keeps_its_id(scene) -> None:
+    for _ in range(8):
+        scene.see((WHOLE, TABLE))
+    assert scene.told() == {1: "table"}
+    for _ in range(3):
+        ids = scene.see((WHOLE, TABLE), (THERE, CUP))
+    assert ids == [1, 2]
+    assert scene.told() == {1: "table", 2: "cup"}
+
+
+def test_another_object_or_one_that_comes_too_late_is_a_new_one() -> None:
+    for kind, pause in ((CHAIR, 0), (CUP, 30)):
+        scene = Scene(lost_s=2.0)
+        for _ in range(4):
+            scene.see((WHOLE, TABLE), (HERE, CUP))
+        for _ in range(8 + pause):
+            scene.see((WHOLE, TABLE))
+        for _ in range(3):
+            scene.see((WHOLE, TABLE), (THERE, kind))
+        assert scene.told() == {1: "table", 3: VOCABULARY.classes[kind]}
+
+
+def test_a_tentative_node_that_is_seen_through_is_removed() -> None:
+    scene = Scene()
+    scene.see((WHOLE, TABLE), (HERE, CUP))
+    for _ in range(6):
+        scene.see((WHOLE, TABLE))
+    assert scene.graph.nodes.ids.tolist() == [1]
+
+
+def test_zero_frames_turns_negative_evidence_off() -> None:
+    scene = Scene(absent_frames=0)
+    for _ in range(4):
+        scene.see((WHOLE, TABLE), (HERE, CUP))
+    for _ in range(20):
+        scene.see((WHOLE, TABLE))
+    assert scene.told() == {1: "table", 2: "cup"}
+
+
+@pytest.mark.parametrize(
+    ("z_m", "through", "present"), [(0.7, True, False), (1.0, False, True), (1.5, False, False)]
+)
+def test_points_before_on_and_behind_what_was_measured(z_m, through, present) -> None:
+    points = np.zeros((1, 10, 3), np.float32)
+    points[0, :, 0] = np.linspace(-0.2, 0.2, 10)
+    points[0, :, 2] = z_m
+    seen_through, there = look(points, np.array([10]), np.eye(4), depth_grid())
+    assert (seen_through[0], there[0]) == (through, present)
+    seen_through, there = look(points, np.array([0]), np.eye(4), depth_grid())
+    assert not seen_through[0] and not there[0]
