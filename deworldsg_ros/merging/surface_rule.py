@@ -176,9 +176,10 @@ class SurfaceMerging:
             present[self._owner_of[graph.resolve(node_id)]] = True
         self._absent_frames[seen_through] += 1
         self._absent_frames[present] = 0
-        gone = np.flatnonzero(self._absent_frames >= self._config.absent_frames)
-        for node_id in [self._node_of[owner] for owner in gone.tolist()]:
-            self._lose(graph, node_id, local.stamp_ns)
+        for owner in np.flatnonzero(self._absent_frames >= self._config.absent_frames).tolist():
+            # Of two that are gone, the one may just have become the other.
+            if self._node_of[owner]:
+                self._lose(graph, self._node_of[owner], local.stamp_ns)
 
     def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
         """Take a node from its place; its id may turn up elsewhere, now or soon."""
