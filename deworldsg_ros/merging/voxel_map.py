@@ -59,7 +59,7 @@ class VoxelMap:
         self._used = 0
         self._query = 0
         self._cells_of: dict[int, list[Int64]] = {}
-        self._counts_of: dict[int, int] = {}
+        self._counts = np.zeros(64, np.int64)
 
     def __len__(self) -> int:
         """Number of cells that have, or had, an owner."""
@@ -67,7 +67,7 @@ class VoxelMap:
 
     def cell_count(self, owner: int) -> int:
         """Number of cells of an owner."""
-        return self._counts_of.get(owner, 0)
+        return int(self._counts[owner]) if owner < len(self._counts) else 0
 
     def cells_of(self, point_sets: Sequence[Float32]) -> CellSets:
         """Distinct cells of each set of points (k, 3), metres."""
@@ -90,7 +90,9 @@ class VoxelMap:
         self._used += created
         if len(new):
             self._cells_of.setdefault(owner, []).append(new)
-            self._counts_of[owner] = self.cell_count(owner) + len(new)
+            if owner >= len(self._counts):
+                self._counts = np.pad(self._counts, (0, owner + 1))
+            self._counts[owner] += len(new)
 
     def shares(self, sets: CellSets, owner_count: int) -> Float64:
         """How far the surface of each set coincides with that of each owner.
@@ -102,7 +104,9 @@ class VoxelMap:
         Returns:
             (n, S) float64 in [0, 1] for n sets and owners 0 ... S - 1.
         """
-        counts = np.array([self.cell_count(owner) for owner in range(owner_count)], np.int64)
+        if owner_count > len(self._counts):
+            self._counts = np.pad(self._counts, (0, owner_count))
+        counts = self._counts[:owner_count]
         shares: Float64 = _shares(
             self._keys, self._owners, self._touched, self._query, sets.cells, sets.starts, counts
         )
@@ -112,7 +116,8 @@ class VoxelMap:
     def remove(self, owner: int) -> Int64:
         """Forget an owner; returns the cells it had."""
         cells = np.concatenate([np.zeros(0, np.int64), *self._cells_of.pop(owner, [])])
-        self._counts_of.pop(owner, None)
+        if len(cells):
+            self._counts[owner] = 0
         _remove(self._keys, self._owners, owner, cells)
         return cells
 
