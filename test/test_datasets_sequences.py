@@ -122,9 +122,11 @@ def test_depth_source_of_3rscan(tmp_path: Path) -> None:
     rendered = np.full((HEIGHT, WIDTH), 1500, np.uint16)
     cv2.imwrite(str(folder / "sequence" / "frame-000000.rendered.depth.png"), rendered)
     for source, wanted in (("auto", 1.5), ("rendered", 1.5), ("sensor", BACKGROUND_M)):
-        options = DatasetOptions(depth_source=source)  # type: ignore[arg-type]
+        options = DatasetOptions(depth_source=source)
         frame = next(open_recording(folder, options=options).frames())
         assert frame.depth_m[0, 0] == pytest.approx(wanted, abs=1e-6)
+    with pytest.raises(RecordingError, match="depth source 'laser': wanted auto, rendered, sensor"):
+        DatasetOptions(depth_source="laser")
 
 
 def test_a_missing_info_says_where_and_how_to_get_it(tmp_path: Path) -> None:

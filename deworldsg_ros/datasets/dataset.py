@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from deworldsg_ros.bags.source import RawRoleMessage, UsedTopic
 
 CAMERA_FRAME = "camera_rgb_optical_frame"
 WORLD_FRAME = "world"
+DEPTH_SOURCES = ("auto", "rendered", "sensor")
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,21 @@ class DatasetOptions:
             ``auto`` = what the compared numbers use.
         poses_needed: whether a frame without a valid pose file is left out; otherwise it comes
             without a pose.
+
+    Raises:
+        RecordingError: for another depth source.
     """
 
     rate_hz: float = 0.0
     intrinsics: tuple[float, float, float, float] | None = None
-    depth_source: Literal["auto", "rendered", "sensor"] = "auto"
+    depth_source: str = "auto"
     poses_needed: bool = True
+
+    def __post_init__(self) -> None:
+        if self.depth_source not in DEPTH_SOURCES:
+            raise RecordingError(
+                f"depth source '{self.depth_source}': wanted {', '.join(DEPTH_SOURCES)}"
+            )
 
 
 class Dataset(ABC):

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from deworldsg_ros.datasets.replica import belongs_to_replica
 from deworldsg_ros.datasets.rooms import belongs_to_rooms
-from deworldsg_ros.datasets.sequence import SequenceDataset, looks_like_scan
+from deworldsg_ros.datasets.sequence import RENDERED_DEPTH, SequenceDataset, looks_like_scan
 
 
 class RioScan(SequenceDataset):
@@ -32,8 +32,7 @@ class RioScan(SequenceDataset):
         """Whether it is a scan that is neither ReplicaSSG's nor a rendered room."""
         return looks_like_scan(path) and not belongs_to_replica(path) and not belongs_to_rooms(path)
 
-    def _choose_depth(self, first: Path) -> str:
-        rendered = first.with_name(first.name.split(".")[0] + ".rendered.depth.png")
-        if self.options.depth_source == "auto" and rendered.exists():
-            return ".rendered.depth.png"
+    def _choose_depth(self, first: int) -> str:
+        if self.options.depth_source == "auto" and self.file(first, RENDERED_DEPTH).exists():
+            return RENDERED_DEPTH
         return super()._choose_depth(first)

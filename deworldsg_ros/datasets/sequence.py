@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -12,35 +10,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.bags import messages as ros
 from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.messages import Role, RoleMessage
-from deworldsg_ros.bags.source import RawRoleMessage, UsedTopic
 from deworldsg_ros.datasets.dataset import (
-    CAMERA_FRAME,
-    WORLD_FRAME,
-    Dataset,
     DatasetOptions,
     decode_image,
     encode_png,
     image_format,
     image_size,
     read_file,
-    serialized,
 )
-from deworldsg_ros.scene.camera import (
-    Float64,
-    Intrinsics,
-    check_pose,
-    pose_from_quaternion,
-    quaternion_from_rotation,
-)
+from deworldsg_ros.datasets.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
+from deworldsg_ros.scene.camera import Float64, Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 
-# Stamps count from here: a ROS time of zero means "unset" to many programs.
-FIRST_STAMP_NS = 10**9
 INFO_NAME = "_info.txt"
-COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)$")
+RENDERED_DEPTH = ".rendered.depth.png"
 
 # Axes of the turned camera in those of the camera: x is what was -y, y is what was x.
 TURNED_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -60,15 +44,13 @@ class SensorInfo:
     depth_units_per_m: float
 
 
-class SequenceDataset(Dataset):
+class SequenceDataset(FrameFiles):
     """One scan of a data set in 3RScan's layout.
 
     Attributes:
         default_rate_hz: frames a second, where the data set has no stamps of its own.
         turned: whether the images are turned by 90 degrees clockwise.
-        pose_suffix: ending of the pose files.
         how_to_get: one sentence for whoever lacks a file.
-        frame_numbers: number of the frame in its file names, by its stamp in nanoseconds.
 
     Raises:
         RecordingError: names the file that was expected, and how to get it.
@@ -76,7 +58,6 @@ class SequenceDataset(Dataset):
 
     default_rate_hz: ClassVar[float]
     turned: ClassVar[bool] = False
-    pose_suffix: ClassVar[str] = ".pose.txt"
     how_to_get: ClassVar[str]
 
     def __init__(self, path: Path, options: DatasetOptions) -> None:
@@ -89,17 +70,13 @@ class SequenceDataset(Dataset):
             raise RecordingError(
                 f"{self.kind} scan {path}: {info_path} is missing; {self.how_to_get}"
             )
-        self._colors = {
-            int(match[1]): file
-            for file in sorted(self.sequence.iterdir())
-            if (match := COLOR_NAME.match(file.name))
-        }
-        if not self._colors:
+        colors = color_files(self.sequence)
+        if not colors:
             raise RecordingError(
                 f"{self.kind} scan {path}: {self.sequence} holds no frame-NNNNNN.color.jpg; "
                 f"{self.how_to_get}"
             )
-        first = next(iter(self._colors.values()))
+        first = next(iter(colors.values()))
         info = read_info(info_path)
         if image_size(first) != (info.color.width, info.color.height):
             raise RecordingError(
@@ -113,110 +90,39 @@ class SequenceDataset(Dataset):
             )
         self.info = info
         self.intrinsics = turned_intrinsics(info.color) if self.turned else info.color
-        self.depth_suffix = self._choose_depth(first)
+        self.depth_suffix = self._choose_depth(min(colors))
         rate_hz = options.rate_hz or self.default_rate_hz
-        self._stamps_ns = {
-            number: FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in self._colors
-        }
-        self.frame_numbers = {stamp_ns: number for number, stamp_ns in self._stamps_ns.items()}
-        self.frame_count = len(self._colors)
-        self.topics = {
-            role: UsedTopic(name, msgtype, self.frame_count)
-            for role, name, msgtype in (
-                (Role.RGB, f"frame-*.color{first.suffix}", ros.COMPRESSED_IMAGE),
-                (Role.DEPTH, f"frame-*{self.depth_suffix}", ros.COMPRESSED_IMAGE),
-                (Role.CAMERA_INFO, INFO_NAME, ros.CAMERA_INFO),
-                (Role.POSE, f"frame-*{self.pose_suffix}", ros.POSE_STAMPED),
-            )
-        }
-
-    def messages(self) -> Iterator[RoleMessage]:
-        """camera_info, pose, depth and RGB of each frame; frames without a valid pose are left."""
-        # What is decoded at once is not worth compressing: half of the time of reading a frame.
-        return self._messages(stored=True)
-
-    def raw_messages(self) -> Iterator[RawRoleMessage]:
-        """The same, serialized and compressed."""
-        return serialized(self._messages(stored=False))
-
-    def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
-        for number, color_path in self._colors.items():
-            depth_path = self.file(number, self.depth_suffix)
-            pose_path = self.file(number, self.pose_suffix)
-            wanted = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
-            missing = next((file for file in wanted if not file.exists()), None)
-            if missing is not None:
-                self.drops["missing_file"] += 1
-                self.losses.append(f"{missing.name} is missing: its frame is left out")
-                continue
-            T_world_camera = None
-            try:
-                T_world_camera = read_pose(pose_path)
-            except RefusedInput as refusal:
-                if self.options.poses_needed:
-                    self.drops[refusal.reason] += 1
-                    continue
-            try:
-                messages = self._frame(
-                    self._stamps_ns[number],
-                    color_path,
-                    depth_path,
-                    np.eye(4) if T_world_camera is None else T_world_camera,
-                    stored,
-                )
-            except RecordingError as error:
-                self.drops["decode_failed"] += 1
-                self.losses.append(f"{error}: its frame is left out")
-                continue
-            for message in messages:
-                if T_world_camera is not None or message.role is not Role.POSE:
-                    yield message
+        stamps_ns = [FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in colors]
+        self._set_frames(colors, stamps_ns, INFO_NAME)
 
     def file(self, number: int, suffix: str) -> Path:
         """File of a frame."""
         return self.sequence / f"frame-{number:06d}{suffix}"
 
-    def _choose_depth(self, first: Path) -> str:
-        """Ending of the depth files; raises RecordingError where a wanted kind is absent."""
+    def _choose_depth(self, first: int) -> str:
+        """Ending of the depth files, by the first frame; RecordingError where they are absent."""
         if self.options.depth_source == "rendered":
-            number = COLOR_NAME.match(first.name)
-            path = self.file(int(number[1]) if number else 0, ".rendered.depth.png")
+            path = self.file(first, RENDERED_DEPTH)
             if not path.exists():
                 raise RecordingError(
                     f"{path} is missing: rendered depth was asked for, this scan has the "
                     "sensor's only"
                 )
-            return ".rendered.depth.png"
+            return RENDERED_DEPTH
         return ".depth.pgm"
 
-    def _frame(
-        self,
-        stamp_ns: int,
-        color_path: Path,
-        depth_path: Path,
-        T_world_camera: Float64,
-        stored: bool,
-    ) -> list[RoleMessage]:
+    def _camera_pose(self, T_world_file: Float64) -> Float64:
+        return turned_pose(T_world_file) if self.turned else T_world_file
+
+    def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
         color, color_format = read_file(color_path), image_format(color_path)
         depth_mm = self._depth_mm(depth_path)
         if self.turned:
             bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
             bgr = np.asarray(cv2.rotate(bgr, cv2.ROTATE_90_CLOCKWISE), np.uint8)
-            color = encode_png(bgr, stored=stored)
-            color_format = "png"
+            color, color_format = encode_png(bgr, stored=stored), "png"
             depth_mm = np.asarray(cv2.rotate(depth_mm, cv2.ROTATE_90_CLOCKWISE), np.uint16)
-            T_world_camera = turned_pose(T_world_camera)
-        return [
-            ros.camera_info(stamp_ns, CAMERA_FRAME, self.intrinsics),
-            ros.pose_stamped(
-                stamp_ns,
-                WORLD_FRAME,
-                T_world_camera[:3, 3],
-                quaternion_from_rotation(T_world_camera[:3, :3]),
-            ),
-            ros.compressed_depth(stamp_ns, CAMERA_FRAME, encode_png(depth_mm, stored=stored)),
-            ros.compressed_image(stamp_ns, CAMERA_FRAME, color, color_format),
-        ]
+        return color, color_format, encode_png(depth_mm, stored=stored)
 
     def _depth_mm(self, path: Path) -> NDArray[np.uint16]:
         """Depth of the colour image's pixels, (H, W) uint16 millimetres; raises RecordingError."""
@@ -330,14 +236,3 @@ def _camera(values: dict[str, str], which: str) -> Intrinsics:
     lower = which.lower()
     size = int(values[f"m_{lower}Width"]), int(values[f"m_{lower}Height"])
     return Intrinsics(numbers[0], numbers[5], numbers[2], numbers[6], *size)
-
-
-def read_pose(path: Path) -> Float64:
-    """T_world_camera (4, 4) of a pose file; raises RefusedInput ``invalid_pose``."""
-    try:
-        T = np.array(path.read_text().split(), np.float64).reshape(4, 4)
-    except (OSError, ValueError) as error:
-        raise RefusedInput("invalid_pose", f"{path}: {error}; wanted a 4x4 matrix") from error
-    check_pose(T)
-    # Printed decimals are not quite a rotation; the message's quaternion is exactly one.
-    return pose_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
