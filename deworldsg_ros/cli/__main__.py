@@ -1,5 +1,5 @@
 """`python -m deworldsg_ros.cli` is `deworldsg`."""
 
-from deworldsg_ros.cli.app import main
+from deworldsg_ros.cli import main
 
 main()

@@ -13,14 +13,13 @@ from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
-from deworldsg_ros.cli import models, probe
+from deworldsg_ros.cli import EXIT_INTERRUPTED, models, probe
 from deworldsg_ros.cli.evaluate import evaluate
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 # Bad usage, a bad configuration, a recording that cannot be used.
 EXIT_USAGE = 2
-EXIT_INTERRUPTED = 130
 
 app = typer.Typer(
     name="deworldsg",
@@ -67,6 +66,10 @@ FrameRate = Annotated[
 CameraIntrinsics = Annotated[
     str,
     typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="of a folder that does not tell"),
+]
+DepthSource = Annotated[
+    str,
+    typer.Option("--depth-source", help="3rscan: rendered or sensor; auto = rendered if there"),
 ]
 Poses = Annotated[
     Optional[Path],
@@ -146,6 +149,7 @@ def run(
     pose: PoseTopic = "",
     rate: FrameRate = 0.0,
     intrinsics: CameraIntrinsics = "",
+    depth_source: DepthSource = "auto",
     poses: Poses = None,
     pose_format: PoseFormat = "auto",
     odometry: OdometryPoses = False,
@@ -167,7 +171,7 @@ def run(
             settings or [],
             max_frames=max_frames,
             topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=_dataset_options(rate, intrinsics),
+            options=_dataset_options(rate, intrinsics, depth_source),
             poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
             temporal=temporal,
             trajectory_out=save_trajectory,
@@ -227,6 +231,7 @@ def convert(
     output: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="file to write")],
     rate: FrameRate = 0.0,
     intrinsics: CameraIntrinsics = "",
+    depth_source: DepthSource = "auto",
     rgb: RgbTopic = "",
     depth: DepthTopic = "",
     camera_info: InfoTopic = "",
@@ -241,7 +246,7 @@ def convert(
             source,
             output,
             topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=_dataset_options(rate, intrinsics),
+            options=_dataset_options(rate, intrinsics, depth_source),
             console=Console(),
         )
 
@@ -267,28 +272,23 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
         typer.echo(described_yaml(effective_config(config, settings)), nl=False)
 
 
-app.command()(_telling_errors()(evaluate))
+# A command's own first sentence would be cut to one line of the list.
+for function, summary in (
+    (evaluate, "Measure scene graphs against annotations."),
+    (probe.train_probe, "Train the probe of a world model."),
+    (probe.import_probe, "Make the published probe ready for use."),
+):
+    app.command(short_help=summary)(_telling_errors()(function))
 app.add_typer(models.app)
-app.command("train-probe")(_telling_errors()(probe.train_probe))
-app.command("import-probe")(_telling_errors()(probe.import_probe))
 
 
-def _dataset_options(rate_hz: float, intrinsics: str) -> DatasetOptions:
+def _dataset_options(rate_hz: float, intrinsics: str, depth_source: str = "auto") -> DatasetOptions:
     if not intrinsics:
-        return DatasetOptions(rate_hz)
+        return DatasetOptions(rate_hz, depth_source=depth_source)
     try:
         fx, fy, cx, cy = (float(word) for word in intrinsics.split(","))
     except ValueError as error:
         raise typer.BadParameter(
             f"'{intrinsics}' is not FX,FY,CX,CY: wanted four numbers, in pixels"
         ) from error
-    return DatasetOptions(rate_hz, (fx, fy, cx, cy))
-
-
-def main() -> None:
-    """Run the program; ends the process with 0, 2 for errors of the user, 130 after Ctrl-C."""
-    app(prog_name="deworldsg")
-
-
-if __name__ == "__main__":
-    main()
+    return DatasetOptions(rate_hz, (fx, fy, cx, cy), depth_source)
