@@ -122,3 +122,23 @@ def test_installed_executables_are_preferred_where_this_is_no_checkout(tmp_path,
     executable.chmod(0o755)
     assert node_command("graph_node") == [str(executable)]
     assert node_command("lifting_node")[:2] == module[:2]
+
+
+@pytest.mark.parametrize(
+    ("program", "while_importing", "wanted"),
+    [
+        ("from deworldsg_ros.cli import main; main()", "typer", 130),
+        ("from deworldsg_ros.nodes.start import start; start('graph_node')", "rclpy", 0),
+    ],
+)
+def test_ctrl_c_while_python_imports_is_quiet(tmp_path, program, while_importing, wanted):
+    """A module that is slow to import stands in for those that the programs begin with."""
+    (tmp_path / f"{while_importing}.py").write_text(
+        "import time; print('ready', flush=True); time.sleep(60)"
+    )
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); {program}"
+    process = start(tmp_path, "slow", code)
+    wait_for_log(process, "ready")
+    process.signal(signal.SIGINT)
+    assert process.wait(20) == wanted
+    assert process.log.read_text() == "ready\n"
