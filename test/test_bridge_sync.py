@@ -244,6 +244,19 @@ def test_a_recording_that_starts_again_is_followed() -> None:
     assert drops["time_jump"] >= 1
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_streams_that_start_again_one_after_the_other_lose_nothing(late: bool) -> None:
+    """Poses and depth of the new time come first, an image of the old time after them."""
+    old = complete(T0 + 100 * SECOND)
+    new = [event for place in range(3) for event in complete(T0 + place * PERIOD)]
+    new.sort(key=lambda event: event.method == "add_rgb")  # stable: images last
+    straggler = [Event("add_rgb", rgb(T0 + 101 * SECOND), T0 + 101 * SECOND)] if late else []
+    images = [event for event in new if event.method == "add_rgb"]
+    frames, drops = feed([*old, *new[: -len(images)], *straggler, *images])
+    assert [frame[0] - T0 for frame in frames] == [100 * SECOND, 0, PERIOD, 2 * PERIOD]
+    assert set(drops) == {"time_jump"}
+
+
 def test_a_changed_camera_info_counts_from_its_stamp_on() -> None:
     changed = camera_info(T0 + PERIOD, (20.0, 0, 4, 0, 20.0, 3, 0, 0, 1))
     assembler = FrameAssembler(INPUTS)

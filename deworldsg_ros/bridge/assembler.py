@@ -63,9 +63,12 @@ class Assembler(ABC, Generic[T, Out]):
     def _forget(self, stamp_ns: int) -> None:
         """Drop what only outputs up to this stamp could need."""
 
-    def _restart(self) -> None:
-        """Forget everything after a jump back in time."""
-        lost = sum(stream.clear() for stream in self._streams)
+    def _restart(self, stamp_ns: int) -> None:
+        """Forget what lies ahead of a jump back in time, to this stamp.
+
+        Streams jump one after the other: what has come of the new time already stays.
+        """
+        lost = sum(stream.clear() for stream in self._streams if stream.restarts(stamp_ns))
         self._waiting_since_ns.clear()
         self._drop("time_jump", f"stamps went back: starting again without {lost} messages")
 
@@ -145,7 +148,7 @@ class Assembler(ABC, Generic[T, Out]):
     def _add(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
         """Keep an item; count it where it is refused, and what it pushes out."""
         if stream.restarts(stamp_ns):
-            self._restart()
+            self._restart(stamp_ns)
         try:
             lost = stream.add(stamp_ns, value)
         except RefusedInput as refusal:

@@ -112,14 +112,15 @@ class PosedAssembler(Assembler[T, Out]):
     def _hear_pose(self, stamp_ns: int) -> None:
         """Note the stamp; poses lie in a buffer of their own, not in the stream."""
         if self._pose.restarts(stamp_ns):
-            self._restart()
+            self._restart(stamp_ns)
         self._pose.heard()
         self._pose.newest_ns = max(stamp_ns, self._pose.newest_ns or stamp_ns)
 
-    def _restart(self) -> None:
-        super()._restart()
-        self._poses = PoseStream(self._pose_slop_ns, self._poses.world_frame)
-        self._transforms.restart()
+    def _restart(self, stamp_ns: int) -> None:
+        if self._pose.restarts(stamp_ns):
+            self._poses = PoseStream(self._pose_slop_ns, self._poses.world_frame)
+            self._transforms.restart()
+        super()._restart(stamp_ns)
 
     def _source(self) -> PoseStream | TransformTree:
         wanted = self._inputs.pose_source

@@ -80,8 +80,8 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         """Keep an RGB image, Image or CompressedImage."""
         self._add(self._leader, stamp_ns, message)
 
-    def _restart(self) -> None:
-        super()._restart()
+    def _restart(self, stamp_ns: int) -> None:
+        super()._restart(stamp_ns)
         self._gate = JumpGate(self._inputs.max_step_m)
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
