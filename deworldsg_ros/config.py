@@ -228,6 +228,10 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_step_m: Annotated[
         float, _number("camera movement between frames above which it is a jump, metres", gt=0)
     ] = 1.0
+    # Hands and heads turn at 300 degrees a second at the most, and an image is blurred far below.
+    max_turn_deg_s: Annotated[
+        float, _number("camera rotation above which it is a jump, degrees a second", gt=0)
+    ] = 360.0
     depth_scale: Annotated[
         float, _number("metres of one unit of a 16UC1 depth image", gt=0, le=1)
     ] = 0.001

@@ -123,11 +123,13 @@ def test_a_pose_in_another_frame_is_refused() -> None:
         first.add(pose(frame_id="odom"), T0 + MS)
 
 
-def reasons(gate: JumpGate, xs: list[float]) -> list[str]:
+def reasons(
+    gate: JumpGate, xs: list[float], turns_deg: list[float] | None = None, step_ns: int = 100 * MS
+) -> list[str]:
     result = []
-    for x in xs:
+    for place, (x, turn_deg) in enumerate(zip(xs, turns_deg or [0.0] * len(xs))):
         try:
-            gate.check(at(x))
+            gate.check(at(x, turn_rad=math.radians(turn_deg)), T0 + place * step_ns)
             result.append("")
         except RefusedInput as refusal:
             result.append(refusal.reason)
@@ -135,17 +137,36 @@ def reasons(gate: JumpGate, xs: list[float]) -> list[str]:
 
 
 def test_one_wild_pose_is_refused_and_the_next_is_not() -> None:
-    assert reasons(JumpGate(1.0), [0.0, 0.9, 7.0, 1.0]) == ["", "", "pose_jump", ""]
+    assert reasons(JumpGate(1.0, 360.0), [0.0, 0.9, 7.0, 1.0]) == ["", "", "pose_jump", ""]
 
 
 def test_a_new_place_is_believed_after_a_while() -> None:
-    seen = reasons(JumpGate(1.0, believed_after=3), [0.0, 7.0, 7.1, 7.2, 7.3])
+    seen = reasons(JumpGate(1.0, 360.0, believed_after=3), [0.0, 7.0, 7.1, 7.2, 7.3])
     assert seen == ["", "pose_jump", "pose_jump", "", ""]
 
 
 def test_poses_that_jump_about_are_never_believed() -> None:
-    seen = reasons(JumpGate(1.0, believed_after=3), [0.0, *(7.0 * step for step in range(1, 20))])
+    seen = reasons(
+        JumpGate(1.0, 360.0, believed_after=3), [0.0, *(7.0 * step for step in range(1, 20))]
+    )
     assert seen == ["", *["pose_jump"] * 19]
+
+
+@pytest.mark.parametrize(
+    ("turns_deg", "step_ms", "wanted"),
+    [
+        ([0, 30, 60, 90], 100, ["", "", "", ""]),  # as fast as a hand turns
+        ([0, 60, 10, 20], 100, ["", "pose_jump", "", ""]),
+        ([0, 60, 60, 60], 33, ["", "pose_jump", "pose_jump", ""]),  # held: relocalised
+        ([0, 60, 120], 500, ["", "", ""]),  # the frames are seconds apart
+        ([0, 5, -5, 5], 1, ["", "", "", ""]),  # noise of a fast tracker
+    ],
+)
+def test_a_camera_that_turns_too_fast_has_jumped(
+    turns_deg: list[float], step_ms: int, wanted: list[str]
+) -> None:
+    gate = JumpGate(1.0, 360.0, believed_after=3)
+    assert reasons(gate, [0.0] * len(turns_deg), turns_deg, step_ms * MS) == wanted
 
 
 def test_tf_chains_static_and_moving_transforms() -> None:

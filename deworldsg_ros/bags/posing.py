@@ -21,7 +21,7 @@ from deworldsg_ros.bags.recording import Recording
 from deworldsg_ros.bags.source import RawRoleMessage, Source, UsedTopic
 from deworldsg_ros.bridge.jump_gate import JumpGate
 from deworldsg_ros.bridge.poses import pose_from_message
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, InputsConfig
 from deworldsg_ros.datasets.sequence import turned_pose
 from deworldsg_ros.poses.frames import OnRefusal, track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
@@ -93,18 +93,18 @@ def posed_frames(
         frames = _tracked(frames, recording.source, config, on_refusal)
     if choice.noise != PoseNoise():
         frames = perturb_poses(frames, choice.noise)
-        frames = gate_jumps(frames, config.inputs.max_step_m, on_refusal)
+        frames = gate_jumps(frames, config.inputs, on_refusal)
     return frames
 
 
 def gate_jumps(
-    frames: Iterable[RgbdFrame], max_step_m: float, on_refusal: OnRefusal
+    frames: Iterable[RgbdFrame], inputs: InputsConfig, on_refusal: OnRefusal
 ) -> Iterator[RgbdFrame]:
     """The frames without those whose camera jumped (`JumpGate`)."""
-    gate = JumpGate(max_step_m)
+    gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
     for frame in frames:
         try:
-            gate.check(frame.T_world_camera)
+            gate.check(frame.T_world_camera, frame.stamp_ns)
         except RefusedInput as refusal:
             on_refusal(refusal)
             continue

@@ -16,8 +16,8 @@ REASONS: dict[str, str] = {
     "invalid_pose": "a pose holds NaN, infinity, or a quaternion that is not of length 1",
     "wrong_frame": "a pose is in another world frame than the first one, or than "
     "`inputs.world_frame`; or a local graph in another than the graph",
-    "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames; believed "
-    "after five frames at the new place",
+    "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames, or turned "
+    "faster than `inputs.max_turn_deg_s`; believed after five frames at the new place",
     "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
     "odometry_lost": "a frame fits none before it: blocked, blank or too fast; it gets no pose",
     # Models

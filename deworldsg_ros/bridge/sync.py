@@ -74,7 +74,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         on_drop: OnDrop | None = None,
     ) -> None:
         super().__init__("rgb", (), inputs, topics, capacity, patience_s, on_drop)
-        self._gate = JumpGate(inputs.max_step_m)
+        self._gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""
@@ -82,7 +82,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
 
     def _restart(self, stamp_ns: int) -> None:
         super()._restart(stamp_ns)
-        self._gate = JumpGate(self._inputs.max_step_m)
+        self._gate = JumpGate(self._inputs.max_step_m, self._inputs.max_turn_deg_s)
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
         return self._posed(stamp_ns)
@@ -94,7 +94,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         depth_m = self._depth_at(stamp_ns)
         rgb = rgb_from_message(value)
         frame = RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
-        self._gate.check(T_world_camera)
+        self._gate.check(T_world_camera, stamp_ns)
         return frame
 
 
