@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.nested import join_nested
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
@@ -37,8 +38,9 @@ class Perceived:
         frame_graph: objects, best score first, and the relations between them.
         instances: (H, W) uint16; k + 1 on the pixels of the k-th object, 0 on nothing.
         drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
-            image), ``over_max_objects``, ``segmenter_error`` (all of the frame); and
-            ``relation_head_error`` for those that went on without relations.
+            image), ``over_max_objects``, ``detected_twice`` (whole and in part),
+            ``segmenter_error`` (all of the frame); and ``relation_head_error`` for those that
+            went on without relations.
         failures: what a backend said when it failed on this frame, by those reasons.
     """
 
@@ -98,6 +100,10 @@ class Perception:
         if masks is None:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
+        found_count = len(objects)
+        objects, masks = join_nested(objects, masks, frame.depth_m)
+        if len(objects) < found_count:
+            drops["detected_twice"] = found_count - len(objects)
         classes = objects.class_probabilities.argmax(axis=1)
         instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
         relations = Relations.none(len(self.vocabulary.predicates))

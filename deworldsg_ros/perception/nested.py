@@ -1,0 +1,93 @@
+"""One thing that was detected twice in a frame, once within the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.perception.protocols import Detections, MaskPatch
+from deworldsg_ros.scene.frame_graph import Float64
+
+# Σ p q of two class distributions above which they speak of one class.
+SAME_CLASS = 0.3
+# Share of a box inside another above which it is nested; boxes are a few pixels off.
+NESTED_SHARE = 0.8
+# Surfaces whose median depths differ by less are not one behind the other.
+DEPTH_STEP_M = 0.05
+DEPTH_STEP_SHARE = 0.03
+
+
+def join_nested(
+    objects: Detections, masks: list[MaskPatch], depth_m: NDArray[np.float32]
+) -> tuple[Detections, list[MaskPatch]]:
+    """Make one object of each that was detected as a whole and in part.
+
+    Suppression by IoU lets a box through that lies in a larger one of its class: the lit part of a
+    screen and the screen. At one depth, the two are one thing: it keeps the outer box, both masks,
+    and what was said of the better score. A box with several such boxes in it is a group of
+    things, and goes; a thing behind the other's gaps is at another depth, and both stay.
+
+    Args:
+        objects: n objects, best score first.
+        masks: of the objects.
+        depth_m: (H, W) float32, metres; 0 = invalid.
+
+    Returns:
+        The objects, best score first, and their masks.
+    """
+    within = _nested(objects)
+    for inner, outer in np.argwhere(within):
+        within[inner, outer] = _at_one_depth(masks[inner], masks[outer], depth_m)
+    if not within.any():
+        return objects, masks
+    boxes, masks = objects.boxes_xyxy.copy(), list(masks)
+    # Of boxes that lie in one another, the largest counts: two that do not make a group.
+    outermost = within & ~(within.astype(int) @ within > 0)
+    gone = outermost.sum(axis=0) > 1
+    for inner, outer in np.argwhere(within):
+        if gone[inner] or gone[outer]:
+            continue
+        keep, other = min(inner, outer), max(inner, outer)  # the better score comes first
+        boxes[keep] = _hull(boxes[inner], boxes[outer])
+        masks[keep] = _union(masks[inner], masks[outer], depth_m.shape)
+        gone[other] = True
+    kept = np.flatnonzero(~gone)
+    return replace(objects, boxes_xyxy=boxes).take(kept), [masks[row] for row in kept]
+
+
+def _nested(objects: Detections) -> NDArray[np.bool_]:
+    """(n, n): the box of the row lies in the larger one of the column, and is of its class."""
+    boxes = objects.boxes_xyxy
+    area = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    shared = np.clip(high - low, 0.0, None).prod(axis=2)
+    same_class = objects.class_probabilities @ objects.class_probabilities.T > SAME_CLASS
+    inside = shared > NESTED_SHARE * area[:, None]
+    return np.asarray(same_class & inside & (area[:, None] < area[None, :]))
+
+
+def _at_one_depth(inner: MaskPatch, outer: MaskPatch, depth_m: NDArray[np.float32]) -> bool:
+    """Whether nothing tells that one is behind the other; what has no depth tells nothing."""
+    medians = [_median_depth(mask, depth_m) for mask in (inner, outer)]
+    step_m = DEPTH_STEP_M + DEPTH_STEP_SHARE * min(medians)
+    return not abs(medians[0] - medians[1]) > step_m
+
+
+def _median_depth(mask: MaskPatch, depth_m: NDArray[np.float32]) -> float:
+    values = depth_m[mask.window][mask.pixels]
+    values = values[values > 0]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _hull(a_xyxy: Float64, b_xyxy: Float64) -> Float64:
+    return np.concatenate([np.minimum(a_xyxy[:2], b_xyxy[:2]), np.maximum(a_xyxy[2:], b_xyxy[2:])])
+
+
+def _union(a: MaskPatch, b: MaskPatch, shape: tuple[int, ...]) -> MaskPatch:
+    image = np.zeros(shape, dtype=bool)
+    image[a.window] |= a.pixels
+    image[b.window] |= b.pixels
+    return MaskPatch(0, 0, image)
