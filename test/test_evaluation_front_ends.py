@@ -15,8 +15,7 @@ from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.sequence import SequenceDataset
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
-from deworldsg_ros.evaluation.front_ends import ground_truth as made
-from deworldsg_ros.evaluation.front_ends.assembly import logits, spread
+from deworldsg_ros.evaluation.front_ends.assembly import logits, spread, visible_box
 from deworldsg_ros.perception.stage import Perceived
 
 
@@ -119,10 +118,10 @@ def test_what_is_too_small_is_not_detected() -> None:
     image[0:9, 0:40] = 1
     image[10:24, 0:14] = 2
     image[10:30, 20:40] = 3
-    assert made.visible_box(image, 1) is None
-    assert made.visible_box(image, 2) is None
-    assert made.visible_box(image, 4) is None
-    box = made.visible_box(image, 3)
+    assert visible_box(image, 1) is None
+    assert visible_box(image, 2) is None
+    assert visible_box(image, 4) is None
+    box = visible_box(image, 3)
     assert box is not None
     assert box.tolist() == [20, 10, 39, 29]
 

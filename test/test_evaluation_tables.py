@@ -24,9 +24,9 @@ from deworldsg_ros.evaluation.comparison.jobs import Job, fingerprint, run_job
 from deworldsg_ros.evaluation.comparison.mapping import run_jobs
 from deworldsg_ros.evaluation.comparison.printed import RUNTIME_MS, printed_rows
 from deworldsg_ros.evaluation.comparison.results import total_ms
-from deworldsg_ros.evaluation.comparison.rows import table_rows
+from deworldsg_ros.evaluation.comparison.rows import SWITCHES, TABLES, table_rows
 from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice
+from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
 from deworldsg_ros.evaluation.predictions import write_predictions
 from deworldsg_ros.evaluation.protocol import ProtocolOptions
@@ -227,6 +227,37 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
     assert "slam.pose.txt" in rows["robust-slam"]["failed"]["room_0"]
 
 
+def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
+    for table, name in (("hard", "robust-jitter"), ("switches", "cell5-label")):
+        told = evaluate(
+            *(root, "--table", table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
+            *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
+        )
+        assert told.exit_code == 0, told.output
+        rows = {row["name"]: row for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
+        assert name in rows
+        assert len(rows) == {"hard": 24, "switches": 4 * len(SWITCHES)}[table]
+        assert not any(row["failed"] for row in rows.values())
+        assert ("merging ms" in told.output) == (table == "switches")
+
+
+def test_each_condition_is_given_to_its_rows() -> None:
+    def configure(file: str, settings: object, row: str) -> Config:
+        return Config()
+
+    front_end = FrontEndChoice("recorded", flip=0.1, miss=0.2)
+    poses = [PoseChoice("odometry")]
+    hard = {row.name: row for row in table_rows("hard", poses, front_end, configure)}
+    assert hard["fross-plain"].front_end == front_end
+    assert hard["fross-plain"].poses == poses[0]
+    assert hard["paper-label"].front_end == replace(front_end, faults=Faults(label=0.1))
+    assert hard["paper-jitter"].front_end == front_end
+    assert hard["paper-jitter"].poses.noise.jitter_deg == 1.0
+    switches = {row.name: row for row in table_rows("switches", poses, front_end, configure)}
+    assert switches["robust-flip0"].front_end == replace(front_end, flip=0.0)
+    assert switches["robust-label"].front_end.flip == 0.1
+
+
 def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
     told = evaluate(
         *(root, "--table", "runtime", "--checkpoints", 0),
@@ -242,7 +273,7 @@ def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--table", "first"), "wanted main, pose, ablation, runtime"),
+        (("--table", "first"), "wanted main, hard, pose, ablation, switches, runtime"),
         (("--table", "main", "--predictions", "p.json"), "wanted NAME=FILE"),
         (("--table", "main", "--predictions", "IMP=none.json"), "there is no file none.json"),
         (("--table", "main", "--poses", "guessed"), "--poses guessed"),
@@ -271,9 +302,11 @@ def test_rows_of_every_table_have_names_of_their_own() -> None:
     def configure(file: str, settings: object, row: str) -> Config:
         return Config()
 
-    for table in ("main", "pose", "ablation", "runtime"):
-        names = [row.name for row in table_rows(table, pose_choices(table, [], ""), configure)]
-        assert len(names) == len(set(names))
+    for table in TABLES:
+        poses = pose_choices(table, [], "")
+        rows = table_rows(table, poses, FrontEndChoice("recorded"), configure)
+        assert len({row.name for row in rows}) == len(rows)
+        assert len({row.title for row in rows}) == len(rows)
 
 
 def test_the_printed_numbers_are_the_paper_s(shared_dir: Path) -> None:

@@ -20,9 +20,13 @@ DEFAULT_OUT = Path("evaluation_out")
 
 def evaluate(
     dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="root folder, with data/ and the annotations")
+        Path,
+        typer.Argument(
+            metavar="DATASET",
+            help="root folder, with data/ and the annotations; or a recording with ground truth",
+        ),
     ],
-    layout: Annotated[str, typer.Option("--layout", help="replica or 3rscan")],
+    layout: Annotated[str, typer.Option("--layout", help="replica, 3rscan, or recording")],
     predictions: Annotated[
         Optional[list[str]],
         typer.Option(
@@ -33,7 +37,10 @@ def evaluate(
     ] = None,
     table: Annotated[
         Optional[str],
-        typer.Option("--table", help="the method against others: main, pose, ablation or runtime"),
+        typer.Option(
+            "--table",
+            help="the method against others: main, hard, pose, ablation, switches or runtime",
+        ),
     ] = None,
     graphs: Annotated[
         Optional[Path],
@@ -50,12 +57,21 @@ def evaluate(
         float, typer.Option("--flip", help="share of labels that are wrong; recorded: 0 or 0.1")
     ] = 0.0,
     miss: Annotated[
-        float, typer.Option("--miss", help="ground-truth: share of detections that are missing")
+        float, typer.Option("--miss", help="recorded, ground-truth: share of detections missing")
     ] = 0.0,
     jitter: Annotated[
-        float, typer.Option("--jitter", help="ground-truth: deviation of box edges, pixels")
+        float,
+        typer.Option("--jitter", help="recorded, ground-truth: deviation of box edges, pixels"),
     ] = 0.0,
-    seed: Annotated[int, typer.Option("--seed", help="ground-truth: seed of the faults")] = 0,
+    faults: Annotated[
+        str,
+        typer.Option(
+            "--faults",
+            metavar="NAME=NUMBER,…",
+            help="recorded, ground-truth: faults that persist over frames, e.g. label=0.1,false=1",
+        ),
+    ] = "",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="seed of all faults")] = 0,
     config: Annotated[
         Optional[Path],
         typer.Option("--config", help="parameter file; without one config/robust.yaml"),
@@ -77,6 +93,7 @@ def evaluate(
     depth_source: Annotated[
         str, typer.Option("--depth-source", help="3rscan: rendered or sensor; auto = rendered")
     ] = "auto",
+    every: Annotated[int, typer.Option("--every", min=1, help="take every so manieth frame")] = 1,
     max_frames: Annotated[
         int, typer.Option("--max-frames", min=0, help="stop after so many frames; 0 = take all")
     ] = 0,
@@ -99,7 +116,7 @@ def evaluate(
         Optional[list[str]],
         typer.Option(
             "--poses",
-            help="with --table: ground-truth, slam, odometry or worse; several for the pose table",
+            help="ground-truth, slam, odometry or worse; several for the pose table",
         ),
     ] = None,
     pose_noise: Annotated[
@@ -127,13 +144,14 @@ def evaluate(
     --front-end KIND (run the pipeline first); or --table KIND, which compares methods.
     """
     from deworldsg_ros.cli.configuration import effective_config
+    from deworldsg_ros.cli.tables import evaluate_table, pose_choices
     from deworldsg_ros.config import Config
-    from deworldsg_ros.datasets.annotations import Annotations
     from deworldsg_ros.datasets.dataset import DatasetOptions
     from deworldsg_ros.evaluation import report
     from deworldsg_ros.evaluation.errors import EvaluationError
-    from deworldsg_ros.evaluation.front_ends import FrontEndChoice
+    from deworldsg_ros.evaluation.front_ends import FrontEndChoice, parse_faults
     from deworldsg_ros.evaluation.protocol import ProtocolOptions
+    from deworldsg_ros.evaluation.recorded_room import open_annotations
     from deworldsg_ros.evaluation.runner import ScanTask
 
     given = [bool(predictions), graphs is not None, front_end is not None]
@@ -147,7 +165,7 @@ def evaluate(
         raise EvaluationError(f"--depth-source {depth_source}: wanted auto, rendered or sensor")
     console = Console()
     options = ProtocolOptions(split, skip_no_rel_objects, overlap_threshold, aligned_ply)
-    annotations = Annotations(dataset, layout)
+    annotations = open_annotations(dataset, layout)
     values: dict[str, Any] = {
         "dataset": dataset.resolve().name,
         "layout": layout,
@@ -162,8 +180,16 @@ def evaluate(
     elif graphs is not None and table is None:
         values |= _evaluate_graphs(annotations, graphs, options, scans, out, console)
     else:
-        choice = FrontEndChoice(front_end or "backend", flip, miss, jitter, seed)  # type: ignore[arg-type]
+        choice = FrontEndChoice(
+            front_end or "backend",  # type: ignore[arg-type]
+            flip,
+            miss,
+            jitter,
+            seed,
+            parse_faults(faults),
+        )
         values["front_end"] = choice.describe()
+        chosen_poses = pose_choices(table, poses or [], pose_noise or "")
         tasks = [
             ScanTask(
                 root=dataset,
@@ -174,16 +200,16 @@ def evaluate(
                 front_end=choice,
                 options=options,
                 dataset=DatasetOptions(depth_source=depth_source),  # type: ignore[arg-type]
+                every=every,
                 max_frames=max_frames,
                 checkpoints=checkpoints,
+                poses=chosen_poses[0],
             )
             for scan in scans or annotations.scans(split)
         ]
         if table is None:
             values |= _evaluate_runs(annotations, tasks, console)
         else:
-            from deworldsg_ros.cli.tables import evaluate_table, pose_choices
-
             values |= evaluate_table(
                 annotations,
                 table,
@@ -191,7 +217,7 @@ def evaluate(
                 config_path=config,
                 settings=settings or [],
                 predictions=predictions or [],
-                poses=pose_choices(table, poses or [], pose_noise or ""),
+                poses=chosen_poses,
                 workers=workers,
                 scheduler=scheduler,
                 fresh=fresh,

@@ -71,7 +71,7 @@ def evaluate_table(
         given = [*([] if alone else ["perception.threads=1"]), *own, *_settings_of(row, settings)]
         return effective_config(_config_path(file, config_path), given)
 
-    rows = table_rows(table, poses, configure)
+    rows = table_rows(table, poses, tasks[0].front_end, configure)
     _check_prefixes(rows, settings)
     jobs = [
         Job(
@@ -82,6 +82,7 @@ def evaluate_table(
                 method=row.method,
                 config=row.config,
                 poses=row.poses,
+                front_end=row.front_end,
             ),
             fresh,
         )
@@ -97,7 +98,10 @@ def evaluate_table(
     for name, path in read:
         lines.append(_predicted(annotations, name, path, tasks[0].options, dataset))
     title = f"{table}: {dataset}, {tasks[0].front_end.describe()} detections"
-    (text.print_runtime if alone else text.print_table)(console, lines, title)
+    if alone:
+        text.print_runtime(console, lines, title)
+    else:
+        text.print_table(console, lines, title, timed=table == "switches")
     written = results.write_table(tasks[0].out, lines)
     names = ", ".join(path.name for path in written)
     console.print(f"in {tasks[0].out}: {names}", highlight=False, soft_wrap=True)
@@ -106,17 +110,24 @@ def evaluate_table(
     return {"table": table, "rows": [line.values() for line in lines]}
 
 
-def pose_choices(table: str, names: Sequence[str], noise: str) -> list[PoseChoice]:
-    """The poses asked for; of the pose table all kinds where none is.
+def pose_choices(table: str | None, names: Sequence[str], noise: str) -> list[PoseChoice]:
+    """The poses asked for; without a name ``worse`` where there is noise, else the true ones.
+
+    Of the pose table all kinds where none is asked for.
 
     Raises:
-        DeWorldSGError: for a kind or noise that does not exist, or several poses for other tables.
+        DeWorldSGError: for a kind or noise that does not exist, noise without ``worse``, or
+            several poses but for the pose table.
     """
     worse = parse_noise(noise) if noise else WORSE
-    chosen: Sequence[Any] = names or (KINDS if table == "pose" else KINDS[:1])
+    default = KINDS if table == "pose" else ("worse",) if noise else KINDS[:1]
+    chosen: Sequence[Any] = list(dict.fromkeys(names)) or default
     if len(chosen) > 1 and table != "pose":
-        raise EvaluationError(f"--table {table} takes one --poses; the pose table takes several")
-    return [PoseChoice(kind, worse) for kind in dict.fromkeys(chosen)]
+        which = f"--table {table}" if table else "a run"
+        raise EvaluationError(f"{which} takes one --poses; the pose table takes several")
+    if noise and "worse" not in chosen:
+        raise EvaluationError(f"--pose-noise with --poses {' '.join(chosen)}: wanted worse")
+    return [PoseChoice(kind, worse) for kind in chosen]
 
 
 def _run(jobs: Sequence[Job], workers: int, scheduler: str, console: Console) -> list[JobResult]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.datasets.dataset import read_file
 from deworldsg_ros.datasets.ply import read_vertices
+from deworldsg_ros.datasets.rooms import read_ground_truth
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 SPLIT_FILES = {
@@ -120,7 +121,9 @@ class Annotations:
 
     def __init__(self, root: Path, layout: str) -> None:
         if layout not in LAYOUTS:
-            raise RecordingError(f"layout '{layout}' is unknown: wanted {', '.join(LAYOUTS)}")
+            raise RecordingError(
+                f"layout '{layout}' is unknown: wanted {', '.join(LAYOUTS)} or recording"
+            )
         self.root = root
         self.layout = LAYOUTS[layout]
         mapping = self._read_json(self.layout.mapping)
@@ -167,6 +170,10 @@ class Annotations:
     def scan_folder(self, scan: str) -> Path:
         """Where a scan is."""
         return self.root / "data" / scan
+
+    def ground_truth(self, scan: str) -> dict[str, Any] | None:
+        """Content of the scan's gt.json; None where it has none."""
+        return read_ground_truth(self.scan_folder(scan))
 
     def _scan_objects(self, scan: str, notes: list[str]) -> dict[int, int]:
         if scan not in self._objects:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.datasets.dataset import decode_image, read_file
-from deworldsg_ros.datasets.rooms import RoomsScan
+from deworldsg_ros.datasets.sequence import SequenceDataset
 
 
 def read_instances(source: object, stamp_ns: int) -> NDArray[np.uint16] | None:
@@ -16,7 +16,10 @@ def read_instances(source: object, stamp_ns: int) -> NDArray[np.uint16] | None:
     Raises:
         RecordingError: where the image is there and cannot be decoded.
     """
-    if not isinstance(source, RoomsScan) or stamp_ns not in source.frame_numbers:
+    # Instance images are as the images lie on disk.
+    if not isinstance(source, SequenceDataset) or source.turned:
+        return None
+    if stamp_ns not in source.frame_numbers:
         return None
     path = source.file(source.frame_numbers[stamp_ns], ".instance.png")
     if not path.exists():

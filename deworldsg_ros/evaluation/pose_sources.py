@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Literal
 
+from deworldsg_ros.bags.source import Source
 from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.datasets.sequence import SequenceDataset, turned_pose
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -44,7 +45,7 @@ class PoseChoice:
 def repose(
     frames: Iterator[RgbdFrame],
     choice: PoseChoice,
-    dataset: SequenceDataset,
+    source: Source,
     odometry: OdometryConfig,
     drops: Counter[str],
 ) -> Iterator[RgbdFrame]:
@@ -62,7 +63,9 @@ def repose(
         return frames
     again = chain([first], frames)
     if choice.kind == "slam":
-        return _of_slam(again, dataset, drops)
+        if not isinstance(source, SequenceDataset):
+            raise EvaluationError("--poses slam: this recording has no frame-NNNNNN.slam.pose.txt")
+        return _of_slam(again, source, drops)
 
     def lost(refusal: RefusedInput) -> None:
         drops[refusal.reason] += 1

@@ -8,7 +8,7 @@ import numpy as np
 
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.datasets.annotations import Annotations, ScanPoints
-from deworldsg_ros.datasets.rooms import GROUND_TRUTH_NAME, read_ground_truth
+from deworldsg_ros.datasets.rooms import GROUND_TRUTH_NAME
 from deworldsg_ros.scene.frame_graph import Float64
 
 
@@ -46,7 +46,7 @@ def read_reference(annotations: Annotations, scan: str, points: ScanPoints) -> R
     Raises:
         RecordingError: for a gt.json that lacks something.
     """
-    content = read_ground_truth(annotations.scan_folder(scan))
+    content = annotations.ground_truth(scan)
     if content is None:
         return _from_points(annotations, scan, points)
     try:

@@ -7,8 +7,8 @@ or a cluster. Its only effect is the folder of its results.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from deworldsg_ros.bags.recording import Recording, open_source
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.dataset import DatasetOptions
-from deworldsg_ros.datasets.sequence import SequenceDataset
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
@@ -25,10 +24,10 @@ from deworldsg_ros.evaluation.labels import translate
 from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
 from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
 from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
+from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.evaluation.scene_graphs import to_prediction
 from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.timing import device_name, total_ms
 
@@ -43,13 +42,14 @@ class ScanTask:
 
     Attributes:
         root: folder of the data set.
-        layout: ``replica`` or ``3rscan``.
+        layout: ``replica``, ``3rscan`` or ``recording``.
         scan: id of the scan.
         out: folder of all results; the scan's own is below it.
         config: of the pipeline.
         front_end: where detections come from.
         options: of the protocol.
         dataset: of the data set folder.
+        every: take every so manieth frame.
         max_frames: stop after so many; 0 = take all.
         checkpoints: how many times, evenly over the frames, the graph so far is measured.
         method: the pipeline, or a baseline by its name.
@@ -64,6 +64,7 @@ class ScanTask:
     front_end: FrontEndChoice
     options: ProtocolOptions
     dataset: DatasetOptions = DatasetOptions()
+    every: int = 1
     max_frames: int = 0
     checkpoints: int = 0
     method: str = PIPELINE
@@ -120,15 +121,16 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     Raises:
         DeWorldSGError: where the scan cannot be read or evaluated.
     """
-    annotations = Annotations(task.root, task.layout)
+    annotations = open_annotations(task.root, task.layout)
     annotation = annotations.scan(task.scan)
     points = annotations.points(task.scan, aligned=task.options.aligned_ply)
     reference = read_reference(annotations, task.scan, points)
-    dataset = _open(annotations, task)
-    front_end = build_front_end(task.front_end, annotations, task.scan, dataset, task.config)
+    source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
+    front_end = build_front_end(task.front_end, annotations, task.scan, source, task.config)
     pipeline = build_method(task.method, task.config, front_end)
-    recording = Recording(dataset, task.config.inputs)
-    total = min(recording.frame_count, task.max_frames or recording.frame_count)
+    recording = Recording(source, task.config.inputs)
+    total = len(range(0, recording.frame_count, task.every))
+    total = min(total, task.max_frames or total)
     marks = {round(total * (i + 1) / task.checkpoints) for i in range(task.checkpoints)}
     refused: Counter[str] = Counter()
     over_time: list[Checkpoint] = []
@@ -143,8 +145,8 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
 
     frames = 0
     started_ns: int | None = None
-    frames_of_scan = _first(recording.frames(), total)
-    for frame in repose(frames_of_scan, task.poses, dataset, task.config.odometry, refused):
+    taken = islice(islice(recording.frames(), 0, None, task.every), total)
+    for frame in repose(taken, task.poses, source, task.config.odometry, refused):
         started_ns = frame.stamp_ns if started_ns is None else started_ns
         try:
             pipeline.process(frame)
@@ -196,21 +198,6 @@ def evaluate_graph(
     reference: ReferenceScene = read_reference(annotations, scan, points)
     result = score_scan(annotations.scan(scan), points, prediction, options)
     return result, measure(graph, reference)
-
-
-def _open(annotations: Annotations, task: ScanTask) -> SequenceDataset:
-    source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
-    if not isinstance(source, SequenceDataset):
-        raise EvaluationError(
-            f"{annotations.scan_folder(task.scan)} is a {source.kind} recording: wanted a scan in "
-            "3RScan's layout"
-        )
-    return source
-
-
-def _first(frames: Iterator[RgbdFrame], count: int) -> Iterator[RgbdFrame]:
-    for _, frame in zip(range(count), frames):
-        yield frame
 
 
 def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:

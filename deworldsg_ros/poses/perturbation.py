@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -51,8 +51,18 @@ class PoseNoise:
 
 
 def parse_noise(text: str) -> PoseNoise:
-    """Noise of ``name=value,name=value,…``; raises ConfigurationError."""
-    names = [field.name for field in fields(PoseNoise)]
+    """Noise of ``name=number,name=number,…``; raises ConfigurationError."""
+    values = parse_numbers(text, [field.name for field in fields(PoseNoise)], "pose noise")
+    seed = int(values.pop("seed", 0))
+    return PoseNoise(**values, seed=seed)
+
+
+def parse_numbers(text: str, names: Sequence[str], what: str) -> dict[str, float]:
+    """Numbers by name of ``name=number,name=number,…``.
+
+    Raises:
+        ConfigurationError: says `what` it is of and which names there are.
+    """
     values: dict[str, float] = {}
     for word in filter(None, text.split(",")):
         name, equals, number = word.partition("=")
@@ -62,10 +72,9 @@ def parse_noise(text: str) -> PoseNoise:
             values[name.strip()] = float(number)
         except ValueError as error:
             raise ConfigurationError(
-                f"pose noise '{word}': wanted NAME=NUMBER, NAME one of {', '.join(names)}"
+                f"{what} '{word}': wanted NAME=NUMBER, NAME one of {', '.join(names)}"
             ) from error
-    seed = int(values.pop("seed", 0))
-    return PoseNoise(**values, seed=seed)
+    return values
 
 
 def perturb_poses(frames: Iterable[RgbdFrame], noise: PoseNoise) -> Iterator[RgbdFrame]:

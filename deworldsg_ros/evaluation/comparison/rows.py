@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import PoseChoice
 from deworldsg_ros.evaluation.runner import PIPELINE
+from deworldsg_ros.poses.perturbation import PoseNoise
 
-Kind = Literal["main", "pose", "ablation", "runtime"]
-TABLES: tuple[Kind, ...] = ("main", "pose", "ablation", "runtime")
+Kind = Literal["main", "hard", "pose", "ablation", "switches", "runtime"]
+TABLES: tuple[Kind, ...] = ("main", "hard", "pose", "ablation", "switches", "runtime")
 POSE_WORDS = {
     "ground-truth": "true poses",
     "slam": "SLAM's poses",
@@ -32,6 +34,7 @@ class Row:
         title: for people.
         method: the pipeline, or a baseline.
         config: of the pipeline, or what a baseline uses of it.
+        front_end: where its detections come from.
         poses: where they come from.
     """
 
@@ -39,7 +42,29 @@ class Row:
     title: str
     method: str
     config: Config
+    front_end: FrontEndChoice
     poses: PoseChoice = PoseChoice()
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What makes the input of a row harder; None = as it was asked for.
+
+    Attributes:
+        name, title: of the condition; without a title there is nothing harder.
+    """
+
+    name: str
+    title: str = ""
+    faults: Faults | None = None
+    poses: PoseChoice | None = None
+    flip: float | None = None
+
+    def apply(self, front_end: FrontEndChoice) -> FrontEndChoice:
+        """The front end under this condition."""
+        faults = front_end.faults if self.faults is None else self.faults
+        flip = front_end.flip if self.flip is None else self.flip
+        return replace(front_end, faults=faults, flip=flip)
 
 
 # name, title, method, configuration file
@@ -59,12 +84,51 @@ ABLATION = (
 )
 
 
-def table_rows(table: str, poses: Sequence[PoseChoice], configure: Configure) -> list[Row]:
+# A hand that trembles, or a tracker that does: 2 cm and 1 degree about each axis.
+TREMBLING = PoseChoice("worse", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
+LABELS = Condition("label", "persistent wrong labels", Faults(label=0.1))
+TREMBLES = Condition("jitter", "poses ±2 cm, ±1°", poses=TREMBLING)
+HARD = (
+    Condition("plain"),
+    LABELS,
+    Condition("false", "false boxes", Faults(false=1.0)),
+    Condition("bleed", "bleeding masks", Faults(bleed=0.3)),
+    Condition("merge", "merged masks", Faults(merge=0.1)),
+    Condition("cut", "cut masks", Faults(cut=0.3)),
+    TREMBLES,
+    Condition(
+        "all", "all of it", Faults(label=0.1, false=1.0, bleed=0.3, merge=0.1, cut=0.3), TREMBLING
+    ),
+)
+# name, title, settings on config/robust.yaml
+SWITCHES = (
+    ("robust", "robust.yaml", ()),
+    ("paper", "the paper's association", ("merging.association=paper",)),
+    ("cell2", "cells of 2 cm", ("merging.cell_m=0.02",)),
+    ("cell5", "cells of 5 cm", ("merging.cell_m=0.05",)),
+    ("class", "classes have to agree", ("merging.overlap_threshold_other_class=1.0",)),
+    ("blind", "classes play no part", ("merging.overlap_threshold_other_class=0.3",)),
+    ("sure", "nodes are sure at once", ("merging.confirm_observations=1",)),
+    ("absent", "no negative evidence", ("merging.absent_frames=0",)),
+    ("rough", "no depth refinement", ("lifting.refine=false",)),
+)
+SWITCH_CONDITIONS = (
+    Condition("flip0", "no flips", flip=0.0),
+    Condition("flip10", "flips 0.1", flip=0.1),
+    LABELS,
+    TREMBLES,
+)
+
+
+def table_rows(
+    table: str, poses: Sequence[PoseChoice], front_end: FrontEndChoice, configure: Configure
+) -> list[Row]:
     """The rows of a table.
 
     Args:
         table: one of `TABLES`.
         poses: of the pose table: one row a method and choice; of the others the first.
+        front_end: of all rows, but for what a row makes harder.
         configure: makes the configuration of a row from the name of a shipped file, settings, and
             the row's name.
 
@@ -76,7 +140,7 @@ def table_rows(table: str, poses: Sequence[PoseChoice], configure: Configure) ->
         raise EvaluationError(f"--table {table}: wanted {', '.join(TABLES)}")
     if table == "ablation":
         return [
-            Row(name, title, PIPELINE, configure("paper", settings, name), poses[0])
+            Row(name, title, PIPELINE, configure("paper", settings, name), front_end, poses[0])
             for name, title, settings in ABLATION
         ]
     if table == "pose":
@@ -86,13 +150,38 @@ def table_rows(table: str, poses: Sequence[PoseChoice], configure: Configure) ->
                 f"{title}, {POSE_WORDS[choice.kind]}",
                 method,
                 configure(file, (), name),
+                front_end,
                 choice,
             )
             for choice in poses
             for name, title, method, file in METHODS
             if name != "kim"
         ]
-    return [
-        Row(name, title, method, configure(file, (), name), poses[0])
+    if table == "switches":
+        return [
+            _harder(
+                Row(
+                    name, title, PIPELINE, configure("robust", settings, name), front_end, poses[0]
+                ),
+                condition,
+            )
+            for condition in SWITCH_CONDITIONS
+            for name, title, settings in SWITCHES
+        ]
+    rows = [
+        Row(name, title, method, configure(file, (), name), front_end, poses[0])
         for name, title, method, file in METHODS
     ]
+    if table == "hard":
+        return [_harder(row, condition) for condition in HARD for row in rows if row.name != "kim"]
+    return rows
+
+
+def _harder(row: Row, condition: Condition) -> Row:
+    return replace(
+        row,
+        name=f"{row.name}-{condition.name}",
+        title=f"{row.title}, {condition.title}" if condition.title else row.title,
+        front_end=condition.apply(row.front_end),
+        poses=condition.poses or row.poses,
+    )

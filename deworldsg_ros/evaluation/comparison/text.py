@@ -30,8 +30,13 @@ BESIDE_COLUMNS = (
 )
 
 
-def print_table(console: Console, rows: Sequence[TableRow], title: str) -> None:
-    """Recall with the paper's rows in a section of their own; then what recall leaves out."""
+def print_table(
+    console: Console, rows: Sequence[TableRow], title: str, *, timed: bool = False
+) -> None:
+    """Recall with the paper's rows in a section of their own; then what recall leaves out.
+
+    With `timed` there are the mean milliseconds of merging a frame, too.
+    """
     printed = [row for row in rows if row.printed]
     table = _table(title, RECALL_COLUMNS)
     for row in rows:
@@ -40,9 +45,12 @@ def print_table(console: Console, rows: Sequence[TableRow], title: str) -> None:
         table.add_row(name, *_numbers(row, RECALL_COLUMNS), end_section=last)
     console.print(table)
     beside = _table(BESIDE_TITLE, BESIDE_COLUMNS)
+    if timed:
+        beside.add_column("merging ms", justify="right", no_wrap=True)
     for row in rows:
         if not row.printed:
-            beside.add_row(row.title, *_numbers(row, BESIDE_COLUMNS))
+            times = [_ms(row.times_ms.get("merging"))] if timed else []
+            beside.add_row(row.title, *_numbers(row, BESIDE_COLUMNS), *times)
     console.print(beside)
     print_failures(console, rows)
 

@@ -4,5 +4,6 @@ Each is a `pipeline.Perceiver`, so that lifting and merging are compared on iden
 """
 
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends.faults import Faults, parse_faults
 
-__all__ = ["FrontEndChoice", "build_front_end"]
+__all__ = ["Faults", "FrontEndChoice", "build_front_end", "parse_faults"]

@@ -16,6 +16,9 @@ from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Voca
 
 # Probabilities are kept this far from 0 and 1 before they become logits.
 LOGIT_MARGIN = 1e-6
+# An object is there to be detected with so many visible pixels, in a box with sides so long.
+MIN_PIXELS = 200
+MIN_BOX_SIDE_PX = 10
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,20 @@ class Relation:
     probabilities: Float64
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What was seen in one frame.
+
+    Attributes:
+        detections, relations: see there; relations name detections by their place.
+        instance_image: (H, W) uint16: the value of each pixel's object.
+    """
+
+    detections: Sequence[Detection]
+    relations: Sequence[Relation]
+    instance_image: NDArray[np.uint16]
+
+
 def logits(probabilities: Float64) -> Float64:
     """log(p / (1 - p)) of each, with p kept `LOGIT_MARGIN` away from 0 and 1."""
     inside = np.clip(probabilities, LOGIT_MARGIN, 1.0 - LOGIT_MARGIN)
@@ -65,19 +82,23 @@ def spread(stated: Mapping[int, float], count: int) -> Float64:
     return np.asarray(distribution / distribution.sum())
 
 
-def assemble(
-    frame: RgbdFrame,
-    vocabulary: Vocabulary,
-    detections: Sequence[Detection],
-    relations: Sequence[Relation],
-    instance_image: NDArray[np.uint16],
-    top_relations: int,
-) -> Perceived:
+def visible_box(instances: NDArray[np.uint16], object_id: int) -> Float64 | None:
+    """Corners x1, y1, x2, y2 of an object's pixels; None where too little is visible."""
+    mask = instances == object_id
+    if int(np.count_nonzero(mask)) < MIN_PIXELS:
+        return None
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    box = np.array([columns[0], rows[0], columns[-1], rows[-1]], np.float64)
+    return None if (box[2:] - box[:2] < MIN_BOX_SIDE_PX).any() else box
+
+
+def assemble(frame: RgbdFrame, vocabulary: Vocabulary, seen: Seen, top_relations: int) -> Perceived:
     """A frame graph and its label image.
 
     A mask is the pixels of the instance image with the object's value, cut to the box. Detections
     are ordered by score, and of the relations the best `top_relations` are kept.
     """
+    detections, relations = seen.detections, seen.relations
     order = sorted(range(len(detections)), key=lambda place: -detections[place].score)
     row_of = {place: row for row, place in enumerate(order)}
     chosen = [detections[place] for place in order]
@@ -87,7 +108,7 @@ def assemble(
     classes = np.array([item.class_probabilities for item in chosen], np.float64)
     classes = classes.reshape(-1, len(vocabulary.classes))
     scores = np.array([item.score for item in chosen], np.float64)
-    masks = [_cut(instance_image, item.instance, box) for item, box in zip(chosen, boxes)]
+    masks = [_cut(seen.instance_image, item.instance, box) for item, box in zip(chosen, boxes)]
     kept = sorted(relations, key=lambda item: -item.score)[:top_relations]
     pairs = [(row_of[item.subject], row_of[item.object]) for item in kept]
     predicates = np.array([item.probabilities for item in kept], np.float64)

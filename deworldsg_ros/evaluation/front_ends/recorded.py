@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.datasets.dataset import decode_image, read_file
 from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.front_ends.assembly import Detection, Relation, assemble, spread
+from deworldsg_ros.evaluation.front_ends.assembly import Detection, Relation, Seen, assemble, spread
+from deworldsg_ros.evaluation.front_ends.injection import Injection
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -36,6 +37,7 @@ class RecordedFrontEnd:
         vocabulary: the classes and predicates that the recording counts.
         flip: which recording: the share of flipped labels, 0 or 0.1.
         top_relations: relations kept a frame.
+        injection: puts faults into what was recorded; None = none.
 
     Raises:
         EvaluationError: for a share that was not recorded.
@@ -49,6 +51,7 @@ class RecordedFrontEnd:
         *,
         flip: float = 0.0,
         top_relations: int = 10,
+        injection: Injection | None = None,
     ) -> None:
         if flip not in FILE_SUFFIXES:
             known = ", ".join(f"{share:g}" for share in FILE_SUFFIXES)
@@ -58,21 +61,25 @@ class RecordedFrontEnd:
         self._frame_numbers = frame_numbers
         self._suffix = FILE_SUFFIXES[flip]
         self._top_relations = top_relations
+        self._injection = injection
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The recorded graph of this frame; raises EvaluationError where there is none."""
         if frame.stamp_ns not in self._frame_numbers:
             raise EvaluationError(f"frame of {frame.stamp_ns} ns is not of {self._sequence}")
-        stem = f"frame-{self._frame_numbers[frame.stamp_ns]:06d}"
-        path = self._sequence / f"{stem}{self._suffix}"
+        number = self._frame_numbers[frame.stamp_ns]
+        path = self._sequence / f"frame-{number:06d}{self._suffix}"
         try:
-            return self._assemble(frame, json.loads(read_file(path)))
+            seen = self._read(frame, json.loads(read_file(path)))
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise EvaluationError(
                 f"{path} is no recording of version {VERSION}: {type(error).__name__}: {error}"
             ) from error
+        if self._injection is not None:
+            seen = self._injection.apply(seen, frame, number)
+        return assemble(frame, self.vocabulary, seen, self._top_relations)
 
-    def _assemble(self, frame: RgbdFrame, content: Mapping[str, Any]) -> Perceived:
+    def _read(self, frame: RgbdFrame, content: Mapping[str, Any]) -> Seen:
         if content["version"] != VERSION:
             raise ValueError(f"version is {content['version']}")
         class_count, predicate_count = (
@@ -107,9 +114,10 @@ class RecordedFrontEnd:
             instance_image = read_instances(self._sequence / names.pop())
         if instance_image.shape != shape:
             raise ValueError(f"instance image is {instance_image.shape}: wanted {shape}")
-        return assemble(
-            frame, self.vocabulary, detections, relations, instance_image, self._top_relations
-        )
+        places = {place for item in relations for place in (item.subject, item.object)}
+        if not places <= set(range(len(detections))):
+            raise ValueError(f"relations name detections {sorted(places)} of {len(detections)}")
+        return Seen(detections, relations, instance_image)
 
 
 def read_instances(path: Path) -> NDArray[np.uint16]:

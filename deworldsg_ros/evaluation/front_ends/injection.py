@@ -1,0 +1,300 @@
+"""Faults put into detections: those of single frames, and those that persist.
+
+Every fault is drawn from a generator that is seeded with the seed, the object and the frame or the
+spell, so that a run does not depend on the order of anything, one fault does not change another,
+and two rates of a fault share their draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.evaluation.front_ends.assembly import (
+    Detection,
+    Relation,
+    Seen,
+    spread,
+    visible_box,
+)
+from deworldsg_ros.evaluation.front_ends.faults import MOST_FALSE_BOXES, Faults
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+
+# Draws of one kind do not repeat those of another.
+FRAME, LABEL, BLEED, MERGE, CUT, FALSE = 0, 2, 3, 4, 5, 6
+# Width of the strip that a bleeding mask takes in, and how near a neighbour's pixels are.
+BLEED_PX = 10
+BORDER_PX = 3
+# What is left of an object that is cut, along one side of its box.
+CUT_LEAVES = (0.4, 0.7)
+# A false box: certainty, size in the room or in the image, and pixels a second where it moves.
+FALSE_CERTAINTY = (0.70, 0.97)
+FALSE_SIZE_M = (0.15, 0.6)
+FALSE_SIZE_PX = (40.0, 160.0)
+FALSE_SPEED_PX = 150.0
+# Values of false boxes in an instance image: the last ones that 16 bits have.
+FIRST_FALSE = np.iinfo(np.uint16).max - MOST_FALSE_BOXES + 1
+
+
+@dataclass(frozen=True)
+class FrameFaults:
+    """Faults that are drawn anew in each frame.
+
+    Attributes:
+        flip: share of labels that are wrong.
+        miss: share of detections that are missing.
+        jitter_px: standard deviation of each box edge, pixels.
+    """
+
+    flip: float = 0.0
+    miss: float = 0.0
+    jitter_px: float = 0.0
+
+
+class Injection:
+    """Makes what was seen in one frame after another worse.
+
+    Args:
+        vocabulary: of the detections.
+        room_classes: places of the classes that occur in the room: what a false box, or an object
+            whose detection names no look-alikes, may be called.
+        frame_faults: of single frames.
+        faults: that persist.
+        seed: of all of them.
+    """
+
+    def __init__(
+        self,
+        vocabulary: Vocabulary,
+        room_classes: Sequence[int],
+        frame_faults: FrameFaults,
+        faults: Faults,
+        seed: int,
+    ) -> None:
+        self._class_count = len(vocabulary.classes)
+        self._room_classes = sorted(set(room_classes))
+        self._frame_faults = frame_faults
+        self._faults = faults
+        self._seed = seed
+        self._anchors: dict[tuple[int, int], Float64] = {}
+
+    def apply(self, seen: Seen, frame: RgbdFrame, number: int) -> Seen:
+        """What is seen of the frame with this number, with all faults."""
+        stamp_s = 1e-9 * frame.stamp_ns
+        seen = self._spoil_masks(seen, stamp_s)
+        detections: list[Detection | None] = []
+        for item in seen.detections:
+            called = self._mislabel(item, stamp_s)
+            detections.append(self._disturb(called, number, frame))
+        seen = keep(seen, detections)
+        return self._add_false(seen, frame, stamp_s) if self._faults.false else seen
+
+    def _spell(self, kind: int, object_id: int, stamp_s: float, length_s: float) -> int:
+        """Number of the spell at this time; each object's begin at moments of their own."""
+        phase = np.random.default_rng([self._seed, kind, object_id]).random()
+        return int(stamp_s / length_s + phase)
+
+    def _affected(
+        self, kind: int, share: float, object_id: int, stamp_s: float
+    ) -> np.random.Generator | None:
+        """The generator of the object's spell, where the fault is in it."""
+        if not share:
+            return None
+        spell = self._spell(kind, object_id, stamp_s, self._faults.spell_s)
+        generator = np.random.default_rng([self._seed, kind, object_id, spell])
+        return generator if generator.random() < share else None
+
+    def _mislabel(self, item: Detection, stamp_s: float) -> Detection:
+        generator = self._affected(LABEL, self._faults.label, item.instance, stamp_s)
+        if generator is None:
+            return item
+        probabilities = item.class_probabilities
+        best = int(probabilities.argmax())
+        # A detector that names look-alikes gives them more than what is left for all the others.
+        others = np.flatnonzero(probabilities > 1.001 * probabilities.min())
+        others = others[others != best]
+        if not len(others):
+            others = np.array([place for place in self._room_classes if place != best], np.int64)
+        return item if not len(others) else called(item, int(generator.choice(others)))
+
+    def _disturb(self, item: Detection, number: int, frame: RgbdFrame) -> Detection | None:
+        """The faults of a single frame; None where the object is missed."""
+        generator = np.random.default_rng([self._seed, FRAME, number, item.instance])
+        missed, flipped = generator.random(2)
+        edges = generator.normal(size=4)
+        if missed < self._frame_faults.miss:
+            return None
+        if flipped < self._frame_faults.flip and self._class_count > 1:
+            best = int(item.class_probabilities.argmax())
+            other = int(generator.integers(self._class_count - 1))
+            item = called(item, other + (other >= best))
+        if not self._frame_faults.jitter_px:
+            return item
+        size = [frame.intrinsics.width - 1.0, frame.intrinsics.height - 1.0] * 2
+        box = np.clip(item.box_xyxy + self._frame_faults.jitter_px * edges, 0.0, size)
+        return None if (box[2:] - box[:2] < 1.0).any() else replace(item, box_xyxy=box)
+
+    def _spoil_masks(self, seen: Seen, stamp_s: float) -> Seen:
+        """Masks that take in a neighbour, are cut, or bleed."""
+        faults = self._faults
+        if not (faults.merge or faults.cut or faults.bleed):
+            return seen
+        image = seen.instance_image.copy()
+        ids = [item.instance for item in seen.detections]
+        for object_id in sorted(ids):
+            if self._affected(MERGE, faults.merge, object_id, stamp_s) is not None:
+                neighbour = _neighbour(image, object_id, ids)
+                image[image == neighbour] = object_id
+        for object_id in sorted(ids):
+            generator = self._affected(CUT, faults.cut, object_id, stamp_s)
+            if generator is not None:
+                _cut(image, object_id, int(generator.integers(4)), generator.uniform(*CUT_LEAVES))
+        before = image.copy()
+        for object_id in sorted(ids):
+            if self._affected(BLEED, faults.bleed, object_id, stamp_s) is not None:
+                image[_grown(before == object_id, BLEED_PX)] = object_id
+        differs = image != seen.instance_image
+        changed = set(np.unique((image[differs], seen.instance_image[differs])).tolist())
+        detections: list[Detection | None] = []
+        for item in seen.detections:
+            box = visible_box(image, item.instance) if item.instance in changed else item.box_xyxy
+            detections.append(None if box is None else replace(item, box_xyxy=box))
+        return keep(replace(seen, instance_image=image), detections)
+
+    def _add_false(self, seen: Seen, frame: RgbdFrame, stamp_s: float) -> Seen:
+        """Boxes on what belongs to no detection."""
+        if not self._room_classes:
+            return seen
+        image = seen.instance_image.copy()
+        background = ~np.isin(image, [item.instance for item in seen.detections])
+        background &= frame.depth_m > 0
+        detections = list(seen.detections)
+        for place in range(MOST_FALSE_BOXES):
+            length_s = self._faults.false_s
+            spell = self._spell(FALSE, place, stamp_s, length_s)
+            generator = np.random.default_rng([self._seed, FALSE, place, spell])
+            if generator.random() * MOST_FALSE_BOXES >= self._faults.false:
+                continue
+            class_place = int(generator.choice(self._room_classes))
+            certainty = float(generator.uniform(*FALSE_CERTAINTY))
+            age_s = stamp_s - (spell - self._phase(place)) * length_s
+            region = (
+                self._staying(generator, (place, spell), frame, background)
+                if generator.random() < 0.5
+                else _moving(generator, age_s, frame)
+            )
+            if region is None:
+                continue
+            value = FIRST_FALSE + place
+            mask = region & background
+            image[mask] = value
+            background &= ~mask
+            box = visible_box(image, value)
+            if box is None:
+                continue
+            scores = spread({class_place: certainty}, self._class_count)
+            detections.append(Detection(box, scores, certainty, value))
+        return replace(seen, detections=detections, instance_image=image)
+
+    def _phase(self, place: int) -> float:
+        return float(np.random.default_rng([self._seed, FALSE, place]).random())
+
+    def _staying(
+        self,
+        generator: np.random.Generator,
+        key: tuple[int, int],
+        frame: RgbdFrame,
+        background: NDArray[np.bool_],
+    ) -> NDArray[np.bool_] | None:
+        """A cube of the room around what the first frame of the spell showed at some pixel."""
+        camera = frame.intrinsics
+        half_m = generator.uniform(*FALSE_SIZE_M) / 2
+        rows, columns = np.nonzero(background)
+        if not len(rows):
+            return None
+        if key not in self._anchors:
+            pixel = int(generator.integers(len(rows)))
+            u, v = columns[pixel], rows[pixel]
+            z = float(frame.depth_m[v, u])
+            point = np.array([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+            T = frame.T_world_camera
+            self._anchors[key] = T[:3, :3] @ point + T[:3, 3]
+        T = frame.T_world_camera
+        x, y, z = T[:3, :3].T @ (self._anchors[key] - T[:3, 3])
+        region = np.zeros(background.shape, bool)
+        if z <= half_m:
+            return None
+        left, right = ((x + d) / z * camera.fx + camera.cx for d in (-half_m, half_m))
+        top, bottom = ((y + d) / z * camera.fy + camera.cy for d in (-half_m, half_m))
+        region[_span(top, bottom, camera.height), _span(left, right, camera.width)] = True
+        return region & (np.abs(frame.depth_m - z) < half_m)
+
+
+def called(item: Detection, class_place: int) -> Detection:
+    """The detection with its likeliest class and another one exchanged."""
+    probabilities = item.class_probabilities.copy()
+    best = int(probabilities.argmax())
+    probabilities[[best, class_place]] = probabilities[[class_place, best]]
+    return replace(item, class_probabilities=probabilities)
+
+
+def keep(seen: Seen, detections: Sequence[Detection | None]) -> Seen:
+    """What was seen with other detections in place of its own; None leaves one out."""
+    kept = [place for place, item in enumerate(detections) if item is not None]
+    new_place = {place: new for new, place in enumerate(kept)}
+    relations = [
+        Relation(new_place[item.subject], new_place[item.object], item.score, item.probabilities)
+        for item in seen.relations
+        if item.subject in new_place and item.object in new_place
+    ]
+    return Seen([item for item in detections if item is not None], relations, seen.instance_image)
+
+
+def _neighbour(image: NDArray[np.uint16], object_id: int, ids: Sequence[int]) -> int:
+    """The detected object with most pixels beside this one; itself where there is none."""
+    beside = image[_grown(image == object_id, BORDER_PX)]
+    values, counts = np.unique(beside, return_counts=True)
+    others = np.isin(values, ids) & (values != object_id)
+    return int(values[others][counts[others].argmax()]) if others.any() else object_id
+
+
+def _grown(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
+    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
+
+
+def _cut(image: NDArray[np.uint16], object_id: int, side: int, left_over: float) -> None:
+    """Leave of an object's pixels a share of its extent: the left, right, upper or lower part."""
+    rows, columns = np.nonzero(image == object_id)
+    if not len(rows):
+        return
+    along = columns if side < 2 else rows
+    if side % 2:
+        along = -along
+    edge = along.min() + left_over * (along.max() - along.min())
+    gone = along > edge
+    image[rows[gone], columns[gone]] = 0
+
+
+def _moving(
+    generator: np.random.Generator, age_s: float, frame: RgbdFrame
+) -> NDArray[np.bool_] | None:
+    """A box that moves through the image, begun anywhere in it."""
+    height, width = frame.depth_m.shape
+    centre = generator.random(2) * (width, height)
+    heading = 2 * np.pi * generator.random()
+    half = generator.uniform(*FALSE_SIZE_PX, size=2) / 2
+    centre = centre + FALSE_SPEED_PX * age_s * np.array([np.cos(heading), np.sin(heading)])
+    (left, top), (right, bottom) = centre - half, centre + half
+    region = np.zeros((height, width), bool)
+    region[_span(top, bottom, height), _span(left, right, width)] = True
+    return region if region.any() else None
+
+
+def _span(low: float, high: float, size: int) -> slice:
+    return slice(int(np.clip(low, 0, size)), int(np.clip(high, 0, size)))
