@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.bags.pacing import Pace, Window
+from deworldsg_ros.bags.messages import Role
+from deworldsg_ros.bags.pacing import MOST_UNDECIDED, Pace, Window
 
 
 @pytest.mark.parametrize(("rate", "due_s"), [(1.0, 12.0), (2.0, 11.0), (0.5, 14.0)])
@@ -60,6 +61,56 @@ def test_refused_frames_are_not_waited_for_and_the_lost_are_counted():
     window.give_up()
     assert window.given_up == 2
     assert window.in_flight == 0
+
+
+NEEDS = (Role.DEPTH, Role.POSE)
+
+
+def test_a_frame_is_in_flight_once_it_can_be_decided():
+    """Here 30 images a second and 5 poses: six images between two poses must not fill a window."""
+    window = Window(4, NEEDS)
+    for stamp_ns in range(1, 7):
+        window.passed(Role.DEPTH, stamp_ns)
+        window.publish(stamp_ns)
+        assert window.in_flight == 0
+    window.passed(Role.POSE, 4)
+    assert window.in_flight == 4
+    assert window.is_full
+    window.answer(4)
+    window.passed(Role.CAMERA_INFO, 9)
+    assert window.in_flight == 0
+    window.close()
+    assert window.in_flight == 2
+
+
+def test_undecided_frames_are_bounded_and_an_answer_answers_them_too():
+    window = Window(4, NEEDS)
+    for stamp_ns in range(1, MOST_UNDECIDED + 3):
+        window.publish(stamp_ns)
+    assert window.in_flight == 2
+    window.answer(MOST_UNDECIDED)
+    window.close()
+    assert window.in_flight == 2
+
+
+def test_a_refusal_that_is_told_before_the_answer_to_an_earlier_frame_counts():
+    window = Window(4)
+    for stamp_ns in range(1, 7):
+        window.publish(stamp_ns)
+    window.excuse(3)  # 2, 3 and 4
+    window.answer(1)
+    assert window.in_flight == 2
+    window.answer(5)
+    assert window.in_flight == 1
+
+
+def test_a_refusal_that_is_told_after_the_answer_to_a_later_frame_excuses_no_other():
+    window = Window(4)
+    for stamp_ns in range(1, 5):
+        window.publish(stamp_ns)
+    window.answer(3)
+    window.excuse(2)
+    assert window.in_flight == 1
 
 
 @given(

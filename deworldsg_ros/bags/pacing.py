@@ -6,8 +6,13 @@ Nothing here sleeps or reads a clock; times are arguments.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Collection
+
+from deworldsg_ros.bags.messages import Role
 
 NANOSECONDS = 10**9
+# Frames that may go out before what they wait for: half of what the nodes keep.
+MOST_UNDECIDED = 32
 
 
 class Pace:
@@ -39,15 +44,23 @@ class Window:
     """Frames that are published and not yet answered; at most `size` of them.
 
     An answer to a frame answers all before it, for frames are worked on in order. A frame that is
-    refused on its way never has an answer of its own: `excused` takes the number of those.
+    refused on its way never has an answer of its own: `excuse` takes the number of those, which is
+    told at any time, before or after the answer to a later frame.
+
+    Nobody can answer a frame before the recording has passed its stamp on every stream that it
+    needs: it may lack a pose, or have one that was recorded later. Until then it is not in flight.
 
     Args:
         size: most frames in flight; 0 = no limit.
+        needs: the streams that a frame needs.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, needs: Collection[Role] = ()) -> None:
         self._size = size
+        self._newest_ns = dict.fromkeys(needs, -1)
+        self._undecided: deque[int] = deque()
         self._in_flight: deque[int] = deque()
+        # Refused frames that are told of and not yet behind an answer; below 0 the other way round.
         self._excused = 0
         self.answered = 0
         self.given_up = 0
@@ -55,7 +68,7 @@ class Window:
     @property
     def in_flight(self) -> int:
         """Frames that may still be answered."""
-        return max(0, len(self._in_flight) - self._excused)
+        return max(0, len(self._in_flight) - max(0, self._excused))
 
     @property
     def is_full(self) -> bool:
@@ -64,21 +77,53 @@ class Window:
 
     def publish(self, stamp_ns: int) -> None:
         """A frame goes out."""
-        self._in_flight.append(stamp_ns)
+        self._undecided.append(stamp_ns)
+        self._decide()
+
+    def passed(self, role: Role, stamp_ns: int) -> None:
+        """A message of another stream goes out."""
+        if role in self._newest_ns:
+            self._newest_ns[role] = stamp_ns
+            self._decide()
+
+    def close(self) -> None:
+        """Nothing more goes out: all that is undecided is now decided as it stands."""
+        self._in_flight += self._undecided
+        self._undecided.clear()
 
     def answer(self, stamp_ns: int) -> None:
         """A frame came back, and with it those before."""
         self.answered += 1
-        while self._in_flight and self._in_flight[0] <= stamp_ns:
-            self._in_flight.popleft()
-        self._excused = 0
+        behind = 0
+        for frames in (self._in_flight, self._undecided):
+            while frames and frames[0] <= stamp_ns:
+                frames.popleft()
+                behind += 1
+        self._excused -= max(0, behind - 1)
+        self._settle()
 
     def excuse(self, number: int) -> None:
         """So many frames were refused, and will not be answered."""
-        self._excused = min(self._excused + number, len(self._in_flight))
+        self._excused += number
+        self._settle()
 
     def give_up(self) -> None:
         """Nobody answers: stop waiting for what is in flight."""
         self.given_up += self.in_flight
         self._in_flight.clear()
-        self._excused = 0
+        self._settle()
+
+    def _settle(self) -> None:
+        # Messages that were refused and are no frames, and frames that were lost without a word,
+        # are not carried on.
+        if not self._in_flight and not self._undecided:
+            self._excused = 0
+
+    def _decide(self) -> None:
+        passed_ns = min(self._newest_ns.values(), default=None)
+        while self._undecided and (
+            passed_ns is None
+            or self._undecided[0] <= passed_ns
+            or len(self._undecided) > MOST_UNDECIDED
+        ):
+            self._in_flight.append(self._undecided.popleft())

@@ -79,7 +79,7 @@ class PipelineMonitor:
 
     def __init__(self, node: Node, window: int) -> None:
         self._node = node
-        self.window = Window(window)
+        self.window = Window(window, (Role.DEPTH, Role.POSE))
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.poses: list[list[float]] = []
         self._local_graphs = self._evidence = 0

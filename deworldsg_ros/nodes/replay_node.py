@@ -124,7 +124,10 @@ class ReplayNode(Node):  # type: ignore[misc]
             if message.role is Role.RGB:
                 self._published += 1
                 self._monitor.window.publish(message.stamp_ns)
+            else:
+                self._monitor.window.passed(message.role, message.stamp_ns)
             self._tell_progress()
+        self._monitor.window.close()
         drained = alone or self._drain()
         if self._settings["save"] and not alone:
             self._save()
