@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from merging_support import VOCABULARY, edit_at_random, seeds
+from merging_support import (
+    VOCABULARY,
+    edit_at_random,
+    random_classes,
+    random_covariances,
+    seeds,
+)
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
@@ -77,6 +83,30 @@ def test_observations_average_with_their_weights() -> None:
     assert graph.nodes.covariances[0] == pytest.approx(np.diag([3.0, 1, 1]))
     assert graph.nodes.class_probabilities[0] == pytest.approx([0.5, 1 / 6, 1 / 6, 1 / 6])
     assert (graph.nodes.first_seen_ns[0], graph.nodes.last_seen_ns[0]) == (0, 7)
+
+
+def test_observing_many_is_observing_each() -> None:
+    rng = np.random.default_rng(0)
+    means, covariances = rng.normal(size=(3, 3)), random_covariances(rng, 3)
+    classes, weights = random_classes(rng, 3), rng.uniform(0.1, 3, 3)
+    surfaces = hash_each(tuple(rng.normal(size=(3, 5, 3)).astype(np.float32)))
+    one, many = graph_of(4), graph_of(4)
+    many.observe_each([4, 1, 3], means, covariances, classes, 9, surfaces, weights)
+    for index, node_id in enumerate([4, 1, 3]):
+        one.observe(
+            node_id,
+            means[index],
+            covariances[index],
+            classes[index],
+            9,
+            surfaces[index],
+            float(weights[index]),
+        )
+    assert equal(one, many)
+    many.observe_each(
+        [], *(np.zeros((0, *shape)) for shape in ((3,), (3, 3), (4,))), 9, [], np.zeros(0)
+    )
+    assert equal(one, many)
 
 
 def test_a_merge_moves_edges_and_sums_their_evidence() -> None:

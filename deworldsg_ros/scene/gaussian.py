@@ -69,20 +69,22 @@ def hellinger_distance(
 
 
 def fuse(
-    weight_i: float,
+    weight_i: Float64 | float,
     mean_i: Float64,
     covariance_i: Float64,
-    weight_j: float,
+    weight_j: Float64 | float,
     mean_j: Float64,
     covariance_j: Float64,
 ) -> tuple[Float64, Float64]:
-    """Moment-preserving fusion of two weighted Gaussians (Eq. 7)."""
+    """Moment-preserving fusion of two Gaussians of weights (...) (Eq. 7)."""
+    weight_i, weight_j = np.asarray(weight_i)[..., None], np.asarray(weight_j)[..., None]
     total = weight_i + weight_j
     difference = mean_i - mean_j
     mean = (weight_i * mean_i + weight_j * mean_j) / total
+    weight_i, weight_j, total = weight_i[..., None], weight_j[..., None], total[..., None]
     covariance = (weight_i * covariance_i + weight_j * covariance_j) / total + (
         weight_i * weight_j / total**2
-    ) * (difference[:, None] * difference)
+    ) * (difference[..., :, None] * difference[..., None, :])
     return mean, covariance
 
 

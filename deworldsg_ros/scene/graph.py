@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, fuse
 from deworldsg_ros.scene.node_states import NodeStateCache
-from deworldsg_ros.scene.nodes import NodeTable
+from deworldsg_ros.scene.nodes import Int64, NodeTable
 from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, SurfaceReservoir, hash_each
 
 
@@ -118,15 +118,35 @@ class SceneGraph:
         weight: float = 1.0,
     ) -> None:
         """Fuse one more observation into a live node (Eq. 7); arguments as in `add_node`."""
-        row = self.nodes.row(node_id)
+        self.observe_each(
+            [node_id],
+            mean_world[None],
+            covariance_world[None],
+            class_probabilities[None],
+            stamp_ns,
+            [surface],
+            np.array([weight]),
+        )
+
+    def observe_each(
+        self,
+        node_ids: Sequence[int],
+        means_world: Float64,
+        covariances_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surfaces: Sequence[HashedPoints],
+        weights: Float64,
+    ) -> None:
+        """Fuse one more observation into each of n different live nodes, as `observe` does."""
         self._fuse_into(
-            row,
-            mean_world,
-            covariance_world,
-            class_probabilities / class_probabilities.sum(),
-            weight,
-            1,
-            surface,
+            [self.nodes.row(node_id) for node_id in node_ids],
+            means_world,
+            covariances_world,
+            class_probabilities / class_probabilities.sum(axis=1, keepdims=True),
+            weights,
+            np.ones(len(node_ids), np.int64),
+            surfaces,
             stamp_ns,
             stamp_ns,
         )
@@ -142,13 +162,13 @@ class SceneGraph:
         keep_id, gone_id = min(a_id, b_id), max(a_id, b_id)
         nodes, gone = self.nodes, self.nodes.row(gone_id)
         self._fuse_into(
-            nodes.row(keep_id),
-            nodes.means[gone],
-            nodes.covariances[gone],
-            nodes.class_probabilities[gone],
-            float(nodes.weights[gone]),
-            int(nodes.observations[gone]),
-            nodes.surfaces[gone].sample,
+            [nodes.row(keep_id)],
+            nodes.means[[gone]],
+            nodes.covariances[[gone]],
+            nodes.class_probabilities[[gone]],
+            nodes.weights[[gone]],
+            nodes.observations[[gone]],
+            [nodes.surfaces[gone].sample],
             int(nodes.first_seen_ns[gone]),
             int(nodes.last_seen_ns[gone]),
         )
@@ -303,36 +323,40 @@ class SceneGraph:
 
     def _fuse_into(
         self,
-        row: int,
-        mean_world: Float64,
-        covariance_world: Float64,
+        rows: list[int],
+        means_world: Float64,
+        covariances_world: Float64,
         class_probabilities: Float64,
-        weight: float,
-        observations: int,
-        surface: HashedPoints,
+        weights: Float64,
+        observations: Int64,
+        surfaces: Sequence[HashedPoints],
         first_seen_ns: int,
         last_seen_ns: int,
     ) -> None:
+        """Fuse something into each of n different rows."""
         nodes = self.nodes
-        known = float(nodes.weights[row])
-        total = known + weight
-        mean, covariance = fuse(
+        known = nodes.weights[rows]
+        means, covariances = fuse(
             known,
-            nodes.means[row],
-            nodes.covariances[row],
-            weight,
-            mean_world,
-            covariance_world,
+            nodes.means[rows],
+            nodes.covariances[rows],
+            weights,
+            means_world,
+            covariances_world,
         )
-        seen = int(nodes.observations[row])
-        classes = (seen * nodes.class_probabilities[row] + observations * class_probabilities) / (
-            seen + observations
-        )
-        nodes.put(row, mean, covariance, classes, total, seen + observations)
-        nodes.surfaces[row].add(surface)
-        nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
-        nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)
-        nodes.revisions[row] = self._changed()
+        totals = (known + weights).tolist()
+        seen = nodes.observations[rows]
+        seen_now = seen + observations
+        classes = (
+            seen[:, None] * nodes.class_probabilities[rows]
+            + observations[:, None] * class_probabilities
+        ) / seen_now[:, None]
+        for index, (row, count) in enumerate(zip(rows, seen_now.tolist())):
+            nodes.put(row, means[index], covariances[index], classes[index], totals[index], count)
+            nodes.surfaces[row].add(surfaces[index])
+            nodes.revisions[row] = self._changed()
+        nodes.first_seen_ns[rows] = np.minimum(nodes.first_seen_ns[rows], first_seen_ns)
+        nodes.last_seen_ns[rows] = np.maximum(nodes.last_seen_ns[rows], last_seen_ns)
 
     def _forget(self, node_id: int, successor: int) -> None:
         self.nodes.remove(node_id)

@@ -73,10 +73,7 @@ def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) ->
     """
     if capacity == 0:
         return EMPTY_SAMPLE
-    if len(sample.hashes) == capacity:
-        # What lies beyond the largest hash kept cannot enter: most points of most frames.
-        entering = np.flatnonzero(points.hashes < sample.hashes[-1])
-        points = HashedPoints(points.hashes[entering], points.points_world[entering])
+    points = _entering(sample, points, capacity)
     if len(points.hashes) == 0:
         return sample
     hashes = np.concatenate((sample.hashes, points.hashes))
@@ -88,6 +85,14 @@ def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) ->
     distinct = np.flatnonzero(ascending[1:] != ascending[:-1]) + 1
     kept = order[np.concatenate(([0], distinct))[:capacity]]
     return SurfaceSample(hashes[kept], points_world[kept])
+
+
+def _entering(sample: SurfaceSample, points: HashedPoints, capacity: int) -> HashedPoints:
+    """Copies of the points that may enter a sample: none beyond the largest hash of a full one."""
+    if len(sample.hashes) < capacity:
+        return HashedPoints(points.hashes.copy(), points.points_world.copy())
+    entering = np.flatnonzero(points.hashes < sample.hashes[-1])
+    return HashedPoints(points.hashes[entering], points.points_world[entering])
 
 
 class SurfaceReservoir:
@@ -108,10 +113,11 @@ class SurfaceReservoir:
         """Take in points, which may be those of another sample."""
         if self._capacity == 0 or len(points.hashes) == 0:
             return
-        # Copies: views would keep the arrays of whole frames alive.
-        self._waiting.append(HashedPoints(points.hashes.copy(), points.points_world.copy()))
+        # Copies: views would keep the arrays of whole frames alive. Of most frames nothing enters.
+        points = _entering(self._sample, points, self._capacity)
+        self._waiting.append(points)
         self._waiting_count += len(points.hashes)
-        # Merged in whole capacities, most points are turned away without being sorted.
+        # What enters is merged in whole capacities: sorting takes most of the time.
         if self._waiting_count >= self._capacity:
             self._merge_in()
 
