@@ -100,6 +100,28 @@ def test_neighbours_of_one_class_stay_two_while_both_are_seen(graph, merging) ->
         assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
 
 
+def test_a_neighbour_that_is_often_missed_is_not_swallowed(graph, merging) -> None:
+    books = [slab((x, 0, 1), (0.035, 0.15, 0.2)) for x in (0.0, 0.036, 0.072)]
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
+    for stamp in range(3, 40):
+        seen = [0, 2] if stamp % 8 else [0, 1, 2]
+        ids = merging.merge(graph, frame(stamp, *[(books[index], CUP) for index in seen]))
+        assert ids == [index + 1 for index in seen]
+    assert merging.merge(graph, frame(50, (books[1], CUP))) == [2]
+
+
+def test_of_neighbours_a_newcomer_is_the_one_that_is_new(graph, merging) -> None:
+    left, middle, right = (slab((x, 0, 1), (0.035, 0.15, 0.2)) for x in (0.0, 0.036, 0.072))
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, (left, CUP), (right, CUP))) == [1, 2]
+    # The newcomer's label is the surest, and its cells touch those of both neighbours.
+    classes = np.array([[0.97, 0.01, 0.01, 0.01], [0.7, 0.1, 0.1, 0.1], [0.7, 0.1, 0.1, 0.1]])
+    for stamp in range(3, 10):
+        local = frame(stamp, (middle, CUP), (left, CUP), (right, CUP), class_probabilities=classes)
+        assert merging.merge(graph, local) == [3, 1, 2]
+
+
 def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
     gap_left, gap_right = slab((-0.7, 0, 1), (0.7, 0.8, 0.01)), slab((0.7, 0, 1), (0.7, 0.8, 0.01))
     assert merging.merge(graph, frame(0, (gap_left, TABLE))) == [1]

@@ -33,6 +33,14 @@ def reference_share(seen: set[tuple[int, ...]], known: set[tuple[int, ...]]) -> 
     return share
 
 
+def dense(owners: np.ndarray, shares: np.ndarray, owner_count: int) -> np.ndarray:
+    """Shares (n, owner_count), with the owners that nothing met."""
+    assert (shares > 0).any(axis=0).all()
+    result = np.zeros((len(shares), owner_count))
+    result[:, owners] = shares
+    return result
+
+
 def random_points(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.uniform(-0.3, 0.3, (count, 3)).astype(np.float32)
 
@@ -46,11 +54,10 @@ def test_shares_equal_the_reference(seed: int) -> None:
     for _ in range(8):
         owner = int(rng.integers(3))
         points = random_points(rng, int(rng.integers(0, 20)))
-        surfaces.add(owner, surfaces.cells_of([points]).of(0))
+        surfaces.add([owner], surfaces.cells_of([points]))
         known[owner] |= cells_of(points)
     sets = [random_points(rng, int(rng.integers(0, 30))) for _ in range(4)]
-    shares = surfaces.shares(surfaces.cells_of(sets), 3)
-    assert shares.shape == (4, 3)
+    shares = dense(*surfaces.shares(surfaces.cells_of(sets)), 3)
     for row, points in enumerate(sets):
         for owner in range(3):
             wanted = reference_share(cells_of(points), known[owner])
@@ -61,23 +68,23 @@ def test_shares_equal_the_reference(seed: int) -> None:
 
 def test_no_points_no_share() -> None:
     surfaces = VoxelMap(CELL_M)
-    assert surfaces.shares(surfaces.cells_of([]), 0).shape == (0, 0)
+    surfaces.add([], surfaces.cells_of([]))
+    assert surfaces.shares(surfaces.cells_of([]))[1].shape == (0, 0)
     empty = surfaces.cells_of([np.zeros((0, 3), np.float32)])
-    surfaces.add(0, empty.of(0))
-    assert surfaces.shares(empty, 1).tolist() == [[0.0]]
+    surfaces.add([0], empty)
+    assert surfaces.shares(empty)[1].shape == (1, 0)
 
 
 def test_growing_loses_nothing_and_a_removed_owner_is_gone() -> None:
     rng = np.random.default_rng(1)
     surfaces = VoxelMap(0.01, cells_per_owner=100_000)
     sets = surfaces.cells_of([rng.uniform(-5, 5, (30_000, 3)) for _ in range(2)])
-    surfaces.add(0, sets.of(0))
-    surfaces.add(1, sets.of(1))
-    assert surfaces.shares(sets, 2).diagonal().tolist() == [1.0, 1.0]
+    surfaces.add([0, 1], sets)
+    assert surfaces.shares(sets)[1].diagonal().tolist() == [1.0, 1.0]
     removed = surfaces.remove(0)
-    assert np.sort(removed).tolist() == sets.of(0).tolist()
+    assert np.sort(removed).tolist() == np.sort(sets.of(0)).tolist()
     assert surfaces.cell_count(0) == 0
-    after = surfaces.shares(sets, 2)
+    after = dense(*surfaces.shares(sets), 2)
     assert after[0, 0] == after[1, 0] == 0.0
     assert after[1, 1] == 1.0
 
@@ -85,7 +92,7 @@ def test_growing_loses_nothing_and_a_removed_owner_is_gone() -> None:
 def test_an_owner_has_at_most_so_many_cells() -> None:
     surfaces = VoxelMap(0.01, cells_per_owner=50)
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
-    surfaces.add(0, surfaces.cells_of([points]).of(0))
+    surfaces.add([0], surfaces.cells_of([points]))
     assert surfaces.cell_count(0) == 50
 
 

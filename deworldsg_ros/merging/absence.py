@@ -23,6 +23,49 @@ MIN_VISIBLE_SHARE = 0.5
 DECISIVE_SHARE = 0.7
 
 
+# Surface points of a node that the depth image is compared with.
+SAMPLED_POINTS = 48
+
+
+class SeenThrough:
+    """Counts, by owner, the frames in a row that looked through a node's place.
+
+    Args:
+        enough_frames: so many, and the node is gone from there; 0 = never.
+    """
+
+    def __init__(self, enough_frames: int) -> None:
+        self._enough_frames = enough_frames
+        self._points_world = np.zeros((0, SAMPLED_POINTS, 3), np.float32)
+        self._point_counts = np.zeros(0, np.int64)
+        self._frames = np.zeros(0, np.int64)
+
+    def renew(self, owner: int, points_world: Float32) -> None:
+        """Take a few of these surface points (k, 3) for those of the node."""
+        if owner >= len(self._frames):
+            more = max(64, owner)
+            self._points_world = np.pad(self._points_world, ((0, more), (0, 0), (0, 0)))
+            self._point_counts = np.pad(self._point_counts, (0, more))
+            self._frames = np.pad(self._frames, (0, more))
+        points = points_world[:SAMPLED_POINTS]
+        self._points_world[owner, : len(points)] = points
+        self._point_counts[owner] = len(points)
+        self._frames[owner] = 0
+
+    def forget(self, owner: int) -> None:
+        """Drop what is known of an owner that is gone."""
+        if owner < len(self._frames):
+            self._point_counts[owner] = self._frames[owner] = 0
+
+    def look(self, T_world_camera: Float64, grid: DepthGrid, seen: list[int]) -> list[int]:
+        """Take in one frame, in which some owners were seen; returns those that are gone."""
+        through, present = look(self._points_world, self._point_counts, T_world_camera, grid)
+        present[[owner for owner in seen if owner < len(present)]] = True
+        self._frames[through] += 1
+        self._frames[present] = 0
+        return np.flatnonzero(self._frames >= self._enough_frames).tolist()
+
+
 def look(
     points_world: Float32, point_counts: Int64, T_world_camera: Float64, grid: DepthGrid
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -32,7 +32,7 @@ class CellSets(NamedTuple):
     """Distinct cells of several sets of points, one after the other.
 
     Attributes:
-        cells: packed cell indices; those of set k are cells[starts[k] : starts[k + 1]], ascending.
+        cells: packed cell indices; those of set k are cells[starts[k] : starts[k + 1]].
         starts: (n + 1,) int64.
     """
 
@@ -81,20 +81,28 @@ class VoxelMap:
         indices = np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=1) - _BIAS
         return ((indices + 0.5) * self.cell_m).astype(np.float32)
 
-    def add(self, owner: int, cells: Int64) -> None:
-        """Note that an owner was seen in these distinct cells."""
-        room = self._cells_per_owner - self.cell_count(owner)
-        if 2 * (self._used + len(cells)) > len(self._keys):
-            self._grow(self._used + len(cells))
-        new, created = _add(self._keys, self._owners, owner, cells, room)
+    def add(self, owners: Sequence[int], sets: CellSets) -> None:
+        """Note that each owner was seen in the cells of its set."""
+        if not len(owners):
+            return
+        self._make_room(max(owners) + 1)
+        if 2 * (self._used + len(sets.cells)) > len(self._keys):
+            self._grow(self._used + len(sets.cells))
+        new, starts, created = _add(
+            self._keys,
+            self._owners,
+            self._counts,
+            self._cells_per_owner,
+            np.array(owners, np.int64),
+            sets.cells,
+            sets.starts,
+        )
         self._used += created
-        if len(new):
-            self._cells_of.setdefault(owner, []).append(new)
-            if owner >= len(self._counts):
-                self._counts = np.pad(self._counts, (0, owner + 1))
-            self._counts[owner] += len(new)
+        for owner, start, stop in zip(owners, starts[:-1].tolist(), starts[1:].tolist()):
+            if stop > start:
+                self._cells_of.setdefault(owner, []).append(new[start:stop].copy())
 
-    def shares(self, sets: CellSets, owner_count: int) -> Float64:
+    def shares(self, sets: CellSets) -> tuple[list[int], Float64]:
         """How far the surface of each set coincides with that of each owner.
 
         The share of the set's cells that the owner was seen in, or that have a face next to such a
@@ -102,16 +110,20 @@ class VoxelMap:
         side that saw less of the object decides.
 
         Returns:
-            (n, S) float64 in [0, 1] for n sets and owners 0 ... S - 1.
+            The S owners that any set met, ascending, and the shares (n, S) float64 in [0, 1].
         """
-        if owner_count > len(self._counts):
-            self._counts = np.pad(self._counts, (0, owner_count))
-        counts = self._counts[:owner_count]
         shares: Float64 = _shares(
-            self._keys, self._owners, self._touched, self._query, sets.cells, sets.starts, counts
+            self._keys,
+            self._owners,
+            self._touched,
+            self._query,
+            sets.cells,
+            sets.starts,
+            self._counts,
         )
         self._query += len(shares)
-        return shares
+        owners = np.flatnonzero(shares.any(axis=0))
+        return owners.tolist(), shares[:, owners]
 
     def remove(self, owner: int) -> Int64:
         """Forget an owner; returns the cells it had."""
@@ -121,15 +133,20 @@ class VoxelMap:
         _remove(self._keys, self._owners, owner, cells)
         return cells
 
+    def _make_room(self, owner_count: int) -> None:
+        if owner_count > len(self._counts):
+            self._counts = np.pad(self._counts, (0, 2 * owner_count - len(self._counts)))
+
     def _allocate(self, capacity: int) -> None:
         self._keys = np.full(capacity, _EMPTY, np.int64)
         self._owners: Int32 = np.full((capacity, OWNERS), -1, np.int32)
+        # The query by which each entry was met last.
         self._touched: Int64 = np.zeros((capacity, OWNERS), np.int64)
 
     def _grow(self, cells: int) -> None:
         keys, owners = self._keys, self._owners
         capacity = len(keys)
-        while capacity < 4 * cells:
+        while capacity < 3 * cells:
             capacity *= 2
         self._allocate(capacity)
         self._used = _rehash(keys, owners, self._keys, self._owners)
@@ -147,28 +164,33 @@ def _slot(keys, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add(keys, owners, owner, cells, room):  # type: ignore[no-untyped-def]
+def _add(keys, owners, counts, limit, who, cells, starts):  # type: ignore[no-untyped-def]
     new = np.empty(len(cells), np.int64)
+    new_starts = np.zeros(len(starts), np.int64)
     new_count = 0
     created = 0
-    for cell in cells:
-        slot = _slot(keys, cell)
-        known = False
-        place = -1
-        for index in range(OWNERS):
-            known = bool(known or owners[slot, index] == owner)
-            if place < 0 and owners[slot, index] < 0:
-                place = index
-        # Four nodes may know a cell; a fifth does not.
-        if known or place < 0 or new_count >= room:
-            continue
-        if keys[slot] != cell:
-            keys[slot] = cell
-            created += 1
-        owners[slot, place] = owner
-        new[new_count] = cell
-        new_count += 1
-    return new[:new_count].copy(), created
+    for index in range(len(who)):
+        owner = who[index]
+        for cell in cells[starts[index] : starts[index + 1]]:
+            slot = _slot(keys, cell)
+            known = False
+            place = -1
+            for candidate in range(OWNERS):
+                known = bool(known or owners[slot, candidate] == owner)
+                if place < 0 and owners[slot, candidate] < 0:
+                    place = candidate
+            # Four nodes may know a cell; a fifth does not.
+            if known or place < 0 or counts[owner] >= limit:
+                continue
+            if keys[slot] != cell:
+                keys[slot] = cell
+                created += 1
+            owners[slot, place] = owner
+            counts[owner] += 1
+            new[new_count] = cell
+            new_count += 1
+        new_starts[index + 1] = new_count
+    return new[:new_count].copy(), new_starts, created
 
 
 @njit(cache=True, nogil=True)
@@ -177,7 +199,10 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
     new_starts = np.zeros(len(starts), np.int64)
     kept = 0
     for index in range(len(starts) - 1):
-        first = kept
+        capacity = 16
+        while capacity < 2 * (starts[index + 1] - starts[index]):
+            capacity *= 2
+        known = np.full(capacity, _EMPTY)
         for point in range(starts[index], starts[index + 1]):
             cell = np.int64(0)
             inside = True
@@ -186,15 +211,11 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
                 inside = bool(inside and -_BIAS <= step < _BIAS)
                 cell = (cell << 21) | (step + _BIAS)
             if inside:
-                cells[kept] = cell
-                kept += 1
-        cells[first:kept].sort()
-        distinct = first
-        for place in range(first, kept):
-            if place == first or cells[place] != cells[distinct - 1]:
-                cells[distinct] = cells[place]
-                distinct += 1
-        kept = distinct
+                slot = _slot(known, cell)
+                if known[slot] != cell:
+                    known[slot] = cell
+                    cells[kept] = cell
+                    kept += 1
         new_starts[index + 1] = kept
     return cells[:kept].copy(), new_starts
 
@@ -202,39 +223,37 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignore[no-untyped-def]
     shares = np.zeros((len(starts) - 1, len(counts)))
-    met = np.empty(7 * OWNERS, np.int32)
-    steps = np.array([0, 1 << 42, -(1 << 42), 1 << 21, -(1 << 21), 1, -1], np.int64)
+    on_owner = np.zeros(len(counts), np.int64)
+    of_owner = np.zeros(len(counts), np.int64)
+    # The cell of the set that met an owner last: a cell meets an owner once.
+    met_at = np.full(len(counts), -1, np.int64)
+    steps = np.array([0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
     for index in range(len(starts) - 1):
         query += 1
-        on_owner = np.zeros(len(counts), np.int64)
-        of_owner = np.zeros(len(counts), np.int64)
-        for cell in cells[starts[index] : starts[index + 1]]:
-            met_count = 0
+        on_owner[:] = 0
+        of_owner[:] = 0
+        for at in range(starts[index], starts[index + 1]):
             for step in steps:
-                slot = _slot(keys, cell + step)
+                slot = _slot(keys, cells[at] + step)
                 if keys[slot] == -1:
                     continue
                 for place in range(OWNERS):
                     owner = owners[slot, place]
-                    if owner < 0 or owner >= len(counts):
+                    if owner < 0:
                         continue
                     if touched[slot, place] != query:
                         touched[slot, place] = query
                         of_owner[owner] += 1
-                    known = False
-                    for other in range(met_count):
-                        known = bool(known or met[other] == owner)
-                    if not known:
-                        met[met_count] = owner
-                        met_count += 1
+                    if met_at[owner] != at:
+                        met_at[owner] = at
                         on_owner[owner] += 1
         cell_count = starts[index + 1] - starts[index]
         for owner in range(len(counts)):
             if on_owner[owner] > 0:
-                shares[index, owner] = on_owner[owner] / cell_count
+                share = on_owner[owner] / cell_count
                 if counts[owner] >= MIN_REVERSE_CELLS:
-                    reverse = of_owner[owner] / counts[owner]
-                    shares[index, owner] = max(shares[index, owner], reverse)
+                    share = max(share, of_owner[owner] / counts[owner])
+                shares[index, owner] = share
     return shares
 
 

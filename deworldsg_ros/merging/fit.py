@@ -1,0 +1,137 @@
+"""How well each object of a frame fits each node that its surface lies on, and who is whom."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.nodes import NodeTable
+
+# Classes agree where two labels drawn from the two distributions are the same this often.
+CLASS_AGREEMENT = 0.3
+# What agreeing classes add to the share of overlap, when several nodes could be the one, and what
+# equal Gaussians add: of neighbours in a row, cells alone do not tell which is meant.
+CLASS_BONUS = 0.5
+GAUSSIAN_BONUS = 0.5
+# Means further apart than so many standard deviations, of the object's and of the node's Gaussian,
+# are not of one body: that of a part lies within 3 where the whole was seen evenly.
+MAX_DEVIATIONS = 4.0
+
+
+def fit(
+    local: LocalGraph,
+    nodes: NodeTable,
+    rows: NDArray[np.int64],
+    shares: Float64,
+    config: MergingConfig,
+) -> Float64:
+    """How well each object fits each node; 0 where they cannot be the same.
+
+    Args:
+        local: n objects.
+        nodes: the nodes of the graph.
+        rows: (k,) those to compare with.
+        shares: (n, k) how far the surfaces coincide.
+        config: thresholds of the shares.
+
+    Returns:
+        (n, k) float64: share + bonus · Σ p q + bonus · exp(-BD), with the Bhattacharyya distance
+        BD of the two Gaussians, both blurred by the size of a cell.
+    """
+    values: Float64 = _fit(
+        local.means_world,
+        local.covariances_world,
+        local.class_probabilities,
+        nodes.means,
+        nodes.covariances,
+        nodes.class_probabilities,
+        rows,
+        shares,
+        config.overlap_threshold,
+        config.overlap_threshold_other_class,
+        # Variance of a place that is known to be in a cell, along each axis.
+        config.cell_m**2 / 12,
+    )
+    return values
+
+
+def one_to_one(values: Float64) -> list[int]:
+    """Column of each row, -1 = none: the assignment of greatest total value."""
+    matched = [-1] * len(values)
+    for row, column in zip(*(ends.tolist() for ends in linear_sum_assignment(values, True))):
+        if values[row, column] > 0:
+            matched[row] = column
+    return matched
+
+
+def warm_up() -> None:
+    """Compile the comparison, or load it from the cache."""
+    gaussian = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
+    _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 0.5, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _solve(covariance, d0, d1, d2):  # type: ignore[no-untyped-def]
+    """|Σ| and dᵀΣ⁻¹d by the LDLᵀ pivots of a covariance."""
+    c00 = covariance[0, 0]
+    l10 = covariance[1, 0] / c00
+    l20 = covariance[2, 0] / c00
+    pivot_1 = covariance[1, 1] - l10 * covariance[1, 0]
+    rest = covariance[2, 1] - l20 * covariance[1, 0]
+    pivot_2 = covariance[2, 2] - l20 * covariance[2, 0] - rest / pivot_1 * rest
+    y1 = d1 - l10 * d0
+    y2 = d2 - l20 * d0 - rest / pivot_1 * y1
+    squared = d0 * d0 / c00 + y1 * y1 / pivot_1 + y2 * y2 / pivot_2
+    return c00 * pivot_1 * pivot_2, squared
+
+
+@njit(cache=True, nogil=True)
+def _fit(  # type: ignore[no-untyped-def]
+    means,
+    covariances,
+    classes,
+    node_means,
+    node_covariances,
+    node_classes,
+    rows,
+    shares,
+    threshold,
+    threshold_other_class,
+    blur_m2,
+):
+    values = np.zeros(shares.shape)
+    blur = blur_m2 * np.eye(3)
+    for index in range(len(shares)):
+        for column in range(len(rows)):
+            share = shares[index, column]
+            if share < threshold and share < threshold_other_class:
+                continue
+            row = rows[column]
+            agreement = 0.0
+            for label in range(classes.shape[1]):
+                agreement += classes[index, label] * node_classes[row, label]
+            wanted = threshold if agreement > CLASS_AGREEMENT else threshold_other_class
+            if share < wanted:
+                continue
+            a = covariances[index] + blur
+            b = node_covariances[row] + blur
+            d0 = means[index, 0] - node_means[row, 0]
+            d1 = means[index, 1] - node_means[row, 1]
+            d2 = means[index, 2] - node_means[row, 2]
+            determinant_a, squared_a = _solve(a, d0, d1, d2)
+            determinant_b, squared_b = _solve(b, d0, d1, d2)
+            if min(squared_a, squared_b) > MAX_DEVIATIONS**2:
+                continue
+            determinant, squared = _solve((a + b) / 2, d0, d1, d2)
+            likeness = math.exp(-squared / 8) * math.sqrt(
+                math.sqrt(determinant_a * determinant_b) / determinant
+            )
+            values[index, column] = share + CLASS_BONUS * agreement + GAUSSIAN_BONUS * likeness
+    return values

@@ -1,0 +1,102 @@
+"""How well objects fit nodes: the compiled comparison against the formulas, and who is whom."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from merging_support import local_graph, random_classes, random_covariances, seeds
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging.fit import (
+    CLASS_AGREEMENT,
+    CLASS_BONUS,
+    GAUSSIAN_BONUS,
+    MAX_DEVIATIONS,
+    fit,
+    one_to_one,
+)
+from deworldsg_ros.merging.joint import JointEvidence
+from deworldsg_ros.scene.gaussian import bhattacharyya_distance
+from deworldsg_ros.scene.nodes import NodeTable
+
+CONFIG = MergingConfig(association="surface")
+
+
+def deviations(difference: np.ndarray, covariance: np.ndarray) -> float:
+    return float(np.sqrt(difference @ np.linalg.solve(covariance, difference)))
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_values_equal_the_formulas(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    local = local_graph(
+        1, rng.normal(0, 0.3, (4, 3)), random_covariances(rng, 4, 0.01), random_classes(rng, 4)
+    )
+    nodes = NodeTable(4)
+    for index in range(5):
+        covariance, classes = random_covariances(rng, 1, 0.01)[0], random_classes(rng, 1)[0]
+        nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
+    rows = rng.permutation(5)[:3]
+    shares = rng.uniform(0, 1, (4, 3))
+    values = fit(local, nodes, rows, shares, CONFIG)
+    blur = CONFIG.cell_m**2 / 12 * np.eye(3)
+    for (index, column), share in np.ndenumerate(shares):
+        row = rows[column]
+        agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
+        same = agreement > CLASS_AGREEMENT
+        wanted = CONFIG.overlap_threshold if same else CONFIG.overlap_threshold_other_class
+        ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
+        difference = local.means_world[index] - nodes.means[row]
+        apart = min(deviations(difference, ours), deviations(difference, theirs))
+        distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
+        value = share + CLASS_BONUS * agreement + GAUSSIAN_BONUS * np.exp(-distance)
+        fits = share >= wanted and apart <= MAX_DEVIATIONS
+        assert values[index, column] == pytest.approx(value if fits else 0.0, abs=1e-9)
+
+
+def test_nothing_to_compare() -> None:
+    empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
+    values = fit(empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), CONFIG)
+    assert values.shape == (0, 0)
+    assert one_to_one(values) == []
+    assert one_to_one(np.zeros((2, 0))) == [-1, -1]
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_the_assignment_has_the_greatest_total(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = rng.uniform(0, 2, (3, 4)) * (rng.random((3, 4)) < 0.6)
+    matched = one_to_one(values)
+    taken = [column for column in matched if column >= 0]
+    assert len(taken) == len(set(taken))
+    total = sum(values[row, column] for row, column in enumerate(matched) if column >= 0)
+    assert all(values[row, column] > 0 for row, column in enumerate(matched) if column >= 0)
+    best = max(
+        values[range(3), list(columns)].sum() for columns in itertools.permutations(range(4), 3)
+    )
+    assert total == pytest.approx(best)
+
+
+def test_a_frame_that_shows_two_outweighs_ten_that_show_one_on_both() -> None:
+    both = np.ones((1, 2))
+    evidence = JointEvidence()
+    for _ in range(2):
+        evidence.note([4, 7], both, both, [0])
+        assert evidence.take() is None
+    evidence.note([4, 7], both, both, [0])
+    assert evidence.take() == (4, 7)
+    evidence.forget(7)
+
+    evidence.note([4, 7], np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2), [0, 1])
+    for _ in range(12):
+        evidence.note([4, 7], both, both, [0])
+    assert evidence.take() is None
+    evidence.note([4, 7], both, both, [0])
+    assert evidence.take() == (4, 7)
+    evidence.forget(7)
+    assert evidence.take() is None
