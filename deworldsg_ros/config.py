@@ -210,7 +210,7 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "auto"
     pose_source: Annotated[
         Literal["auto", "pose", "odometry", "tf"],
-        _number("PoseStamped, Odometry or TF; auto = what is published on camera/pose"),
+        _number("PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"),
     ] = "auto"
     world_frame: Annotated[
         str, _number("world frame that poses must have; empty = that of the first pose")

@@ -76,11 +76,11 @@ def pose(
     )
 
 
-def odometry(stamp_ns: int = T0, x: float = 0.0) -> SimpleNamespace:
+def odometry(stamp_ns: int = T0, x: float = 0.0, child: str = "camera") -> SimpleNamespace:
     stamped = pose(stamp_ns, x)
     return SimpleNamespace(
         header=stamped.header,
-        child_frame_id="camera",
+        child_frame_id=child,
         pose=SimpleNamespace(pose=stamped.pose, covariance=np.zeros(36)),
     )
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deworldsg_ros.bridge.jump_gate import JumpGate
+from deworldsg_ros.bridge.pose_stream import PoseStream
 from deworldsg_ros.bridge.poses import (
     PoseBuffer,
-    PoseStream,
     pose_from_message,
     set_stamp,
     stamp_ns_of,

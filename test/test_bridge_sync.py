@@ -164,6 +164,53 @@ def test_tf_is_as_good_as_a_pose() -> None:
     assert (frame.T_world_camera[0, 3], frame.frame_id) == (2.0, "map")
 
 
+MOUNT = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+
+
+def robot(options: InputsConfig = INPUTS) -> FrameAssembler:
+    """An assembler that is told the odometry of base_link 3 m along x, and one image."""
+    assembler = FrameAssembler(options)
+    assembler.expect_transforms()
+    for event in complete(T0):
+        if event.method != "add_pose":
+            add(assembler, event)
+    assembler.add_pose(odometry(T0, 3.0, "base_link"), T0)
+    return assembler
+
+
+def test_an_odometry_of_the_robot_is_carried_over_to_its_camera() -> None:
+    assembler = robot()
+    assert assembler.pop_ready(0) == []  # how the camera is mounted is yet to come
+    assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
+    # Localisation publishes its transforms ahead of time: that is no jump of the poses.
+    ahead_ns = T0 + 2 * SECOND
+    assembler.add_transforms(tf(transform("map", "odom", np.eye(4), ahead_ns)))
+    (frame,) = assembler.pop_ready(0)
+    wanted = MOUNT.copy()
+    wanted[0, 3] += 3.0
+    np.testing.assert_allclose(frame.T_world_camera, wanted, atol=1e-12)
+    for event in complete(T0 + PERIOD):
+        if event.method != "add_pose":
+            add(assembler, event)
+    assembler.add_pose(odometry(T0 + PERIOD, 3.1, "base_link"), T0 + PERIOD)
+    (frame,) = assembler.pop_ready(0)
+    assert frame.T_world_camera[0, 3] == pytest.approx(3.4)
+    assert not assembler.drops
+
+
+def test_a_camera_whose_mounting_nobody_tells_gives_no_frame() -> None:
+    assembler = robot()
+    assert assembler.flush() == []
+    assert assembler.drops == {"no_transform": 1}
+
+
+def test_an_odometry_of_the_camera_needs_no_transforms() -> None:
+    assembler = robot()
+    assembler.add_pose(odometry(T0 + PERIOD, 3.0, "/camera"), T0 + PERIOD)
+    (frame,) = assembler.pop_ready(0)
+    assert frame.T_world_camera[0, 3] == 3.0
+
+
 @pytest.mark.parametrize("missing", ["add_camera_info", "add_pose", "add_depth"])
 def test_what_is_missing_is_the_reason(missing: str) -> None:
     events = [event for event in complete(T0) if event.method != missing]

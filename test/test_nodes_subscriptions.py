@@ -16,6 +16,7 @@ from nodes_bench import (
     CAMERA,
     LIMIT_S,
     Bench,
+    camera_info,
     local_graph,
     pose,
     rgb,
@@ -218,5 +219,24 @@ def test_tf_stands_in_only_where_nobody_publishes_poses(
         assert "/tf" not in topics_of(at.node)
         at.peer.spin_for(2.0)
         assert ({"/tf", "/tf_static"} <= topics_of(at.node)) == (not posed)
+    finally:
+        at.close()
+
+
+@pytest.mark.parametrize("child", ["camera", "base_link"])
+def test_transforms_are_listened_to_for_the_odometry_of_a_robot(
+    monkeypatch: pytest.MonkeyPatch, child: str
+) -> None:
+    monkeypatch.setattr(inputs, "TFMessage", TransformStamped)
+    at = Bench(SegmentationNode, {**CAMERA, "camera/pose": Odometry})
+    try:
+        at.send(rgb__camera_info=camera_info(at.next_stamp()))
+        at.expect(lambda: at.node._frames.camera_frame == "camera", "the camera's frame")
+        message = odometry(at.next_stamp())
+        message.child_frame_id = child
+        at.send(camera__pose=message)
+        at.expect(lambda: len(at.node._frames._poses) > 0, "the odometry")
+        at.peer.spin_for(0.2)
+        assert ({"/tf", "/tf_static"} <= topics_of(at.node)) == (child == "base_link")
     finally:
         at.close()

@@ -10,13 +10,15 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import CHECK_PERIOD_S, StageNode
+from deworldsg_ros.bridge.posed import PosedAssembler
 from deworldsg_ros.bridge.poses import stamp_ns_of
 from deworldsg_ros.bridge.qos import AutoSubscription, Source, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
 
 try:  # On a full installation of ROS, and not in its wheels.
-    from tf2_msgs.msg import TFMessage
+    from tf2_msgs.msg import TFMessage as TFMessage  # odometry_node has it from here
 except ImportError:
     TFMessage = None
 
@@ -68,59 +70,77 @@ def listen_camera_info(node: StageNode, take: Taker) -> None:
     node.listen("camera_info", sources, _stamped(take), reliability, IMAGE_DEPTH)
 
 
-def listen_pose(node: StageNode, take: Taker, take_transforms: Callable[[Any, bool], None]) -> None:
-    """Take poses, or transforms with whether they are static.
+def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
+    """Take poses, and transforms where they are wanted or needed.
 
     Raises:
         ConfigurationError: where TF is wanted and its messages are not installed.
     """
     wanted = node.parameters.inputs.pose_source
-    if wanted == "tf" and TFMessage is None:
-        raise ConfigurationError(
-            "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a full "
-            "ROS 2 installation, or poses on camera/pose"
-        )
+    transforms = _Transforms(node, frames)
     if wanted == "tf":
-        _listen_transforms(node, take_transforms)
+        transforms.listen()
         return
     kinds = {"pose": [PoseStamped], "odometry": [Odometry], "auto": [PoseStamped, Odometry]}
+    carried = wanted == "auto" and TFMessage is not None
+    add = node.taking(frames.add_pose)
+
+    def take(message: Any, stamp_ns: int) -> None:
+        add(message, stamp_ns)
+        if carried and getattr(message, "child_frame_id", "") not in ("", frames.camera_frame):
+            transforms.listen()
+
     sources = [source("camera/pose", kind) for kind in kinds[wanted]]
     reliability = node.parameters.inputs.reliability
     poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
-    if wanted == "auto" and TFMessage is not None:
-        _fall_back_on_transforms(node, poses, take_transforms)
+    if carried:
+        frames.expect_transforms()
+        _fall_back_on_transforms(node, poses, transforms)
+
+
+class _Transforms:
+    """Subscriptions to /tf and /tf_static, made once."""
+
+    def __init__(self, node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
+        self._node = node
+        self._take = node.taking(frames.add_transforms)
+        self._is_listening = False
+
+    def listen(self) -> None:
+        """Subscribe, unless that is done; raises ConfigurationError without tf2_msgs."""
+        if TFMessage is None:
+            raise ConfigurationError(
+                "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a "
+                "full ROS 2 installation, or poses on camera/pose"
+            )
+        if self._is_listening:
+            return
+        self._is_listening = True
+        self._node.get_logger().info("listening to /tf and /tf_static")
+        for topic, static in (("/tf", False), ("/tf_static", True)):
+
+            def received(message: Any, topic: str = topic, static: bool = static) -> None:
+                self._node.health.received(topic)
+                self._take(message, static)
+
+            profile = reliable(POSE_DEPTH, latched=static)
+            self._node.create_subscription(TFMessage, topic, self._node.guarded(received), profile)
 
 
 def _fall_back_on_transforms(
-    node: StageNode, poses: AutoSubscription, take: Callable[[Any, bool], None]
+    node: StageNode, poses: AutoSubscription, transforms: _Transforms
 ) -> None:
     """Listen to TF once nobody has offered poses for a while, and not before.
 
     The two may be in different world frames: a graph must not begin in one and go on in the other.
     """
     started_s = time.monotonic()
-    listening = False
 
     def look() -> None:
-        nonlocal listening
-        waited_s = time.monotonic() - started_s
-        if not listening and not poses.was_published and waited_s > TF_AFTER_S:
-            listening = True
-            node.get_logger().info(f"nobody publishes {poses.topic}: listening to /tf")
-            _listen_transforms(node, take)
+        if not poses.was_published and time.monotonic() - started_s > TF_AFTER_S:
+            transforms.listen()
 
     node.every(CHECK_PERIOD_S, look)
-
-
-def _listen_transforms(node: StageNode, take: Callable[[Any, bool], None]) -> None:
-    for topic, static in (("/tf", False), ("/tf_static", True)):
-
-        def received(message: Any, topic: str = topic, static: bool = static) -> None:
-            node.health.received(topic)
-            take(message, static)
-
-        profile = reliable(POSE_DEPTH, latched=static)
-        node.create_subscription(TFMessage, topic, node.guarded(received), profile)
 
 
 def _stamped(take: Taker) -> Callable[[Any], None]:

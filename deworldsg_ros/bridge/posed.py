@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from deworldsg_ros.bridge.assembler import Assembler, OnDrop, Out, T
 from deworldsg_ros.bridge.camera_info import intrinsics_from_message
 from deworldsg_ros.bridge.images import depth_from_message
-from deworldsg_ros.bridge.poses import PoseStream, stamp_ns_of
+from deworldsg_ros.bridge.pose_stream import PoseStream
+from deworldsg_ros.bridge.poses import stamp_ns_of
 from deworldsg_ros.bridge.streams import Stream
 from deworldsg_ros.bridge.transforms import TransformTree
 from deworldsg_ros.config import InputsConfig
@@ -89,6 +90,10 @@ class PosedAssembler(Assembler[T, Out]):
         if not self._intrinsics or self._intrinsics[-1][1] != intrinsics:
             self._intrinsics = [*self._intrinsics[-15:], (stamp_ns, intrinsics)]
 
+    def expect_transforms(self) -> None:
+        """Carry an Odometry of another frame than the camera's over to it, by `add_transforms`."""
+        self._poses.transforms = self._transforms
+
     def add_pose(self, message: Any, stamp_ns: int) -> None:
         """Keep a PoseStamped or Odometry of the camera's optical frame."""
         self._hear_pose(stamp_ns)
@@ -99,15 +104,17 @@ class PosedAssembler(Assembler[T, Out]):
 
     def add_transforms(self, message: Any, static: bool = False) -> None:
         """Keep the transforms of a TFMessage of /tf, or of /tf_static."""
+        try:
+            self._transforms.add(message, static=static)
+        except RefusedInput as refusal:
+            self._drop(refusal.reason, str(refusal))
+        if self._source() is not self._transforms:
+            return
         # Many publishers share /tf, each with stamps of its own: going back means nothing here.
         self._pose.heard()
         if not static:
             stamps_ns = map(stamp_ns_of, message.transforms)
             self._pose.newest_ns = max(self._pose.newest_ns or 0, *stamps_ns, 0)
-        try:
-            self._transforms.add(message, static=static)
-        except RefusedInput as refusal:
-            self._drop(refusal.reason, str(refusal))
 
     def _hear_pose(self, stamp_ns: int) -> None:
         """Note the stamp; poses lie in a buffer of their own, not in the stream."""
@@ -118,7 +125,9 @@ class PosedAssembler(Assembler[T, Out]):
 
     def _restart(self, stamp_ns: int) -> None:
         if self._pose.restarts(stamp_ns):
-            self._poses = PoseStream(self._pose_slop_ns, self._poses.world_frame)
+            self._poses = PoseStream(
+                self._pose_slop_ns, self._poses.world_frame, self._poses.transforms
+            )
             self._transforms.restart()
         super()._restart(stamp_ns)
 

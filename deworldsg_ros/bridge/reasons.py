@@ -19,6 +19,9 @@ REASONS: dict[str, str] = {
     "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames, or turned "
     "faster than `inputs.max_turn_deg_s`; believed after five frames at the new place",
     "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
+    "no_transform": "the odometry is of another frame than the camera's, and TF does not connect "
+    "the two; publish that transform, or set `inputs.pose_source` to odometry if the poses are the "
+    "camera's all the same",
     "odometry_lost": "a frame fits none before it: blocked, blank or too fast; it gets no pose",
     # Models
     "detector_error": "the detector failed on the image; the log has the first traceback, other "

@@ -48,28 +48,34 @@ class TransformTree:
                 buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
                 buffer.add(stamp_ns_of(transform), T_parent_child)
 
-    def settled(self, stamp_ns: int, camera_frame: str) -> bool:
-        """Whether later transforms cannot change the answer at this stamp."""
+    def settled(self, stamp_ns: int, camera_frame: str, parent_frame: str = "") -> bool:
+        """Whether later transforms cannot change the answer of `at` or `between`."""
+        parent_frame = parent_frame or self._world_frame
         try:
-            ours, theirs, _ = self._paths(camera_frame)
+            ours, theirs, _ = self._paths(camera_frame, parent_frame)
         except RefusedInput:
             return False
         moving = [frame for frame in ours + theirs if frame not in self._static]
-        if not moving and not self._world_frame:
+        if not moving and not parent_frame:
             return False  # The rest of the tree has not arrived yet.
         return all(self._moving[frame].settled(stamp_ns) for frame in moving)
 
     def at(self, stamp_ns: int, camera_frame: str) -> tuple[Float64, str]:
-        """T_world_camera (4, 4) and the world frame at a stamp.
+        """T_world_camera (4, 4) and the world frame at a stamp; refuses as `between`."""
+        *_, world_frame = self._paths(camera_frame, self._world_frame)
+        T_world_camera = self.between(stamp_ns, world_frame, camera_frame)
+        self._world_frame = world_frame
+        return T_world_camera, world_frame
+
+    def between(self, stamp_ns: int, parent_frame: str, child_frame: str) -> Float64:
+        """T_parent_child (4, 4) at a stamp.
 
         Raises:
             RefusedInput: ``no_pose`` where the frames are not connected, or a transform is
                 further away in time than the slop.
         """
-        ours, theirs, world_frame = self._paths(camera_frame)
-        T_world_camera = invert_pose(self._chain(theirs, stamp_ns)) @ self._chain(ours, stamp_ns)
-        self._world_frame = world_frame
-        return T_world_camera, world_frame
+        ours, theirs, _ = self._paths(child_frame, parent_frame)
+        return invert_pose(self._chain(theirs, stamp_ns)) @ self._chain(ours, stamp_ns)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Drop transforms that no stamp from here on can need."""
@@ -96,13 +102,16 @@ class TransformTree:
             path.append(self._parents[path[-1]])
         return path
 
-    def _paths(self, camera_frame: str) -> tuple[list[str], list[str], str]:
-        """Frames from camera and world up to, without, their common ancestor; the world frame."""
+    def _paths(self, camera_frame: str, world_frame: str) -> tuple[list[str], list[str], str]:
+        """Frames from camera and world up to, without, their common ancestor; the world frame.
+
+        Without a name it is the root of the tree above the camera.
+        """
         ours = self._ancestry(camera_frame.lstrip("/"))
-        world_frame = self._world_frame or ours[-1]
+        world_frame = world_frame.lstrip("/") or ours[-1]
         theirs = self._ancestry(world_frame)
         common = next((frame for frame in ours if frame in theirs), None)
-        if common is None or len(ours) == 1:
+        if common is None or camera_frame.lstrip("/") == world_frame:
             raise RefusedInput(
                 "no_pose",
                 f"TF does not connect camera frame '{camera_frame}' with "

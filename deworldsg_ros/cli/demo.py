@@ -20,6 +20,7 @@ from rich.console import Console
 from deworldsg_ros import __version__
 from deworldsg_ros.bags import events
 from deworldsg_ros.bags.errors import RecordingError
+from deworldsg_ros.bags.messages import ODOMETRY, Role
 from deworldsg_ros.bags.recording import open_source
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import outputs
@@ -63,6 +64,7 @@ def run_demo(
     # Problems of the recording are told before anything is started.
     source = open_source(path, topics=topics, inputs=config.inputs, options=options)
     name, kind, frames = source.name, source.kind, source.frame_count
+    pose_type = source.topics[Role.POSE].msgtype
     source.close()
     outputs.prepare_folder(out, config)
     (out / outputs.GRAPH_FILE).unlink(missing_ok=True)
@@ -72,8 +74,9 @@ def run_demo(
     started_s = time.perf_counter()
     with _one_interrupt(), _processes(console) as processes:
         parameters = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]
-        # Whatever the recording has, the replay publishes poses.
-        parameters += ["-p", "inputs.pose_source:=auto"]
+        # Poses out of TF become messages in the replay.
+        pose_source = "odometry" if pose_type == ODOMETRY else "pose"
+        parameters += ["-p", f"inputs.pose_source:={pose_source}"]
         environment = dds_environment()
         for node in NODES:
             command = [*node_command(node), *parameters]

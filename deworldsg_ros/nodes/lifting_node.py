@@ -29,7 +29,7 @@ class LiftingNode(JoiningNode[LiftingFrame]):
         frames = self._frames = LiftingAssembler(self.parameters.inputs, **self.assembler_options())
         self.join(frames, self._lift)
         listen_camera_info(self, self.taking(frames.add_camera_info))
-        listen_pose(self, self.taking(frames.add_pose), self.taking(frames.add_transforms))
+        listen_pose(self, frames)
         listen_depth(self, self.taking(frames.add_depth))
         self.listen(
             "instances",

@@ -8,7 +8,13 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
 
-from deworldsg_ros.bridge.inputs import listen_camera_info, listen_depth, listen_rgb
+from deworldsg_ros.bridge.inputs import (
+    POSE_DEPTH,
+    TFMessage,
+    listen_camera_info,
+    listen_depth,
+    listen_rgb,
+)
 from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import run
 from deworldsg_ros.bridge.poses import set_stamp
@@ -17,13 +23,6 @@ from deworldsg_ros.bridge.unposed import UnposedAssembler, UnposedFrame
 from deworldsg_ros.poses.odometry import RgbdOdometry
 from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
 from deworldsg_ros.scene.errors import ConfigurationError
-
-try:  # On a full installation of ROS, and not in its wheels.
-    from tf2_msgs.msg import TFMessage
-except ImportError:
-    TFMessage = None
-
-POSE_DEPTH = 100
 
 
 class OdometryNode(JoiningNode[UnposedFrame]):

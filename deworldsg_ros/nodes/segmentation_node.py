@@ -32,7 +32,7 @@ class SegmentationNode(JoiningNode[RgbdFrame]):
         frames = self._frames = FrameAssembler(inputs, **self.assembler_options())
         self.join(frames, self._segment)
         listen_camera_info(self, self.taking(frames.add_camera_info))
-        listen_pose(self, self.taking(frames.add_pose), self.taking(frames.add_transforms))
+        listen_pose(self, frames)
         listen_depth(self, self.taking(frames.add_depth))
         listen_rgb(self, self.taking(frames.add_rgb))
 
