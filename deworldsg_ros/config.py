@@ -210,7 +210,9 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "auto"
     pose_source: Annotated[
         Literal["auto", "pose", "odometry", "tf"],
-        _number("PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"),
+        _number(
+            "PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"
+        ),
     ] = "auto"
     world_frame: Annotated[
         str, _number("world frame that poses must have; empty = that of the first pose")
@@ -268,7 +270,7 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 15
     frame_id: Annotated[str, _number("world frame of the poses, where nothing gives one")] = "odom"
     publish_tf: Annotated[
-        bool, _number("also publish the camera frame below it on /tf, where tf2_msgs is installed")
+        bool, _number("also publish what the camera is mounted on to /tf (needs tf2_msgs)")
     ] = False
 
 

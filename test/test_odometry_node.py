@@ -7,17 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bridge_support import tf, transform
 from corner_room import INTRINSICS, LEVEL, corner_frame, walk
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from nodes_bench import Bench, bench, camera_info, image, works
 from sensor_msgs.msg import CameraInfo, Image
 
-from deworldsg_ros.bridge.poses import pose_from_message, stamp_ns_of
+from deworldsg_ros.bridge.poses import pose_from_message, pose_from_transform, stamp_ns_of
 from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.bridge.transform_output import camera_transform
+from deworldsg_ros.bridge.transforms import TransformTree
 from deworldsg_ros.nodes.odometry_node import OdometryNode
+from deworldsg_ros.poses.motion import rigid_motion
 from deworldsg_ros.scene.camera import invert_pose
 
+STAMP_NS = 1_700_000_000_123_456_789
 TOPICS = {"rgb/image_raw": Image, "depth/image_raw": Image, "rgb/camera_info": CameraInfo}
 
 
@@ -94,3 +99,25 @@ def test_a_recording_played_again_starts_anew(odometry: Bench) -> None:
     odometry.refuses("time_jump", lambda: send(odometry, path[1]))
     odometry.expect(lambda: len(poses) == 1, "a pose")
     np.testing.assert_allclose(pose_from_message(poses[0])[0], LEVEL, atol=1e-12)
+
+
+def at(x: float = 0.0, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
+    return rigid_motion(np.array([x, y, 0.0]), np.array([0.0, 0.0, turn_rad]))
+
+
+def test_the_camera_is_published_below_what_it_is_mounted_on() -> None:
+    """A frame has one parent: an optical frame that has one already gets no other."""
+    tree = TransformTree(0)
+    T_world_camera = at(1.0, 2.0, 0.5)
+    alone = camera_transform(tree, STAMP_NS, "odom", "optical", T_world_camera)
+    assert (alone.header.frame_id, alone.child_frame_id) == ("odom", "optical")
+    np.testing.assert_allclose(pose_from_transform(alone.transform), T_world_camera, atol=1e-12)
+    link_color, color_optical = at(0.0, 0.015), at(turn_rad=1.5)
+    tree.add(tf(transform("camera_link", "color", link_color)), static=True)
+    tree.add(tf(transform("color", "optical", color_optical)), static=True)
+    mounted = camera_transform(tree, STAMP_NS, "odom", "optical", T_world_camera)
+    assert (mounted.child_frame_id, stamp_ns_of(mounted)) == ("camera_link", STAMP_NS)
+    T_world_link = pose_from_transform(mounted.transform)
+    np.testing.assert_allclose(
+        T_world_link @ link_color @ color_optical, T_world_camera, atol=1e-12
+    )

@@ -18,7 +18,7 @@ from deworldsg_ros.bridge.qos import AutoSubscription, Source, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
 
 try:  # On a full installation of ROS, and not in its wheels.
-    from tf2_msgs.msg import TFMessage as TFMessage  # odometry_node has it from here
+    from tf2_msgs.msg import TFMessage as TFMessage  # transform_output has it from here
 except ImportError:
     TFMessage = None
 

@@ -77,6 +77,10 @@ class TransformTree:
         ours, theirs, _ = self._paths(child_frame, parent_frame)
         return invert_pose(self._chain(theirs, stamp_ns)) @ self._chain(ours, stamp_ns)
 
+    def root(self, frame: str) -> str:
+        """The frame that has no parent, above or at this one."""
+        return self._ancestry(frame)[-1]
+
     def forget_before(self, stamp_ns: int) -> None:
         """Drop transforms that no stamp from here on can need."""
         for buffer in self._moving.values():

@@ -5,12 +5,11 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, TransformStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 
 from deworldsg_ros.bridge.inputs import (
     POSE_DEPTH,
-    TFMessage,
     listen_camera_info,
     listen_depth,
     listen_rgb,
@@ -19,10 +18,10 @@ from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import run
 from deworldsg_ros.bridge.poses import set_stamp
 from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.bridge.transform_output import TransformOutput, put_pose
 from deworldsg_ros.bridge.unposed import UnposedAssembler, UnposedFrame
 from deworldsg_ros.poses.odometry import RgbdOdometry
-from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.camera import Float64
 
 
 class OdometryNode(JoiningNode[UnposedFrame]):
@@ -31,11 +30,6 @@ class OdometryNode(JoiningNode[UnposedFrame]):
     def __init__(self, **options: Any) -> None:
         super().__init__("odometry_node", "poses", **options)
         config = self.parameters.odometry
-        if config.publish_tf and TFMessage is None:
-            raise ConfigurationError(
-                "parameter odometry.publish_tf is true, but tf2_msgs is not installed: wanted a "
-                "full ROS 2 installation"
-            )
         self._world_frame = self.parameters.inputs.world_frame or config.frame_id
         self._odometry = RgbdOdometry(config)
         self._newest_ns = 0
@@ -43,11 +37,7 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         self._odometry_output = self.create_publisher(
             Odometry, "camera/odometry", reliable(POSE_DEPTH)
         )
-        self._tf_output = (
-            self.create_publisher(TFMessage, "/tf", reliable(POSE_DEPTH))
-            if config.publish_tf
-            else None
-        )
+        self._tf_output = TransformOutput(self) if config.publish_tf else None
         frames = self._frames = UnposedAssembler(self.parameters.inputs, **self.assembler_options())
         self.join(frames, self._track)
         listen_camera_info(self, self.taking(frames.add_camera_info))
@@ -65,17 +55,15 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         pose = PoseStamped()
         pose.header.frame_id = self._world_frame
         set_stamp(pose, stamp_ns)
-        _put(T_world_camera, pose.pose.position, pose.pose.orientation)
+        put_pose(T_world_camera, pose.pose.position, pose.pose.orientation)
         self._pose_output.publish(pose)
         odometry = Odometry(header=pose.header, child_frame_id=self._frames.camera_frame)
         odometry.pose.pose = pose.pose
         self._odometry_output.publish(odometry)
         if self._tf_output is not None:
-            transform = TransformStamped(
-                header=pose.header, child_frame_id=self._frames.camera_frame
+            self._tf_output.publish(
+                stamp_ns, self._world_frame, self._frames.camera_frame, T_world_camera
             )
-            _put(T_world_camera, transform.transform.translation, transform.transform.rotation)
-            self._tf_output.publish(TFMessage(transforms=[transform]))
 
     def more_values(self) -> dict[str, str]:
         """What became of the frames."""
@@ -83,14 +71,6 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         counts = {"tracked": odometry.tracked, "lost": odometry.lost, "restarts": odometry.restarts}
         told = {f"odometry {name}": str(count) for name, count in counts.items()}
         return {**super().more_values(), **told}
-
-
-def _put(T: Float64, position: Any, orientation: Any) -> None:
-    """Write a pose into a Point or Vector3, and a Quaternion."""
-    position.x, position.y, position.z = map(float, T[:3, 3])
-    orientation.x, orientation.y, orientation.z, orientation.w = map(
-        float, quaternion_from_rotation(T[:3, :3])
-    )
 
 
 def main(args: list[str] | None = None) -> int:
