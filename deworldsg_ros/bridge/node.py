@@ -1,4 +1,4 @@
-"""What the four nodes share: start, parameters, guarded callbacks, diagnostics, a clean end."""
+"""What the nodes share: start, parameters, guarded callbacks, diagnostics, a clean end."""
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ class StageNode(Node):  # type: ignore[misc]
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.parameters = declare(self)
+        self.get_logger().info("loading (a first start compiles kernels, up to a minute)")
         self.health = Health(product)
         self._logged_s: dict[str, float] = {}
         self._log_lock = threading.Lock()
