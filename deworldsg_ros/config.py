@@ -170,9 +170,20 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, _number("visual entropy above which the prior enters, nats", ge=0, le=10)
     ] = 1.0
     fusion_alpha: Annotated[float, _number("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
+    encode: Annotated[
+        Literal["uncertain", "all"],
+        _number(
+            "clips that the world model looks at: of pairs whose edges are uncertain, or all of "
+            "every frame"
+        ),
+    ] = "uncertain"
+    clips_per_s: Annotated[
+        float,
+        _number("most clips encoded a second, by the images' stamps; 0 = unlimited", ge=0, le=1000),
+    ] = 10.0
     queue_size: Annotated[
         int, _number("clips that may wait for the world model", ge=1, le=4096)
-    ] = 32
+    ] = 256
     seed: Annotated[int, _number("seed of the deterministic world model", ge=0)] = 0
     model_path: Annotated[
         str, _number("checkpoint of the world model's backbone: a folder, or a hub id")

@@ -11,6 +11,7 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
+from deworldsg_ros.relations.graph_view import LiveGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import build_world_model, require_predicates
 from deworldsg_ros.scene import wire
@@ -98,6 +99,7 @@ class Pipeline:
             )
         if self.builder is None:
             self.builder = GraphBuilder(self.config, local.vocabulary, local.frame_id)
+            self.relations.watch(LiveGraph(self.builder.graph))
         with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
         with timed(self.times_s["relations"]):

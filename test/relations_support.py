@@ -57,7 +57,9 @@ def picture(stamp_ns: int) -> np.ndarray:
 
 
 def config(**changes) -> RelationsConfig:
-    return RelationsConfig(**{"world_model": "fake", "clip_length": 4, "queue_size": 8, **changes})
+    return RelationsConfig(
+        **{"world_model": "fake", "clip_length": 4, "queue_size": 8, "clips_per_s": 0.0, **changes}
+    )
 
 
 class RecordingModel(FakeWorldModel):

@@ -1,22 +1,42 @@
-"""The queue: bounded, ordered by a function and by nothing else."""
+"""The queue: bounded, ordered by a policy and by nothing else."""
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from relations_support import VOCABULARY
+from relations_support import VOCABULARY, config
 
-from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip, newest_first
-from deworldsg_ros.relations.clips import FrameBuffer
+from deworldsg_ros.relations import clip_queue
+from deworldsg_ros.relations.clip_policy import ClipPolicy, PairKey, Rank
+from deworldsg_ros.relations.clip_queue import ClipQueue
+from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip
 
 
 def clip(stamp_ns, geo_cost=0.1, rows=(0, 1)):
     box = np.zeros(4)
     return QueuedClip(
-        stamp_ns, (stamp_ns,), (0, 0, 1, 1), VOCABULARY, rows, (0, 1), (box, box), geo_cost
+        stamp_ns, (stamp_ns,), (0, 0, 10, 10), VOCABULARY, rows, (0, 1), (box, box), geo_cost
     )
+
+
+def queue_of(size, policy=None):
+    dropped = Counter()
+
+    def drop(reason):
+        dropped[reason] += 1
+
+    return ClipQueue(size, policy or ClipPolicy(config()), drop), dropped
+
+
+class ByPair(ClipPolicy):
+    """Every clip is of the pair that its rows name."""
+
+    def judge(self, clip):
+        return Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes))
 
 
 clips = st.lists(
@@ -25,48 +45,66 @@ clips = st.lists(
 
 
 def test_empty_queue_gives_nothing():
-    queue = ClipQueue(3)
-    assert len(queue) == 0 and queue.pop() is None and queue.clear() == 0
+    queue, _ = queue_of(3)
+    assert len(queue) == 0 and queue.take(5) == [] and queue.ready() == 0 and queue.clear() == 0
 
 
-@settings(max_examples=40, deadline=None)
 @given(clips, st.integers(1, 5))
-def test_keeps_the_best_in_order_and_gives_back_the_rest(items, size):
-    queue = ClipQueue(size)
-    dropped = [lost for lost in map(queue.put, items) if lost is not None]
-    assert len(queue) == min(size, len(items))
-    kept = [newest_first(queue.pop()) for _ in range(len(queue))]
-    best = sorted(map(newest_first, items), reverse=True)
-    assert kept == best[:size]
-    assert sorted(map(newest_first, dropped), reverse=True) == best[size:]
-
-
-def test_worse_than_all_of_a_full_queue_is_itself_dropped():
-    queue = ClipQueue(1)
-    queue.put(clip(9))
-    late = clip(1)
-    assert queue.put(late) is late
+def test_keeps_the_best_in_order_and_counts_the_rest(items, size):
+    queue, dropped = queue_of(size)
+    for item in items:
+        queue.put([item])
+    assert len(queue) == queue.ready() == min(size, len(items))
+    kept = [(item.stamp_ns, -item.geo_cost) for item in queue.take(len(items))]
+    best = sorted(((item.stamp_ns, -item.geo_cost) for item in items), reverse=True)
+    assert kept == best[:size] and len(queue) == 0
+    assert dropped["queue_full"] == len(best[size:]) == dropped.total()
 
 
 def test_order_does_not_depend_on_the_order_of_arrival():
     items = [clip(1, rows=(i, j)) for i in range(4) for j in range(i + 1, 4)]
-    orders = []
     for arrival in (items, items[::-1]):
-        queue = ClipQueue(10)
-        for item in arrival:
-            queue.put(item)
-        orders.append([queue.pop().rows for _ in items])
-    assert orders[0] == orders[1] == [item.rows for item in items]
+        queue, _ = queue_of(10)
+        queue.put(arrival)
+        assert [item.rows for item in queue.take(10)] == [item.rows for item in items]
 
 
-def test_another_order_is_a_function():
-    queue = ClipQueue(2, order=lambda item: (item.geo_cost,))
-    for item in (clip(1, 0.3), clip(2, 0.1), clip(3, 0.2)):
-        queue.put(item)
-    assert [queue.pop().stamp_ns, queue.pop().stamp_ns] == [1, 3]
+def test_of_two_clips_of_a_pair_the_newer_waits():
+    queue, dropped = queue_of(10, ByPair(config()))
+    queue.put([clip(1), clip(2), clip(1, rows=(0, 2))])
+    queue.put([clip(3, rows=(0, 2))])
+    assert [(item.stamp_ns, item.rows) for item in queue.take(9)] == [(3, (0, 2)), (2, (0, 1))]
+    assert dropped == {"superseded": 2}
 
 
-@pytest.mark.parametrize(("kind", "what"), [(ClipQueue, "clips"), (FrameBuffer, "frames")])
-def test_room_for_nothing_is_refused(kind, what):
-    with pytest.raises(ValueError, match=f"of 0 {what}: wanted at least 1"):
-        kind(0)
+def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_go(monkeypatch):
+    frames = FrameBuffer(2)
+    image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
+    frames.add(1, image)
+    known, lost = queue_of(10, ByPair(config()))
+    unknown, stale = queue_of(10)
+    for queue in (known, unknown):
+        queue.put([clip(1)])
+        queue.cut(1, frames, 4)
+    (item,) = known.take(1)
+    assert item.pixels.shape == (4, 10, 10, 3) and (item.pixels == image).all() and not lost
+    assert len(unknown) == 0 and stale == {"stale": 1}
+
+
+def test_cut_clips_have_so_much_room_and_the_worst_go(monkeypatch):
+    monkeypatch.setattr(clip_queue, "CUT_BYTES", 2 * 4 * 300)
+    frames = FrameBuffer(3)
+    queue, dropped = queue_of(10, ByPair(config()))
+    for stamp in (1, 2, 3):
+        frames.add(stamp, np.zeros((10, 10, 3), np.uint8))
+        queue.put([clip(stamp, rows=(0, stamp))])
+    queue.cut(3, frames, 4)
+    assert [item.stamp_ns for item in queue.take(9)] == [3, 2] and dropped == {"stale": 1}
+
+
+@pytest.mark.parametrize("size", [0, -1])
+def test_room_for_nothing_is_refused(size):
+    with pytest.raises(ValueError, match=f"of {size} clips: wanted at least 1"):
+        queue_of(size)
+    with pytest.raises(ValueError, match=f"of {size} frames: wanted at least 1"):
+        FrameBuffer(size)

@@ -56,7 +56,7 @@ def test_distant_objects_are_no_pair():
     stage = reasoner()
     graph = local_graph(1, [[0, 0, 9, 9], [0, 0, 9, 9]], [1.0, 1.5], [0, 1])
     assert len(stage.observe(graph, picture(1)).pairs) == 0
-    assert stage.pending == 0
+    assert stage.counters().pending == 0
 
 
 def test_work_answers_both_directions_from_one_clip():
@@ -118,7 +118,7 @@ def test_within_a_frame_the_nearest_pair_is_first():
 def test_full_queue_loses_the_oldest_and_counts_it():
     stage = reasoner(queue_size=2)
     observe(stage, 1, 2, 3, 4)
-    assert stage.pending == 2
+    assert stage.counters().pending == 2
     assert [evidence.stamp_ns for evidence in stage.drain()] == [4, 3]
     assert stage.counters().dropped == {"queue_full": 2} and accounted(stage)
 

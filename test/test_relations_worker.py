@@ -74,7 +74,7 @@ def test_stop_gives_up_on_a_model_that_hangs_and_nothing_comes_after_it():
     for _ in range(2):
         model.allowed.release()
     assert worker.stop(LONG_S)
-    assert receiver.evidence == [] and worker.reasoner.pending == 0
+    assert receiver.evidence == [] and worker.reasoner.counters().pending == 0
 
 
 def test_stop_of_an_idle_worker_and_of_one_never_started():

@@ -1,21 +1,28 @@
-"""relation_node: local graphs and RGB → deworldsg/relation_evidence, predictions when they come."""
+"""relation_node: local graphs and RGB → deworldsg/relation_evidence, predictions when they come.
+
+What the graph node publishes tells which pairs are worth a prediction.
+"""
 
 from __future__ import annotations
 
 import sys
 from typing import Any
 
+from std_msgs.msg import String
+
 from deworldsg_ros.bridge.inputs import listen_rgb
 from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import run
+from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.bridge.sync import PairingFrame, RelationAssembler
 from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
+from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
 from deworldsg_ros.relations.world_model import build_world_model, require_predicates
+from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
 from deworldsg_ros.scene.frame_graph import RelationEvidence
-from deworldsg_ros.scene.wire import LocalGraphMessage
 
 
 class RelationNode(JoiningNode[PairingFrame]):
@@ -32,14 +39,44 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._publish = self.json_publisher("deworldsg/relation_evidence", 50)
         self._world_model = EvidenceWorker(self._reasoner, self._deliver, report)
         self._world_model.start()
+        self._graph = PublishedGraph()
+        self._snapshot_text = ""
+        if world_model is not None and config.encode == "uncertain":
+            self._watch_graph()
         frames = self._frames = RelationAssembler(**self.assembler_options())
         self.join(frames, self._relate)
         listen_rgb(self, self.taking(frames.add_rgb))
         self.listen_json(
-            "deworldsg/local_graph", LocalGraphMessage, self.taking(self._add_local_graph), 50
+            "deworldsg/local_graph", wire.LocalGraphMessage, self.taking(self._add_local_graph), 50
         )
 
-    def _add_local_graph(self, message: LocalGraphMessage) -> None:
+    def _watch_graph(self) -> None:
+        self._reasoner.watch(self._graph)
+        self.listen_json(
+            "/scene_graph/updates", wire.SceneGraphUpdateMessage, self._update_graph, 50
+        )
+        self.create_subscription(
+            String, "/scene_graph", self.guarded(self._keep_snapshot), reliable(1, latched=True)
+        )
+
+    def _update_graph(self, update: wire.SceneGraphUpdateMessage) -> None:
+        generation = self._graph.generation
+        self._world_model.learn(lambda: self._graph.apply(update))
+        if self._graph.generation != generation:
+            self._snapshot_text = ""  # of the graph before
+        self._catch_up()
+
+    def _keep_snapshot(self, message: Any) -> None:
+        # The whole graph comes with every change: it is read only where updates were lost.
+        self._snapshot_text = message.data
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        if self._snapshot_text and self._graph.wants_snapshot:
+            snapshot = wire.decode(self._snapshot_text, wire.SceneGraphMessage)
+            self._world_model.learn(lambda: self._graph.reset(snapshot))
+
+    def _add_local_graph(self, message: wire.LocalGraphMessage) -> None:
         self._frames.add_local_graph(local_graph_from_message(message))
 
     def _relate(self, frame: PairingFrame) -> None:
@@ -52,8 +89,9 @@ class RelationNode(JoiningNode[PairingFrame]):
     def more_values(self) -> dict[str, str]:
         """What became of the clips."""
         counters = self._reasoner.counters()
-        clips = {"queued": counters.queued, "pending": counters.pending}
-        clips["encoded"] = counters.encoded
+        clips = {"queued": counters.queued, "encoded": counters.encoded}
+        clips["pending"] = counters.ready
+        clips["waiting"] = counters.pending - counters.ready
         clips.update((f"dropped {reason}", n) for reason, n in sorted(counters.dropped.items()))
         told = {f"clips {name}": str(count) for name, count in clips.items()}
         return {**super().more_values(), **told}

@@ -1,7 +1,8 @@
 """Stage d: neighbour pairs (Eq. 8), clips, world models, evidence and fusion (Eq. 9-10)."""
 
-from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip
-from deworldsg_ros.relations.clips import FrameBuffer, crop_clip, union_box
+from deworldsg_ros.relations.clip_policy import ClipPolicy
+from deworldsg_ros.relations.clip_queue import ClipQueue
+from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, union_box
 from deworldsg_ros.relations.evidence import (
     ClassPairPrior,
     FusedEdge,
@@ -13,6 +14,7 @@ from deworldsg_ros.relations.evidence import (
     fuse_edges,
     visual_distribution,
 )
+from deworldsg_ros.relations.graph_view import GraphView, LiveGraph, NodeView, PublishedGraph
 from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
 from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
@@ -26,13 +28,18 @@ from deworldsg_ros.relations.world_model import (
 
 __all__ = [
     "ClassPairPrior",
+    "ClipPolicy",
     "ClipQueue",
     "ClipRequest",
     "EvidenceWorker",
     "FrameBuffer",
     "FusedEdge",
     "FusedEdges",
+    "GraphView",
+    "LiveGraph",
+    "NodeView",
     "PairContext",
+    "PublishedGraph",
     "QueuedClip",
     "RelationCounters",
     "RelationReasoner",

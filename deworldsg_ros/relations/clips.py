@@ -9,13 +9,44 @@ from __future__ import annotations
 import math
 from bisect import bisect_right, insort
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
 Float64 = NDArray[np.float64]
 Rgb = NDArray[np.uint8]
 CropBox = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class QueuedClip:
+    """A neighbour pair of one frame whose clip may be encoded.
+
+    Attributes:
+        stamp_ns: frame in which both objects were last seen.
+        frame_stamps_ns: the clip's frames, oldest first, ending with that one.
+        crop_xyxy: union box of that frame.
+        vocabulary: of the frame's local graph.
+        rows: rows of the two objects in that local graph, the smaller first.
+        classes: their classes.
+        boxes_xyxy: their boxes, each (4,) float64 pixels of the image.
+        geo_cost: the cost of Eq. 8.
+        pixels: the clip itself, (T, h, w, 3) uint8, where it was cut before its frames left the
+            frame buffer; None while they are there.
+    """
+
+    stamp_ns: int
+    frame_stamps_ns: tuple[int, ...]
+    crop_xyxy: CropBox
+    vocabulary: Vocabulary
+    rows: tuple[int, int]
+    classes: tuple[int, int]
+    boxes_xyxy: tuple[Float64, Float64]
+    geo_cost: float
+    pixels: Rgb | None = None
 
 
 class FrameBuffer:
@@ -48,6 +79,11 @@ class FrameBuffer:
         self._images[stamp_ns] = rgb
         if len(self._stamps_ns) > self.capacity:
             del self._images[self._stamps_ns.pop(0)]
+
+    def leaving(self, stamp_ns: int) -> int | None:
+        """Stamp of the frame that would have to go for one with this stamp; None if none would."""
+        full = len(self) == self.capacity and stamp_ns not in self._images
+        return self._stamps_ns[0] if full and stamp_ns > self._stamps_ns[0] else None
 
     def window(self, stamp_ns: int, length: int) -> tuple[int, ...]:
         """Stamps of the at most `length` consecutive frames that end with this one.

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.clip_queue import ClipQueue, QueuedClip
-from deworldsg_ros.relations.clips import FrameBuffer, Rgb, crop_clip, union_box
+from deworldsg_ros.relations.clip_policy import ClipPolicy
+from deworldsg_ros.relations.clip_queue import ClipQueue
+from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, Rgb, crop_clip, union_box
+from deworldsg_ros.relations.graph_view import GraphView
 from deworldsg_ros.relations.pairing import neighbour_pairs
 from deworldsg_ros.relations.prior import SUM_TOLERANCE
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
@@ -22,6 +24,7 @@ from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
+Waiting = tuple[QueuedClip, list[Rgb]]
 
 # Frames kept, in clip lengths: a clip stays encodable while one more clip length of frames comes.
 BUFFERED_CLIP_LENGTHS = 2
@@ -34,15 +37,18 @@ class RelationCounters:
     Attributes:
         queued: clips that were put into the queue.
         pending: clips that wait now.
+        ready: those of them that wait for the world model alone; the others wait for the graph,
+            for their nodes to be confirmed, or for the budget.
         encoded: clips that the world model answered.
-        dropped: clips lost, by reason: ``queue_full`` (a better one took its place), ``stale``
-            (its frames had left the buffer), ``world_model_error`` (the model failed on it),
-            ``cleared`` (by a reset or at the end), and ``no_frame`` (never queued, because the
-            frame's image did not come or came too late).
+        dropped: clips that were not encoded, by reason: those of `ClipPolicy.judge` and of
+            `ClipQueue`, ``world_model_error`` (the model failed on it), ``cleared`` (by a reset
+            or at the end), and ``no_frame`` (never queued, because the frame's image did not come
+            or came too late).
     """
 
     queued: int
     pending: int
+    ready: int
     encoded: int
     dropped: dict[str, int]
 
@@ -80,10 +86,21 @@ class RelationReasoner:
         self._reported = ""
         self._lock = threading.Lock()
         self._frames = FrameBuffer(BUFFERED_CLIP_LENGTHS * config.clip_length)
-        self._queue = ClipQueue(config.queue_size)
         self._queued = 0
         self._encoded = 0
         self._dropped: Counter[str] = Counter()
+        self._policy = ClipPolicy(config)
+        self._queue = ClipQueue(config.queue_size, self._policy, self._drop)
+
+    def watch(self, graph: GraphView) -> None:
+        """Choose clips by what this graph says of their pairs, from now on."""
+        with self._lock:
+            self._policy.watch(graph)
+
+    def learn(self, change: Callable[[], None]) -> None:
+        """Change the graph that is watched, with nobody looking at it meanwhile."""
+        with self._lock:
+            change()
 
     def add_frame(self, stamp_ns: int, rgb: Rgb) -> None:
         """Keep an image, (H, W, 3) uint8, for clips; it must not be changed afterwards.
@@ -92,7 +109,7 @@ class RelationReasoner:
         """
         if self._world_model is not None:
             with self._lock:
-                self._frames.add(stamp_ns, rgb)
+                self._keep(stamp_ns, rgb)
 
     def observe(self, local: LocalGraph, rgb: Rgb | None = None) -> RelationEvidence:
         """Neighbour pairs of a frame (Eq. 8); their clips are queued.
@@ -125,7 +142,7 @@ class RelationReasoner:
         )
 
     def work(self) -> RelationEvidence | None:
-        """Encode the first queued clip that can be; None when the queue is empty.
+        """Encode the first queued clip that may be; None where there is none.
 
         Returns:
             the predictions of both directions of its pair, rows of the local graph with that
@@ -134,7 +151,7 @@ class RelationReasoner:
         return next(iter(self.work_batch(1)), None)
 
     def work_batch(self, size: int | None = None) -> list[RelationEvidence]:
-        """Encode the first queued clips that can be, at once; empty when the queue is.
+        """Encode the first queued clips that may be, at once; empty where there are none.
 
         Args:
             size: most clips; default: `relations.batch_size`.
@@ -157,7 +174,7 @@ class RelationReasoner:
                 return evidence
 
     def drain(self) -> list[RelationEvidence]:
-        """Encode everything that is queued, first to last.
+        """Encode everything that is queued and may be, first to last.
 
         After each `observe`, this makes a run in one thread deterministic.
         """
@@ -171,20 +188,16 @@ class RelationReasoner:
         with self._lock:
             count = self._queue.clear()
             self._frames.clear()
+            self._policy.clear()
             if count:
                 self._dropped["cleared"] += count
-
-    @property
-    def pending(self) -> int:
-        """Number of clips that wait."""
-        with self._lock:
-            return len(self._queue)
 
     def counters(self) -> RelationCounters:
         """What became of the clips so far."""
         with self._lock:
+            ready = self._queue.ready()
             return RelationCounters(
-                self._queued, len(self._queue), self._encoded, dict(self._dropped)
+                self._queued, len(self._queue), ready, self._encoded, dict(self._dropped)
             )
 
     def _queue_clips(
@@ -194,42 +207,43 @@ class RelationReasoner:
         once = np.flatnonzero(pairs[:, 0] < pairs[:, 1])
         with self._lock:
             if rgb is not None:
-                self._frames.add(local.stamp_ns, rgb)
+                self._keep(local.stamp_ns, rgb)
+            self._policy.advance(local.stamp_ns)
             stamps_ns = self._frames.window(local.stamp_ns, self._config.clip_length)
             if not stamps_ns:
                 if len(once):
                     self._dropped["no_frame"] += len(once)
                 return
-            for row in once.tolist():
-                i, j = pairs[row].tolist()
-                boxes = (local.boxes_xyxy[i], local.boxes_xyxy[j])
-                item = QueuedClip(
-                    stamp_ns=local.stamp_ns,
-                    frame_stamps_ns=stamps_ns,
-                    crop_xyxy=union_box(*boxes, local.width, local.height),
-                    vocabulary=local.vocabulary,
-                    rows=(i, j),
-                    classes=(int(classes[row, 0]), int(classes[row, 1])),
-                    boxes_xyxy=boxes,
-                    geo_cost=float(costs[row]),
-                )
-                self._queued += 1
-                if self._queue.put(item) is not None:
-                    self._dropped["queue_full"] += 1
+            self._queued += len(once)
+            self._queue.put(
+                _clip_of(local, stamps_ns, pairs[row], classes[row], float(costs[row]))
+                for row in once.tolist()
+            )
 
-    def _take(self, size: int) -> list[tuple[QueuedClip, list[Rgb]]]:
-        """The first clips whose frames are still here, and these frames."""
-        batch: list[tuple[QueuedClip, list[Rgb]]] = []
+    def _keep(self, stamp_ns: int, rgb: Rgb) -> None:
+        """Keep an image; what waits for a frame that has to go for it is cut first."""
+        leaving_ns = self._frames.leaving(stamp_ns)
+        if leaving_ns is not None:
+            self._queue.cut(leaving_ns, self._frames, self._config.clip_length)
+        self._frames.add(stamp_ns, rgb)
+
+    def _drop(self, reason: str) -> None:
+        self._dropped[reason] += 1
+
+    def _take(self, size: int) -> list[Waiting]:
+        """The first clips that may be encoded, and their frames."""
+        batch: list[Waiting] = []
         with self._lock:
-            while len(batch) < size and (item := self._queue.pop()) is not None:
-                images = self._frames.images(item.frame_stamps_ns)
-                if images is None:
-                    self._dropped["stale"] += 1
-                else:
-                    batch.append((item, images))
+            while len(batch) < size and (taken := self._queue.take(size - len(batch))):
+                for item in taken:
+                    images = self._frames.images(item.frame_stamps_ns)
+                    if images is None and item.pixels is None:  # images of another size came
+                        self._dropped["stale"] += 1
+                    else:
+                        batch.append((item, images or []))
         return batch
 
-    def _encode_batch(self, batch: list[tuple[QueuedClip, list[Rgb]]]) -> list[RelationEvidence]:
+    def _encode_batch(self, batch: list[Waiting]) -> list[RelationEvidence]:
         """Predictions of both directions of each clip; without those that the model failed on."""
         model = self._world_model
         assert model is not None  # nothing is queued without one
@@ -273,8 +287,26 @@ class RelationReasoner:
             self._report(message)
 
 
+def _clip_of(
+    local: LocalGraph, stamps_ns: tuple[int, ...], pair: Int64, classes: Int64, geo_cost: float
+) -> QueuedClip:
+    """The clip of one pair of rows of a local graph."""
+    i, j = pair.tolist()
+    boxes = (local.boxes_xyxy[i], local.boxes_xyxy[j])
+    return QueuedClip(
+        stamp_ns=local.stamp_ns,
+        frame_stamps_ns=stamps_ns,
+        crop_xyxy=union_box(*boxes, local.width, local.height),
+        vocabulary=local.vocabulary,
+        rows=(i, j),
+        classes=(int(classes[0]), int(classes[1])),
+        boxes_xyxy=boxes,
+        geo_cost=geo_cost,
+    )
+
+
 def _request_of(item: QueuedClip, images: list[Rgb], clip_length: int) -> ClipRequest:
-    """The clip of a queued pair, cropped now, and both directions of the pair in it."""
+    """The clip of a queued pair, and both directions of the pair in it."""
     x1, y1, _, _ = item.crop_xyxy
     boxes = [box - np.array([x1, y1, x1, y1], np.float64) for box in item.boxes_xyxy]
     names = [item.vocabulary.classes[index] for index in item.classes]
@@ -289,7 +321,10 @@ def _request_of(item: QueuedClip, images: list[Rgb], clip_length: int) -> ClipRe
         )
         for subject, object_ in ((0, 1), (1, 0))
     )
-    return ClipRequest(crop_clip(images, item.crop_xyxy, clip_length), directions, item.vocabulary)
+    pixels = item.pixels
+    if pixels is None:
+        pixels = crop_clip(images, item.crop_xyxy, clip_length)
+    return ClipRequest(pixels, directions, item.vocabulary)
 
 
 def _checked(answer: Float64, pair_count: int, predicate_count: int) -> Float64:

@@ -37,6 +37,8 @@ class EvidenceWorker:
         self._changed = threading.Condition()
         self._stopping = False
         self._busy = False
+        # Something came since the last look, so that a clip may be worth its time now.
+        self._news = False
         # A daemon, so that a model that never returns cannot keep the process alive.
         self._thread = threading.Thread(target=self._run, name="world-model", daemon=True)
 
@@ -47,15 +49,19 @@ class EvidenceWorker:
     def observe(self, local: LocalGraph, rgb: Rgb | None = None) -> RelationEvidence:
         """Neighbour pairs of a frame, at once; see `RelationReasoner.observe`."""
         evidence = self.reasoner.observe(local, rgb)
-        with self._changed:
-            self._changed.notify_all()
+        self._wake()
         return evidence
 
+    def learn(self, change: Callable[[], None]) -> None:
+        """Change the graph that clips are chosen by; see `RelationReasoner.learn`."""
+        self.reasoner.learn(change)
+        self._wake()
+
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until every queued clip is encoded and delivered; False where time ran out."""
+        """Wait until all clips that may be are encoded and delivered; False where time ran out."""
         with self._changed:
             return self._changed.wait_for(
-                lambda: self._stopping or not (self._busy or self.reasoner.pending), timeout_s
+                lambda: self._stopping or not (self._busy or self._news), timeout_s
             )
 
     def stop(self, timeout_s: float = 5.0) -> bool:
@@ -73,16 +79,23 @@ class EvidenceWorker:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
+    def _wake(self) -> None:
+        with self._changed:
+            self._news = True
+            self._changed.notify_all()
+
     def _run(self) -> None:
         while True:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._stopping or self.reasoner.pending > 0)
-                if self._stopping:
-                    return
+                self._changed.wait_for(lambda: self._stopping or self._news)
+                self._news = False
                 self._busy = True
-            self._deliver_all(self.reasoner.work_batch())
+            while not self._stopping and (batch := self.reasoner.work_batch()):
+                self._deliver_all(batch)
+            if self._stopping:
+                return
 
     def _deliver_all(self, batch: list[RelationEvidence]) -> None:
         for evidence in batch:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.errors import RefusedInput
@@ -22,6 +25,16 @@ class GraphReplica:
     def sequence(self) -> int:
         """Number of the last update that this copy shows."""
         return self._sequence
+
+    @property
+    def nodes(self) -> Mapping[int, wire.NodeState]:
+        """The nodes by id, read only."""
+        return MappingProxyType(self._nodes)
+
+    @property
+    def edges(self) -> Mapping[tuple[int, int], wire.EdgeState]:
+        """The edges by subject and object, read only."""
+        return MappingProxyType(self._edges)
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Start anew from a snapshot."""

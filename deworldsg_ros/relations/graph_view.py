@@ -1,0 +1,176 @@
+"""The global graph, as far as the choice of clips asks of it: in process, and as published."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol
+
+from deworldsg_ros.relations.evidence import entropy_nats, visual_distribution
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.replica import GraphReplica
+
+# Frames and removed nodes that a published graph is remembered by; clips wait for far fewer.
+REMEMBERED_FRAMES = 1024
+REMEMBERED_REMOVALS = 65536
+
+
+class NodeView(NamedTuple):
+    """A confirmed node.
+
+    Attributes:
+        label: its most probable class.
+        observations: frames in which it was seen.
+    """
+
+    label: str
+    observations: int
+
+
+class GraphView(Protocol):
+    """What is asked of the graph."""
+
+    @property
+    def generation(self) -> int:
+        """Another number means another graph, whose node ids mean something else."""
+        ...
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp up to which is known what became of frames; None = no graph is known."""
+        ...
+
+    def nodes_of_frame(self, stamp_ns: int) -> Sequence[int] | None:
+        """The node that each row of a local graph is today, 0 = gone; None = not known."""
+        ...
+
+    def node(self, node_id: int) -> NodeView | None:
+        """A live node; None while it is tentative."""
+        ...
+
+    def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
+        """Entropy of P_vis (Eq. 9) of the pair; infinite where neither direction was seen.
+
+        The greater one of the directions of which something was seen.
+        """
+        ...
+
+
+class LiveGraph:
+    """The graph of this process."""
+
+    def __init__(self, graph: SceneGraph) -> None:
+        self.generation = 0
+        # Frames are merged before they come here: what is not known now will never be.
+        self.newest_ns = sys.maxsize
+        self._graph = graph
+
+    def nodes_of_frame(self, stamp_ns: int) -> Sequence[int] | None:
+        """See `GraphView`."""
+        return self._graph.nodes_of_frame(stamp_ns)
+
+    def node(self, node_id: int) -> NodeView | None:
+        """See `GraphView`."""
+        nodes = self._graph.nodes
+        row = nodes.row(node_id)
+        if not nodes.confirmed[row]:
+            return None
+        label = self._graph.vocabulary.classes[int(nodes.class_probabilities[row].argmax())]
+        return NodeView(label, int(nodes.observations[row]))
+
+    def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
+        """See `GraphView`."""
+        edges = [self._graph.edges.get(pair) for pair in ((a_id, b_id), (b_id, a_id))]
+        return max(
+            (
+                float(entropy_nats(visual_distribution(edge.visual_logits)))
+                for edge in edges
+                if edge is not None and edge.frames
+            ),
+            default=math.inf,
+        )
+
+
+class PublishedGraph:
+    """The graph of another process, from `/scene_graph/updates`.
+
+    Where it joins late, and after lost updates, it wants a snapshot, and goes on with what it has
+    meanwhile. A graph that starts anew, which its sequence numbers tell, replaces the one before.
+
+    Attributes:
+        wants_snapshot: whether `reset` would help.
+    """
+
+    def __init__(self) -> None:
+        self.generation = 0
+        self.newest_ns: int | None = None
+        self.wants_snapshot = True
+        self._replica = GraphReplica()
+        self._last_sequence = 0
+        self._frames: dict[int, list[int]] = {}
+        # Where each id that is gone went; 0 = nowhere.
+        self._successors: dict[int, int] = {}
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
+        """Take in an update, in the order of publication."""
+        if update.sequence <= self._last_sequence:
+            self.generation += 1
+            self._replica = GraphReplica()
+            self._frames.clear()
+            self._successors.clear()
+        self._last_sequence = update.sequence
+        for removed in update.removed_nodes:
+            self._successors[removed.id] = removed.merged_into or 0
+        # A node that was hidden for a while is told as removed, and comes back under its id.
+        for node in update.nodes:
+            self._successors.pop(node.id, None)
+        for association in update.associations:
+            self._frames[wire.ns_from_stamp(association.stamp)] = association.nodes
+        _forget_oldest(self._successors, REMEMBERED_REMOVALS)
+        _forget_oldest(self._frames, REMEMBERED_FRAMES)
+        self.newest_ns = wire.ns_from_stamp(update.stamp)
+        try:
+            self._replica.apply(update)
+            self.wants_snapshot = False
+        except RefusedInput:
+            self.wants_snapshot = True
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        """Take the nodes and edges of a snapshot, unless it is older than the last update."""
+        if snapshot.sequence < self._last_sequence:
+            return
+        self._replica.reset(snapshot)
+        self.wants_snapshot = False
+        if self.newest_ns is None:
+            self.newest_ns = wire.ns_from_stamp(snapshot.stamp)
+
+    def nodes_of_frame(self, stamp_ns: int) -> Sequence[int] | None:
+        """See `GraphView`."""
+        node_ids = self._frames.get(stamp_ns)
+        return None if node_ids is None else [self._resolve(node_id) for node_id in node_ids]
+
+    def node(self, node_id: int) -> NodeView | None:
+        """See `GraphView`."""
+        state = self._replica.nodes.get(node_id)
+        if state is None or not state.confirmed:
+            return None
+        return NodeView(state.label, state.observations)
+
+    def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
+        """See `GraphView`; an edge that was seen is always published."""
+        edges = [self._replica.edges.get(pair) for pair in ((a_id, b_id), (b_id, a_id))]
+        seen = [edge.entropy_nats for edge in edges if edge is not None and edge.observations]
+        return max(seen, default=math.inf)
+
+    def _resolve(self, node_id: int) -> int:
+        while node_id in self._successors:
+            node_id = self._successors[node_id]
+        return node_id
+
+
+def _forget_oldest(remembered: dict[int, Any], count: int) -> None:
+    while len(remembered) > count:
+        del remembered[next(iter(remembered))]
