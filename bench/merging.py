@@ -22,9 +22,11 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import build_merging
 from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
-from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, hellinger_distance, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.surface import hash_each
 
 CLASSES = 80
 PREDICATES = 50
@@ -34,6 +36,11 @@ VOCABULARY = Vocabulary(
 )
 LOCAL_NODES = 12
 DENSITY_PER_M2 = 3.0
+POINTS = 200  # of the surface of each object, as lifting hands them on
+# A wall far behind everything: the surface rule compares it with nodes that are out of sight.
+DEPTH = DepthGrid(
+    np.full((60, 80), 60_000, np.uint16), 8, Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+)
 
 
 class World:
@@ -44,12 +51,18 @@ class World:
         side_m = (count / DENSITY_PER_M2) ** 0.5
         self.means = rng.uniform((0, 0, 0), (side_m, side_m, 1.5), (count, 3))
         bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-        variances = rng.uniform(0.05, 0.5, (count, 1, 3)) ** 2
+        variances = rng.uniform(0.05, 0.5, (count, 1, 3)) ** 2 / 12
         # The surface that a camera sees is thin in one direction.
-        variances[:, :, 2] = 0.01**2
+        variances[:, :, 2] = 0.005**2
         self.covariances = bases * variances @ bases.swapaxes(1, 2)
         self.covariances = (self.covariances + self.covariances.swapaxes(1, 2)) / 2
+        self.roots = bases * variances**0.5
         self.classes = rng.integers(0, CLASSES, count)
+
+    def surface_points(self, row: int, rng: np.random.Generator) -> np.ndarray:
+        """Points (k, 3) of an object's surface, spread evenly over a thin slab of its moments."""
+        spread = rng.uniform(-(3**0.5), 3**0.5, (POINTS, 3))
+        return (self.means[row] + spread @ self.roots[row].T).astype(np.float32)
 
     def probabilities(self, rows: np.ndarray) -> np.ndarray:
         """Class distributions (n, C) of an observation of these objects."""
@@ -62,9 +75,10 @@ def graph_of(world: World) -> SceneGraph:
     """One node an object; 5 edges a node."""
     graph = SceneGraph(VOCABULARY, "world")
     rows = np.arange(len(world.means))
-    for row, probabilities in zip(rows, world.probabilities(rows)):
-        graph.add_node(world.means[row], world.covariances[row], probabilities, 0)
     rng = np.random.default_rng(1)
+    surfaces = hash_each(tuple(world.surface_points(row, rng) for row in rows))
+    for row, probabilities in zip(rows, world.probabilities(rows)):
+        graph.add_node(world.means[row], world.covariances[row], probabilities, 0, surfaces[row])
     for subject in range(1, len(rows) + 1):
         for object_ in rng.integers(1, len(rows) + 1, 5).tolist():
             graph.add_visual(subject, object_, rng.normal(size=PREDICATES), 0)
@@ -96,9 +110,8 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
                 covariances_world=world.covariances[rows],
                 depths_m=np.ones(n),
                 pixel_counts=np.full(n, 1000),
-                surface_points_world=tuple(
-                    rng.normal(world.means[row], 0.1, (64, 3)).astype(np.float32) for row in rows
-                ),
+                surface_points_world=tuple(world.surface_points(row, rng) for row in rows),
+                depth_grid=DEPTH,
                 relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(10)),
             )
         )
@@ -175,9 +188,11 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     before = len(graph)
     merging = build_merging(config)
     times = [milliseconds(lambda frame=local: merging.merge(graph, frame)) for local in frames]
+    after = len(graph)
     dense = count**2 * PREDICATES * 8
     print(
-        f"{association} stage {LOCAL_NODES} x {before:6d} nodes, {len(graph.edges)} edges: "
+        f"{association} stage {LOCAL_NODES} x {before:6d} nodes ({after} after), "
+        f"{len(graph.edges)} edges: "
         f"median {statistics.median(times):6.3f} ms, 95 % {sorted(times)[int(0.95 * rounds)]:6.3f} "
         f"ms a frame; graph holds {held / 1e6:.1f} MB, peak {peak / 1e6:.1f} MB "
         f"(a dense relation array would be {dense / 1e6:.0f} MB)"

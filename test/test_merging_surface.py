@@ -112,7 +112,7 @@ def test_a_neighbour_that_is_often_missed_is_not_swallowed(graph, merging) -> No
 
 
 def test_of_neighbours_a_newcomer_is_the_one_that_is_new(graph, merging) -> None:
-    left, middle, right = (slab((x, 0, 1), (0.035, 0.15, 0.2)) for x in (0.0, 0.036, 0.072))
+    left, middle, right = (slab((x, 0, 1), (0.02, 0.15, 0.2)) for x in (0.0, 0.022, 0.044))
     for stamp in range(3):
         assert merging.merge(graph, frame(stamp, (left, CUP), (right, CUP))) == [1, 2]
     # The newcomer's label is the surest, and its cells touch those of both neighbours.

@@ -17,6 +17,7 @@ from merging_support import (
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.gaussian import fuse, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.storage import state_of
 from deworldsg_ros.scene.surface import hash_each
@@ -103,6 +104,14 @@ def test_observing_many_is_observing_each() -> None:
             float(weights[index]),
         )
     assert equal(one, many)
+    for index, node_id in enumerate([4, 1, 3]):
+        row = many.nodes.row(node_id)
+        known = (1.0, np.array([10.0 * (node_id - 1), 0, 0]), np.eye(3))
+        mean, covariance = fuse(*known, weights[index], means[index], covariances[index])
+        assert many.nodes.means[row] == pytest.approx(mean, rel=1e-14)
+        assert many.nodes.covariances[row] == pytest.approx(covariance, rel=1e-14)
+        cached = many.nodes.log_determinants[row]
+        assert cached == log_determinant(many.nodes.covariances[row])
     many.observe_each(
         [], *(np.zeros((0, *shape)) for shape in ((3,), (3, 3), (4,))), 9, [], np.zeros(0)
     )

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.surface import hash_each
+
+
+def warm_up_graph() -> None:
+    """Compile what changes a scene graph, or load it from the cache."""
+    graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
+    seen = (np.zeros(3), np.eye(3), np.ones(1), 1, hash_each((np.zeros((1, 3), np.float32),))[0])
+    graph.observe(graph.add_node(*seen), *seen)
 
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.gates import bhattacharyya_bound
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
-from deworldsg_ros.merging.local import add_relations, check_fits
+from deworldsg_ros.merging.local import add_relations, check_fits, warm_up_graph
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
@@ -22,6 +22,7 @@ class PaperMerging:
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
         warm_up()
+        warm_up_graph()
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph.

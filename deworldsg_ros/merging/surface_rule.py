@@ -15,7 +15,7 @@ from deworldsg_ros.merging.absence import SeenThrough, look
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
 from deworldsg_ros.merging.joint import JointEvidence
-from deworldsg_ros.merging.local import add_relations, check_fits
+from deworldsg_ros.merging.local import add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
 from deworldsg_ros.merging.voxel_map import CellSets, Int64, VoxelMap
@@ -53,6 +53,7 @@ class SurfaceMerging:
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
         look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
         warm_up_fit()
+        warm_up_graph()
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.

@@ -69,22 +69,20 @@ def hellinger_distance(
 
 
 def fuse(
-    weight_i: Float64 | float,
+    weight_i: float,
     mean_i: Float64,
     covariance_i: Float64,
-    weight_j: Float64 | float,
+    weight_j: float,
     mean_j: Float64,
     covariance_j: Float64,
 ) -> tuple[Float64, Float64]:
-    """Moment-preserving fusion of two Gaussians of weights (...) (Eq. 7)."""
-    weight_i, weight_j = np.asarray(weight_i)[..., None], np.asarray(weight_j)[..., None]
+    """Moment-preserving fusion of two weighted Gaussians (Eq. 7)."""
     total = weight_i + weight_j
     difference = mean_i - mean_j
     mean = (weight_i * mean_i + weight_j * mean_j) / total
-    weight_i, weight_j, total = weight_i[..., None], weight_j[..., None], total[..., None]
     covariance = (weight_i * covariance_i + weight_j * covariance_j) / total + (
         weight_i * weight_j / total**2
-    ) * (difference[..., :, None] * difference[..., None, :])
+    ) * (difference[:, None] * difference)
     return mean, covariance
 
 
@@ -113,4 +111,7 @@ def eigenvalue_bound(covariance: Float64) -> float:
 
     The Frobenius norm: equal to it for a thin Gaussian, at most √3 times it for a sphere.
     """
-    return math.hypot(*covariance.ravel().tolist())
+    squares = 0.0  # summed in this order also where nodes are fused (`sum` is not, everywhere)
+    for value in covariance.ravel().tolist():
+        squares += value * value
+    return math.sqrt(squares)

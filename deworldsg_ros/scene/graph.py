@@ -10,7 +10,7 @@ import numpy as np
 from deworldsg_ros.scene import storage, wire
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.gaussian import Float64, fuse
+from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import Int64, NodeTable
 from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, SurfaceReservoir, hash_each
@@ -335,28 +335,12 @@ class SceneGraph:
     ) -> None:
         """Fuse something into each of n different rows."""
         nodes = self.nodes
-        known = nodes.weights[rows]
-        means, covariances = fuse(
-            known,
-            nodes.means[rows],
-            nodes.covariances[rows],
-            weights,
-            means_world,
-            covariances_world,
-        )
-        totals = (known + weights).tolist()
-        seen = nodes.observations[rows]
-        seen_now = seen + observations
-        classes = (
-            seen[:, None] * nodes.class_probabilities[rows]
-            + observations[:, None] * class_probabilities
-        ) / seen_now[:, None]
-        for index, (row, count) in enumerate(zip(rows, seen_now.tolist())):
-            nodes.put(row, means[index], covariances[index], classes[index], totals[index], count)
-            nodes.surfaces[row].add(surfaces[index])
+        nodes.fuse(rows, means_world, covariances_world, class_probabilities, weights, observations)
+        for row, surface in zip(rows, surfaces):
+            nodes.surfaces[row].add(surface)
             nodes.revisions[row] = self._changed()
-        nodes.first_seen_ns[rows] = np.minimum(nodes.first_seen_ns[rows], first_seen_ns)
-        nodes.last_seen_ns[rows] = np.maximum(nodes.last_seen_ns[rows], last_seen_ns)
+            nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
+            nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)
 
     def _forget(self, node_id: int, successor: int) -> None:
         self.nodes.remove(node_id)

@@ -7,9 +7,11 @@ they are replaced when a node is added or removed, so do not keep them across su
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
@@ -120,6 +122,41 @@ class NodeTable:
         self.weights[row] = weight
         self.observations[row] = observations
 
+    def fuse(
+        self,
+        rows: list[int],
+        means_world: Float64,
+        covariances_world: Float64,
+        class_probabilities: Float64,
+        weights: Float64,
+        observations: Int64,
+    ) -> None:
+        """Fuse a Gaussian, classes and counts into each of n different rows (Eq. 7).
+
+        Raises:
+            ValueError: where a covariance is not positive definite; rows before it were fused.
+        """
+        refused = _fuse(
+            np.array(rows, np.int64),
+            self.means,
+            self.covariances,
+            self.class_probabilities,
+            self.weights,
+            self.observations,
+            self.log_determinants,
+            self.eigenvalue_bounds,
+            means_world,
+            covariances_world,
+            class_probabilities,
+            weights,
+            observations,
+        )
+        if refused >= 0:
+            raise ValueError(
+                f"covariance {covariances_world[refused].tolist()}, fused into node "
+                f"{self.ids[rows[refused]]}, gives one that is not positive definite"
+            )
+
     def remove(self, node_id: int) -> None:
         """Remove a node; the last row takes its place."""
         row, last = self.row(node_id), len(self._rows) - 1
@@ -135,3 +172,59 @@ class NodeTable:
     def _show(self, count: int) -> None:
         for name, column in self._storage.items():
             setattr(self, name, column[:count])
+
+
+@njit(cache=True, nogil=True)
+def _fuse(  # type: ignore[no-untyped-def]
+    rows,
+    means,
+    covariances,
+    classes,
+    weights,
+    observations,
+    log_determinants,
+    eigenvalue_bounds,
+    new_means,
+    new_covariances,
+    new_classes,
+    new_weights,
+    new_observations,
+):
+    """`scene.gaussian.fuse` with what is cached of the result; place that was refused, -1 = none.
+
+    The operations are those of `fuse`, `log_determinant` and `eigenvalue_bound`, one by one.
+    """
+    c = np.empty((3, 3))
+    for index in range(len(rows)):
+        row = rows[index]
+        known, weight = weights[row], new_weights[index]
+        total = known + weight
+        cross = known * weight / (total * total)
+        squares = 0.0
+        for i in range(3):
+            for j in range(3):
+                apart = (means[row, i] - new_means[index, i]) * (
+                    means[row, j] - new_means[index, j]
+                )
+                mixed = known * covariances[row, i, j] + weight * new_covariances[index, i, j]
+                c[i, j] = mixed / total + cross * apart
+                squares += c[i, j] * c[i, j]
+        pivot_1 = c[1, 1] - c[1, 0] / c[0, 0] * c[1, 0]
+        rest = c[2, 1] - c[2, 0] / c[0, 0] * c[1, 0]
+        pivot_2 = c[2, 2] - c[2, 0] / c[0, 0] * c[2, 0] - rest / pivot_1 * rest
+        if not (c[0, 0] > 0.0 and pivot_1 > 0.0 and pivot_2 > 0.0):
+            return index
+        log_determinants[row] = math.log(c[0, 0] * pivot_1 * pivot_2)
+        eigenvalue_bounds[row] = math.sqrt(squares)
+        seen, seen_now = observations[row], new_observations[index]
+        for i in range(3):
+            means[row, i] = (known * means[row, i] + weight * new_means[index, i]) / total
+            for j in range(3):
+                covariances[row, i, j] = c[i, j]
+        for label in range(classes.shape[1]):
+            classes[row, label] = (
+                seen * classes[row, label] + seen_now * new_classes[index, label]
+            ) / (seen + seen_now)
+        weights[row] = total
+        observations[row] = seen + seen_now
+    return -1

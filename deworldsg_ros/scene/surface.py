@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
@@ -43,13 +44,22 @@ def content_hashes(points: Float32) -> UInt64:
     """64-bit hash (n,) of each point (n, 3), a function of its float32 values alone."""
     # Adding zero turns -0.0 into 0.0: equal values hash alike.
     bits = (np.ascontiguousarray(points, np.float32) + np.float32(0)).view(np.uint32)
-    state = np.zeros(len(bits), np.uint64)
-    for axis in range(3):
-        state = (state ^ bits[:, axis]) + _GOLDEN_GAMMA
-        state = (state ^ (state >> np.uint64(30))) * _MIX_1
-        state = (state ^ (state >> np.uint64(27))) * _MIX_2
-        state ^= state >> np.uint64(31)
-    return state
+    hashes: UInt64 = _mix(bits)
+    return hashes
+
+
+@njit(cache=True, nogil=True)
+def _mix(bits):  # type: ignore[no-untyped-def]
+    hashes = np.empty(len(bits), np.uint64)
+    for row in range(len(bits)):
+        state = np.uint64(0)
+        for axis in range(3):
+            state = (state ^ np.uint64(bits[row, axis])) + _GOLDEN_GAMMA
+            state = (state ^ (state >> np.uint64(30))) * _MIX_1
+            state = (state ^ (state >> np.uint64(27))) * _MIX_2
+            state ^= state >> np.uint64(31)
+        hashes[row] = state
+    return hashes
 
 
 def hash_each(point_sets: tuple[Float32, ...]) -> list[HashedPoints]:
