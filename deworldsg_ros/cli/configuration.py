@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,11 @@ def _put(config: Config, setting: str) -> Config:
         known = ", ".join(mapping.get(section, mapping))
         raise ConfigurationError(f"--set {setting}: there is no {name}; known are {known}")
     mapping[section][field] = _value(text, mapping[section][field])
-    return from_mapping(mapping, f"--set {setting}")
+    try:
+        return from_mapping(mapping)
+    except ConfigurationError as error:
+        described = next(line for path, line in _described_fields() if path == (section, field))
+        raise ConfigurationError(f"--set {setting}: no value of {name}, {described}") from error
 
 
 def _value(text: str, current: Any) -> Any:
@@ -61,17 +66,22 @@ def described_yaml(config: Config) -> str:
     """ROS parameter file of a configuration, each field under its description and range."""
     lines = ["/**:", "  ros__parameters:"]
     mapping = to_mapping(config)
+    for (section, field), description in _described_fields():
+        if f"    {section}:" not in lines:
+            kind = type(getattr(config, section))
+            lines += [f"    # {(kind.__doc__ or '').strip()}", f"    {section}:"]
+        value = msgspec.yaml.encode(mapping[section][field]).decode()
+        # A document that is one plain value ends with a line of three dots.
+        lines += [f"      # {description}", f"      {field}: {value.splitlines()[0]}"]
+    return "\n".join(lines) + "\n"
+
+
+def _described_fields() -> Iterator[tuple[tuple[str, str], str]]:
+    """Section, field and description of everything that can be configured."""
     sections: Any = msgspec.inspect.type_info(Config)
     for section in sections.fields:
-        kind = section.type.cls
-        lines.append(f"    # {(kind.__doc__ or '').strip()}")
-        lines.append(f"    {section.name}:")
         for field in section.type.fields:
-            lines.append(f"      # {_description(field.type)}")
-            value = msgspec.yaml.encode(mapping[section.name][field.name]).decode()
-            # A document that is one plain value ends with a line of three dots.
-            lines.append(f"      {field.name}: {value.splitlines()[0]}")
-    return "\n".join(lines) + "\n"
+            yield (section.name, field.name), _description(field.type)
 
 
 def _description(metadata: Any) -> str:
