@@ -86,3 +86,18 @@ def test_each_set_of_a_frame_is_hashed_alike() -> None:
     for points, together in zip(sets, hash_each(sets)):
         assert same(together, hashed(points))
     assert hash_each(()) == []
+
+
+def test_some_points_are_points_of_the_surface() -> None:
+    rng = np.random.default_rng(5)
+    reservoir = SurfaceReservoir(20)
+    assert reservoir.some_points(8).shape == (0, 3)
+    known: set[tuple[float, ...]] = set()
+    for count in (3, 30, 10):
+        points = rng.normal(size=(count, 3)).astype(np.float32)
+        known |= set(map(tuple, points.tolist()))
+        reservoir.add(hash_each((points,))[0])
+        some = reservoir.some_points(8)
+        assert len(some) == min(8, len(known))
+        assert set(map(tuple, some.tolist())) <= known
+    assert len(reservoir.points_world) == 20

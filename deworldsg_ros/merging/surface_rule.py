@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging.absence import SeenThrough, look
+from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough, look
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
 from deworldsg_ros.merging.joint import JointEvidence
@@ -149,8 +149,8 @@ class SurfaceMerging:
             return
         # What is seen need not be looked for: its points are renewed when it is out of sight.
         for owner in self._changed - seen:
-            row = graph.nodes.row(self._owners.node(owner))
-            self._through.renew(owner, graph.nodes.surfaces[row].points_world)
+            surface = graph.nodes.surfaces[graph.nodes.row(self._owners.node(owner))]
+            self._through.renew(owner, surface.some_points(SAMPLED_POINTS))
         self._changed = seen
         for owner in self._through.look(local.T_world_camera, local.depth_grid, list(seen)):
             # Of two that are gone, the one may just have become the other.

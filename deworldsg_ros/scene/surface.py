@@ -143,6 +143,11 @@ class SurfaceReservoir:
         """(k, 3) float32, metres; in the sample's order."""
         return self.sample.points_world
 
+    def some_points(self, count: int) -> Float32:
+        """As many points (k, 3) of the surface, or all; those that wait may be left out."""
+        enough = len(self._sample.hashes) >= count
+        return (self._sample if enough else self.sample).points_world[:count]
+
     def _merge_in(self) -> None:
         points = HashedPoints(
             np.concatenate([points.hashes for points in self._waiting]),
