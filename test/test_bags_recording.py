@@ -25,6 +25,7 @@ from deworldsg_ros.bags.messages import Role
 from deworldsg_ros.bags.recording import open_recording, open_source
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bags.writer import write_mcap
+from deworldsg_ros.bridge.poses import stamp_ns_of
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.camera import invert_pose
 
@@ -163,7 +164,7 @@ def test_slop_of_the_configuration_decides_what_belongs_together(tmp_path):
     items = camera_items(3)
     for topic, _, _, message in items:
         if "depth" in topic:
-            message.header = ros.header(ros.stamp_ns_of(message) + 30_000_000, CAMERA)
+            message.header = ros.header(stamp_ns_of(message) + 30_000_000, CAMERA)
     bag = write_bag(tmp_path / "bag", items)
     assert len(frames_of(bag)[0]) == 0
     assert len(frames_of(bag, inputs=InputsConfig(slop_s=0.04))[0]) == 3

@@ -91,7 +91,6 @@ def test_poses_may_come_in_any_order(order: list[int]) -> None:
     buffer = PoseBuffer(SLOP)
     for step in order:
         buffer.add(T0 + step * 10 * MS, at(float(step)))
-    assert buffer.newest_ns == T0 + 70 * MS
     assert buffer.at(T0 + 35 * MS)[0, 3] == pytest.approx(3.5)
 
 

@@ -13,7 +13,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from deworldsg_ros.bags import events, messages
-from deworldsg_ros.bags.messages import stamp_ns_of
+from deworldsg_ros.bridge.poses import stamp_ns_of
 from deworldsg_ros.bridge.qos import reliable
 
 COUNT = 12

@@ -72,12 +72,6 @@ def encode(message: Any, msgtype: str) -> bytes:
     return bytes(typestore().serialize_cdr(message, msgtype))
 
 
-def stamp_ns_of(message: Any) -> int:
-    """Header time of a message in nanoseconds."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
 def stamp_ns_of_cdr(data: bytes) -> int:
     """Header time of a serialized message whose first field is its header, without decoding it."""
     sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)

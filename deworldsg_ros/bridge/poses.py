@@ -68,11 +68,6 @@ class PoseBuffer:
     def __len__(self) -> int:
         return len(self._stamps_ns)
 
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest pose."""
-        return self._stamps_ns[-1] if self._stamps_ns else None
-
     def add(self, stamp_ns: int, T: Float64) -> None:
         """Keep a pose; one with the same stamp is replaced."""
         row = bisect_left(self._stamps_ns, stamp_ns)

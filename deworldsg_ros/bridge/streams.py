@@ -39,7 +39,6 @@ class Stream(Generic[T]):
         self.newest_ns: int | None = None
         self._fresh = False
         self._heard_ns: int | None = None
-        self.received = 0
 
     def __len__(self) -> int:
         return len(self._items)
@@ -67,7 +66,6 @@ class Stream(Generic[T]):
     def heard(self) -> None:
         """Note that a message came, good or bad."""
         self._fresh = True
-        self.received += 1
 
     def first(self) -> _Item[T]:
         """The oldest item."""

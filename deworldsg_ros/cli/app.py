@@ -15,7 +15,7 @@ from deworldsg_ros import __version__
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import EXIT_INTERRUPTED, models, probe
 from deworldsg_ros.cli.evaluate import evaluate
-from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 # Bad usage, a bad configuration, a recording that cannot be used.
@@ -171,7 +171,7 @@ def run(
             settings or [],
             max_frames=max_frames,
             topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=_dataset_options(rate, intrinsics, depth_source),
+            options=DatasetOptions(rate, parse_intrinsics(intrinsics), depth_source),
             poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
             temporal=temporal,
             trajectory_out=save_trajectory,
@@ -213,7 +213,7 @@ def demo(
             settings or [],
             rate=rate,
             topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=_dataset_options(0.0, intrinsics),
+            options=DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
             console=Console(),
         )
 
@@ -246,7 +246,7 @@ def convert(
             source,
             output,
             topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=_dataset_options(rate, intrinsics, depth_source),
+            options=DatasetOptions(rate, parse_intrinsics(intrinsics), depth_source),
             console=Console(),
         )
 
@@ -258,9 +258,6 @@ def info(recording: RecordingPath) -> None:
         from deworldsg_ros.cli.info import show_recording
 
         show_recording(recording, Console())
-
-
-app.command("topics", help="The same as info.", hidden=True)(info)
 
 
 @app.command("config")
@@ -280,15 +277,3 @@ for function, summary in (
 ):
     app.command(short_help=summary)(_telling_errors()(function))
 app.add_typer(models.app)
-
-
-def _dataset_options(rate_hz: float, intrinsics: str, depth_source: str = "auto") -> DatasetOptions:
-    if not intrinsics:
-        return DatasetOptions(rate_hz, depth_source=depth_source)
-    try:
-        fx, fy, cx, cy = (float(word) for word in intrinsics.split(","))
-    except ValueError as error:
-        raise typer.BadParameter(
-            f"'{intrinsics}' is not FX,FY,CX,CY: wanted four numbers, in pixels"
-        ) from error
-    return DatasetOptions(rate_hz, (fx, fy, cx, cy), depth_source)

@@ -50,6 +50,19 @@ class DatasetOptions:
             )
 
 
+def parse_intrinsics(text: str) -> tuple[float, float, float, float] | None:
+    """fx, fy, cx, cy of ``FX,FY,CX,CY``, None of an empty text; raises RecordingError."""
+    if not text:
+        return None
+    try:
+        fx, fy, cx, cy = map(float, text.split(","))
+    except ValueError as error:
+        raise RecordingError(
+            f"intrinsics '{text}': wanted FX,FY,CX,CY, four numbers in pixels"
+        ) from error
+    return fx, fy, cx, cy
+
+
 class Dataset(ABC):
     """A folder as a `Source` of messages.
 

@@ -86,7 +86,6 @@ class PipelineMonitor:
         self._refused_frames = 0
         self._complete_since_s: float | None = None
         self._heard_s: float | None = None
-        self._now_s = 0.0
         node.create_subscription(String, "deworldsg/local_graph", self._on_local, reliable(50))
         node.create_subscription(
             String, "deworldsg/relation_evidence", self._on_evidence, reliable(50)
@@ -138,7 +137,6 @@ class PipelineMonitor:
 
     def silent_for(self, now_s: float) -> float:
         """Seconds since the last sign of progress, or since this was first asked."""
-        self._now_s = now_s
         if self._heard_s is None:
             self._heard_s = now_s
         return now_s - self._heard_s

@@ -33,7 +33,7 @@ from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bags.writer import topic_of
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.config import Config, load_config
-from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.nodes.replay_monitor import SETTLE_S, Endpoint, PipelineMonitor
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
@@ -146,11 +146,6 @@ class ReplayNode(Node):  # type: ignore[misc]
                 "parameter recording is empty: wanted -p recording:=BAG_OR_FOLDER"
             )
         config = load_config(settings["config"]) if settings["config"] else Config()
-        numbers = [float(word) for word in settings["intrinsics"].split(",") if word]
-        if len(numbers) not in (0, 4):
-            raise ConfigurationError(
-                f"parameter intrinsics is '{settings['intrinsics']}': wanted FX,FY,CX,CY"
-            )
         return open_source(
             Path(settings["recording"]),
             topics=TopicChoice(
@@ -161,8 +156,7 @@ class ReplayNode(Node):  # type: ignore[misc]
             ),
             inputs=config.inputs,
             options=DatasetOptions(
-                float(settings["frame_rate"]),
-                (numbers[0], numbers[1], numbers[2], numbers[3]) if numbers else None,
+                float(settings["frame_rate"]), parse_intrinsics(settings["intrinsics"])
             ),
         )
 

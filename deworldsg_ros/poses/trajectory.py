@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from deworldsg_ros.scene.camera import (
     Float64,
     check_pose,
     interpolate_pose,
-    invert_pose,
     pose_from_quaternion,
     quaternion_from_rotation,
 )
@@ -68,11 +67,6 @@ class Trajectory:
         key = place if self.kind == "kitti" else number
         row = bisect_left(self.keys, key)
         return self.T_world_cameras[row] if self.keys[row : row + 1] == (key,) else None
-
-    def starting_at(self, T_world_first: Float64) -> Trajectory:
-        """The same motion, with this (4, 4) as the first pose: a tracker's world made another's."""
-        moved = T_world_first @ invert_pose(self.T_world_cameras[0]) @ self.T_world_cameras
-        return replace(self, T_world_cameras=moved)
 
     def _at_stamp(self, stamp_ns: int, slop_ns: int) -> Float64 | None:
         keys, poses = self.keys, self.T_world_cameras
