@@ -24,8 +24,9 @@ import transformers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from deworldsg_ros.checkpoints import choose_device, choose_dtype
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.backbone import FrozenBackbone, choose_device, choose_dtype, quantise
+from deworldsg_ros.relations.backbone import FrozenBackbone, quantise
 from deworldsg_ros.relations.probe import BackboneIdentity
 from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -192,7 +193,7 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     try:
-        device = choose_device(options.device)
+        device = choose_device("--device", options.device)
     except ConfigurationError as error:
         sys.exit(f"error: {error}")
     choice = Choice(device, choose_dtype(device), options.batch_size, options.quantise)

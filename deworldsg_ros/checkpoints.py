@@ -5,7 +5,7 @@ Imported by a backend that needs torch, and only when it is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,8 +89,13 @@ class CheckpointSource:
             )
         return found
 
-    def load(self, model_class: Any, config: Any) -> Any:
+    def load(self, model_class: Any, config: Any, unused: Sequence[str] = ()) -> Any:
         """The network, whole, frozen, in float32 on the CPU.
+
+        Args:
+            model_class: of transformers.
+            config: the checkpoint's, from `config`.
+            unused: prefixes of parameters that need not be there.
 
         Raises:
             ConfigurationError: it cannot be read, or is not whole.
@@ -110,7 +115,7 @@ class CheckpointSource:
                 raise
             except Exception as error:
                 raise ConfigurationError(self._cannot_load(error)) from error
-        missing = sorted(report["missing_keys"])
+        missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(unused)))
         if missing:
             raise ConfigurationError(
                 f"{self.parameter} '{self.name}' lacks {len(missing)} parameters of "
@@ -139,6 +144,15 @@ def choose_device(parameter: str, wanted: str) -> torch.device:
             "'auto' or 'cpu', or install a CUDA build of torch and its driver"
         )
     return torch.device("cuda" if there and wanted != "cpu" else "cpu")
+
+
+def choose_dtype(device: torch.device) -> torch.dtype:
+    """float16 on CUDA, float32 on a CPU, for every network.
+
+    Of the two half precisions float16 has the finer numbers, which boxes and masks need, and every
+    CUDA device computes with it; bfloat16 is emulated before Ampere.
+    """
+    return torch.float16 if device.type == "cuda" else torch.float32
 
 
 def is_out_of_memory(error: BaseException) -> bool:

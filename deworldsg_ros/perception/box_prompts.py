@@ -9,7 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from deworldsg_ros.checkpoints import CheckpointSource, choose_device, enough_memory
+from deworldsg_ros.checkpoints import (
+    CheckpointSource,
+    choose_device,
+    choose_dtype,
+    enough_memory,
+)
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.image_tensors import IMAGENET_MEAN, IMAGENET_STD
 from deworldsg_ros.perception.protocols import MaskPatch
@@ -45,7 +50,7 @@ class BoxPromptedSegmenter(ABC):
             local_files_only=config.local_files_only,
         )
         self.device = choose_device("perception.device", config.device)
-        self.dtype = torch.float16 if self.device.type == "cuda" else torch.float32
+        self.dtype = choose_dtype(self.device)
         self._chunk = config.sam_box_batch
         model, self.image_size = self._load(source, config.sam_image_size)
         with enough_memory("loading the segmenter", TOO_LITTLE_MEMORY):

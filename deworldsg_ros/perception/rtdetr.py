@@ -12,7 +12,12 @@ import torch
 from numpy.typing import NDArray
 from transformers import RTDetrForObjectDetection, RTDetrV2ForObjectDetection
 
-from deworldsg_ros.checkpoints import CheckpointSource, choose_device, enough_memory
+from deworldsg_ros.checkpoints import (
+    CheckpointSource,
+    choose_device,
+    choose_dtype,
+    enough_memory,
+)
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.checkpoint_card import (
     CARD_FILE,
@@ -58,7 +63,7 @@ class RtDetrDetector:
         )
         self.device = choose_device("perception.device", config.device)
         # Half precision: of the two kinds the one that still tells neighbouring pixels apart.
-        self.dtype = torch.float16 if self.device.type == "cuda" else torch.float32
+        self.dtype = choose_dtype(self.device)
         network = self.source.config(ARCHITECTURES)
         self.card = _effective_card(read_card(self.source.file(CARD_FILE)), config)
         self.classes = _class_names(network, self.card, self.source)

@@ -1,20 +1,24 @@
-"""Frozen backbones on torch: device, precision, loading, and clips in, features out."""
+"""Frozen backbones on torch: clips in, features out."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
-import transformers
 from numpy.typing import NDArray
 
+from deworldsg_ros.checkpoints import (
+    CheckpointSource,
+    choose_device,
+    choose_dtype,
+    enough_memory,
+)
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.preprocessing import ClipGeometry, normalise, resize_and_crop
 from deworldsg_ros.relations.probe import BackboneIdentity
@@ -24,6 +28,10 @@ Float32 = NDArray[np.float32]
 
 # Values of each tensor that its fingerprint is made of.
 FINGERPRINT_SAMPLES = 64
+REMEDY = (
+    "lower relations.batch_size or relations.image_size, choose a smaller checkpoint, or free the "
+    "device"
+)
 
 
 @dataclass(frozen=True)
@@ -72,7 +80,7 @@ class FrozenBackbone:
         if not clips:
             return np.zeros((0, self.identity.feature_dim), np.float32)
         on_cuda = self.device.type == "cuda"
-        with enough_memory(f"encoding {len(clips)} clips"), torch.inference_mode():
+        with enough_memory(f"encoding {len(clips)} clips", REMEDY), torch.inference_mode():
             images = torch.stack([resize_and_crop(clip, self.geometry) for clip in clips])
             if on_cuda:
                 images = images.pin_memory().to(self.device, non_blocking=True)
@@ -80,31 +88,11 @@ class FrozenBackbone:
             return features.to("cpu", torch.float32).numpy()
 
 
-def choose_device(wanted: str) -> torch.device:
-    """`auto`, `cpu` or `cuda` as a device; raises ConfigurationError where there is no CUDA."""
-    there = torch.cuda.is_available()
-    if wanted == "cuda" and not there:
-        raise ConfigurationError(
-            f"relations.device is 'cuda' and torch {torch.__version__} finds no CUDA device: set "
-            "it to 'auto' or 'cpu', or install a CUDA build of torch and its driver"
-        )
-    return torch.device("cuda" if there and wanted != "cpu" else "cpu")
-
-
-def choose_dtype(device: torch.device) -> torch.dtype:
-    """Half precision on CUDA, of the kind that the device computes with; float32 on a CPU."""
-    if device.type != "cuda":
-        return torch.float32
-    # The backbones were trained in bfloat16; before Ampere it is only emulated.
-    major, _ = torch.cuda.get_device_capability(device)
-    return torch.bfloat16 if major >= 8 else torch.float16
-
-
 def load_checkpoint(
     config: RelationsConfig,
     family: str,
     model_class: Any,
-    changes: Callable[[Any], dict[str, int]] = lambda _: {},
+    changes: Mapping[str, int] = MappingProxyType({}),
     unused: Sequence[str] = (),
 ) -> torch.nn.Module:
     """A pretrained model of `transformers`, whole and frozen, on the CPU in float32.
@@ -113,46 +101,19 @@ def load_checkpoint(
         config: section ``relations``.
         family: model type that the checkpoint must have.
         model_class: class that it is loaded into.
-        changes: fields of its configuration to set, given that configuration.
+        changes: fields of its configuration to set.
         unused: prefixes of parameters that need not be there.
 
     Raises:
         ConfigurationError: where there is no checkpoint, or it is another model's, or not whole.
     """
-    source = _source(config)
-    options = {"local_files_only": config.local_files_only}
-    logging: Any = transformers.utils.logging
-    logging.disable_progress_bar()
-    with enough_memory(f"loading '{source}'"):
-        try:
-            found = transformers.AutoConfig.from_pretrained(source, **options)
-        except Exception as error:  # transformers raises whatever its parts raise
-            raise ConfigurationError(_cannot_load(config, source, error)) from error
-        if found.model_type != family:
-            raise ConfigurationError(
-                f"relations.model_path '{source}' is a {found.model_type} checkpoint: world model "
-                f"'{family}' wants one of {family}"
-            )
-        try:
-            model, report = model_class.from_pretrained(
-                source,
-                **options,
-                **changes(found),
-                dtype=torch.float32,
-                output_loading_info=True,
-            )
-        except (ConfigurationError, MemoryError, torch.OutOfMemoryError):
-            raise
-        except Exception as error:
-            raise ConfigurationError(_cannot_load(config, source, error)) from error
-    missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(unused)))
-    if missing:
-        raise ConfigurationError(
-            f"checkpoint '{source}' lacks {len(missing)} parameters of {model_class.__name__}, "
-            f"first '{missing[0]}': get it again, or choose the checkpoint of the whole backbone"
-        )
-    module: torch.nn.Module = model
-    return module.eval().requires_grad_(False)
+    source = CheckpointSource.find(
+        "relations.model_path", config.model_path, local_files_only=config.local_files_only
+    )
+    settings = source.config([family])
+    settings.update(dict(changes))
+    model: torch.nn.Module = source.load(model_class, settings, unused)
+    return model
 
 
 def place(
@@ -163,11 +124,11 @@ def place(
     Raises:
         ConfigurationError: no CUDA, no memory, or quantisation that is not to be had.
     """
-    device = choose_device(config.device)
+    device = choose_device("relations.device", config.device)
     dtype = choose_dtype(device)
     if config.quantise:
         return quantise(model, device), device, dtype
-    with enough_memory(f"moving the backbone to {device}"):
+    with enough_memory(f"moving the backbone to {device}", REMEDY):
         return model.to(device, dtype), device, dtype
 
 
@@ -200,47 +161,3 @@ def fingerprint(model: torch.nn.Module) -> str:
         digest.update(f"{name} {tuple(value.shape)}".encode())
         digest.update(sample.astype("<f4").tobytes())
     return digest.hexdigest()[:16]
-
-
-@contextmanager
-def enough_memory(what: str) -> Iterator[None]:
-    """Turn running out of memory, of whichever device, into a ConfigurationError."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
-            "can't allocate memory" in str(error) or "out of memory" in str(error)
-        ):
-            raise ConfigurationError(
-                f"out of memory while {what}: lower relations.batch_size or relations.image_size, "
-                "choose a smaller checkpoint, or free the device"
-            ) from error
-        raise
-
-
-def _source(config: RelationsConfig) -> str:
-    path = config.model_path
-    if not path:
-        raise ConfigurationError(
-            f"relations.model_path is empty: world model '{config.world_model}' wants the folder "
-            "or hub id of a checkpoint; docs/models.md tells where to get one"
-        )
-    folder = Path(path).expanduser()
-    if folder.is_dir():
-        return str(folder)
-    if path.startswith(("/", "~", ".")) or path.count("/") != 1:
-        raise ConfigurationError(
-            f"relations.model_path '{path}': there is no such folder; wanted one with config.json "
-            "and model.safetensors, or a hub id"
-        )
-    return path
-
-
-def _cannot_load(config: RelationsConfig, source: str, error: Exception) -> str:
-    first_line = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-    hint = "wanted a folder with config.json and model.safetensors of transformers' format"
-    if not Path(source).is_dir():
-        hint = "download it to a folder and name that"
-        if config.local_files_only:
-            hint += ", or set relations.local_files_only to false"
-    return f"checkpoint '{source}' cannot be loaded ({first_line}): {hint}"

@@ -29,9 +29,7 @@ def load_backbone(config: RelationsConfig) -> FrozenBackbone:
     """
     # The rotary positions follow the configured size of the image: it is set, not the checkpoint's.
     changes = {"crop_size": config.image_size} if config.image_size else {}
-    model: Any = load_checkpoint(
-        config, FAMILY, VJEPA2Model, lambda _: changes, unused=("predictor.",)
-    )
+    model: Any = load_checkpoint(config, FAMILY, VJEPA2Model, changes, unused=("predictor.",))
     settings = model.config
     _check(settings, config)
     model.predictor = torch.nn.Identity()
