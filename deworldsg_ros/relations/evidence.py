@@ -33,8 +33,10 @@ Provenance = Literal["visual", "prior", "fused"]
 PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
 _VISUAL, _PRIOR, _FUSED = range(3)
 
-# Entropies closer than this are equal: the order in which predictions were summed must not choose.
-ENTROPY_TIE_NATS = 1e-9
+# Entropies closer than this are equal. The prior is a running mean: with less, an edge would turn
+# round again and again as predictions come in. Where the prior alone speaks, over 50 predicates and
+# at the paper's weight, it is what a greatest probability of 0.8 has over one of 0.7.
+ENTROPY_TIE_NATS = 0.1
 
 
 def visual_distribution(summed_logits: Float64) -> Float64:
@@ -191,8 +193,8 @@ def choose_directions(
 
     The prior completes both directions of a pair, usually with a predicate and something like its
     inverse. A direction that nothing was seen of is told only where nothing was seen of the other
-    either, and then only the one whose distribution has less entropy; on a tie, the one with the
-    smaller subject id.
+    either, and then only the one whose distribution has clearly less entropy (0.1 nats); else the
+    one with the smaller subject id.
 
     Args:
         edges: (E, 2) subject and object ids, each directed edge at most once, any order.
