@@ -1,7 +1,8 @@
 """deworldsg_ros on an Intel RealSense: its topic names, everything else as in deworldsg.launch.py.
 
-Start the camera with depth aligned to colour (align_depth.enable:=true). The pose comes from your
-odometry or SLAM: from TF, or pose:=/my/odometry. Without either, odometry:=true makes it.
+Start the camera with depth aligned to colour and of its stamps (align_depth.enable:=true
+enable_sync:=true). The pose comes from your odometry or SLAM: from TF, or pose:=/odom. Without
+either, odometry:=true makes it.
 """
 
 from __future__ import annotations
@@ -13,35 +14,27 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
 CAMERA_TOPICS = {
-    "rgb": "/camera/camera/color/image_raw",
-    "camera_info": "/camera/camera/color/camera_info",
-    "depth": "/camera/camera/aligned_depth_to_color/image_raw",
+    "rgb": "/color/image_raw",
+    "camera_info": "/color/camera_info",
+    "depth": "/aligned_depth_to_color/image_raw",
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    launch_file = PathJoinSubstitution(
-        [FindPackageShare("deworldsg_ros"), "launch", "deworldsg.launch.py"]
+    camera = DeclareLaunchArgument(
+        "camera",
+        default_value="/camera/camera",
+        description="namespace and name of the camera node; of older drivers /camera",
     )
-    arguments = [
-        DeclareLaunchArgument(
-            "pose", default_value="camera/pose", description="topic of the poses; or use TF"
-        ),
-        DeclareLaunchArgument(
-            "odometry",
-            default_value="false",
-            choices=["true", "false"],
-            description="start odometry_node, which makes the poses out of the images",
-        ),
-        *(
-            DeclareLaunchArgument(name, default_value=topic, description=f"the camera's {topic}")
-            for name, topic in CAMERA_TOPICS.items()
-        ),
-    ]
     nodes = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(launch_file),
+        PythonLaunchDescriptionSource(
+            PathJoinSubstitution(
+                [FindPackageShare("deworldsg_ros"), "launch", "deworldsg.launch.py"]
+            )
+        ),
+        # What else is given on the command line reaches the included file by itself.
         launch_arguments=[
-            (name, LaunchConfiguration(name)) for name in ("pose", "odometry", *CAMERA_TOPICS)
+            (name, [LaunchConfiguration("camera"), topic]) for name, topic in CAMERA_TOPICS.items()
         ],
     )
-    return LaunchDescription([*arguments, nodes])
+    return LaunchDescription([camera, nodes])

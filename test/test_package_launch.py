@@ -97,17 +97,18 @@ def test_every_launch_configuration_is_a_declared_argument(
     }
 
 
-def test_realsense_passes_its_topics_on(
+def test_realsense_passes_the_topics_of_its_camera_on(
     root_dir: Path, launch_classes: dict[str, type[Kept]]
 ) -> None:
     path = root_dir / "launch" / "realsense.launch.py"
+    (camera,) = describe(path, launch_classes, "DeclareLaunchArgument")
     (include,) = describe(path, launch_classes, "IncludeLaunchDescription")
-    passed = {name: value.args[0] for name, value in include.kwargs["launch_arguments"]}
-    declared = {
-        entity.args[0]: entity.kwargs["default_value"]
-        for entity in describe(path, launch_classes, "DeclareLaunchArgument")
+    passed = {name: parts for name, parts in include.kwargs["launch_arguments"]}
+    assert all(prefix.args == ("camera",) for prefix, _ in passed.values())
+    assert {
+        name: camera.kwargs["default_value"] + topic for name, (_, topic) in passed.items()
+    } == {
+        "rgb": "/camera/camera/color/image_raw",
+        "camera_info": "/camera/camera/color/camera_info",
+        "depth": "/camera/camera/aligned_depth_to_color/image_raw",
     }
-    assert passed == {name: name for name in declared}
-    assert declared["rgb"] == "/camera/camera/color/image_raw"
-    assert declared["depth"] == "/camera/camera/aligned_depth_to_color/image_raw"
-    assert declared["camera_info"] == "/camera/camera/color/camera_info"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import signal
-import sys
 import threading
 import time
 import traceback
@@ -14,16 +12,16 @@ from typing import Any
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
 from deworldsg_ros.bridge.health import INTERNAL_ERROR, Health
 from deworldsg_ros.bridge.parameters import declare
+from deworldsg_ros.bridge.process import run_process
 from deworldsg_ros.bridge.qos import AutoSubscription, Source, reliable
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.errors import RefusedInput
 
 CHECK_PERIOD_S = 0.25
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -185,38 +183,21 @@ class StageNode(Node):  # type: ignore[misc]
 
 
 def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; returns the exit code.
+    """Run a node until SIGINT or SIGTERM; returns the exit code, see `run_process`."""
 
-    Returns:
-        0 after a signal, 2 for a configuration that cannot be used.
-    """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    # Our handlers, not rclpy's: those shut the context down while callbacks still publish.
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # a parameter file that cannot be read, a bad --ros-args
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    node = None
-    try:
+    def body(stop: threading.Event) -> int:
         node = make_node()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        node.get_logger().info("ready")
-        while not stop.is_set() and rclpy.ok():
-            with node.refusing():
-                executor.spin_once(timeout_sec=SPIN_PERIOD_S)
-        executor.shutdown(timeout_sec=1.0)
-    except ConfigurationError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
+        try:
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            node.get_logger().info("ready")
+            while not stop.is_set() and rclpy.ok():
+                with node.refusing():
+                    executor.spin_once(timeout_sec=SPIN_PERIOD_S)
+            executor.shutdown(timeout_sec=1.0)
+        finally:
             node.close()
             node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+        return 0
+
+    return run_process(body, args)

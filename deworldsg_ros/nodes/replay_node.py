@@ -7,20 +7,17 @@ of it that nothing is lost on a slow machine.
 
 from __future__ import annotations
 
-import signal
 import sys
 import threading
 import time
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
@@ -31,6 +28,7 @@ from deworldsg_ros.bags.recording import open_source
 from deworldsg_ros.bags.source import RawRoleMessage
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bags.writer import topic_of
+from deworldsg_ros.bridge.process import refuse, run_process
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
@@ -67,7 +65,6 @@ PUBLISHER_DEPTH = 10
 TELL_PERIOD_S = 0.2
 # The longest that a signal waits to be noticed.
 SPIN_PERIOD_S = 0.1
-EXIT_CONFIGURATION = 2
 EXIT_NOT_READY = 3
 
 
@@ -273,28 +270,21 @@ class ReplayNode(Node):  # type: ignore[misc]
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; 0 at the end or after a signal, 2 for what cannot be used, 3 if not ready."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    node = None
-    try:
+
+    def body(stop: threading.Event) -> int:
         node = ReplayNode(stop)
-        node.replay()
-    except NotReady as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_NOT_READY
-    except DeWorldSGError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_CONFIGURATION
-    except (Stopped, KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
+        try:
+            node.replay()
+        except NotReady as error:
+            return refuse(error, EXIT_NOT_READY)
+        except Stopped:
+            pass
+        finally:
             node.close()
             node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
+        return 0
+
+    return run_process(body, args)
 
 
 if __name__ == "__main__":
