@@ -17,8 +17,11 @@ from pair_rooms import render_room  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from deworldsg_ros.cli.app import app  # noqa: E402
+from deworldsg_ros.cli.probe import read_predicates  # noqa: E402
+from deworldsg_ros.perception.checkpoint_card import CheckpointCard, write_card  # noqa: E402
 from deworldsg_ros.perception.vocabularies import REPLICA_SSG_PREDICATES  # noqa: E402
 from deworldsg_ros.relations.probe_network import load_probe  # noqa: E402
+from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 NAMES = ("above", "on")
 
@@ -85,7 +88,7 @@ def test_a_probe_from_a_data_set(tmp_path):
         ({"model": "/absent"}, "there is no such folder"),
         ({"world-model": "fake"}, "wanted vjepa2 or dinov2"),
         ({"layout": "three"}, "wanted two_layer or batch_norm"),
-        ({"predicates": "/absent"}, "wanted replica_ssg, 3dssg, or a file"),
+        ({"predicates": "/absent"}, "wanted replica_ssg, 3dssg, a file"),
         ({"predicates": "3dssg"}, "which is none of the 7 of the chosen set"),
     ],
 )
@@ -125,3 +128,11 @@ def test_a_published_probe_is_imported(tmp_path):
     wrong = run("import-probe", tmp_path / "p.pt", tmp_path / "out2")
     assert wrong.exit_code == 2 and "50 predicates" in wrong.output
     assert not (tmp_path / "out2").exists()
+
+
+def test_predicates_are_those_of_an_imported_checkpoint(tmp_path):
+    write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=("on", "near")))
+    assert read_predicates(str(tmp_path)) == ("on", "near")
+    write_card(tmp_path / "deworldsg.json", CheckpointCard())
+    with pytest.raises(ConfigurationError, match="checkpoint with a relation head"):
+        read_predicates(str(tmp_path))

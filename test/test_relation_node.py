@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
+import pytest
+import rclpy
 from nodes_bench import Bench, changed, local_graph, rgb
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.nodes import relation_node
 from deworldsg_ros.nodes.relation_node import RelationNode
+from deworldsg_ros.perception.checkpoint_card import CheckpointCard, write_card
+from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import ConfigurationError
 
 WORLD_MODEL = [
     Parameter("relations.world_model", value="fake"),
@@ -103,3 +111,47 @@ def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
         assert "dropped internal_error" not in at.node.health.drops
     finally:
         at.close()
+
+
+def start(**overrides: str) -> RelationNode:
+    """The node as it starts with a world model and parameters, named with __ for a dot."""
+    parameters = [
+        Parameter(name.replace("__", "."), value=value) for name, value in overrides.items()
+    ]
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        node = RelationNode(context=context, parameter_overrides=[*WORLD_MODEL, *parameters])
+        node.close()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+    return node
+
+
+class Bound(FakeWorldModel):
+    """A world model of certain predicates, as one with a probe is."""
+
+    def require_predicates(self, predicates: tuple[str, ...]) -> None:
+        if predicates != ("on", "under"):
+            raise ConfigurationError(f"the probe was trained on others than {predicates}")
+
+
+def test_predicates_of_an_imported_checkpoint_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The relation node runs no perception, and may run where its checkpoint is not."""
+    monkeypatch.setattr(relation_node, "build_world_model", lambda config: Bound(4, 0))
+    chosen = {"perception__predicate_set": "checkpoint"}
+    for predicates in (("on", "under"), ("on", "near"), ()):
+        write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
+        if predicates == ("on", "under"):
+            start(**chosen, perception__detector_path=str(tmp_path))
+            start(**chosen, perception__relation_head_path=str(tmp_path))
+            continue
+        told = "trained on others" if predicates else "names no predicates"
+        with pytest.raises(ConfigurationError, match=told):
+            start(**chosen, perception__detector_path=str(tmp_path))
+    start(**chosen, perception__detector_path="somebody/elsewhere")
+    with pytest.raises(ConfigurationError, match="trained on others"):
+        start(perception__predicate_set="3dssg")

@@ -220,9 +220,11 @@ def test_choice_of_directions_equals_the_reference(seed):
         assert chosen[row] == wanted
 
 
-def test_rounding_does_not_choose_a_direction():
+@pytest.mark.parametrize("difference", [1e-14, 0.02])
+def test_neither_rounding_nor_one_more_prediction_turns_an_edge_round(difference):
     """Two priors that were summed in another order differ in their last bits."""
-    almost = np.array([UNSURE, UNSURE]) + np.array([[0.0, 0, 0], [1e-14, -1e-14, 0]])
+    almost = np.array([UNSURE, UNSURE])
+    almost[1] += (difference, -difference, 0)
     for probabilities in (almost, almost[::-1]):
         chosen = choose_directions([(1, 2), (2, 1)], np.zeros(2, bool), probabilities)
         assert chosen.tolist() == [True, False]

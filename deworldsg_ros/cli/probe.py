@@ -11,13 +11,16 @@ import typer
 from rich.console import Console
 
 from deworldsg_ros.config import RelationsConfig, from_mapping
+from deworldsg_ros.perception.checkpoint_card import CARD_FILE, read_card
 from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.scene.errors import ConfigurationError
 
 PredicateSet = Annotated[
     str,
     typer.Option(
-        "--predicates", metavar="SET", help="replica_ssg, 3dssg, or a file with a name a line"
+        "--predicates",
+        metavar="SET",
+        help="replica_ssg, 3dssg, a file with a name a line, or the folder of an imported FROSS",
     ),
 ]
 
@@ -158,15 +161,18 @@ def import_probe(
 
 
 def read_predicates(choice: str) -> tuple[str, ...]:
-    """Names of a set, or of a file; raises ConfigurationError."""
+    """Names of a set, of a file, or of a checkpoint's card; raises ConfigurationError."""
     if choice in PREDICATE_SETS:
         return PREDICATE_SETS[choice]
+    card_path = Path(choice) / CARD_FILE
+    if card_path.is_file() and (names := read_card(card_path).predicates):
+        return names
     try:
         lines = Path(choice).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
-            f"--predicates '{choice}': wanted {', '.join(PREDICATE_SETS)}, or a file with a name a "
-            f"line ({error})"
+            f"--predicates '{choice}': wanted {', '.join(PREDICATE_SETS)}, a file with a name a "
+            f"line, or the folder of an imported checkpoint with a relation head ({error})"
         ) from error
     names = tuple(line.strip() for line in lines if line.strip())
     if not names or len(set(names)) != len(names):

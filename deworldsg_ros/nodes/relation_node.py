@@ -15,7 +15,7 @@ from deworldsg_ros.bridge.joining import JoiningNode
 from deworldsg_ros.bridge.node import run
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.bridge.sync import PairingFrame, RelationAssembler
-from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
+from deworldsg_ros.perception.checkpoint_card import graph_predicates
 from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
@@ -33,7 +33,9 @@ class RelationNode(JoiningNode[PairingFrame]):
         config = self.parameters.relations
         report = self.get_logger().warning
         world_model = build_world_model(config)
-        require_predicates(world_model, PREDICATE_SETS[self.parameters.perception.predicate_set])
+        predicates = graph_predicates(self.parameters.perception)
+        if predicates is not None:  # else the first local graph tells
+            require_predicates(world_model, predicates)
         self._reasoner = RelationReasoner(config, world_model, report)
         self._world_frame = ""
         self._publish = self.json_publisher("deworldsg/relation_evidence", 50)

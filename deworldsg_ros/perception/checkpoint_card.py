@@ -5,6 +5,8 @@ from typing import Annotated, Literal, Union
 
 import msgspec
 
+from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.scene.errors import ConfigurationError
 
 CARD_FILE = "deworldsg.json"
@@ -49,3 +51,27 @@ def read_card(path: Union[Path, None]) -> CheckpointCard:
 def write_card(path: Path, card: CheckpointCard) -> None:
     """Write a card, for people to read, too."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+
+
+def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
+    """The predicates that the graph will have, for who runs no perception.
+
+    Returns:
+        None where only loading the relation head would tell: its checkpoint is no folder here.
+
+    Raises:
+        ConfigurationError: the checkpoint's card cannot be read, or names none.
+    """
+    if config.predicate_set != "checkpoint":
+        return PREDICATE_SETS[config.predicate_set]
+    folder = Path(config.relation_head_path or config.detector_path).expanduser()
+    path = folder / CARD_FILE
+    if not path.is_file():
+        return None
+    predicates = read_card(path).predicates
+    if not predicates:
+        raise ConfigurationError(
+            f"perception.predicate_set is 'checkpoint' and {path} names no predicates: it is the "
+            "card of a detector without a relation head"
+        )
+    return predicates
