@@ -66,77 +66,72 @@ def hash_each(point_sets: tuple[Float32, ...]) -> list[HashedPoints]:
     """The hashes of each set of points (k, 3), computed in one pass."""
     if not point_sets:
         return []
-    hashes = content_hashes(np.concatenate(point_sets))
-    hashed = []
-    start = 0
-    for points in point_sets:
-        stop = start + len(points)
-        hashed.append(HashedPoints(hashes[start:stop], points))
-        start = stop
-    return hashed
+    points_world = np.concatenate(point_sets)
+    hashes = content_hashes(points_world)
+    stops = np.cumsum([len(points) for points in point_sets]).tolist()
+    return [
+        HashedPoints(hashes[start:stop], points_world[start:stop])
+        for start, stop in zip([0, *stops], stops)
+    ]
 
 
 def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) -> SurfaceSample:
     """The sample of the union of a sample and more points, or another sample.
 
-    Between samples it is commutative, associative and idempotent.
+    Between samples it is commutative, associative and idempotent. The points are copied: views
+    would keep the arrays of whole frames alive.
     """
     if capacity == 0:
         return EMPTY_SAMPLE
-    points = _entering(sample, points, capacity)
-    if len(points.hashes) == 0:
-        return sample
-    hashes = np.concatenate((sample.hashes, points.hashes))
-    points_world = np.concatenate((sample.points_world, points.points_world))
-    # Stable sorting is by runs here, and the sample is one long run.
-    order = np.argsort(hashes, kind="stable")
-    ascending = hashes[order]
-    # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
-    distinct = np.flatnonzero(ascending[1:] != ascending[:-1]) + 1
-    kept = order[np.concatenate(([0], distinct))[:capacity]]
-    return SurfaceSample(hashes[kept], points_world[kept])
+    return SurfaceSample(*_union(*sample, *points, capacity))
 
 
-def _entering(sample: SurfaceSample, points: HashedPoints, capacity: int) -> HashedPoints:
-    """Copies of the points that may enter a sample: none beyond the largest hash of a full one."""
-    if len(sample.hashes) < capacity:
-        return HashedPoints(points.hashes.copy(), points.points_world.copy())
-    entering = np.flatnonzero(points.hashes < sample.hashes[-1])
-    return HashedPoints(points.hashes[entering], points.points_world[entering])
+@njit(cache=True, nogil=True)
+def _union(hashes, points, new_hashes, new_points, capacity):  # type: ignore[no-untyped-def]
+    full = len(hashes) >= capacity
+    # Of most frames nothing enters a sample that is full.
+    entering = np.empty(len(new_hashes), np.int64)
+    entering_count = 0
+    for row in range(len(new_hashes)):
+        entering[entering_count] = row
+        entering_count += int(not full or new_hashes[row] < hashes[-1])
+    if entering_count == 0:
+        return hashes, points
+    entering = entering[:entering_count]
+    order = entering[np.argsort(new_hashes[entering])]
+
+    size = min(capacity, len(hashes) + entering_count)
+    all_hashes = np.empty(size, np.uint64)
+    all_points = np.empty((size, 3), np.float32)
+    kept = old = new = 0
+    while kept < size and (old < len(hashes) or new < entering_count):
+        if new == entering_count or (old < len(hashes) and hashes[old] <= new_hashes[order[new]]):
+            all_hashes[kept] = hashes[old]
+            for axis in range(3):
+                all_points[kept, axis] = points[old, axis]
+            old += 1
+        else:
+            all_hashes[kept] = new_hashes[order[new]]
+            for axis in range(3):
+                all_points[kept, axis] = new_points[order[new], axis]
+            new += 1
+        # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
+        kept += int(kept == 0 or all_hashes[kept] != all_hashes[kept - 1])
+    return all_hashes[:kept], all_points[:kept]
 
 
 class SurfaceReservoir:
-    """A surface sample that grows: points wait until there are enough of them to be merged in.
+    """A surface sample that grows: at all times that of all points added, in whatever order."""
 
-    What it shows is at all times the sample of all points added, in whatever order.
-    """
-
-    __slots__ = ("_capacity", "_sample", "_waiting", "_waiting_count")
+    __slots__ = ("_capacity", "sample")
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self._sample = EMPTY_SAMPLE
-        self._waiting: list[HashedPoints] = []
-        self._waiting_count = 0
+        self.sample = EMPTY_SAMPLE
 
     def add(self, points: HashedPoints) -> None:
         """Take in points, which may be those of another sample."""
-        if self._capacity == 0 or len(points.hashes) == 0:
-            return
-        # Copies: views would keep the arrays of whole frames alive. Of most frames nothing enters.
-        points = _entering(self._sample, points, self._capacity)
-        self._waiting.append(points)
-        self._waiting_count += len(points.hashes)
-        # What enters is merged in whole capacities: sorting takes most of the time.
-        if self._waiting_count >= self._capacity:
-            self._merge_in()
-
-    @property
-    def sample(self) -> SurfaceSample:
-        """The sample of all points added."""
-        if self._waiting:
-            self._merge_in()
-        return self._sample
+        self.sample = merge_samples(self.sample, points, self._capacity)
 
     @property
     def points_world(self) -> Float32:
@@ -144,15 +139,5 @@ class SurfaceReservoir:
         return self.sample.points_world
 
     def some_points(self, count: int) -> Float32:
-        """As many points (k, 3) of the surface, or all; those that wait may be left out."""
-        enough = len(self._sample.hashes) >= count
-        return (self._sample if enough else self.sample).points_world[:count]
-
-    def _merge_in(self) -> None:
-        points = HashedPoints(
-            np.concatenate([points.hashes for points in self._waiting]),
-            np.concatenate([points.points_world for points in self._waiting]),
-        )
-        self._waiting.clear()
-        self._waiting_count = 0
-        self._sample = merge_samples(self._sample, points, self._capacity)
+        """As many points (k, 3) of the surface, or all."""
+        return self.sample.points_world[:count]
