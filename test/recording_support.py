@@ -62,16 +62,16 @@ def raw_image(
     )
 
 
-def pose_message(index: int, offset_ns: int = 0) -> RoleMessage:
-    T = pose(index)
+def pose_message(index: int, offset_ns: int = 0, T_camera_child: Any = None) -> RoleMessage:
+    T = pose(index) if T_camera_child is None else pose(index) @ T_camera_child
     return ros.pose_stamped(
         stamp_ns(index) + offset_ns, WORLD, T[:3, 3], quaternion_from_rotation(T[:3, :3])
     )
 
 
-def odometry(index: int, child: str = CAMERA) -> Any:
+def odometry(index: int, child: str = CAMERA, T_camera_child: Any = None) -> Any:
     types = typestore().types
-    at = pose_message(index).message
+    at = pose_message(index, T_camera_child=T_camera_child).message
     zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
     return types[ros.ODOMETRY](
         header=at.header,

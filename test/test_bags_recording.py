@@ -23,7 +23,6 @@ from deworldsg_ros.bags import messages as ros
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import Role
 from deworldsg_ros.bags.recording import open_recording, open_source
-from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bags.writer import write_mcap
 from deworldsg_ros.bridge.poses import stamp_ns_of
 from deworldsg_ros.config import InputsConfig
@@ -106,18 +105,39 @@ def recording_raw(path):
     source.close()
 
 
-def test_tf_is_taken_where_odometry_is_of_another_frame(tmp_path):
+def robot_items():
+    """A camera on a base, and the odometry of the base."""
     items = camera_items(COUNT, with_pose=False) + tf_items([stamp_ns(i) for i in range(COUNT)])
-    items += [("/odom", ros.ODOMETRY, stamp_ns(i), odometry(i, "base")) for i in range(COUNT)]
-    items.sort(key=lambda item: item[2])
-    bag = write_bag(tmp_path / "bag", items)
+    return items + [
+        ("/odom", ros.ODOMETRY, stamp_ns(i), odometry(i, "base", invert_pose(T_BASE_CAMERA)))
+        for i in range(COUNT)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("without", "topic"),
+    [
+        ((), "/odom"),  # /tf_static carries it over
+        (("/tf",), "/odom"),
+        (("/tf_static",), "/tf"),  # the two are not connected
+    ],
+)
+def test_an_odometry_of_the_robot_is_carried_over_to_its_camera(tmp_path, without, topic):
+    items = [item for item in robot_items() if item[0] not in without]
+    bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
     frames, recording = frames_of(bag)
-    assert recording.source.topics[Role.POSE].name == "/tf"
-    assert_whole(frames)
-    # … unless the user says otherwise.
-    chosen = open_source(bag, topics=TopicChoice(pose="/odom"))
-    assert chosen.topics[Role.POSE].name == "/odom"
-    chosen.close()
+    assert recording.source.topics[Role.POSE].name == topic
+    if topic == "/odom":
+        assert_whole(frames)
+        # A replay sees the same poses, as PoseStamped.
+        kinds = {item.msgtype for item in recording_raw(bag) if item.role is Role.POSE}
+        assert kinds == {ros.POSE_STAMPED}
+    # … unless the user says that it is the camera's.
+    inputs = InputsConfig(pose_source="odometry")
+    frames, recording = frames_of(bag, inputs=inputs)
+    assert recording.source.topics[Role.POSE].msgtype == ros.ODOMETRY
+    expected = pose(0) @ invert_pose(T_BASE_CAMERA)
+    np.testing.assert_allclose(frames[0].T_world_camera, expected, atol=1e-9)
 
 
 def test_the_configuration_decides_between_poses_odometry_and_tf(tmp_path):

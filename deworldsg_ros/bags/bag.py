@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from deworldsg_ros.bags.errors import RecordingError
 from deworldsg_ros.bags.messages import (
     ODOMETRY,
+    POSE_STAMPED,
     TF_MESSAGE,
     Role,
     RoleMessage,
@@ -21,16 +22,21 @@ from deworldsg_ros.bags.messages import (
 from deworldsg_ros.bags.source import RawRoleMessage, UsedTopic
 from deworldsg_ros.bags.storage import RawBag, RawMessage, Topic
 from deworldsg_ros.bags.topics import TopicChoice, find_topics
+from deworldsg_ros.bridge.poses import pose_from_message
 from deworldsg_ros.bridge.transforms import TransformTree
 from deworldsg_ros.config import InputsConfig
-from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
 from deworldsg_ros.scene.errors import RefusedInput
+
+# Ending of the topic of transforms that do not change.
+STATIC = "tf_static"
 
 
 class BagSource:
     """Messages of the four roles of a bag; see `Source`.
 
-    Where the pose is in TF, a PoseStamped of the RGB frame is computed for every RGB image.
+    Where the pose is in TF, a PoseStamped of the RGB frame is computed for every RGB image. Where
+    it is an Odometry of another frame, /tf_static carries it over to the RGB frame.
 
     Args:
         path: folder, .mcap or .db3 file.
@@ -62,14 +68,16 @@ class BagSource:
             found = find_topics(
                 self._bag.topics, choice, str(path), self._inputs, need_pose=need_pose
             )
-            if Role.POSE in found:
-                self._prefer_tf(found, choice)
+            self._T_child_camera = self._mounting(found, choice)
         except RecordingError:
             self._bag.close()
             raise
         self.topics = {
             role: UsedTopic(topic.name, topic.msgtype, topic.count) for role, topic in found.items()
         }
+        if self._T_child_camera is not None:
+            odometry = found[Role.POSE]
+            self.topics[Role.POSE] = UsedTopic(odometry.name, POSE_STAMPED, odometry.count)
         self.frame_count = found[Role.RGB].count
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
@@ -85,8 +93,10 @@ class BagSource:
             if role is Role.RGB and poses is not None:
                 pose = poses.at(stamp_ns, decode(raw.data, raw.msgtype).header.frame_id)
                 if pose is not None:
-                    data = encode(pose.message, pose.msgtype)
-                    yield RawRoleMessage(Role.POSE, pose.msgtype, stamp_ns, raw.log_time_ns, data)
+                    yield _serialized(pose, raw.log_time_ns)
+            if role is Role.POSE and self._T_child_camera is not None:
+                yield from self._carried(raw, self._T_child_camera)
+                continue
             yield RawRoleMessage(role, raw.msgtype, stamp_ns, raw.log_time_ns, raw.data)
         if poses is not None and poses.refusal:
             self.losses.append(poses.refusal)
@@ -105,20 +115,47 @@ class BagSource:
         """Close the files."""
         self._bag.close()
 
-    def _prefer_tf(self, found: dict[Role, Topic], choice: TopicChoice) -> None:
-        """Take TF instead of the odometry of a frame that is not the camera's."""
-        tf = next((t for t in self._bag.topics if t.msgtype == TF_MESSAGE and t.count), None)
-        is_told = choice.pose or self._inputs.pose_source != "auto"
-        if is_told or tf is None or found[Role.POSE].msgtype != ODOMETRY:
+    def _mounting(self, found: dict[Role, Topic], choice: TopicChoice) -> Float64 | None:
+        """T_child_camera (4, 4) of an odometry of another frame than the camera's, else None.
+
+        Where /tf_static does not connect the two, TF alone takes the odometry's place.
+        """
+        pose = found.get(Role.POSE)
+        if pose is None or pose.msgtype != ODOMETRY or self._inputs.pose_source != "auto":
+            return None
+        camera = self._first(found[Role.RGB]).header.frame_id.lstrip("/")
+        child = self._first(pose).child_frame_id.lstrip("/")
+        if child in ("", camera):
+            return None
+        try:
+            return _TfPoses(self._bag, self._inputs).mounting(child, camera)
+        except RefusedInput:
+            moving = [t for t in self._bag.topics if t.msgtype == TF_MESSAGE and t.count]
+            moving = [t for t in moving if not t.name.endswith(STATIC)]
+            if moving and not choice.pose:
+                found[Role.POSE] = next((t for t in moving if t.name == "/tf"), moving[0])
+            return None
+
+    def _carried(self, raw: RawMessage, T_child_camera: Float64) -> Iterator[RawRoleMessage]:
+        """PoseStamped of the camera out of an Odometry."""
+        try:
+            T_world_child, frame_id = pose_from_message(decode(raw.data, raw.msgtype))
+        except RefusedInput as refusal:
+            self.drops[refusal.reason] += 1
             return
-        camera = self._first(found[Role.RGB]).header.frame_id
-        child = self._first(found[Role.POSE]).child_frame_id
-        if child.lstrip("/") != camera.lstrip("/"):
-            found[Role.POSE] = next((t for t in self._bag.topics if t.name == "/tf"), tf)
+        T = T_world_child @ T_child_camera
+        quat_xyzw = quaternion_from_rotation(T[:3, :3])
+        pose = pose_stamped(stamp_ns_of_cdr(raw.data), frame_id, T[:3, 3], quat_xyzw)
+        yield _serialized(pose, raw.log_time_ns)
 
     def _first(self, topic: Topic) -> Any:
         raw = next(self._bag.messages([topic.name]))
         return decode(raw.data, raw.msgtype)
+
+
+def _serialized(item: RoleMessage, log_time_ns: int) -> RawRoleMessage:
+    data = encode(item.message, item.msgtype)
+    return RawRoleMessage(item.role, item.msgtype, item.stamp_ns, log_time_ns, data)
 
 
 class _TfPoses:
@@ -127,11 +164,15 @@ class _TfPoses:
     def __init__(self, bag: RawBag, inputs: InputsConfig) -> None:
         self._tree = TransformTree(round(inputs.pose_slop_s * 1e9), inputs.world_frame)
         names = [t.name for t in bag.topics if t.msgtype == TF_MESSAGE]
-        static = [name for name in names if name.endswith("tf_static")]
+        static = [name for name in names if name.endswith(STATIC)]
         self.refusal = ""
         for raw in bag.messages(static):
             self._add(raw, is_static=True)
         self._moving = bag.messages([name for name in names if name not in static])
+
+    def mounting(self, parent_frame: str, camera_frame: str) -> Float64:
+        """T_parent_camera (4, 4) of frames that do not move; RefusedInput where none is told."""
+        return self._tree.between(0, parent_frame, camera_frame)
 
     def at(self, stamp_ns: int, camera_frame: str) -> RoleMessage | None:
         """PoseStamped of the camera; None, with the reason in `refusal`, where TF has none."""
