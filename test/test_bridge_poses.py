@@ -202,6 +202,16 @@ def test_without_a_name_the_world_is_the_root_and_stays() -> None:
     assert tree.at(T0, "camera")[1] == "odom"
 
 
+def test_what_the_camera_is_mounted_on_is_no_world() -> None:
+    tree = TransformTree(SLOP)
+    tree.add(tf(transform("camera_link", "camera", at(0.1))), static=True)
+    with pytest.raises(RefusedInput, match="fixed to 'camera_link', which does not move"):
+        tree.at(T0, "camera")
+    named = TransformTree(SLOP, "camera_link")  # a camera on a wall
+    named.add(tf(transform("camera_link", "camera", at(0.1))), static=True)
+    np.testing.assert_allclose(named.at(T0, "camera")[0], at(0.1))
+
+
 def test_tf_says_which_frames_it_knows() -> None:
     tree = TransformTree(SLOP, "map")
     tree.add(tf(transform("odom", "base", at(1.0))), static=False)

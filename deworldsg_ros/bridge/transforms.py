@@ -61,8 +61,19 @@ class TransformTree:
         return all(self._moving[frame].settled(stamp_ns) for frame in moving)
 
     def at(self, stamp_ns: int, camera_frame: str) -> tuple[Float64, str]:
-        """T_world_camera (4, 4) and the world frame at a stamp; refuses as `between`."""
-        *_, world_frame = self._paths(camera_frame, self._world_frame)
+        """T_world_camera (4, 4) and the world frame at a stamp.
+
+        Raises:
+            RefusedInput: as `between`, or ``no_pose`` where nobody names the world and nothing
+                moves above the camera: then the root is its mounting, and no world.
+        """
+        ours, _, world_frame = self._paths(camera_frame, self._world_frame)
+        if not self._world_frame and all(frame in self._static for frame in ours):
+            raise RefusedInput(
+                "no_pose",
+                f"TF knows camera frame '{camera_frame}' as fixed to '{world_frame}', which does "
+                "not move in any world: wanted a localisation's transforms, or inputs.world_frame",
+            )
         T_world_camera = self.between(stamp_ns, world_frame, camera_frame)
         self._world_frame = world_frame
         return T_world_camera, world_frame
