@@ -35,8 +35,8 @@ def queue_of(size, policy=None):
 class ByPair(ClipPolicy):
     """Every clip is of the pair that its rows name."""
 
-    def judge(self, clip):
-        return Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes))
+    def judge(self, clips):
+        return [Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes)) for clip in clips]
 
 
 clips = st.lists(

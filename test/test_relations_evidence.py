@@ -210,17 +210,17 @@ def test_choice_of_directions_equals_the_reference(seed):
     seen = generator.random(len(edges)) < 0.3
     probabilities = np.array([SURE, UNSURE])[generator.integers(0, 2, len(edges))]
     chosen = choose_directions(edges, seen, probabilities)
-    entropies = entropy_nats(probabilities)
+    greatest = probabilities.max(axis=1)
     for row, (a, b) in enumerate(edges):
         wanted = True
         if (b, a) in edges:
             other = edges.index((b, a))
-            unseen_wins = (entropies[row], a) < (entropies[other], b)
+            unseen_wins = (-greatest[row], a) < (-greatest[other], b)
             wanted = seen[row] or (not seen[other] and unseen_wins)
         assert chosen[row] == wanted
 
 
-@pytest.mark.parametrize("difference", [1e-14, 0.02])
+@pytest.mark.parametrize("difference", [1e-14, 0.04])
 def test_neither_rounding_nor_one_more_prediction_turns_an_edge_round(difference):
     """Two priors that were summed in another order differ in their last bits."""
     almost = np.array([UNSURE, UNSURE])

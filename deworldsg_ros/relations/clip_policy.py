@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -91,8 +92,8 @@ class ClipPolicy:
         """How many of `count` clips the budget allows now."""
         return count if not self._clips_per_s else min(count, math.floor(self._credit + 1e-9))
 
-    def judge(self, clip: QueuedClip) -> Rank | str:
-        """How a clip stands, or the reason why it is not worth its time.
+    def judge(self, clips: Iterable[QueuedClip]) -> Iterator[Rank | str]:
+        """How each clip stands, or the reason why it is not worth its time.
 
         The reasons: ``certain`` (what was seen decides the pair's edges), ``looked_at`` (the pair
         was encoded, and not been seen much more often since), ``other_class`` (the frame calls one
@@ -100,17 +101,26 @@ class ClipPolicy:
         one, or the graph did not take the frame).
         """
         graph = self._graph
-        newest_first = (clip.stamp_ns, -clip.geo_cost, -clip.rows[0], -clip.rows[1])
         if graph is None or graph.newest_ns is None:
-            return Rank(newest_first)
+            yield from (Rank(_newest_first(clip)) for clip in clips)
+            return
         if graph.generation != self._generation:
             self._generation = graph.generation
             self._looks.clear()
             self._class_looks.clear()
-        node_ids = graph.nodes_of_frame(clip.stamp_ns)
+        frames: dict[int, Sequence[int] | None] = {}
+        for clip in clips:
+            if clip.stamp_ns not in frames:
+                frames[clip.stamp_ns] = graph.nodes_of_frame(clip.stamp_ns)
+            yield self._judge(clip, frames[clip.stamp_ns], graph, graph.newest_ns)
+
+    def _judge(
+        self, clip: QueuedClip, node_ids: Sequence[int] | None, graph: GraphView, newest_ns: int
+    ) -> Rank | str:
+        newest_first = _newest_first(clip)
         if node_ids is None:
             # The graph's answer is on its way, or has got lost.
-            on_its_way = clip.stamp_ns > graph.newest_ns
+            on_its_way = clip.stamp_ns > newest_ns
             return Rank((1, *newest_first), ready=False) if on_its_way else "node_gone"
         if max(clip.rows) >= len(node_ids):
             return "node_gone"
@@ -154,6 +164,11 @@ class ClipPolicy:
         """Time has jumped: the budget is full."""
         self._credit = self._most_credit
         self._newest_ns = None
+
+
+def _newest_first(clip: QueuedClip) -> Order:
+    """Newest frame, then nearest pair."""
+    return (clip.stamp_ns, -clip.geo_cost, -clip.rows[0], -clip.rows[1])
 
 
 def _unordered(classes: tuple[int, int]) -> tuple[int, int]:

@@ -87,8 +87,8 @@ class ClipQueue:
         ranked: list[tuple[Rank, QueuedClip]] = []
         newest: dict[PairKey, int] = {}
         # Newest first, so that the first clip of a pair is the one to keep.
-        for item in sorted(self._items, key=lambda item: -item.stamp_ns):
-            rank = self._policy.judge(item)
+        items = sorted(self._items, key=lambda item: -item.stamp_ns)
+        for item, rank in zip(items, self._policy.judge(items)):
             if isinstance(rank, str):
                 self._on_drop(rank)
             elif rank.pair is not None and newest.setdefault(rank.pair, id(item)) != id(item):
