@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import re
 
 import pytest
 import typer.testing
 from cli_support import deworldsg
 from recording_support import camera_items, write_bag, write_seven_scenes
+from rich.console import Console
 
 import deworldsg_ros
 from deworldsg_ros.bags.recording import open_recording
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import described_yaml, effective_config
+from deworldsg_ros.cli.progress import working
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -148,3 +151,10 @@ def test_a_setting_of_the_wrong_type_is_refused():
 
 def test_the_shipped_default_is_used_without_a_file():
     assert effective_config(None) == Config()
+
+
+def test_what_takes_a_while_is_said_where_no_spinner_can_turn():
+    console = Console(file=io.StringIO())
+    with working(console, "loading …"):
+        pass
+    assert console.file.getvalue() == "loading …\n"

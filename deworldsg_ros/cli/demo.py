@@ -27,7 +27,7 @@ from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.installation import find_shared, node_command
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
-from deworldsg_ros.cli.progress import frame_progress
+from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import DeWorldSGError
@@ -41,6 +41,7 @@ READY_S = 900.0
 EXPLAIN_AFTER_S = 8.0
 STALL_S = 30.0
 POLL_S = 0.2
+STARTING = "starting the four nodes …"
 
 
 class DemoFailed(DeWorldSGError):
@@ -193,7 +194,7 @@ def _follow(
         lines.put(None)
 
     threading.Thread(target=read, name="replay events", daemon=True).start()
-    status = console.status("starting the four nodes …")
+    status = working(console, STARTING)
     status.start()
     progress = frame_progress(console)
     task = progress.add_task("replaying", total=frames, start=False, note="")
@@ -248,7 +249,7 @@ def _event(line: bytes) -> events.Event | None:
 def _waiting_text(event: events.Waiting, since_s: float) -> str:
     words = [words[0] for item in event.missing if (words := item.split())[0] in NODES]
     names = ", ".join(dict.fromkeys(words)) or event.missing[0]
-    text = f"starting the four nodes … waiting for {names}"
+    text = f"{STARTING} waiting for {names}"
     if since_s > EXPLAIN_AFTER_S:
         text += "\n  (the first start compiles the kernels, which takes a minute or two)"
     return text

@@ -1,4 +1,4 @@
-"""One progress bar for every command."""
+"""One progress bar, and one way to say that something takes a while, for every command."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rich.progress import (
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.status import Status
 from rich.text import Text
 
 
@@ -19,6 +20,13 @@ class _RateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
         speed = task.finished_speed or task.speed
         return Text(f"{speed:5.1f}/s" if speed else "     –", style="progress.data.speed")
+
+
+def working(console: Console, text: str) -> Status:
+    """A spinner beside a text; in a file or a pipe, where none can turn, the text alone."""
+    if not console.is_terminal:
+        console.print(text, highlight=False, soft_wrap=True)
+    return console.status(text)
 
 
 def frame_progress(console: Console) -> Progress:

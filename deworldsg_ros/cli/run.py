@@ -20,7 +20,7 @@ from deworldsg_ros.bags.recording import Recording, open_source
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.progress import frame_progress
+from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.temporal import UpdateLog
 from deworldsg_ros.pipeline import Pipeline
@@ -61,7 +61,7 @@ def run_recording(
     try:
         recording = Recording(choose_poses(source, poses, config), config.inputs)
         outputs.prepare_folder(out, config)
-        with console.status(LOADING):
+        with working(console, LOADING):
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
         started_s = time.perf_counter()
