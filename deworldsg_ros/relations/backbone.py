@@ -85,7 +85,7 @@ class FrozenBackbone:
             if on_cuda:
                 images = images.pin_memory().to(self.device, non_blocking=True)
             features = self.features(normalise(images, self.dtype))
-            return features.to("cpu", torch.float32).numpy()
+            return np.asarray(features.to("cpu", torch.float32).numpy(), np.float32)
 
 
 def load_checkpoint(
