@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import pytest
 from rcl_interfaces.msg import ParameterDescriptor
 
 from deworldsg_ros import config as configuration
+from deworldsg_ros.bridge import parameters as ros_parameters
 from deworldsg_ros.bridge.options import NodeOptions, Parameters
-from deworldsg_ros.bridge.parameters import descriptor, fields, resolve
+from deworldsg_ros.bridge.parameters import descriptor, fields
 from deworldsg_ros.scene.errors import ConfigurationError
 
 FIELDS = {field.name: field for field in fields()}
+
+
+def resolve(overrides: dict[str, Any], source: str = "parameters") -> Parameters:
+    return ros_parameters.resolve(overrides, source, Parameters)
 
 
 def complaint(overrides: dict) -> str:

@@ -1,4 +1,4 @@
-"""docs/nodes.md says what the code does; `python test/test_nodes_docs.py` writes its tables."""
+"""The pages say what the code does; `python test/test_nodes_docs.py` writes their tables."""
 
 from __future__ import annotations
 
@@ -7,13 +7,18 @@ import re
 import sys
 from pathlib import Path
 
+import msgspec
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
+from deworldsg_ros.bridge.options import Parameters  # noqa: E402
 from deworldsg_ros.bridge.parameters import fields  # noqa: E402
 from deworldsg_ros.bridge.reasons import REASONS  # noqa: E402
+from deworldsg_ros.nodes.replay_options import ReplayParameters  # noqa: E402
 
-PAGE = ROOT / "docs" / "nodes.md"
+PAGES = (ROOT / "docs" / "nodes.md", ROOT / "docs" / "recordings.md")
 # What the nodes run.
 PACKAGES = (
     "bridge",
@@ -33,9 +38,9 @@ def reasons_table() -> str:
     return "\n".join(["| reason | what it means, what to do |", "|---|---|", *rows])
 
 
-def parameters_table() -> str:
+def parameters_table(parameters: type[msgspec.Struct]) -> str:
     rows = []
-    for field in fields():
+    for field in fields(parameters):
         default = "''" if field.default == "" else str(field.default).lower()
         limits = field.limits() or ("true, false" if field.kind is bool else "")
         kind = field.kind.__name__
@@ -44,15 +49,19 @@ def parameters_table() -> str:
 
 
 def with_tables(text: str) -> str:
-    for name, table in (("reasons", reasons_table()), ("parameters", parameters_table())):
-        pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
-        assert pattern.search(text), name
-        text = pattern.sub(lambda match, t=table: f"{match[1]}{t}\n{match[2]}", text)
-    return text
+    tables = {
+        "reasons": reasons_table(),
+        "parameters": parameters_table(Parameters),
+        "replay": parameters_table(ReplayParameters),
+    }
+    pattern = re.compile(r"(<!-- (\w+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
+    return pattern.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", text)
 
 
-def test_the_tables_of_the_page_are_those_of_the_code() -> None:
-    text = PAGE.read_text(encoding="utf-8")
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_tables_of_the_page_are_those_of_the_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert "<!-- /" in text
     assert text == with_tables(text), "run: python test/test_nodes_docs.py"
 
 
@@ -82,4 +91,5 @@ def test_every_reason_of_the_code_is_explained() -> None:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -153,6 +153,8 @@ def test_a_signal_ends_it_with_0(tmp_path, bag, number):
         ({"intrinsics": "'1,2'"}, "FX,FY,CX,CY"),
         ({"config": "nowhere.yaml"}, "nowhere.yaml"),
         ({"pose_topic": "/nothing"}, "/nothing"),
+        ({"rates": 2.0}, "did you mean rate"),
+        ({"rate": -1}, "wanted float >= 0"),
     ],
 )
 def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, bag, parameters, words):

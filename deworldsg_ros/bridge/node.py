@@ -17,6 +17,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from deworldsg_ros.bridge.health import INTERNAL_ERROR, Health
+from deworldsg_ros.bridge.options import Parameters
 from deworldsg_ros.bridge.parameters import declare
 from deworldsg_ros.bridge.process import run_process
 from deworldsg_ros.bridge.qos import AutoSubscription, Source, reliable
@@ -48,7 +49,7 @@ class StageNode(Node):  # type: ignore[misc]
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.parameters = declare(self)
+        self.parameters = declare(self, Parameters)
         self.get_logger().info("loading (a first start compiles kernels, up to a minute)")
         self.health = Health(product)
         self._logged_s: dict[str, float] = {}

@@ -6,7 +6,7 @@ import difflib
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -17,6 +17,8 @@ from deworldsg_ros.scene.errors import ConfigurationError
 # Parameters that rclpy itself reads from the overrides.
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
 RCLPY_PREFIXES = ("qos_overrides.",)
+
+P = TypeVar("P", bound=msgspec.Struct)
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Field:
         return " and ".join(parts)
 
 
-def fields() -> list[Field]:
+def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
     """Every parameter, in the order of the configuration."""
-    return list(_walk(Parameters))
+    return list(_walk(kind))
 
 
 def _walk(struct: type[msgspec.Struct]) -> Iterator[Field]:
@@ -94,13 +96,13 @@ def _field(name: str, path: tuple[str, str], kind: Any, default: Any, descriptio
     )
 
 
-def resolve(overrides: dict[str, Any], source: str = "parameters") -> Parameters:
+def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
     """Validate overrides, by full name, into the whole set.
 
     Raises:
         ConfigurationError: in one line: the name, what was seen, what was wanted.
     """
-    known = {field.name: field for field in fields()}
+    known = {field.name: field for field in fields(kind)}
     content: dict[str, dict[str, Any]] = {}
     for name, value in overrides.items():
         field = known.get(name)
@@ -110,11 +112,11 @@ def resolve(overrides: dict[str, Any], source: str = "parameters") -> Parameters
             raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
         section, key = field.path
         try:
-            msgspec.convert({section: {key: value}}, Parameters)
+            msgspec.convert({section: {key: value}}, kind)
         except msgspec.ValidationError as error:
             raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
         content.setdefault(section, {})[key] = value
-    return msgspec.convert(content, Parameters)
+    return msgspec.convert(content, kind)
 
 
 def _complaint(field: Field, value: Any) -> str:
@@ -150,7 +152,7 @@ def descriptor(field: Field) -> ParameterDescriptor:
     return result
 
 
-def declare(node: Any) -> Parameters:
+def declare(node: Any, kind: type[P]) -> P:
     """Declare every parameter on a node, with the values it was started with.
 
     Raises:
@@ -161,8 +163,8 @@ def declare(node: Any) -> Parameters:
         for name, parameter in node._parameter_overrides.items()
         if name not in RCLPY_NAMES and not name.startswith(RCLPY_PREFIXES)
     }
-    parameters = resolve(overrides, node.get_name())
-    for field in fields():
+    parameters = resolve(overrides, node.get_name(), kind)
+    for field in fields(kind):
         value = getattr(getattr(parameters, field.path[0]), field.path[1])
         node.declare_parameter(field.name, value, descriptor(field), ignore_override=True)
     return parameters

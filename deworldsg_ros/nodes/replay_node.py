@@ -28,32 +28,15 @@ from deworldsg_ros.bags.recording import open_source
 from deworldsg_ros.bags.source import RawRoleMessage
 from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.bags.writer import topic_of
+from deworldsg_ros.bridge.parameters import declare
 from deworldsg_ros.bridge.process import refuse, run_process
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.nodes.replay_monitor import SETTLE_S, Endpoint, PipelineMonitor
+from deworldsg_ros.nodes.replay_options import ReplayParameters
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
-PARAMETERS: dict[str, tuple[Any, str]] = {
-    "recording": ("", "rosbag2 folder, .mcap or .db3 file, 7-Scenes or TUM RGB-D folder"),
-    "rate": (1.0, "pace: 1 = as recorded, 0 = as fast as the pipeline keeps up"),
-    "window": (4, "most frames that wait for their local graph; 0 = never wait"),
-    "wait_s": (10.0, "how long to wait for the four nodes, seconds; 0 = not at all"),
-    "listener_s": (4.0, "without the four nodes: how long to wait for any listener, seconds"),
-    "required": (False, "whether to end with an error where they do not come"),
-    "stall_s": (20.0, "after so long without an answer, frames in flight are given up, seconds"),
-    "clock": (False, "publish the recorded time on /clock, for use_sim_time"),
-    "save": (False, "at the end, when all is worked off, have graph_node save its graph"),
-    "events": (False, "tell what happens as JSON lines on the standard output"),
-    "config": ("", "parameter file of the pipeline: world frame and slop of poses from TF"),
-    "rgb_topic": ("", "RGB images in the bag; empty = found by name"),
-    "depth_topic": ("", "depth images in the bag; empty = found by name"),
-    "camera_info_topic": ("", "calibration in the bag; empty = found by name"),
-    "pose_topic": ("", "poses in the bag, also an odometry or /tf; empty = found by name"),
-    "intrinsics": ("", "FX,FY,CX,CY of a folder that does not tell"),
-    "frame_rate": (0.0, "frames a second of a folder without stamps; 0 = its own"),
-}
 CLASSES = {
     messages.IMAGE: Image,
     messages.COMPRESSED_IMAGE: CompressedImage,
@@ -87,10 +70,7 @@ class ReplayNode(Node):  # type: ignore[misc]
     def __init__(self, stop: threading.Event, **options: Any) -> None:
         super().__init__("replay_node", **options)
         self._stop = stop
-        self._settings = {
-            name: self.declare_parameter(name, default).value
-            for name, (default, _) in PARAMETERS.items()
-        }
+        self._options = declare(self, ReplayParameters).node
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._source = self._open()
@@ -99,10 +79,10 @@ class ReplayNode(Node):  # type: ignore[misc]
             for role, topic in self._source.topics.items()
         }
         self._clock_output = (
-            self.create_publisher(Clock, "/clock", 10) if self._settings["clock"] else None
+            self.create_publisher(Clock, "/clock", 10) if self._options.clock else None
         )
-        self._monitor = PipelineMonitor(self, int(self._settings["window"]))
-        self._pace = Pace(float(self._settings["rate"]))
+        self._monitor = PipelineMonitor(self, self._options.window)
+        self._pace = Pace(self._options.rate)
         self._published = 0
         self._told_s = 0.0
 
@@ -126,7 +106,7 @@ class ReplayNode(Node):  # type: ignore[misc]
             self._tell_progress()
         self._monitor.window.close()
         drained = alone or self._drain()
-        if self._settings["save"] and not alone:
+        if self._options.save and not alone:
             self._save()
         self._tell_progress(at_once=True)
         self._finish(drained)
@@ -137,24 +117,22 @@ class ReplayNode(Node):  # type: ignore[misc]
         self._executor.shutdown(timeout_sec=1.0)
 
     def _open(self) -> Any:
-        settings = self._settings
-        if not settings["recording"]:
+        options = self._options
+        if not options.recording:
             raise ConfigurationError(
                 "parameter recording is empty: wanted -p recording:=BAG_OR_FOLDER"
             )
-        config = load_config(settings["config"]) if settings["config"] else Config()
+        config = load_config(options.config) if options.config else Config()
         return open_source(
-            Path(settings["recording"]),
+            Path(options.recording),
             topics=TopicChoice(
-                settings["rgb_topic"],
-                settings["depth_topic"],
-                settings["camera_info_topic"],
-                settings["pose_topic"],
+                options.rgb_topic,
+                options.depth_topic,
+                options.camera_info_topic,
+                options.pose_topic,
             ),
             inputs=config.inputs,
-            options=DatasetOptions(
-                float(settings["frame_rate"]), parse_intrinsics(settings["intrinsics"])
-            ),
+            options=DatasetOptions(options.frame_rate, parse_intrinsics(options.intrinsics)),
         )
 
     def _publisher(self, role: Role, msgtype: str) -> Any:
@@ -170,7 +148,7 @@ class ReplayNode(Node):  # type: ignore[misc]
 
     def _wait_for_pipeline(self) -> bool:
         """Whether the four nodes are there and connected."""
-        wait_s = float(self._settings["wait_s"])
+        wait_s = self._options.wait_s
         end_s = time.monotonic() + wait_s
         endpoints = {
             role: Endpoint(output.topic_name, output) for role, output in self._outputs.items()
@@ -184,7 +162,7 @@ class ReplayNode(Node):  # type: ignore[misc]
                 self._told_s = time.monotonic()
                 self._tell(events.Waiting(missing))
             self._spin(SPIN_PERIOD_S)
-        if self._settings["required"]:
+        if self._options.required:
             raise NotReady(f"after {wait_s:g} s still waiting for: {'; '.join(missing)}")
         if wait_s > 0:
             self.get_logger().warning(
@@ -194,7 +172,7 @@ class ReplayNode(Node):  # type: ignore[misc]
 
     def _wait_to_be_found(self) -> None:
         """Give whoever listens the time to discover the topics."""
-        end_s = time.monotonic() + float(self._settings["listener_s"])
+        end_s = time.monotonic() + self._options.listener_s
         while time.monotonic() < end_s and not self._has_listener():
             self._spin(SPIN_PERIOD_S)
         end_s = time.monotonic() + SETTLE_S
@@ -213,14 +191,14 @@ class ReplayNode(Node):  # type: ignore[misc]
         self._spin(0.0)
         # The messages of a frame come around its RGB image: it alone has to wait.
         while message.role is Role.RGB and not alone and self._monitor.window.is_full:
-            self._monitor.give_up_after(float(self._settings["stall_s"]), time.monotonic())
+            self._monitor.give_up_after(self._options.stall_s, time.monotonic())
             self._spin(SPIN_PERIOD_S)
             self._tell_progress()
         self._pace.late(time.monotonic() - now_s)
 
     def _drain(self) -> bool:
         """Wait until all is worked off; False where nobody answers any more."""
-        stall_s = float(self._settings["stall_s"])
+        stall_s = self._options.stall_s
         while not self._monitor.drained(time.monotonic()):
             if self._monitor.silent_for(time.monotonic()) > stall_s:
                 self._monitor.window.give_up()
@@ -231,7 +209,7 @@ class ReplayNode(Node):  # type: ignore[misc]
 
     def _save(self) -> None:
         future = self._monitor.request_save()
-        end_s = time.monotonic() + float(self._settings["stall_s"])
+        end_s = time.monotonic() + self._options.stall_s
         while not future.done() and time.monotonic() < end_s:
             self._spin(SPIN_PERIOD_S)
         if future.done():
@@ -264,7 +242,7 @@ class ReplayNode(Node):  # type: ignore[misc]
             self._tell(events.Progress(self._published, monitor.window.answered, monitor.nodes))
 
     def _tell(self, event: events.Event) -> None:
-        if self._settings["events"]:
+        if self._options.events:
             print(events.encode(event), flush=True)
 
 
