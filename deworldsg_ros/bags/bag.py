@@ -143,6 +143,9 @@ class BagSource:
         except RefusedInput as refusal:
             self.drops[refusal.reason] += 1
             return
+        except Exception:  # whatever rosbags raises on a broken message
+            self.drops["invalid_message"] += 1
+            return
         T = T_world_child @ T_child_camera
         quat_xyzw = quaternion_from_rotation(T[:3, :3])
         pose = pose_stamped(stamp_ns_of_cdr(raw.data), frame_id, T[:3, 3], quat_xyzw)
