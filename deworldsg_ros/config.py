@@ -142,6 +142,33 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confirm_observations: Annotated[
         int, _number("frames that make a node sure (surface rule)", ge=1, le=1000)
     ] = 3
+    confirm_score: Annotated[
+        float,
+        _number(
+            "detection score that a node has to have once, or it takes four times as many frames "
+            "to be sure (surface rule); 0 = none",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.5
+    baseline_deg: Annotated[
+        float,
+        _number(
+            "movement of the camera, seen from a node, that makes another look at it; where the "
+            "camera moves, a node is not sure before that, or half a second (surface rule)",
+            ge=0,
+            le=90,
+        ),
+    ] = 0.5
+    min_detection_rate: Annotated[
+        float,
+        _number(
+            "share of the looks at a node in full view that have to detect it, or it is tentative "
+            "again (surface rule); 0 = none",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.4
     expire_tentative_s: Annotated[
         float, _number("time unseen after which a tentative node goes (surface rule)", gt=0)
     ] = 10.0

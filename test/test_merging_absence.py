@@ -148,7 +148,15 @@ def test_points_before_on_and_behind_what_was_measured(z_m, through, present) ->
     points = np.zeros((1, 10, 3), np.float32)
     points[0, :, 0] = np.linspace(-0.2, 0.2, 10)
     points[0, :, 2] = z_m
-    seen_through, there = look(points, np.array([10]), np.eye(4), depth_grid())
-    assert (seen_through[0], there[0]) == (through, present)
-    seen_through, there = look(points, np.array([0]), np.eye(4), depth_grid())
-    assert not seen_through[0] and not there[0]
+    seen_through, there, whole = look(points, np.array([10]), np.eye(4), depth_grid())
+    assert (seen_through[0], there[0], whole[0]) == (through, present, present)
+    seen_through, there, whole = look(points, np.array([0]), np.eye(4), depth_grid())
+    assert not seen_through[0] and not there[0] and not whole[0]
+
+
+def test_what_the_image_cuts_is_not_in_full_view() -> None:
+    points = np.zeros((1, 10, 3), np.float32)
+    points[0, :, 0] = np.linspace(-1.4, 0.6, 10)  # the image ends at 1.07 m to the left
+    points[0, :, 2] = WALL_M
+    _, there, whole = look(points, np.array([10]), np.eye(4), depth_grid())
+    assert there[0] and not whole[0]

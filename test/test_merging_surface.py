@@ -57,9 +57,12 @@ def graph() -> SceneGraph:
     return SceneGraph(VOCABULARY, "world")
 
 
+CONFIG = MergingConfig(association="surface")
+
+
 @pytest.fixture
 def merging() -> SurfaceMerging:
-    return SurfaceMerging(MergingConfig(association="surface"))
+    return SurfaceMerging(CONFIG)
 
 
 LEFT = slab((-0.5, 0, 1), (1.2, 0.8, 0.01))
@@ -175,7 +178,7 @@ def test_the_result_does_not_depend_on_the_world_frame() -> None:
     results = []
     for move in (False, True):
         graph = SceneGraph(VOCABULARY, "world")
-        merging = SurfaceMerging(MergingConfig(association="surface"))
+        merging = SurfaceMerging(CONFIG)
         ids = []
         for stamp, view in enumerate(views):
             moved = [
@@ -195,7 +198,7 @@ def test_a_loaded_graph_goes_on(graph, merging, tmp_path) -> None:
     graph.save(tmp_path / "graph.npz")
     loaded = SceneGraph.load(tmp_path / "graph.npz")
     assert loaded.nodes.confirmed.tolist() == [True]
-    again = SurfaceMerging(MergingConfig(association="surface"))
+    again = SurfaceMerging(CONFIG)
     assert again.merge(loaded, frame(5, (WHOLE, TABLE))) == [1]
 
 

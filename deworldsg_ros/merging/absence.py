@@ -23,6 +23,8 @@ MIN_VISIBLE_SHARE = 0.5
 DECISIVE_SHARE = 0.7
 
 
+# A node with this share of its points in the image is in full view of the camera.
+WHOLE_SHARE = 0.9
 # Surface points of a node that the depth image is compared with.
 SAMPLED_POINTS = 48
 
@@ -57,19 +59,28 @@ class SeenThrough:
         if owner < len(self._frames):
             self._point_counts[owner] = self._frames[owner] = 0
 
-    def look(self, T_world_camera: Float64, grid: DepthGrid, seen: list[int]) -> list[int]:
-        """Take in one frame, in which some owners were seen; returns those that are gone."""
-        through, present = look(self._points_world, self._point_counts, T_world_camera, grid)
-        present[[owner for owner in seen if owner < len(present)]] = True
+    def look(
+        self, T_world_camera: Float64, grid: DepthGrid, seen: list[int]
+    ) -> tuple[list[int], list[int]]:
+        """Take in one frame, in which some owners were seen.
+
+        Returns:
+            The owners that are gone, and those that were there in full view but not seen.
+        """
+        through, present, whole = look(self._points_world, self._point_counts, T_world_camera, grid)
+        seen = [owner for owner in seen if owner < len(present)]
+        present[seen] = True
+        whole[seen] = False
         self._frames[through] += 1
         self._frames[present] = 0
-        return np.flatnonzero(self._frames >= self._enough_frames).tolist()
+        gone = self._frames >= self._enough_frames if self._enough_frames else through & False
+        return np.flatnonzero(gone).tolist(), np.flatnonzero(whole).tolist()
 
 
 def look(
     points_world: Float32, point_counts: Int64, T_world_camera: Float64, grid: DepthGrid
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which nodes' surfaces were seen through, and which were there.
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which nodes' surfaces were seen through, which were there, and which of these in full view.
 
     Args:
         points_world: (S, K, 3) float32 surface points of S nodes, metres.
@@ -78,11 +89,11 @@ def look(
         grid: the depth image.
 
     Returns:
-        seen_through (S,) and present (S,) bool; both false where too little was visible, because
-        it is out of view, occluded or without valid depth.
+        seen_through (S,), present (S,) and whole (S,) bool; all false where too little was visible,
+        because it is out of view, occluded or without valid depth.
     """
     camera = grid.intrinsics
-    through, there = _count(
+    through, there, inside = _count(
         points_world,
         point_counts,
         invert_pose(T_world_camera),
@@ -95,8 +106,11 @@ def look(
     )
     visible = through + there
     enough = (visible >= MIN_VISIBLE_POINTS) & (visible >= MIN_VISIBLE_SHARE * point_counts)
-    return enough & (through >= DECISIVE_SHARE * visible), enough & (
-        there >= DECISIVE_SHARE * visible
+    present = enough & (there >= DECISIVE_SHARE * visible)
+    return (
+        enough & (through >= DECISIVE_SHARE * visible),
+        present,
+        present & (inside >= WHOLE_SHARE * point_counts),
     )
 
 
@@ -104,6 +118,7 @@ def look(
 def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
     through = np.zeros(len(points), np.int64)
     there = np.zeros(len(points), np.int64)
+    inside = np.zeros(len(points), np.int64)
     rows, columns = depth_mm.shape
     for node in range(len(points)):
         for index in range(counts[node]):
@@ -134,6 +149,7 @@ def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  #
             row = int(np.floor((fy * y_camera / z_camera + cy) / stride))
             if column < 0 or row < 0 or column >= columns or row >= rows:
                 continue
+            inside[node] += 1
             measured_m = depth_mm[row, column] * 0.001
             if measured_m == 0.0:
                 continue
@@ -142,4 +158,4 @@ def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  #
                 through[node] += 1
             elif measured_m > z_camera - tolerance_m:
                 there[node] += 1
-    return through, there
+    return through, there, inside

@@ -12,6 +12,7 @@ import numpy as np
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough, look
+from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
 from deworldsg_ros.merging.joint import JointEvidence
@@ -38,10 +39,13 @@ class SurfaceMerging:
         # Each of these knows the nodes by their owner indices.
         self._map = VoxelMap(config.cell_m)
         self._joint = JointEvidence()
+        self._existence = Existence(config)
         self._through = SeenThrough(config.absent_frames)
         # Owners whose surface has changed since `_through` took points of it.
         self._changed: set[int] = set()
         self._lost = LostNodes(config.lost_s)
+        # Nodes that were confirmed once.
+        self._doubted: set[int] = set()
 
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
@@ -125,15 +129,24 @@ class SurfaceMerging:
                 )
                 owners[row] = self._owners.take(node_ids[row])
         self._map.add(owners, cells)
+        self._existence.detected(
+            owners,
+            local.means_world,
+            local.scores,
+            local.T_world_camera[:3, 3],
+            local.stamp_ns,
+        )
         return [self._confirm(graph, node_id) for node_id in node_ids]
 
     def _confirm(self, graph: SceneGraph, node_id: int) -> int:
         """Confirm a node that was seen often enough; it may take up the id of one that was lost."""
         row = graph.nodes.row(node_id)
-        seen = graph.nodes.observations[row]
-        if graph.nodes.confirmed[row] or seen < self._config.confirm_observations:
+        if graph.nodes.confirmed[row] or not self._existence.sure(self._owner(node_id)):
             return node_id
         graph.set_confirmed(node_id, True)
+        if node_id in self._doubted:
+            self._doubted.remove(node_id)
+            return node_id
         lost_id = self._lost.match(graph, node_id)
         if lost_id is None:
             return node_id
@@ -145,17 +158,29 @@ class SurfaceMerging:
         """Lose the nodes through whose place the camera has looked for some frames in a row."""
         seen = {self._owner(node_id) for node_id in node_ids}
         self._changed |= seen
-        if local.depth_grid is None or not self._config.absent_frames:
+        if local.depth_grid is None:
             return
         # What is seen need not be looked for: its points are renewed when it is out of sight.
         for owner in self._changed - seen:
             surface = graph.nodes.surfaces[graph.nodes.row(self._owners.node(owner))]
             self._through.renew(owner, surface.some_points(SAMPLED_POINTS))
         self._changed = seen
-        for owner in self._through.look(local.T_world_camera, local.depth_grid, list(seen)):
+        gone, missed = self._through.look(local.T_world_camera, local.depth_grid, list(seen))
+        self._doubt(graph, missed, local.T_world_camera[:3, 3])
+        for owner in gone:
             # Of two that are gone, the one may just have become the other.
             if self._owners.node(owner):
                 self._lose(graph, self._owners.node(owner), local.stamp_ns)
+
+    def _doubt(self, graph: SceneGraph, missed: list[int], camera_world: Float64) -> None:
+        """Hide the nodes that the detector fails to find although they are in full view."""
+        node_ids = [self._owners.node(owner) for owner in missed]
+        rows = [graph.nodes.row(node_id) for node_id in node_ids]
+        for owner in self._existence.missed(missed, graph.nodes.means[rows], camera_world):
+            node_id = self._owners.node(owner)
+            if graph.nodes.confirmed[graph.nodes.row(node_id)]:
+                graph.set_confirmed(node_id, False)
+                self._doubted.add(node_id)
 
     def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
         """Take a node from its place; its id may turn up elsewhere, now or soon."""
@@ -181,6 +206,7 @@ class SurfaceMerging:
             a_id, b_id = (self._owners.node(owner) for owner in pair)
             kept_id = graph.merge_nodes(a_id, b_id)
             kept = self._owner(kept_id)
+            self._existence.merge(kept, self._owner(b_id if kept_id == a_id else a_id))
             cells = self._free(b_id if kept_id == a_id else a_id)
             self._map.add([kept], CellSets(cells, np.array([0, len(cells)])))
             self._changed.add(kept)
@@ -203,6 +229,8 @@ class SurfaceMerging:
             owners, self._map.cells_of([surface.points_world for surface in graph.nodes.surfaces])
         )
         self._changed.update(owners)
+        for owner, observations in zip(owners, graph.nodes.observations.tolist()):
+            self._existence.restore(owner, observations)
 
     def _owner(self, node_id: int) -> int:
         owner = self._owners.of(node_id)
@@ -212,6 +240,8 @@ class SurfaceMerging:
     def _free(self, node_id: int) -> Int64:
         """Forget a node that is gone; returns the cells it had."""
         owner = self._owners.free(node_id)
+        self._doubted.discard(node_id)
+        self._existence.forget(owner)
         self._joint.forget(owner)
         self._through.forget(owner)
         self._changed.discard(owner)

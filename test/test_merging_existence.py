@@ -1,0 +1,131 @@
+"""A node is sure when it was found often, surely, from more than one place, and is not missed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from merging_support import VOCABULARY
+from test_merging_absence import HERE, depth_grid
+from test_merging_surface import CUP, frame
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.scene.graph import SceneGraph
+
+STEP_M = 0.05  # 4 degrees, seen from the cup
+
+
+class Walk:
+    """A cup before a wall, and a camera that goes sideways or stands, at 10 frames a second."""
+
+    def __init__(self, **config: float) -> None:
+        self.graph = SceneGraph(VOCABULARY, "world")
+        self.merging = SurfaceMerging(MergingConfig(association="surface", **config))
+        self.stamp = 0
+        self.x_m = 0.0
+
+    def see(self, *, found: bool, step_m: float = STEP_M, z_m: float = 0.0, score: float = 0.9):
+        """One frame in which the cup is there, detected or not."""
+        self.stamp += 1
+        self.x_m += step_m
+        pose = np.eye(4)
+        pose[:3, 3] = self.x_m, 0.0, z_m
+        points = HERE - pose[:3, 3].astype(np.float32)
+        in_view = points[np.abs(points[:, 0]) < points[:, 2]]
+        grid = depth_grid(in_view, background_m=1.0 - z_m)
+        changes = {"T_world_camera": pose, "depth_grid": grid}
+        if found:
+            changes["scores"] = np.array([score])
+        objects = [(HERE, CUP)] if found else []
+        self.merging.merge(self.graph, frame(self.stamp, *objects, **changes))
+
+    @property
+    def told(self) -> list[int]:
+        return list(self.graph.node_states(1))
+
+
+def test_three_frames_of_one_picture_are_not_yet_an_object():
+    walk = Walk()
+    for _ in range(5):
+        walk.see(found=True, step_m=0.001)
+    assert walk.told == []
+    walk.see(found=True, step_m=0.001)  # but it is not waited for longer than half a second
+    assert walk.told == [1]
+
+
+@pytest.mark.parametrize("step_m", [0.0, STEP_M])
+def test_three_frames_are_enough_where_the_camera_moves_on_or_cannot(step_m):
+    walk = Walk()
+    for told in ([], [], [1]):
+        walk.see(found=True, step_m=step_m)
+        assert walk.told == told
+
+
+def test_without_one_sure_detection_it_takes_four_times_as_many():
+    walk = Walk()
+    for _ in range(11):
+        walk.see(found=True, step_m=0.02, score=0.45)
+    assert walk.told == []
+    walk.see(found=True, step_m=0.02, score=0.45)
+    assert walk.told == [1]
+    off = Walk(confirm_score=0.0)
+    for _ in range(3):
+        off.see(found=True, score=0.45)
+    assert off.told == [1]
+
+
+def test_what_is_missed_from_most_places_is_in_doubt_and_comes_back_when_found():
+    walk = Walk()
+    for _ in range(3):
+        walk.see(found=True)
+    for _ in range(4):
+        walk.see(found=False)
+    assert walk.told == [1]  # 3 of 7 looks
+    walk.see(found=False)
+    assert walk.told == []
+    for _ in range(2):
+        walk.see(found=True)
+    assert walk.told == [1]
+    row = walk.graph.nodes.row(1)
+    assert walk.graph.nodes.observations[row] == 5
+
+
+@pytest.mark.parametrize(
+    ("frames", "step_m", "z_m"),
+    [
+        (60, 0.0, 0.0),  # the camera stands: one look, which found it before
+        (12, 0.0, -0.4),  # further away than it was ever detected from
+        (3, 1.2, 0.0),  # out of view
+    ],
+)
+def test_what_need_not_be_detected_stays(frames, step_m, z_m):
+    walk = Walk()
+    for _ in range(6):
+        walk.see(found=True, step_m=0.0)
+    for _ in range(frames):
+        walk.see(found=False, step_m=step_m, z_m=z_m)
+        if z_m:
+            walk.x_m += 0.02
+    assert walk.told == [1]
+
+
+def test_a_rate_of_zero_turns_it_off():
+    walk = Walk(min_detection_rate=0.0)
+    for _ in range(3):
+        walk.see(found=True)
+    for _ in range(10):
+        walk.see(found=False)
+    assert walk.told == [1]
+
+
+def test_a_loaded_node_is_sure_and_stays_in_what_it_was(tmp_path):
+    walk = Walk()
+    for _ in range(3):
+        walk.see(found=True)
+    walk.graph.save(tmp_path / "graph.npz")
+    walk.graph = SceneGraph.load(tmp_path / "graph.npz")
+    walk.merging = SurfaceMerging(MergingConfig(association="surface"))
+    walk.see(found=False)
+    assert walk.told == [1]
+    walk.see(found=True)
+    assert walk.told == [1] and walk.graph.nodes.ids.tolist() == [1]
