@@ -7,8 +7,12 @@ import json
 import pytest
 from cli_support import DEMO_ROOM, deworldsg
 from recording_support import camera_items, write_bag
+from typer.testing import CliRunner
 
+from deworldsg_ros import pipeline
+from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import load_config
+from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene import wire
 
 pytestmark = pytest.mark.slow
@@ -52,3 +56,22 @@ def test_a_recording_without_a_usable_frame_is_an_error_that_says_why(tmp_path):
     assert told.returncode == 2
     assert "3 no_depth" in told.stdout
     assert "not one frame" in told.stderr
+
+
+class Broken(FakeWorldModel):
+    """A world model that fails on every clip."""
+
+    def predict_batch(self, requests):
+        raise RuntimeError("no memory left")
+
+
+@pytest.mark.timeout(400)
+def test_a_world_model_that_fails_is_in_the_report_and_the_run_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "build_world_model", lambda config: Broken(16, 0))
+    options = ["--max-frames", "6", "--set", "relations.encode=all"]
+    told = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
+    assert told.exit_code == 0, told.output
+    clips = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["clips"]
+    failed = clips["dropped"]["world_model_error"]
+    assert failed > 0 and clips["encoded"] == 0
+    assert f"left out by world model: {failed} world_model_error" in told.output

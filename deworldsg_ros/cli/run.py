@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,9 @@ def run_recording(
     outputs.show_graph(out, graph, console, T_world_cameras, config.inputs.world_up)
     if trajectory_out is not None:
         write_tum(trajectory_out, list(path_taken), T_world_cameras)
+    clips = pipeline.relations.counters()
+    if failed := clips.dropped.get("world_model_error"):
+        drops["world model"] = {"world_model_error": failed}
     report = {
         "program": f"deworldsg {__version__} run",
         "recording": recording.name,
@@ -96,6 +100,8 @@ def run_recording(
         "times_ms": _times_ms(pipeline.times_s),
         "device": device_name(),
     }
+    if pipeline.relations.source != "none":
+        report["clips"] = asdict(clips)
     if updates is not None:
         report["temporal"] = updates.quality().numbers()
     outputs.write_report(out, report)
