@@ -74,6 +74,8 @@ def salvage_mcap(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
                     yield message
             except Exception as error:  # struct, unicode, or whatever a decompressor raises
                 note(f"{path.name}: the record at byte {start} is damaged and lost ({error})")
+            if is_cut:
+                return
 
 
 def _chunk_messages(content: bytes, tables: _Tables, is_cut: bool) -> list[Message]:
