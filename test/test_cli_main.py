@@ -98,11 +98,20 @@ def test_convert_makes_a_bag_that_info_and_run_understand(invoke, tmp_path):
 
 
 def test_info_shows_topics_also_where_one_is_missing(invoke, tmp_path):
-    write_bag(tmp_path / "bag", camera_items(2, with_pose=False))
+    write_bag(tmp_path / "bag", [item for item in camera_items(2) if "depth" not in item[0]])
     told = invoke("info", "bag")
     assert told.exit_code == 2
     assert "/camera/color/camera_info" in told.stdout
-    assert "no pose topic" in told.stderr
+    assert "no depth topic" in told.stderr
+
+
+def test_info_says_how_a_recording_without_poses_is_used(invoke, tmp_path):
+    write_bag(tmp_path / "bag", camera_items(2, with_pose=False))
+    told = invoke("info", "bag")
+    assert told.exit_code == 0
+    assert re.search(r"/camera/color/camera_info +CameraInfo +2 +camera_info", told.stdout)
+    assert "--odometry" in told.stdout
+    assert "--odometry" in invoke("convert", "auto", "bag", "out.mcap").stderr
 
 
 def test_info_tells_what_is_lost(invoke, tmp_path):

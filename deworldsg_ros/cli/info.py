@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from deworldsg_ros.bags.errors import RecordingError
+from deworldsg_ros.bags.messages import Role
 from deworldsg_ros.bags.recording import detect_kind, open_source
 from deworldsg_ros.bags.storage import RawBag
 
@@ -21,7 +22,7 @@ def show_recording(path: Path, console: Console) -> None:
     losses: list[str] = []
     frames = 0
     try:
-        source = open_source(path, kind=kind)
+        source = open_source(path, kind=kind, need_poses=False)
     except RecordingError as error:
         if kind != "rosbag2":
             raise
@@ -45,6 +46,10 @@ def show_recording(path: Path, console: Console) -> None:
     for name, msgtype, count in rows:
         table.add_row(name, msgtype.split("/")[-1], str(count), used.get(name, ""))
     console.print(table)
+    if used and Role.POSE.value not in used.values():
+        console.print(
+            "[yellow]no poses:[/] run it with --odometry or --poses FILE", highlight=False
+        )
     for loss in losses:
         console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
     if problem:
