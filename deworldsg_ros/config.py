@@ -139,6 +139,13 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1
         ),
     ] = 0.55
+    contest_cells: Annotated[
+        bool,
+        _number(
+            "what a frame shows to be one object is no longer part of another that it shows, too "
+            "(surface rule)"
+        ),
+    ] = True
     confirm_observations: Annotated[
         int, _number("frames that make a node sure (surface rule)", ge=1, le=1000)
     ] = 3

@@ -136,6 +136,29 @@ def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
     assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
 
 
+def split_after_one_mask_over_two(graph, **config) -> list[list[int]]:
+    """Ten frames that take two things for one, six that tell them apart, then each alone."""
+    merging = SurfaceMerging(MergingConfig(association="surface", **config))
+    left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.1)), slab((0.06, 0, 1), (0.12, 0.3, 0.1))
+    views = [[np.concatenate((left, right))]] * 10 + [[left, right]] * 6 + [[right], [left]]
+    return [
+        merging.merge(graph, frame(stamp, *((points, CUP) for points in view)))
+        for stamp, view in enumerate(views)
+    ]
+
+
+def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart(graph) -> None:
+    ids = split_after_one_mask_over_two(graph)
+    assert ids[9] == [1] and ids[15] == [1, 2]
+    assert ids[16:] == [[2], [1]]
+    means = graph.nodes.means[:, 0]
+    assert means[1] == pytest.approx(0.06, abs=0.005)
+    # Its Gaussian has the ten frames in it, but they count for half.
+    uncorrected = SceneGraph(VOCABULARY, "world")
+    split_after_one_mask_over_two(uncorrected, contest_cells=False)
+    assert means[0] < uncorrected.nodes.means[0, 0] - 0.005
+
+
 def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:
     cup = slab((3, 0, 1), (0.08, 0.08, 0.09))
     merging.merge(graph, frame(0, (WHOLE, TABLE), (cup, CUP)))

@@ -66,6 +66,32 @@ def test_shares_equal_the_reference(seed: int) -> None:
         assert surfaces.cell_count(owner) == len(known[owner])
 
 
+@given(seeds)
+@settings(max_examples=30)
+def test_contested_cells_equal_the_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    surfaces = VoxelMap(CELL_M)
+    known = [random_points(rng, int(rng.integers(1, 60))) for _ in range(4)]
+    for owner, points in enumerate(known):
+        surfaces.add([owner], surfaces.cells_of([points]))
+    seen = [random_points(rng, int(rng.integers(0, 60))) for _ in range(4)]
+    owners = [2, -1, 0, 1]  # the second founds a node; the last node is out of view
+    least_share = float(rng.choice([0.0, 0.1]))
+    lost = surfaces.contest(owners, surfaces.cells_of(seen), least_share)
+    for owner, points in enumerate(known):
+        had, own = cells_of(points), set()
+        shown = cells_of(seen[owners.index(owner)]) if owner in owners else set()
+        if owner in owners:
+            others = [s for s, o in zip(seen, owners) if o != owner]
+            own = had & set().union(*map(cells_of, others))
+            own = {cell for cell in own if not shown & set(neighbourhood(cell))}
+        share = len(own) / len(had)
+        own = own if share > least_share else set()
+        assert lost.get(owner, 0.0) == pytest.approx(share if own else 0.0)
+        assert cells_of(surfaces.centres(owner)) == had - own
+        assert surfaces.cell_count(owner) == len(had - own)
+
+
 def test_no_points_no_share() -> None:
     surfaces = VoxelMap(CELL_M)
     surfaces.add([], surfaces.cells_of([]))

@@ -28,6 +28,9 @@ from deworldsg_ros.scene.surface import hash_each
 
 # Gaussians are weighted by their number of pixels; this many make an observation of weight 1.
 PIXELS_OF_UNIT_WEIGHT = 1000.0
+# A node that has this share of its cells where a frame shows others has swallowed a part of them;
+# less are cells along a common border.
+CONTESTED_SHARE = 0.1
 
 
 class SurfaceMerging:
@@ -53,6 +56,7 @@ class SurfaceMerging:
         sets = known.cells_of([np.zeros((1, 3), np.float32)])
         known.add([0], sets)
         known.shares(sets)
+        known.contest([0], sets, 0.0)
         known.remove(0)
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
         look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
@@ -73,6 +77,8 @@ class SurfaceMerging:
         values = fit(local, graph.nodes, np.array(rows, np.int64), shares, self._config)
         matched = one_to_one(values)
         places = [owners[column] if column >= 0 else -1 for column in matched]
+        if self._config.contest_cells:
+            self._contest(graph, cells, places)
         node_ids = self._place(graph, local, cells, places)
         self._joint.note(owners, shares, values, matched)
         self._merge_grown(graph)
@@ -97,6 +103,14 @@ class SurfaceMerging:
             self._map.remove(owner)
             self._map.add([owner], cells)
             self._through.renew(owner, points)
+
+    def _contest(self, graph: SceneGraph, cells: CellSets, owners: list[int]) -> None:
+        """Correct nodes that have a part of what this frame shows to be another.
+
+        A Gaussian with so much of another object in it is worth less than those to come.
+        """
+        for owner, share in self._map.contest(owners, cells, CONTESTED_SHARE).items():
+            graph.discount(self._owners.node(owner), 1.0 - share)
 
     def _place(
         self, graph: SceneGraph, local: LocalGraph, cells: CellSets, owners: list[int]

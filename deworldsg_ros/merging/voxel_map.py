@@ -26,6 +26,8 @@ _FIRST_CAPACITY = 1 << 14
 # Cell indices lie in ±2^20: with cells of 3 cm that is 31 km around the origin.
 _BIAS = 1 << 20
 _MASK = (1 << 21) - 1
+# From a cell to itself and to those that share a face with it.
+STEPS = np.array([0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
 
 
 class CellSets(NamedTuple):
@@ -124,6 +126,42 @@ class VoxelMap:
         self._query += len(shares)
         owners = np.flatnonzero(shares.any(axis=0))
         return owners.tolist(), shares[:, owners]
+
+    def contest(
+        self, owners: Sequence[int], sets: CellSets, least_share: float
+    ) -> dict[int, float]:
+        """Take from each owner the cells in which a frame shows another of its owners instead.
+
+        Args:
+            owners: of each set; -1 = none yet.
+            sets: where the frame shows each of them. What touches an owner's own set stays its own.
+            least_share: of an owner's cells; fewer are left to it.
+
+        Returns:
+            The share of its cells that each owner lost, of those that lost some.
+        """
+        self._make_room(max(owners, default=-1) + 1)
+        cells, losers = _contest(
+            self._keys,
+            self._owners,
+            len(self._counts),
+            np.array(owners, np.int64),
+            sets.cells,
+            sets.starts,
+        )
+        # Counted once for each of the others that is shown there.
+        at_most = np.bincount(losers, minlength=len(self._counts))
+        shares = {}
+        for owner in np.flatnonzero(at_most > least_share * self._counts).tolist():
+            lost = np.unique(cells[losers == owner])
+            share = len(lost) / int(self._counts[owner])
+            if share > least_share:
+                known = np.concatenate(self._cells_of[owner])
+                _remove(self._keys, self._owners, owner, lost)
+                self._cells_of[owner] = [np.setdiff1d(known, lost, assume_unique=True)]
+                self._counts[owner] -= len(lost)
+                shares[owner] = share
+        return shares
 
     def remove(self, owner: int) -> Int64:
         """Forget an owner; returns the cells it had."""
@@ -227,13 +265,12 @@ def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignor
     of_owner = np.zeros(len(counts), np.int64)
     # The cell of the set that met an owner last: a cell meets an owner once.
     met_at = np.full(len(counts), -1, np.int64)
-    steps = np.array([0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
     for index in range(len(starts) - 1):
         query += 1
         on_owner[:] = 0
         of_owner[:] = 0
         for at in range(starts[index], starts[index + 1]):
-            for step in steps:
+            for step in STEPS:
                 slot = _slot(keys, cells[at] + step)
                 if keys[slot] == -1:
                     continue
@@ -255,6 +292,38 @@ def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignor
                     share = max(share, of_owner[owner] / counts[owner])
                 shares[index, owner] = share
     return shares
+
+
+@njit(cache=True, nogil=True)
+def _contest(keys, owners, owner_count, who, cells, starts):  # type: ignore[no-untyped-def]
+    set_of = np.full(owner_count, -1, np.int64)
+    ascending = cells.copy()
+    for index in range(len(who)):
+        if who[index] >= 0:
+            set_of[who[index]] = index
+            ascending[starts[index] : starts[index + 1]].sort()
+    lost = np.empty(len(cells) * OWNERS, np.int64)
+    losers = np.empty(len(cells) * OWNERS, np.int64)
+    count = 0
+    for index in range(len(who)):
+        for cell in cells[starts[index] : starts[index + 1]]:
+            slot = _slot(keys, cell)
+            if keys[slot] == -1:
+                continue
+            for place in range(OWNERS):
+                owner = owners[slot, place]
+                if owner < 0 or owner == who[index] or set_of[owner] < 0:
+                    continue
+                own = ascending[starts[set_of[owner]] : starts[set_of[owner] + 1]]
+                near = False
+                for step in STEPS:
+                    at = np.searchsorted(own, cell + step)
+                    near = bool(near or (at < len(own) and own[at] == cell + step))
+                if not near:
+                    lost[count] = cell
+                    losers[count] = owner
+                    count += 1
+    return lost[:count].copy(), losers[:count].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -177,6 +177,10 @@ class SceneGraph:
         self._forget(gone_id, keep_id)
         return keep_id
 
+    def discount(self, node_id: int, factor: float) -> None:
+        """Let the Gaussian of a live node count for less than it did beside those to come."""
+        self.nodes.weights[self.nodes.row(node_id)] *= factor
+
     def set_confirmed(self, node_id: int, confirmed: bool) -> None:
         """Note that a node is sure to be an object, or no longer sure."""
         row = self.nodes.row(node_id)
