@@ -121,7 +121,11 @@ def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  #
     inside = np.zeros(len(points), np.int64)
     rows, columns = depth_mm.shape
     for node in range(len(points)):
+        most_hidden = (1.0 - MIN_VISIBLE_SHARE) * counts[node]
         for index in range(counts[node]):
+            # Of a node that is too little visible the rest of the points tell nothing.
+            if index - through[node] - there[node] > most_hidden:
+                break
             x = np.float64(points[node, index, 0])
             y = np.float64(points[node, index, 1])
             z = np.float64(points[node, index, 2])
