@@ -236,7 +236,7 @@ def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> 
         assert told.exit_code == 0, told.output
         rows = {row["name"]: row for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
         assert name in rows
-        assert len(rows) == {"hard": 24, "switches": 4 * len(SWITCHES)}[table]
+        assert len(rows) == {"hard": 24, "switches": 5 * len(SWITCHES)}[table]
         assert not any(row["failed"] for row in rows.values())
         assert ("merging ms" in told.output) == (table == "switches")
 

@@ -87,11 +87,12 @@ ABLATION = (
 # A hand that trembles, or a tracker that does: 2 cm and 1 degree about each axis.
 TREMBLING = PoseChoice("worse", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
 LABELS = Condition("label", "persistent wrong labels", Faults(label=0.1))
+FALSE = Condition("false", "false boxes", Faults(false=1.0))
 TREMBLES = Condition("jitter", "poses ±2 cm, ±1°", poses=TREMBLING)
 HARD = (
     Condition("plain"),
     LABELS,
-    Condition("false", "false boxes", Faults(false=1.0)),
+    FALSE,
     Condition("bleed", "bleeding masks", Faults(bleed=0.3)),
     Condition("merge", "merged masks", Faults(merge=0.1)),
     Condition("cut", "cut masks", Faults(cut=0.3)),
@@ -108,14 +109,26 @@ SWITCHES = (
     ("cell5", "cells of 5 cm", ("merging.cell_m=0.05",)),
     ("class", "classes have to agree", ("merging.overlap_threshold_other_class=1.0",)),
     ("blind", "classes play no part", ("merging.overlap_threshold_other_class=0.3",)),
-    ("sure", "nodes are sure at once", ("merging.confirm_observations=1",)),
-    ("absent", "no negative evidence", ("merging.absent_frames=0",)),
+    ("contest", "cells not contested", ("merging.contest_cells=false",)),
+    (
+        "sure",
+        "nodes sure at once",
+        (
+            "merging.confirm_observations=1",
+            "merging.confirm_score=0.0",
+            "merging.baseline_deg=0.0",
+            "merging.min_detection_rate=0.0",
+        ),
+    ),
+    ("rate", "missed looks not counted", ("merging.min_detection_rate=0.0",)),
+    ("absent", "seen through, not lost", ("merging.absent_frames=0",)),
     ("rough", "no depth refinement", ("lifting.refine=false",)),
 )
 SWITCH_CONDITIONS = (
     Condition("flip0", "no flips", flip=0.0),
     Condition("flip10", "flips 0.1", flip=0.1),
     LABELS,
+    FALSE,
     TREMBLES,
 )
 
