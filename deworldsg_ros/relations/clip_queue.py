@@ -9,7 +9,7 @@ from deworldsg_ros.relations.clip_policy import ClipPolicy, PairKey, Rank
 from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip
 
 # Room for the pixels of clips that wait longer than their frames are kept.
-CUT_BYTES = 64 * 2**20
+CUT_BYTES = 128 * 2**20
 
 
 class ClipQueue:
