@@ -7,11 +7,13 @@ import os
 import signal
 import subprocess
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 from cli_support import DEMO_ROOM, deworldsg, first_frames, start
 
+from deworldsg_ros.bags.messages import Role
 from deworldsg_ros.bags.recording import open_source
 from deworldsg_ros.scene import wire
 
@@ -30,10 +32,24 @@ def read_graph(folder):
     return wire.decode((folder / "scene_graph.json").read_bytes(), wire.SceneGraphMessage)
 
 
-def test_demo_and_run_end_with_the_same_graph(recording, tmp_path):
-    ran = deworldsg(tmp_path, "run", recording, "--out", "ran", limit_s=400)
+@pytest.fixture(scope="module")
+def unposed(tmp_path_factory):
+    """The same without poses."""
+    source = open_source(DEMO_ROOM)
+    source.raw_messages = partial(without_poses, source.raw_messages)
+    return first_frames(source, FRAMES, tmp_path_factory.mktemp("unposed") / "short.mcap")
+
+
+def without_poses(messages):
+    return (message for message in messages() if message.role is not Role.POSE)
+
+
+@pytest.mark.parametrize("poses", ["recorded", "--odometry"])
+def test_demo_and_run_end_with_the_same_graph(recording, unposed, tmp_path, poses):
+    arguments = [unposed, poses] if poses == "--odometry" else [recording]
+    ran = deworldsg(tmp_path, "run", *arguments, "--out", "ran", limit_s=400)
     assert ran.returncode == 0, ran.stderr
-    shown = deworldsg(tmp_path, "demo", recording, "--out", "shown", "--rate", 0, limit_s=400)
+    shown = deworldsg(tmp_path, "demo", *arguments, "--out", "shown", "--rate", 0, limit_s=400)
     assert shown.returncode == 0, shown.stderr + shown.stdout
     ours, theirs = read_graph(tmp_path / "ran"), read_graph(tmp_path / "shown")
     assert ours.nodes

@@ -49,7 +49,7 @@ WANTED = {
     Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
     Role.DEPTH: "an Image or CompressedImage with depth in its name",
     Role.CAMERA_INFO: "a CameraInfo beside the RGB image",
-    Role.POSE: "a PoseStamped, an Odometry or /tf, or deworldsg run --odometry or --poses FILE",
+    Role.POSE: "a PoseStamped, an Odometry or /tf, or --odometry, or run with --poses FILE",
 }
 
 

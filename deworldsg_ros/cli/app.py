@@ -201,6 +201,7 @@ def demo(
     camera_info: InfoTopic = "",
     pose: PoseTopic = "",
     intrinsics: CameraIntrinsics = "",
+    odometry: OdometryPoses = False,
 ) -> None:
     """Make it with the four ROS 2 nodes, from a replay."""
     with _telling_errors():
@@ -214,6 +215,7 @@ def demo(
             rate=rate,
             topics=TopicChoice(rgb, depth, camera_info, pose),
             options=DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
+            odometry=odometry,
             console=Console(),
         )
 

@@ -33,6 +33,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
+ODOMETRY_NODE = "odometry_node"
 REPLAY = "replay_node"
 SHIPPED = ("bags/demo_room.mcap", "bags/demo_room")
 # Loading models and compiling kernels for the first time takes minutes on a small machine.
@@ -41,7 +42,7 @@ READY_S = 900.0
 EXPLAIN_AFTER_S = 8.0
 STALL_S = 30.0
 POLL_S = 0.2
-STARTING = "starting the four nodes …"
+STARTING = "starting the nodes …"
 
 
 class DemoFailed(DeWorldSGError):
@@ -57,15 +58,19 @@ def run_demo(
     rate: float,
     topics: TopicChoice,
     options: DatasetOptions,
+    odometry: bool,
     console: Console,
 ) -> None:
     """Start the nodes, replay, write the results, end the nodes; raises DeWorldSGError."""
     path = path or _shipped()
     config = effective_config(config_path, settings)
     # Problems of the recording are told before anything is started.
-    source = open_source(path, topics=topics, inputs=config.inputs, options=options)
+    source = open_source(
+        path, topics=topics, inputs=config.inputs, options=options, need_poses=not odometry
+    )
     name, kind, frames = source.name, source.kind, source.frame_count
-    pose_type = source.topics[Role.POSE].msgtype
+    # Poses out of TF or of odometry_node are messages of their own.
+    is_odometry = not odometry and source.topics[Role.POSE].msgtype == ODOMETRY
     source.close()
     outputs.prepare_folder(out, config)
     (out / outputs.GRAPH_FILE).unlink(missing_ok=True)
@@ -75,18 +80,20 @@ def run_demo(
     started_s = time.perf_counter()
     with _one_interrupt(), _processes(console) as processes:
         parameters = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]
-        # Poses out of TF become messages in the replay.
-        pose_source = "odometry" if pose_type == ODOMETRY else "pose"
-        parameters += ["-p", f"inputs.pose_source:={pose_source}"]
+        parameters += ["-p", f"inputs.pose_source:={'odometry' if is_odometry else 'pose'}"]
         environment = dds_environment()
-        for node in NODES:
+        for node in (*NODES, ODOMETRY_NODE) if odometry else NODES:
             command = [*node_command(node), *parameters]
             if node == "graph_node":
                 command += ["-p", f"save_path:={(out / outputs.GRAPH_FILE).absolute()}"]
             processes.append(LoggedProcess(node, command, environment, logs / f"{node}.log"))
         replay = LoggedProcess(
             REPLAY,
-            [*node_command(REPLAY), "--ros-args", *_replay_parameters(path, out, rate, topics)]
+            [
+                *node_command(REPLAY),
+                "--ros-args",
+                *_replay_parameters(path, out, rate, topics, odometry),
+            ]
             + (["-p", f"intrinsics:='{_joined(options)}'"] if options.intrinsics else []),
             environment,
             logs / f"{REPLAY}.log",
@@ -131,13 +138,16 @@ def _joined(options: DatasetOptions) -> str:
     return ",".join(map(str, options.intrinsics or ()))
 
 
-def _replay_parameters(path: Path, out: Path, rate: float, topics: TopicChoice) -> list[str]:
+def _replay_parameters(
+    path: Path, out: Path, rate: float, topics: TopicChoice, odometry: bool
+) -> list[str]:
     values: dict[str, Any] = {
         "recording": f"'{path.absolute()}'",
         "rate": float(rate),
         "wait_s": READY_S,
         "required": "true",
         "stall_s": STALL_S,
+        "odometry": str(odometry).lower(),
         "save": "true",
         "events": "true",
         "config": f"'{(out / outputs.CONFIG_FILE).absolute()}'",
@@ -247,7 +257,7 @@ def _event(line: bytes) -> events.Event | None:
 
 
 def _waiting_text(event: events.Waiting, since_s: float) -> str:
-    words = [words[0] for item in event.missing if (words := item.split())[0] in NODES]
+    words = [words[0] for item in event.missing if (words := item.split())[0].endswith("_node")]
     names = ", ".join(dict.fromkeys(words)) or event.missing[0]
     text = f"{STARTING} waiting for {names}"
     if since_s > EXPLAIN_AFTER_S:

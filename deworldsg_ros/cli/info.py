@@ -48,7 +48,8 @@ def show_recording(path: Path, console: Console) -> None:
     console.print(table)
     if used and Role.POSE.value not in used.values():
         console.print(
-            "[yellow]no poses:[/] run it with --odometry or --poses FILE", highlight=False
+            "[yellow]no poses:[/] run or demo with --odometry, or run with --poses FILE",
+            highlight=False,
         )
     for loss in losses:
         console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)

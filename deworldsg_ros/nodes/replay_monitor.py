@@ -21,11 +21,12 @@ from deworldsg_ros.bags.pacing import Window
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.scene import wire
 
-SEGMENTATION, LIFTING, RELATION, GRAPH = (
+SEGMENTATION, LIFTING, RELATION, GRAPH, ODOMETRY = (
     "segmentation_node",
     "lifting_node",
     "relation_node",
     "graph_node",
+    "odometry_node",
 )
 LISTENERS = {
     Role.RGB: {SEGMENTATION, RELATION},
@@ -40,6 +41,8 @@ BETWEEN = {
     "deworldsg/local_graph": ({LIFTING}, {RELATION, GRAPH}),
     "deworldsg/relation_evidence": ({RELATION}, {GRAPH}),
 }
+ODOMETRY_LISTENS_TO = (Role.RGB, Role.DEPTH, Role.CAMERA_INFO)
+POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
 # Each participant tells of its endpoints on its own: what is seen here is soon seen everywhere.
 SETTLE_S = 1.0
 # How long evidence may lag behind the last local graph before it is taken to be all.
@@ -65,11 +68,12 @@ class Endpoint:
 
 
 class PipelineMonitor:
-    """Watches the four nodes.
+    """Watches the nodes.
 
     Args:
         node: of the replay.
         window: most frames in flight.
+        odometry: whether odometry_node makes the poses.
 
     Attributes:
         window: frames published and answered.
@@ -77,9 +81,14 @@ class PipelineMonitor:
         poses: T_world_camera of the local graphs, 16 values each.
     """
 
-    def __init__(self, node: Node, window: int) -> None:
+    def __init__(self, node: Node, window: int, *, odometry: bool) -> None:
         self._node = node
-        self.window = Window(window, (Role.DEPTH, Role.POSE))
+        self.window = Window(window, (Role.DEPTH,) if odometry else (Role.DEPTH, Role.POSE))
+        self._listening = {
+            role: names | ({ODOMETRY} if odometry and role in ODOMETRY_LISTENS_TO else set())
+            for role, names in LISTENERS.items()
+        }
+        self._between = {**BETWEEN, **(POSES_OF_ODOMETRY if odometry else {})}
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.poses: list[list[float]] = []
         self._local_graphs = self._evidence = 0
@@ -105,11 +114,12 @@ class PipelineMonitor:
             listeners = self._listeners(endpoint.topic)
             missing += [
                 f"{name} to listen to {endpoint.topic}"
-                for name in sorted(LISTENERS[role] - listeners)
+                for name in sorted(self._listening[role] - listeners)
             ]
-            if not missing and endpoint.publisher.get_subscription_count() < len(LISTENERS[role]):
+            wanted = len(self._listening[role])
+            if not missing and endpoint.publisher.get_subscription_count() < wanted:
                 missing.append(f"a connection on {endpoint.topic}")
-        for topic, (publishers, listeners) in BETWEEN.items():
+        for topic, (publishers, listeners) in self._between.items():
             full_name = self._node.resolve_topic_name(topic)
             infos = self._node.get_publishers_info_by_topic(full_name)
             absent = publishers - {info.node_name for info in infos}

@@ -77,11 +77,12 @@ class ReplayNode(Node):  # type: ignore[misc]
         self._outputs = {
             role: self._publisher(role, topic.msgtype)
             for role, topic in self._source.topics.items()
+            if role is not Role.POSE or not self._options.odometry
         }
         self._clock_output = (
             self.create_publisher(Clock, "/clock", 10) if self._options.clock else None
         )
-        self._monitor = PipelineMonitor(self, self._options.window)
+        self._monitor = PipelineMonitor(self, self._options.window, odometry=self._options.odometry)
         self._pace = Pace(self._options.rate)
         self._published = 0
         self._told_s = 0.0
@@ -93,6 +94,8 @@ class ReplayNode(Node):  # type: ignore[misc]
             self._wait_to_be_found()
         self._tell(events.Started(self._source.frame_count))
         for message in self._source.raw_messages():
+            if message.role not in self._outputs:
+                continue
             self._wait_until_due(message, alone)
             self._outputs[message.role].publish(message.data)
             if self._clock_output is not None:
@@ -133,6 +136,7 @@ class ReplayNode(Node):  # type: ignore[misc]
             ),
             inputs=config.inputs,
             options=DatasetOptions(options.frame_rate, parse_intrinsics(options.intrinsics)),
+            need_poses=not options.odometry,
         )
 
     def _publisher(self, role: Role, msgtype: str) -> Any:

@@ -34,6 +34,9 @@ class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         _option("after so long without an answer, frames in flight are given up, seconds", gt=0),
     ] = 20.0
     clock: Annotated[bool, _option("publish the recorded time on /clock, for use_sim_time")] = False
+    odometry: Annotated[
+        bool, _option("poses are odometry_node's to make, which is waited for: none is published")
+    ] = False
     save: Annotated[
         bool, _option("at the end, when all is worked off, have graph_node save its graph")
     ] = False
