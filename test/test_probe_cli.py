@@ -84,8 +84,8 @@ def test_a_probe_from_a_data_set(tmp_path):
 @pytest.mark.parametrize(
     "changes, told",
     [
-        ({"device": "cuda"}, "finds no CUDA device"),
-        ({"model": "/absent"}, "there is no such folder"),
+        ({"device": "cuda"}, "--device is 'cuda'"),
+        ({"model": "/absent"}, "--model '/absent': there is no such folder"),
         ({"world-model": "fake"}, "wanted vjepa2 or dinov2"),
         ({"layout": "three"}, "wanted two_layer or batch_norm"),
         ({"predicates": "/absent"}, "wanted replica_ssg, 3dssg, a file"),

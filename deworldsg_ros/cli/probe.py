@@ -15,6 +15,14 @@ from deworldsg_ros.perception.checkpoint_card import CARD_FILE, read_card
 from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.scene.errors import ConfigurationError
 
+OPTION_OF = {
+    "model_path": "--model",
+    "clip_length": "--clip-length",
+    "image_size": "--image-size",
+    "batch_size": "--batch-size",
+    "device": "--device",
+}
+
 PredicateSet = Annotated[
     str,
     typer.Option(
@@ -29,7 +37,8 @@ def train_probe(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="CLIPS", help="folder of clips, or a data set in ReplicaSSG's layout"
+            metavar="CLIPS",
+            help="folder of clips, or a data set in ReplicaSSG's or 3RScan's layout",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="folder of the probe")],
@@ -95,11 +104,12 @@ def train_probe(
     names = read_predicates(predicates)
     console = Console(highlight=False, soft_wrap=True)
     with _needing_torch():
+        from deworldsg_ros.cli.probe_clips import read_clips
         from deworldsg_ros.relations.training.fit import FitOptions
         from deworldsg_ros.relations.training.train import Progress, TrainingOptions
         from deworldsg_ros.relations.training.train import train_probe as train
 
-        clips = _read_clips(source, clip_length, clips_per_pair)
+        clips = read_clips(source, clip_length, clips_per_pair)
         options = TrainingOptions(
             layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
             inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
@@ -180,62 +190,19 @@ def read_predicates(choice: str) -> tuple[str, ...]:
     return names
 
 
-def _read_clips(source: Path, clip_length: int, clips_per_pair: int) -> Any:
-    from deworldsg_ros.datasets.annotations import LAYOUTS, Annotations
-    from deworldsg_ros.relations.training.labelled_clips import read_clip_folder
-
-    if not (source / LAYOUTS["replica"].relations).is_file():
-        return read_clip_folder(source)
-    annotations = Annotations(source, "replica")
-    folder = source / "data"
-    scans = sorted(path.name for path in folder.iterdir() if path.is_dir())
-    clips = [
-        clip
-        for scan in scans
-        for clip in _scan_clips(annotations, scan, clip_length, clips_per_pair)
-    ]
-    if not clips:
-        raise ConfigurationError(
-            f"data set '{source}': no related pair is seen in a frame; wanted "
-            "data/SCAN/sequence/frame-NNNNNN.color.jpg with .bb.txt beside it"
-        )
-    return clips
-
-
-def _scan_clips(annotations: Any, scan: str, clip_length: int, clips_per_pair: int) -> Any:
-    from deworldsg_ros.datasets.dataset import image_size
-    from deworldsg_ros.datasets.sequence import sequence_folder
-    from deworldsg_ros.relations.training.scan_clips import cut_clips, read_boxes
-
-    sequence = sequence_folder(annotations.scan_folder(scan))
-    images = sorted(sequence.glob("frame-*.color.jpg"))
-    if not images:
-        return []
-    frames = [
-        (image, read_boxes(image.with_name(image.name.split(".")[0] + ".bb.txt")))
-        for image in images
-    ]
-    names = annotations.vocabulary.predicates
-    relations = [
-        (subject, object_, names[place])
-        for subject, object_, place in annotations.scan(scan).relations
-        if place >= 0
-    ]
-    return cut_clips(
-        scan,
-        frames,
-        image_size(images[0]),
-        relations,
-        clip_length=clip_length,
-        clips_per_pair=clips_per_pair,
-    )
-
-
 def _load_backbone(config: RelationsConfig) -> Any:
     from deworldsg_ros.relations.world_models import dinov2, vjepa2
 
     loaders = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
-    return loaders[_one_of("world-model", config.world_model, tuple(loaders))](config)
+    load = loaders[_one_of("world-model", config.world_model, tuple(loaders))]
+    try:
+        return load(config)
+    except ConfigurationError as error:
+        # Who types options is told of options.
+        told = str(error).replace("set relations.local_files_only to false", "give --download")
+        for name, option in OPTION_OF.items():
+            told = told.replace(f"relations.{name}", option)
+        raise ConfigurationError(told) from error
 
 
 def _one_of(option: str, value: str, choices: tuple[str, ...]) -> Any:

@@ -30,6 +30,8 @@ DROPOUT = 0.2
 # What the published probe was trained on: V-JEPA 2 ViT-g at 384 pixels, 16 frames.
 PUBLISHED_BACKBONE = BackboneIdentity("vjepa2", 1408, 384, 16)
 PUBLISHED_HIDDEN_DIM = 512
+# A probe has 14 at most.
+MOST_NAMED_KEYS = 14
 
 
 def build_network(card: ProbeCard) -> torch.nn.Sequential:
@@ -104,6 +106,12 @@ def load_probe(folder: Path) -> Probe:
     return with_weights(card, state, str(path))
 
 
+def _first_of(names: list[str]) -> str:
+    """The names; of more than a probe has, the first ones."""
+    more = len(names) - MOST_NAMED_KEYS
+    return ", ".join(names[:MOST_NAMED_KEYS]) + (f" and {more} more" if more > 0 else "")
+
+
 def with_weights(card: ProbeCard, state: dict[str, torch.Tensor], source: str) -> Probe:
     """A probe of given weights.
 
@@ -115,8 +123,8 @@ def with_weights(card: ProbeCard, state: dict[str, torch.Tensor], source: str) -
     missing = sorted(wanted.keys() - state.keys())
     unknown = sorted(state.keys() - wanted.keys())
     if missing or unknown:
-        parts = [f"lacks {', '.join(missing)}"] if missing else []
-        parts += [f"has unknown {', '.join(unknown)}"] if unknown else []
+        parts = [f"lacks {_first_of(missing)}"] if missing else []
+        parts += [f"has unknown {_first_of(unknown)}"] if unknown else []
         raise ConfigurationError(
             f"probe weights {source}: wanted the keys of layout '{card.layout}'; the file "
             f"{' and '.join(parts)}"

@@ -15,28 +15,32 @@ from deworldsg_ros.relations.training.labelled_clips import LabelledClip
 from deworldsg_ros.scene.errors import RefusedInput
 
 Float64 = NDArray[np.float64]
+# Boxes of the objects in a frame by object id, (4,) float64 xyxy pixels.
+Boxes = Mapping[int, Float64]
 
 
 def cut_clips(
     scan: str,
-    frames: Sequence[tuple[Path, Mapping[int, Float64]]],
+    frames: Sequence[tuple[Path, Boxes]],
     image_size: tuple[int, int],
     relations: Sequence[tuple[int, int, str]],
     *,
     clip_length: int,
     clips_per_pair: int,
     min_side_px: float = 10.0,
+    turned: bool = False,
 ) -> list[LabelledClip]:
     """Clips of each related pair, at frames spread evenly over those in which both are seen.
 
     Args:
         scan: its id; the clips' group.
-        frames: image file and boxes by object id, (4,) float64 xyxy pixels, in order of time.
+        frames: image file and boxes by object id, in order of time.
         image_size: width and height of all images.
         relations: subject id, object id, predicate.
         clip_length: T.
         clips_per_pair: at most so many of each.
         min_side_px: shortest side of a box that counts as seen.
+        turned: whether boxes and sizes are of the images turned by 90 degrees clockwise.
     """
     width, height = image_size
     clips = []
@@ -62,7 +66,7 @@ def cut_clips(
                     boxes=relative_box_pair(
                         boxes[subject] - corner, boxes[object_] - corner, x2 - x1, y2 - y1
                     ),
-                    read=_reader(paths, crop, clip_length),
+                    read=_reader(paths, crop, clip_length, turned),
                 )
             )
     return clips
@@ -103,13 +107,17 @@ def _spread(places: list[int], count: int) -> list[int]:
     return [places[int(step)] for step in steps]
 
 
-def _reader(paths: Sequence[Path], crop: CropBox, clip_length: int) -> Callable[[], Rgb]:
+def _reader(
+    paths: Sequence[Path], crop: CropBox, clip_length: int, turned: bool
+) -> Callable[[], Rgb]:
     def read() -> Rgb:
         images = []
         for path in paths:
             image = cv2.imread(str(path), cv2.IMREAD_COLOR)
             if image is None:
                 raise RefusedInput("unreadable_clip", f"{path} cannot be decoded")
+            if turned:
+                image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
             images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8))
         return crop_clip(images, crop, clip_length)
 
