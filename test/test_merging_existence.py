@@ -90,6 +90,18 @@ def test_what_is_missed_from_most_places_is_in_doubt_and_comes_back_when_found()
     assert walk.graph.nodes.observations[row] == 5
 
 
+def test_what_is_in_doubt_keeps_its_id_however_long_it_is_not_seen():
+    walk = Walk(expire_tentative_s=1.0)
+    for _ in range(3):
+        walk.see(found=True)
+    for _ in range(20):
+        walk.see(found=False, step_m=0.02)
+    assert walk.told == [] and walk.graph.nodes.ids.tolist() == [1]
+    for _ in range(30):
+        walk.see(found=True, step_m=0.01)
+    assert walk.told == [1]
+
+
 @pytest.mark.parametrize(
     ("frames", "step_m", "z_m"),
     [

@@ -47,7 +47,7 @@ class SurfaceMerging:
         # Owners whose surface has changed since `_through` took points of it.
         self._changed: set[int] = set()
         self._lost = LostNodes(config.lost_s)
-        # Nodes that were confirmed once.
+        # Nodes that were sure once; they are hidden, and keep their ids until they are found again.
         self._doubted: set[int] = set()
 
     def warm_up(self) -> None:
@@ -230,9 +230,10 @@ class SurfaceMerging:
         nodes = graph.nodes
         oldest_ns = stamp_ns - int(self._config.expire_tentative_s * 1e9)
         old = nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist()
-        for node_id in [node_id for node_id in old if node_id not in self._lost]:
-            graph.remove_node(node_id)
-            self._free(node_id)
+        for node_id in old:
+            if node_id not in self._lost and node_id not in self._doubted:
+                graph.remove_node(node_id)
+                self._free(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
 
