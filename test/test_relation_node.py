@@ -113,6 +113,31 @@ def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
         at.close()
 
 
+def test_a_recording_that_starts_again_is_looked_at_again() -> None:
+    at = Bench(
+        RelationNode,
+        {"rgb/image_raw": Image, "deworldsg/local_graph": String},
+        parameter_overrides=WORLD_MODEL,
+    )
+
+    def encoded() -> int:
+        return int(at.node.more_values()["clips encoded"])
+
+    try:
+        at.peer.spin_for(0.5)
+        started_ns = at.stamp_ns
+        for count in range(1, 13):  # more than the buffer of eight holds
+            send_two_objects(at)
+            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+        at.stamp_ns = started_ns
+        for count in (13, 14):
+            send_two_objects(at)
+            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+        assert at.node.more_values().get("clips dropped no_frame") is None
+    finally:
+        at.close()
+
+
 def start(**overrides: str) -> RelationNode:
     """The node as it starts with a world model and parameters, named with __ for a dot."""
     parameters = [

@@ -38,6 +38,7 @@ class RelationNode(JoiningNode[PairingFrame]):
             require_predicates(world_model, predicates)
         self._reasoner = RelationReasoner(config, world_model, report)
         self._world_frame = ""
+        self._newest_ns = 0
         self._publish = self.json_publisher("deworldsg/relation_evidence", 50)
         self._world_model = EvidenceWorker(self._reasoner, self._deliver, report)
         self._world_model.start()
@@ -82,6 +83,9 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._frames.add_local_graph(local_graph_from_message(message))
 
     def _relate(self, frame: PairingFrame) -> None:
+        if frame.local.stamp_ns < self._newest_ns:  # a recording was started again
+            self._reasoner.clear()
+        self._newest_ns = frame.local.stamp_ns
         self._world_frame = frame.local.frame_id
         self._deliver(self._world_model.observe(frame.local, frame.rgb))
 
