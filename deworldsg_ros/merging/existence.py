@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.scene.gaussian import Float64
-
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 
 # Another look comes soon where the camera moves, and is waited for this long, so that what it sees
 # is found well within two seconds. A camera that stands gives none, and is not waited for.
@@ -21,6 +18,26 @@ STILL_M = 0.001
 REACH = 1.1
 # Detections that are all as likely wrong as right have to be so many times as frequent.
 UNSURE_TIMES = 4
+
+RECORD = np.dtype(
+    [
+        ("detections", np.int64),
+        # Furthest distance of a detection, and its best score.
+        ("reach_m", np.float64),
+        ("best_score", np.float64),
+        ("first_ns", np.int64),
+        ("last_ns", np.int64),
+        # Looks that are over, and those of them that found the node.
+        ("looks", np.int64),
+        ("found", np.int64),
+        # Whether the present look found it, and where it began.
+        ("finds", np.bool_),
+        ("camera_world", np.float64, 3),
+        # Whether the camera has moved since the first detection.
+        ("moving", np.bool_),
+    ],
+    align=True,
+)
 
 
 class Existence:
@@ -35,18 +52,15 @@ class Existence:
 
     def __init__(self, config: MergingConfig) -> None:
         self._config = config
-        self._detections: Int64 = np.zeros(0, np.int64)
-        # Furthest distance of a detection, and its best score.
-        self._reach_m: Float64 = np.zeros(0)
-        self._best_score: Float64 = np.zeros(0)
-        self._first_ns: Int64 = np.zeros(0, np.int64)
-        self._last_ns: Int64 = np.zeros(0, np.int64)
-        # Looks that are over, those of them that found the node, and the present one.
-        self._looks: Int64 = np.zeros(0, np.int64)
-        self._found: Int64 = np.zeros(0, np.int64)
-        self._finds: Bool = np.zeros(0, np.bool_)
-        self._moving: Bool = np.zeros(0, np.bool_)
-        self._camera_world: Float64 = np.zeros((0, 3))
+        self._baseline_rad = math.radians(config.baseline_deg)
+        self._nodes = np.zeros(0, RECORD)
+
+    def warm_up(self) -> None:
+        """Compile now what would else be compiled during the first frame."""
+        place = np.zeros((1, 3))
+        spare = Existence(self._config)
+        spare.detected([0], place, np.ones(1), place[0], 0)
+        spare.missed([0], place, place[0])
 
     def detected(
         self,
@@ -57,91 +71,122 @@ class Existence:
         stamp_ns: int,
     ) -> None:
         """Take in the objects (n) of a frame, by owner, seen from a camera position (3,)."""
-        if not owners:
-            return
-        self._make_room(max(owners) + 1)
-        new = [owner for owner in owners if not self._detections[owner]]
-        self._first_ns[new] = stamp_ns
-        self._camera_world[new] = camera_world
-        distances_m = np.linalg.norm(means_world - camera_world, axis=1)
-        self._look(np.array(owners, np.int64), distances_m, camera_world)
-        self._finds[owners] = True
-        self._detections[owners] += 1
-        self._last_ns[owners] = stamp_ns
-        self._reach_m[owners] = np.maximum(self._reach_m[owners], distances_m)
-        self._best_score[owners] = np.maximum(self._best_score[owners], scores)
+        if owners:
+            self._make_room(max(owners) + 1)
+            _detected(
+                self._nodes,
+                np.array(owners, np.int64),
+                means_world,
+                scores,
+                np.ascontiguousarray(camera_world),
+                stamp_ns,
+                self._baseline_rad,
+            )
 
     def missed(self, owners: list[int], means_world: Float64, camera_world: Float64) -> list[int]:
         """Take in nodes (n) that were in full view but not detected; returns those now in doubt."""
-        distances_m = np.linalg.norm(means_world - camera_world, axis=1)
-        fair = distances_m <= REACH * self._reach_m[owners]
-        missed = np.array(owners, np.int64)[fair]
-        self._look(missed, distances_m[fair], camera_world)
-        return [owner for owner in missed.tolist() if self._doubtful(owner)]
+        if not owners:
+            return []
+        fair = _missed(
+            self._nodes,
+            np.array(owners, np.int64),
+            means_world,
+            np.ascontiguousarray(camera_world),
+            self._baseline_rad,
+        )
+        return [owner for owner in fair.tolist() if self._doubtful(owner)]
 
     def sure(self, owner: int) -> bool:
         """Whether a node was detected often and surely enough, and in more than one look."""
-        surely = self._best_score[owner] >= self._config.confirm_score
+        node = self._nodes[owner]
+        surely = node["best_score"] >= self._config.confirm_score
         wanted = self._config.confirm_observations * (1 if surely else UNSURE_TIMES)
-        waited = self._last_ns[owner] - self._first_ns[owner] >= WAIT_NS
-        again = self._looks[owner] or not self._moving[owner] or waited
-        return bool(again and self._detections[owner] >= wanted and not self._doubtful(owner))
+        waited = node["last_ns"] - node["first_ns"] >= WAIT_NS
+        again = node["looks"] or not node["moving"] or waited
+        return bool(again and node["detections"] >= wanted and not self._doubtful(owner))
 
     def restore(self, owner: int, detections: int) -> None:
         """Take in a node of a graph that was loaded."""
         self._make_room(owner + 1)
-        self._detections[owner] = detections
-        self._best_score[owner] = 1.0
-        self._looks[owner] = self._found[owner] = 1
-        self._camera_world[owner] = np.inf
+        node = self._nodes[owner]
+        node["detections"], node["best_score"] = detections, 1.0
+        node["looks"] = node["found"] = 1
+        node["camera_world"] = np.inf
 
     def merge(self, kept: int, gone: int) -> None:
         """Count two owners, which are one object, as one."""
-        self._detections[kept] += self._detections[gone]
-        self._reach_m[kept] = max(self._reach_m[kept], self._reach_m[gone])
-        self._best_score[kept] = max(self._best_score[kept], self._best_score[gone])
-        self._first_ns[kept] = min(self._first_ns[kept], self._first_ns[gone])
-        self._last_ns[kept] = max(self._last_ns[kept], self._last_ns[gone])
+        node, other = self._nodes[kept], self._nodes[gone]
+        node["detections"] += other["detections"]
+        for name, either in (("reach_m", max), ("best_score", max), ("last_ns", max)):
+            node[name] = either(node[name], other[name])
+        node["first_ns"] = min(node["first_ns"], other["first_ns"])
         # What one of them missed the other may have found: looks at the same place are not added.
-        if self._found[gone] * self._looks[kept] > self._found[kept] * self._looks[gone]:
-            self._looks[kept], self._found[kept] = self._looks[gone], self._found[gone]
+        if other["found"] * node["looks"] > node["found"] * other["looks"]:
+            node["looks"], node["found"] = other["looks"], other["found"]
 
     def forget(self, owner: int) -> None:
         """Drop what is known of an owner that is gone."""
-        if owner < len(self._detections):
-            for column in (self._detections, self._looks, self._found):
-                column[owner] = 0
-            self._reach_m[owner] = self._best_score[owner] = 0.0
-            self._finds[owner] = self._moving[owner] = False
-
-    def _look(self, owners: Int64, distances_m: Float64, camera_world: Float64) -> None:
-        """Begin another look at those nodes from which the camera has turned far enough."""
-        steps_m = np.linalg.norm(camera_world - self._camera_world[owners], axis=1)
-        baselines_m = math.radians(self._config.baseline_deg) * distances_m
-        moving = steps_m > STILL_M
-        self._moving[owners] |= moving
-        over = owners[moving & (steps_m >= baselines_m)]
-        self._looks[over] += 1
-        self._found[over] += self._finds[over]
-        self._finds[over] = False
-        self._camera_world[over] = camera_world
+        if owner < len(self._nodes):
+            self._nodes[owner] = np.zeros((), RECORD)
 
     def _doubtful(self, owner: int) -> bool:
-        looks = self._looks[owner] + 1
-        found = self._found[owner] + self._finds[owner]
+        node = self._nodes[owner]
+        found, looks = node["found"] + node["finds"], node["looks"] + 1
         return bool(found < self._config.min_detection_rate * looks)
 
     def _make_room(self, count: int) -> None:
-        if count <= len(self._detections):
-            return
-        more = max(64, 2 * count) - len(self._detections)
-        self._detections = np.pad(self._detections, (0, more))
-        self._reach_m = np.pad(self._reach_m, (0, more))
-        self._best_score = np.pad(self._best_score, (0, more))
-        self._first_ns = np.pad(self._first_ns, (0, more))
-        self._last_ns = np.pad(self._last_ns, (0, more))
-        self._looks = np.pad(self._looks, (0, more))
-        self._found = np.pad(self._found, (0, more))
-        self._finds = np.pad(self._finds, (0, more))
-        self._moving = np.pad(self._moving, (0, more))
-        self._camera_world = np.pad(self._camera_world, ((0, more), (0, 0)))
+        if count > len(self._nodes):
+            more = np.zeros(max(64, 2 * count) - len(self._nodes), RECORD)
+            self._nodes = np.concatenate((self._nodes, more))
+
+
+@njit(cache=True, nogil=True)
+def _look(node, mean, camera, baseline_rad):  # type: ignore[no-untyped-def]
+    """Begin another look where the camera has moved on; returns its distance from the node."""
+    distance = 0.0
+    step = 0.0
+    for axis in range(3):
+        distance += (mean[axis] - camera[axis]) ** 2
+        step += (node.camera_world[axis] - camera[axis]) ** 2
+    distance, step = math.sqrt(distance), math.sqrt(step)
+    if step > STILL_M:
+        node.moving = True
+        if step >= baseline_rad * distance:
+            node.looks += 1
+            node.found += node.finds
+            node.finds = False
+            for axis in range(3):
+                node.camera_world[axis] = camera[axis]
+    return distance
+
+
+@njit(cache=True, nogil=True)
+def _detected(nodes, owners, means, scores, camera, stamp_ns, baseline_rad):  # type: ignore[no-untyped-def]
+    for index in range(len(owners)):
+        node = nodes[owners[index]]
+        if node.detections == 0:
+            node.first_ns = stamp_ns
+            for axis in range(3):
+                node.camera_world[axis] = camera[axis]
+        distance = _look(node, means[index], camera, baseline_rad)
+        node.finds = True
+        node.detections += 1
+        node.last_ns = stamp_ns
+        node.reach_m = max(node.reach_m, distance)
+        node.best_score = max(node.best_score, scores[index])
+
+
+@njit(cache=True, nogil=True)
+def _missed(nodes, owners, means, camera, baseline_rad):  # type: ignore[no-untyped-def]
+    fair = np.empty(len(owners), np.int64)
+    count = 0
+    for index in range(len(owners)):
+        node = nodes[owners[index]]
+        squared = 0.0
+        for axis in range(3):
+            squared += (means[index, axis] - camera[axis]) ** 2
+        if math.sqrt(squared) <= REACH * node.reach_m:
+            _look(node, means[index], camera, baseline_rad)
+            fair[count] = owners[index]
+            count += 1
+    return fair[:count]

@@ -60,6 +60,7 @@ class SurfaceMerging:
         known.remove(0)
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
         look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
+        self._existence.warm_up()
         warm_up_fit()
         warm_up_graph()
 

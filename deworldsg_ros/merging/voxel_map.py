@@ -149,6 +149,8 @@ class VoxelMap:
             sets.cells,
             sets.starts,
         )
+        if not len(losers):
+            return {}
         # Counted once for each of the others that is shown there.
         at_most = np.bincount(losers, minlength=len(self._counts))
         shares = {}
@@ -298,10 +300,10 @@ def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignor
 def _contest(keys, owners, owner_count, who, cells, starts):  # type: ignore[no-untyped-def]
     set_of = np.full(owner_count, -1, np.int64)
     ascending = cells.copy()
+    sorted_yet = np.zeros(len(who), np.bool_)
     for index in range(len(who)):
         if who[index] >= 0:
             set_of[who[index]] = index
-            ascending[starts[index] : starts[index + 1]].sort()
     lost = np.empty(len(cells) * OWNERS, np.int64)
     losers = np.empty(len(cells) * OWNERS, np.int64)
     count = 0
@@ -315,6 +317,9 @@ def _contest(keys, owners, owner_count, who, cells, starts):  # type: ignore[no-
                 if owner < 0 or owner == who[index] or set_of[owner] < 0:
                     continue
                 own = ascending[starts[set_of[owner]] : starts[set_of[owner] + 1]]
+                if not sorted_yet[set_of[owner]]:
+                    own.sort()
+                    sorted_yet[set_of[owner]] = True
                 near = False
                 for step in STEPS:
                     at = np.searchsorted(own, cell + step)
