@@ -84,8 +84,8 @@ class CheckpointSource:
             raise ConfigurationError(self._cannot_load(error)) from error
         if found.model_type not in families:
             raise ConfigurationError(
-                f"{self.parameter} '{self.name}' is a checkpoint of {found.model_type}: wanted one "
-                f"of {' or '.join(sorted(families))}"
+                f"{self.parameter} '{self.name}' is a checkpoint of {found.model_type}: wanted "
+                f"{' or '.join(sorted(families))}"
             )
         return found
 

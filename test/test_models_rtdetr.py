@@ -159,7 +159,9 @@ def test_half_precision_runs_through(folders):
 def test_a_folder_of_another_architecture_is_named(tmp_path):
     from perception_models_support import save_sam
 
-    with pytest.raises(ConfigurationError, match="is a checkpoint of sam: wanted one of rt_detr"):
+    with pytest.raises(
+        ConfigurationError, match="is a checkpoint of sam: wanted rt_detr or rt_detr_v2"
+    ):
         detector(save_sam(tmp_path))
 
 

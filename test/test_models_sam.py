@@ -164,9 +164,9 @@ def test_sam_refuses_another_size(folders):
 
 
 def test_the_other_architecture_is_named(folders, tmp_path):
-    with pytest.raises(ConfigurationError, match="of sam: wanted one of sam2 or sam2_video"):
+    with pytest.raises(ConfigurationError, match="of sam: wanted sam2 or sam2_video"):
         Sam2Segmenter(settings(segmenter_path=str(folders["sam"])))
-    with pytest.raises(ConfigurationError, match="of rt_detr: wanted one of sam"):
+    with pytest.raises(ConfigurationError, match="of rt_detr: wanted sam"):
         SamSegmenter(settings(segmenter_path=str(save_rtdetr(tmp_path))))
 
 

@@ -77,7 +77,7 @@ def test_of_two_clips_of_a_pair_the_newer_waits():
     assert dropped == {"superseded": 2}
 
 
-def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_go(monkeypatch):
+def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_go():
     frames = FrameBuffer(2)
     image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
     frames.add(1, image)
