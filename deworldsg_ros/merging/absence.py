@@ -21,8 +21,6 @@ MIN_VISIBLE_POINTS = 6
 MIN_VISIBLE_SHARE = 0.5
 # This share of the visible points has to be seen through, or to be there.
 DECISIVE_SHARE = 0.7
-
-
 # A node with this share of its points in the image is in full view of the camera.
 WHOLE_SHARE = 0.9
 # Surface points of a node that the depth image is compared with.
