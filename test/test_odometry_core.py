@@ -9,6 +9,7 @@ import pytest
 from corner_room import INTRINSICS, LEVEL, corner_frame, turned, walk
 
 from deworldsg_ros.config import OdometryConfig
+from deworldsg_ros.poses import odometry as odometry_module
 from deworldsg_ros.poses.depth_alignment import fit_share, points_of, refine, surface_of
 from deworldsg_ros.poses.motion import rigid_motion, rotation_angle_deg
 from deworldsg_ros.poses.odometry import LEVEL_CAMERA, RgbdOdometry
@@ -33,8 +34,11 @@ def blind(frame: RgbdFrame) -> RgbdFrame:
     return replace(frame, depth_m=np.zeros_like(frame.depth_m))
 
 
-@pytest.mark.parametrize("method", ["rgbd", "depth"])
-def test_a_walk_is_followed(method: str) -> None:
+@pytest.mark.parametrize("method", ["rgbd", "depth", "without OpenCV's"])
+def test_a_walk_is_followed(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if method not in ("rgbd", "depth"):
+        monkeypatch.setattr(odometry_module, "HAS_ODOMETRY", False)
+        method = "rgbd"
     poses = walk(15)
     odometry = RgbdOdometry(OdometryConfig(method=method), poses[0])
     for T in poses:
@@ -135,6 +139,7 @@ def test_a_refinement_without_surfaces_keeps_the_guess() -> None:
     np.testing.assert_array_equal(refine(points, nothing, guess, INTRINSICS), guess)
 
 
+@pytest.mark.skipif(not odometry_module.HAS_ODOMETRY, reason="OpenCV before 5")
 def test_a_camera_that_turns_fast_is_followed() -> None:
     poses = [turned(9.0 * k, 1.2 + 0.03 * k, -0.8 - 0.02 * k) for k in range(5)]
     odometry = RgbdOdometry(CONFIG, poses[0])

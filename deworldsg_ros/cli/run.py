@@ -25,6 +25,7 @@ from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.temporal import UpdateLog
 from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
 from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import RefusedInput
@@ -52,6 +53,8 @@ def run_recording(
 ) -> None:
     """Run, write the results and print them; raises DeWorldSGError."""
     config = effective_config(config_path, settings)
+    if poses.odometry and not HAS_ODOMETRY:
+        console.print(f"[yellow]warning:[/] {WITHOUT_ODOMETRY}", highlight=False, soft_wrap=True)
     source = open_source(
         path,
         topics=topics,

@@ -20,7 +20,7 @@ from deworldsg_ros.bridge.poses import set_stamp
 from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.bridge.transform_output import TransformOutput, put_pose
 from deworldsg_ros.bridge.unposed import UnposedAssembler, UnposedFrame
-from deworldsg_ros.poses.odometry import RgbdOdometry
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY, RgbdOdometry
 from deworldsg_ros.scene.camera import Float64
 
 
@@ -32,6 +32,8 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         config = self.parameters.odometry
         self._world_frame = self.parameters.inputs.world_frame or config.frame_id
         self._odometry = RgbdOdometry(config)
+        if not HAS_ODOMETRY:
+            self.get_logger().warning(WITHOUT_ODOMETRY)
         self._newest_ns = 0
         self._pose_output = self.create_publisher(PoseStamped, "camera/pose", reliable(POSE_DEPTH))
         self._odometry_output = self.create_publisher(

@@ -3,8 +3,9 @@
 Each frame is aligned to a reference frame by OpenCV's RGB-D odometry (photometric and point-to-
 plane residuals on an image pyramid). Where the depth then does not fit, that alignment and the
 motion so far are refined on the depth (`depth_alignment`): a camera that turns fast leaves the
-pyramid's reach. The reference is the frame before, or an older one while the camera has hardly
-moved since: a camera that stands still does not drift. Nothing closes loops.
+pyramid's reach. An OpenCV before 5 has no such odometry: there that refinement is all there is, of
+the motion so far and of none. The reference is the frame before, or an older one while the camera
+has hardly moved since: a camera that stands still does not drift. Nothing closes loops.
 """
 
 from __future__ import annotations
@@ -41,6 +42,12 @@ LEVEL_CAMERA = np.array(
 # An alignment of which less than this fits is tried to be refined; it is, by this much more.
 GOOD_FIT = 0.97
 BETTER_BY = 0.005
+# OpenCV has it from version 5 on, which needs numpy 2; beside a sourced ROS 2 Jazzy numpy is 1.
+HAS_ODOMETRY = hasattr(cv2, "Odometry")
+WITHOUT_ODOMETRY = (
+    f"OpenCV {cv2.__version__} has no RGB-D odometry, which comes with version 5: depth alone is "
+    "aligned, and drifts more"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +128,8 @@ class RgbdOdometry:
             self.restarts += 1
         self._intrinsics = intrinsics
         self._reference = self._newest = None
+        if not HAS_ODOMETRY:
+            return
         settings = cv2.OdometrySettings()
         settings.setCameraMatrix(intrinsics.matrix.astype(np.float32))
         settings.setMaxDepth(self._config.max_depth_m)
@@ -132,6 +141,8 @@ class RgbdOdometry:
         self._odometry = cv2.Odometry(kind, settings, cv2.OdometryAlgoType_COMMON)
 
     def _prepare(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Any:
+        if not HAS_ODOMETRY:
+            return None
         holes = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32)
         frame = cv2.OdometryFrame(holes, np.ascontiguousarray(rgb[:, :, ::-1]))
         self._odometry.prepareFrame(frame)
@@ -141,10 +152,7 @@ class RgbdOdometry:
         self, view: _View, frame: Any, depth_m: NDArray[np.float32], intrinsics: Intrinsics
     ) -> tuple[Float64 | None, str]:
         """T_camera_view, or None and why it is not believed."""
-        found, T_camera_view = self._odometry.compute(view.frame, frame)
-        guesses = [self._predicted(view)]
-        if found and np.isfinite(T_camera_view).all():
-            guesses.insert(0, np.asarray(T_camera_view, np.float64))
+        guesses = self._guesses(view, frame, depth_m, intrinsics)
         best, share = self._best(view.points, depth_m, guesses, intrinsics)
         step_m = float(np.linalg.norm(best[:3, 3]))
         if share < self._config.min_fit:
@@ -154,6 +162,20 @@ class RgbdOdometry:
         if rotation_angle_deg(best[:3, :3]) > self._config.max_rotation_deg:
             return None, "the camera would have turned too far (odometry.max_rotation_deg)"
         return best, ""
+
+    def _guesses(
+        self, view: _View, frame: Any, depth_m: NDArray[np.float32], intrinsics: Intrinsics
+    ) -> list[Float64]:
+        """T_camera_view as it may be, most trusted first."""
+        predicted = self._predicted(view)
+        if not HAS_ODOMETRY:
+            surface = surface_of(depth_m, intrinsics)
+            starts = (predicted, np.eye(4))
+            return [refine(view.points, surface, start, intrinsics) for start in starts]
+        found, T_camera_view = self._odometry.compute(view.frame, frame)
+        if found and np.isfinite(T_camera_view).all():
+            return [np.asarray(T_camera_view, np.float64), predicted]
+        return [predicted]
 
     def _predicted(self, view: _View) -> Float64:
         """T_camera_view if the camera goes on moving as it did."""
