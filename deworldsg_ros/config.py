@@ -146,6 +146,13 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "(surface rule)"
         ),
     ] = True
+    align_poses: Annotated[
+        bool,
+        _number(
+            "each frame is laid on the graph before it is merged: for poses that drift "
+            "(surface rule)"
+        ),
+    ] = False
     confirm_observations: Annotated[
         int, _number("frames that make a node sure (surface rule)", ge=1, le=1000)
     ] = 3

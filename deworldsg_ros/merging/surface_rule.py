@@ -12,6 +12,7 @@ import numpy as np
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough, look
+from deworldsg_ros.merging.alignment import PoseAlignment
 from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
@@ -49,6 +50,7 @@ class SurfaceMerging:
         self._lost = LostNodes(config.lost_s)
         # Nodes that were sure once; they are hidden, and keep their ids until they are found again.
         self._doubted: set[int] = set()
+        self._alignment = PoseAlignment()
 
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
@@ -61,6 +63,7 @@ class SurfaceMerging:
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
         look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
         self._existence.warm_up()
+        self._alignment.warm_up()
         warm_up_fit()
         warm_up_graph()
 
@@ -72,6 +75,8 @@ class SurfaceMerging:
         check_fits(graph, local)
         if not self._owners and len(graph):
             self._restore(graph)
+        if self._config.align_poses:
+            local = self._alignment.align(graph, local)
         cells = self._map.cells_of(local.surface_points_world)
         owners, shares = self._map.shares(cells)
         rows = [graph.nodes.row(self._owners.node(owner)) for owner in owners]
@@ -93,6 +98,8 @@ class SurfaceMerging:
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Follow nodes that a correction (4, 4) has moved in the graph."""
+        # Whoever corrects the past corrects the poses to come.
+        self._alignment = PoseAlignment()
         for node_id in node_ids:
             owner = self._owners.of(node_id)
             if owner is None:  # lost: it is in no cell
@@ -258,6 +265,7 @@ class SurfaceMerging:
         owner = self._owners.free(node_id)
         self._doubted.discard(node_id)
         self._existence.forget(owner)
+        self._alignment.forget(node_id)
         self._joint.forget(owner)
         self._through.forget(owner)
         self._changed.discard(owner)
