@@ -139,6 +139,14 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1
         ),
     ] = 0.55
+    size_ratio_other_class: Annotated[
+        float,
+        _number(
+            "most times that one is larger across than the other where the classes of two that are "
+            "one do not agree (surface rule)",
+            ge=1,
+        ),
+    ] = 5.0
     contest_cells: Annotated[
         bool,
         _number(

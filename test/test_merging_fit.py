@@ -54,7 +54,9 @@ def test_values_equal_the_formulas(seed: int) -> None:
         apart = min(deviations(difference, ours), deviations(difference, theirs))
         distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
         value = share + CLASS_BONUS * agreement + GAUSSIAN_BONUS * np.exp(-distance)
-        fits = share >= wanted and apart <= MAX_DEVIATIONS
+        sizes = np.sqrt([np.trace(ours), np.trace(theirs)])
+        alike = same or sizes.max() <= CONFIG.size_ratio_other_class * sizes.min()
+        fits = share >= wanted and alike and apart <= MAX_DEVIATIONS
         assert values[index, column] == pytest.approx(value if fits else 0.0, abs=1e-9)
 
 

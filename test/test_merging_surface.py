@@ -125,6 +125,18 @@ def test_of_neighbours_a_newcomer_is_the_one_that_is_new(graph, merging) -> None
         assert merging.merge(graph, local) == [3, 1, 2]
 
 
+def test_a_small_thing_on_a_large_one_is_no_other_name_for_it(graph, merging) -> None:
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, (WHOLE, TABLE))) == [1]
+    mat = slab((0.5, 0.1, 1.005), (0.2, 0.15, 0.01))
+    for stamp in range(3, 6):
+        assert merging.merge(graph, frame(stamp, (mat, CUP))) == [2]
+    # Nor is the large one another name for the small.
+    assert merging.merge(graph, frame(6, (WHOLE, TABLE))) == [1]
+    # A part of the table that is called a chair is the table.
+    assert merging.merge(graph, frame(7, (LEFT, CHAIR))) == [1]
+
+
 def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
     gap_left, gap_right = slab((-0.7, 0, 1), (0.7, 0.8, 0.01)), slab((0.7, 0, 1), (0.7, 0.8, 0.01))
     assert merging.merge(graph, frame(0, (gap_left, TABLE))) == [1]

@@ -56,6 +56,7 @@ def fit(
         shares,
         config.overlap_threshold,
         config.overlap_threshold_other_class,
+        config.size_ratio_other_class**2,
         # Variance of a place that is known to be in a cell, along each axis.
         config.cell_m**2 / 12,
     )
@@ -74,7 +75,7 @@ def one_to_one(values: Float64) -> list[int]:
 def warm_up() -> None:
     """Compile the comparison, or load it from the cache."""
     gaussian = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
-    _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 0.5, 1.0)
+    _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 0.5, 1.0, 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -104,6 +105,7 @@ def _fit(  # type: ignore[no-untyped-def]
     shares,
     threshold,
     threshold_other_class,
+    variance_ratio_other_class,
     blur_m2,
 ):
     values = np.zeros(shares.shape)
@@ -117,11 +119,16 @@ def _fit(  # type: ignore[no-untyped-def]
             agreement = 0.0
             for label in range(classes.shape[1]):
                 agreement += classes[index, label] * node_classes[row, label]
-            wanted = threshold if agreement > CLASS_AGREEMENT else threshold_other_class
-            if share < wanted:
+            agree = agreement > CLASS_AGREEMENT
+            if share < (threshold if agree else threshold_other_class):
                 continue
             a = covariances[index] + blur
             b = node_covariances[row] + blur
+            if not agree:
+                size_a = a[0, 0] + a[1, 1] + a[2, 2]
+                size_b = b[0, 0] + b[1, 1] + b[2, 2]
+                if max(size_a, size_b) > variance_ratio_other_class * min(size_a, size_b):
+                    continue
             d0 = means[index, 0] - node_means[row, 0]
             d1 = means[index, 1] - node_means[row, 1]
             d2 = means[index, 2] - node_means[row, 2]
