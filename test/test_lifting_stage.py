@@ -193,7 +193,7 @@ def test_surface_points_are_an_even_sample_of_the_inliers():
     _, depth_m, intrinsics, T = scene
     assert len(references) > 2
     for points, reference in zip(local.surface_points_world, references):
-        assert points.shape == (32, 3)
+        assert len(points) >= 32
         assert points.dtype == np.float32
         camera = (points.astype(np.float64) - T[:3, 3]) @ T[:3, :3]
         u = np.rint(camera[:, 0] / camera[:, 2] * intrinsics.fx + intrinsics.cx).astype(int)
@@ -205,6 +205,15 @@ def test_surface_points_are_an_even_sample_of_the_inliers():
         assert np.ptp(np.diff(places)) <= 1
     none = lift(scene, config=LiftingConfig(surface_points=0))
     assert all(points.shape == (0, 3) for points in none.surface_points_world)
+
+
+def test_a_large_surface_gives_more_points_so_that_two_samples_of_it_meet():
+    intrinsics = Intrinsics(500.0, 500.0, 320.0, 240.0, 640, 480)
+    instances = np.ones((480, 640), np.uint16)
+    for depth_m, wanted in ((0.5, 200), (1.2, 589), (4.0, 800)):
+        scene = (instances, np.full((480, 640), depth_m, np.float32), intrinsics, np.eye(4))
+        (points,) = lift(scene, count=1).surface_points_world
+        assert abs(len(points) - wanted) <= 1
 
 
 def test_the_same_frame_gives_the_same_graph_whatever_the_memory_layout():

@@ -23,6 +23,11 @@ from deworldsg_ros.scene.frame_graph import (
     Vocabulary,
 )
 
+# Two samples of a wardrobe have to meet in cells of 3 cm, with those beside them: so much visible
+# surface gets a point of its own, where the usual number leaves more, up to a few times that.
+POINT_AREA_M2 = 0.003
+LARGE_FACTOR = 4
+
 
 class Lifting:
     """Lifts the objects of a frame to 3D Gaussians in the world frame; keeps no state."""
@@ -84,7 +89,10 @@ class Lifting:
             depths_m=depths_m,
             pixel_counts=np.array([len(pixels) for pixels in objects], np.int64),
             surface_points_world=_surface_points(
-                objects, self.config.surface_points, intrinsics, T_world_camera
+                objects,
+                _point_numbers(objects, depths_m, intrinsics, self.config.surface_points),
+                intrinsics,
+                T_world_camera,
             ),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
@@ -180,13 +188,23 @@ def _check_grids(
             )
 
 
+def _point_numbers(
+    objects: list[Pixels], depths_m: Float64, intrinsics: Intrinsics, number: int
+) -> list[int]:
+    """Surface points that each object gives: this number, more of a large surface, or all."""
+    pixels = np.array([len(item) for item in objects], np.int64)
+    areas_m2 = pixels * depths_m**2 / (intrinsics.fx * intrinsics.fy)
+    wanted = np.clip((areas_m2 / POINT_AREA_M2).astype(np.int64), number, LARGE_FACTOR * number)
+    numbers: list[int] = np.minimum(wanted, pixels).tolist()
+    return numbers
+
+
 def _surface_points(
-    objects: list[Pixels], most: int, intrinsics: Intrinsics, T_world_camera: Float64
+    objects: list[Pixels], numbers: list[int], intrinsics: Intrinsics, T_world_camera: Float64
 ) -> tuple[NDArray[np.float32], ...]:
-    """At most so many points of each object, world frame: every n-th of its inliers."""
+    """So many points of each object, world frame: every n-th of its inliers."""
     if not objects:
         return ()
-    numbers = [min(most, len(pixels)) for pixels in objects]
     chosen = [
         np.arange(number) * len(pixels) // max(number, 1)
         for number, pixels in zip(numbers, objects)
