@@ -41,6 +41,12 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = -1.0
     max_objects: Annotated[int, _number("most objects kept a frame, best first", ge=1, le=300)] = 50
     top_relations: Annotated[int, _number("relations kept a frame", ge=0, le=1000)] = 10
+    join_nested: Annotated[
+        bool, _number("one thing that is detected whole and in part in a frame is one object")
+    ] = True
+    drop_views: Annotated[
+        bool, _number("a box that reaches all four borders of the image is no object")
+    ] = True
     threads: Annotated[int, _number("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
     detector_path: Annotated[
         str, _number("checkpoint of the detector rtdetr: a folder, or a hub id")
@@ -154,6 +160,13 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "(surface rule)"
         ),
     ] = True
+    even_gaussians: Annotated[
+        bool,
+        _number(
+            "published Gaussians count every part of a surface once, instead of every pixel "
+            "(surface rule)"
+        ),
+    ] = True
     align_poses: Annotated[
         bool,
         _number(
@@ -172,7 +185,7 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ge=0,
             le=1,
         ),
-    ] = 0.5
+    ] = 0.45
     baseline_deg: Annotated[
         float,
         _number(

@@ -37,7 +37,13 @@ class GraphBuilder:
         self._relations = config.relations
         self._output = config.output
         self._merging = build_merging(config.merging)
-        self.graph = SceneGraph(vocabulary, frame_id, config.merging.surface_points)
+        self.graph = SceneGraph(
+            vocabulary,
+            frame_id,
+            config.merging.surface_points,
+            even_gaussians=config.merging.association == "surface"
+            and config.merging.even_gaussians,
+        )
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         self._newest_ns: int | None = None
         self._associations: list[wire.Association] = []

@@ -110,8 +110,20 @@ def test_what_is_dropped_is_counted():
 
 def test_boxes_are_cut_to_the_image():
     frame, *_ = table_and_cup()
-    found = stage(ListedDetector([[-20, -30, 400, 300]], [0], [0.9])).perceive(frame)
-    assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, WIDTH - 1, HEIGHT - 1]]
+    found = stage(ListedDetector([[-20, -30, 60, 300]], [0], [0.9])).perceive(frame)
+    assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
+
+
+def test_what_reaches_all_four_borders_is_the_view_and_no_object():
+    frame, *_ = table_and_cup()
+    near = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
+    far = [*near[:3], 0.9 * HEIGHT]
+    detector = ListedDetector([near, far], [0, 1], [0.9, 0.8])
+    perceived = stage(detector).perceive(frame)
+    assert perceived.drops == {"box_is_the_view": 1}
+    assert perceived.frame_graph.scores.tolist() == [0.8]
+    perceived = stage(detector, drop_views=False, join_nested=False).perceive(frame)
+    assert perceived.frame_graph.scores.tolist() == [0.9, 0.8]
 
 
 def test_relations_can_be_off():

@@ -227,4 +227,10 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
         for section in robust
         for field, value in robust[section].items()
         if paper[section][field] != value
-    } == {("merging", "association"), ("relations", "encode"), ("relations", "clips_per_s")}
+    } == {
+        ("perception", "join_nested"),
+        ("perception", "drop_views"),
+        ("merging", "association"),
+        ("relations", "encode"),
+        ("relations", "clips_per_s"),
+    }

@@ -13,6 +13,7 @@ from deworldsg_ros.scene.surface import (
     HashedPoints,
     SurfaceReservoir,
     content_hashes,
+    even_moments,
     hash_each,
     merge_samples,
 )
@@ -101,3 +102,24 @@ def test_some_points_are_points_of_the_surface() -> None:
         assert len(some) == min(8, len(known))
         assert set(map(tuple, some.tolist())) <= known
     assert len(reservoir.points_world) == 20
+
+
+def test_even_moments_do_not_lean_to_where_points_are_dense() -> None:
+    rng = np.random.default_rng(8)
+    plate = rng.uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 0.001), (4000, 3))
+    looked_at_long = rng.uniform((0.2, -0.2, 0.0), (0.3, 0.2, 0.001), (20_000, 3))
+    points = np.concatenate((plate, looked_at_long)).astype(np.float32)
+    assert points.mean(axis=0)[0] > 0.15
+    mean, covariance = even_moments(points)
+    assert np.abs(mean).max() < 0.011
+    assert np.allclose(
+        np.sqrt(np.diagonal(covariance))[:2], np.array([0.6, 0.4]) / 12**0.5, rtol=0.1
+    )
+    assert np.array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_even_moments_of_one_point() -> None:
+    mean, covariance = even_moments(np.full((1, 3), 1.005, np.float32))
+    assert np.allclose(mean, 1.01)
+    assert np.linalg.eigvalsh(covariance).min() > 0

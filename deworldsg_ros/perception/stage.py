@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 # Below this a box has no inside to segment.
 MIN_BOX_SIDE_PX = 2.0
+# A box reaches a border of the image from so near, as a share of the image's side.
+BORDER_SHARE = 0.04
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class Perceived:
         frame_graph: objects, best score first, and the relations between them.
         instances: (H, W) uint16; k + 1 on the pixels of the k-th object, 0 on nothing.
         drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
-            image), ``over_max_objects``, ``detected_twice`` (whole and in part),
-            ``segmenter_error`` (all of the frame); and ``relation_head_error`` for those that
-            went on without relations.
+            image), ``box_is_the_view``, ``over_max_objects``, ``detected_twice`` (whole and in
+            part), ``segmenter_error`` (all of the frame); and ``relation_head_error`` for those
+            that went on without relations.
         failures: what a backend said when it failed on this frame, by those reasons.
     """
 
@@ -101,7 +103,8 @@ class Perception:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
         found_count = len(objects)
-        objects, masks = join_nested(objects, masks, frame.depth_m)
+        if self._config.join_nested:
+            objects, masks = join_nested(objects, masks, frame.depth_m)
         if len(objects) < found_count:
             drops["detected_twice"] = found_count - len(objects)
         classes = objects.class_probabilities.argmax(axis=1)
@@ -193,13 +196,17 @@ class Perception:
     ) -> tuple[Detections, Counter[str]]:
         """Boxes cut to the image, best score first, at most `max_objects`."""
         boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
-        usable = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
+        large = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
+        view = is_the_view(boxes, width, height) & self._config.drop_views
+        usable = large & ~view
         order = np.argsort(-found.scores, kind="stable")
         order = order[usable[order]]
         kept = order[: self._config.max_objects]
         drops: Counter[str] = Counter()
-        if not usable.all():
-            drops["box_too_small"] = int((~usable).sum())
+        if not large.all():
+            drops["box_too_small"] = int((~large).sum())
+        if view.any():
+            drops["box_is_the_view"] = int(view.sum())
         if len(order) > len(kept):
             drops["over_max_objects"] = len(order) - len(kept)
         return replace(found, boxes_xyxy=boxes).take(kept), drops
@@ -208,3 +215,12 @@ class Perception:
         """Direction against gravity in the camera frame, (3,) unit vector."""
         self._up.observe(T_world_camera)
         return np.asarray(T_world_camera[:3, :3].T @ self._up.up_world())
+
+
+def is_the_view(boxes_xyxy: Float64, width: int, height: int) -> NDArray[np.bool_]:
+    """Which boxes (n, 4) reach all four borders of the image.
+
+    Nothing tells where such a thing ends: it is named after the scene, and holds what is in it.
+    """
+    margins = boxes_xyxy * [1.0, 1.0, -1.0, -1.0] + [0.0, 0.0, width - 1.0, height - 1.0]
+    return np.asarray((margins <= BORDER_SHARE * np.array([width, height] * 2)).all(axis=1))

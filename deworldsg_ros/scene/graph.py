@@ -29,6 +29,8 @@ class SceneGraph:
         frame_id: world frame.
         surface_point_capacity: most surface points kept a node.
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
+        even_gaussians: messages show the moments of a node's surface, of which every part counts
+            once, instead of the pooled Gaussian (`scene.surface.even_moments`).
         nodes: the nodes as parallel arrays; read only.
         revision: number of changes so far.
     """
@@ -39,6 +41,7 @@ class SceneGraph:
         frame_id: str,
         surface_point_capacity: int = 512,
         remembered_frames: int = 1024,
+        even_gaussians: bool = False,
     ) -> None:
         self.vocabulary = vocabulary
         self.frame_id = frame_id
@@ -52,7 +55,7 @@ class SceneGraph:
         self._successors: dict[int, int] = {}
         self._removals: list[int] = []
         self._frames: dict[int, tuple[int, ...]] = {}
-        self._states = NodeStateCache()
+        self._states = NodeStateCache(even_gaussians)
 
     def __len__(self) -> int:
         return len(self.nodes)

@@ -6,15 +6,22 @@ import numpy as np
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.nodes import NodeTable
+from deworldsg_ros.scene.surface import even_moments
 
 # What a message was built with: top k, with surface points.
 _Form = tuple[int, bool]
 
 
 class NodeStateCache:
-    """The newest message of each node, in each form asked for, with the revision it shows."""
+    """The newest message of each node, in each form asked for, with the revision it shows.
 
-    def __init__(self) -> None:
+    Args:
+        even_gaussians: show the moments of a node's surface, of which every part counts once,
+            instead of the pooled Gaussian.
+    """
+
+    def __init__(self, even_gaussians: bool = False) -> None:
+        self._even_gaussians = even_gaussians
         self._known: dict[_Form, dict[int, tuple[int, wire.NodeState]]] = {}
 
     def states(
@@ -34,7 +41,8 @@ class NodeStateCache:
         for row, node_id, revision in zip(rows.tolist(), ids, revisions):
             entry = known.get(node_id)
             if entry is None or entry[0] != revision:
-                entry = (revision, _state(nodes, row, classes, top_k, with_points))
+                state = _state(nodes, row, classes, top_k, with_points, self._even_gaussians)
+                entry = (revision, state)
                 known[node_id] = entry
             states[node_id] = entry[1]
         return states
@@ -46,19 +54,22 @@ class NodeStateCache:
 
 
 def _state(
-    nodes: NodeTable, row: int, classes: tuple[str, ...], top_k: int, with_points: bool
+    nodes: NodeTable, row: int, classes: tuple[str, ...], top_k: int, with_points: bool, even: bool
 ) -> wire.NodeState:
     probabilities = nodes.class_probabilities[row]
     # Stable: of equal probabilities the first class of the vocabulary comes first.
     order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
     beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
     points = nodes.surfaces[row].points_world
+    mean, covariance = nodes.means[row], nodes.covariances[row]
+    if even and len(points):
+        mean, covariance = even_moments(points)
     return wire.NodeState(
         id=int(nodes.ids[row]),
         label=beliefs[0].label,
         classes=beliefs,
-        mean_m=nodes.means[row].tolist(),
-        covariance_m2=nodes.covariances[row].ravel().tolist(),
+        mean_m=mean.tolist(),
+        covariance_m2=covariance.ravel().tolist(),
         observations=int(nodes.observations[row]),
         confirmed=bool(nodes.confirmed[row]),
         first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),

@@ -14,7 +14,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 UInt64 = NDArray[np.uint64]
+
+# Edge of the cells that make a surface even: about the distance of the points that are kept of an
+# object of half a metre.
+EVEN_CELL_M = 0.02
 
 # The constants of SplitMix64.
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -118,6 +123,19 @@ def _union(hashes, points, new_hashes, new_points, capacity):  # type: ignore[no
         # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
         kept += int(kept == 0 or all_hashes[kept] != all_hashes[kept - 1])
     return all_hashes[:kept], all_points[:kept]
+
+
+def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
+    """Mean (3,) and covariance (3, 3) of a surface, of which every part counts once.
+
+    Points (n, 3), n >= 1, lie densely where a camera looked long or from near. Counted here are the
+    cells of `EVEN_CELL_M` that they fall into; the covariance includes that of a cell.
+    """
+    cells = np.unique(np.floor(points_world / EVEN_CELL_M), axis=0)
+    centres = (cells + 0.5) * EVEN_CELL_M
+    mean = centres.mean(axis=0)
+    offsets = centres - mean
+    return mean, offsets.T @ offsets / len(centres) + EVEN_CELL_M**2 / 12 * np.eye(3)
 
 
 class SurfaceReservoir:
