@@ -65,6 +65,18 @@ def test_what_is_seen_through_goes_after_some_frames_in_a_row(scene) -> None:
     assert scene.told() == {1: "table"}
 
 
+def test_what_was_all_that_was_known_goes_for_good_when_its_time_is_over() -> None:
+    scene = Scene(lost_s=10e-9)
+    for _ in range(4):
+        scene.see((HERE, CUP))
+    for _ in range(30):
+        scene.see()
+    assert len(scene.graph) == 0
+    for _ in range(3):
+        scene.see((HERE, CUP))
+    assert scene.told() == {2: "cup"}
+
+
 def test_an_object_that_is_there_but_not_detected_stays(scene) -> None:
     for _ in range(50):
         scene.see((WHOLE, TABLE), grid=depth_grid(HERE))

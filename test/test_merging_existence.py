@@ -64,13 +64,13 @@ def test_three_frames_are_enough_where_the_camera_moves_on_or_cannot(step_m):
 def test_without_one_sure_detection_it_takes_four_times_as_many():
     walk = Walk()
     for _ in range(11):
-        walk.see(found=True, step_m=0.02, score=0.45)
+        walk.see(found=True, step_m=0.02, score=0.4)
     assert walk.told == []
-    walk.see(found=True, step_m=0.02, score=0.45)
+    walk.see(found=True, step_m=0.02, score=0.4)
     assert walk.told == [1]
     off = Walk(confirm_score=0.0)
     for _ in range(3):
-        off.see(found=True, score=0.45)
+        off.see(found=True, score=0.4)
     assert off.told == [1]
 
 
@@ -141,3 +141,18 @@ def test_a_loaded_node_is_sure_and_stays_in_what_it_was(tmp_path):
     assert walk.told == [1]
     walk.see(found=True)
     assert walk.told == [1] and walk.graph.nodes.ids.tolist() == [1]
+
+
+def test_a_loaded_node_was_missed_in_no_look_before(tmp_path):
+    walk = Walk()
+    for _ in range(3):
+        walk.see(found=True)
+    walk.graph.save(tmp_path / "graph.npz")
+    walk.graph = SceneGraph.load(tmp_path / "graph.npz")
+    walk.merging = SurfaceMerging(MergingConfig(association="surface"))
+    walk.see(found=True)
+    for _ in range(3):
+        walk.see(found=False)
+    assert walk.told == [1]  # 2 of 5 looks
+    walk.see(found=False)
+    assert walk.told == []

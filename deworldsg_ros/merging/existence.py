@@ -110,7 +110,8 @@ class Existence:
         self._make_room(owner + 1)
         node = self._nodes[owner]
         node["detections"], node["best_score"] = detections, 1.0
-        node["looks"] = node["found"] = 1
+        # What found it was a look from somewhere else.
+        node["finds"] = True
         node["camera_world"] = np.inf
 
     def merge(self, kept: int, gone: int) -> None:

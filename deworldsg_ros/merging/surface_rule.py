@@ -73,7 +73,7 @@ class SurfaceMerging:
         Two objects of one frame are never one node: they stay two even where both overlap it.
         """
         check_fits(graph, local)
-        if not self._owners and len(graph):
+        if not self._owners and len(graph) > len(self._lost):
             self._restore(graph)
         if self._config.align_poses:
             local = self._alignment.align(graph, local)
@@ -221,6 +221,7 @@ class SurfaceMerging:
         """Let the id of a lost node stand for the node that its object has become."""
         graph.take_over(old_id, new_id)
         self._owners.rename(new_id, old_id)
+        self._alignment.forget(new_id)
 
     def _merge_grown(self, graph: SceneGraph) -> None:
         """Merge nodes that have turned out to be parts of one object."""
