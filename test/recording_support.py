@@ -132,15 +132,16 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
 
 
 def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
-    """A rosbag2 folder of the items."""
+    """A rosbag2 folder of the items, messages or the bytes of them."""
     plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
     connections: dict[str, Any] = {}
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         for topic, msgtype, time_ns, message in items:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore())
-            data = typestore().serialize_cdr(message, msgtype)
-            writer.write(connections[topic], time_ns, data)
+            if not isinstance(message, bytes):
+                message = bytes(typestore().serialize_cdr(message, msgtype))
+            writer.write(connections[topic], time_ns, message)
     return folder
 
 

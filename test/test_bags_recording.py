@@ -190,6 +190,17 @@ def test_slop_of_the_configuration_decides_what_belongs_together(tmp_path):
     assert len(frames_of(bag, inputs=InputsConfig(slop_s=0.04))[0]) == 3
 
 
+def test_a_robots_odometry_is_carried_over_though_its_first_message_is_broken(tmp_path):
+    items = sorted(robot_items(), key=lambda item: item[2])
+    first = next(index for index, item in enumerate(items) if item[0] == "/odom")
+    topic, kind, time_ns, message = items[first]
+    items[first] = (topic, kind, time_ns, ros.encode(message, kind)[:30])
+    frames, recording = frames_of(write_bag(tmp_path / "bag", items))
+    assert recording.source.topics[Role.POSE].msgtype == ros.POSE_STAMPED
+    assert recording.source.drops["invalid_message"] == 1
+    np.testing.assert_allclose(frames[-1].T_world_camera, pose(COUNT - 1), atol=1e-6)
+
+
 def test_a_message_that_cannot_be_decoded_is_counted(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(3))
     source = open_source(bag)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -123,8 +124,11 @@ class BagSource:
         pose = found.get(Role.POSE)
         if pose is None or pose.msgtype != ODOMETRY or self._inputs.pose_source != "auto":
             return None
-        camera = self._first(found[Role.RGB]).header.frame_id.lstrip("/")
-        child = self._first(pose).child_frame_id.lstrip("/")
+        image, odometry = self._first(found[Role.RGB]), self._first(pose)
+        if image is None or odometry is None:
+            return None
+        camera = image.header.frame_id.lstrip("/")
+        child = odometry.child_frame_id.lstrip("/")
         if child in ("", camera):
             return None
         try:
@@ -152,8 +156,11 @@ class BagSource:
         yield _serialized(pose, raw.log_time_ns)
 
     def _first(self, topic: Topic) -> Any:
-        raw = next(self._bag.messages([topic.name]))
-        return decode(raw.data, raw.msgtype)
+        """The first message that can be decoded; None where none can."""
+        for raw in self._bag.messages([topic.name]):
+            with contextlib.suppress(Exception):  # whatever rosbags raises on a broken message
+                return decode(raw.data, raw.msgtype)
+        return None
 
 
 def _serialized(item: RoleMessage, log_time_ns: int) -> RawRoleMessage:
