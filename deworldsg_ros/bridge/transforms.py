@@ -41,12 +41,13 @@ class TransformTree:
             parent = str(transform.header.frame_id).lstrip("/")
             child = str(transform.child_frame_id).lstrip("/")
             T_parent_child = pose_from_transform(transform.transform)
-            self._parents[child] = parent
             if static:
                 self._static[child] = T_parent_child
             else:
                 buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
                 buffer.add(stamp_ns_of(transform), T_parent_child)
+            # Last: whoever reads in another thread then finds the transform of each frame.
+            self._parents[child] = parent
 
     def settled(self, stamp_ns: int, camera_frame: str, parent_frame: str = "") -> bool:
         """Whether later transforms cannot change the answer of `at` or `between`."""
