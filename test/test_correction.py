@@ -18,6 +18,9 @@ from deworldsg_ros.scene.wire import NodeState, SceneGraphMessage
 
 S = 10**9
 
+# Surface points, and what is published of them, are rounded to float32: a neighbour may be lost.
+TOLERANCE_M = {"paper": 1e-9, "surface": 1e-3}
+
 
 def config(association: str) -> Config:
     return Config(
@@ -60,8 +63,10 @@ def test_a_correction_and_its_inverse_restore_the_graph(association: str, seed: 
     assert list(after) == list(before)
     for node_id, node in before.items():
         restored = after[node_id]
-        np.testing.assert_allclose(restored.mean_m, node.mean_m, atol=1e-9)
-        np.testing.assert_allclose(restored.covariance_m2, node.covariance_m2, atol=1e-9)
+        np.testing.assert_allclose(restored.mean_m, node.mean_m, atol=TOLERANCE_M[association])
+        np.testing.assert_allclose(
+            restored.covariance_m2, node.covariance_m2, atol=TOLERANCE_M[association]
+        )
         np.testing.assert_allclose(
             by_hash(restored.surface_points_m), by_hash(node.surface_points_m), atol=2e-3
         )
@@ -86,10 +91,14 @@ def test_what_was_known_before_stays_and_what_is_new_moves_rigidly(
         if node_id not in moved:
             assert node == known
             continue
-        np.testing.assert_allclose(node.mean_m, T[:3, :3] @ known.mean_m + T[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(
+            node.mean_m, T[:3, :3] @ known.mean_m + T[:3, 3], atol=TOLERANCE_M[association]
+        )
         sigma = np.reshape(known.covariance_m2, (3, 3))
         expected = T[:3, :3] @ sigma @ T[:3, :3].T
-        np.testing.assert_allclose(np.reshape(node.covariance_m2, (3, 3)), expected, atol=1e-9)
+        np.testing.assert_allclose(
+            np.reshape(node.covariance_m2, (3, 3)), expected, atol=TOLERANCE_M[association]
+        )
         assert len(node.surface_points_m) == len(known.surface_points_m)
     assert builder.full().edges == edges
 

@@ -121,5 +121,15 @@ def test_even_moments_do_not_lean_to_where_points_are_dense() -> None:
 
 def test_even_moments_of_one_point() -> None:
     mean, covariance = even_moments(np.full((1, 3), 1.005, np.float32))
-    assert np.allclose(mean, 1.01)
+    assert np.allclose(mean, 1.005)
     assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_even_moments_move_with_the_world_frame() -> None:
+    rng = np.random.default_rng(9)
+    points = rng.uniform(-0.2, 0.2, (300, 3)) * (1, 1, 0.1)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    mean, covariance = even_moments(points.astype(np.float32))
+    moved = even_moments((points @ rotation.T + (1, 2, 3)).astype(np.float32))
+    assert np.allclose(moved[0], rotation @ mean + (1, 2, 3), atol=1e-3)
+    assert np.allclose(moved[1], rotation @ covariance @ rotation.T, atol=1e-4)

@@ -8,7 +8,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import hash_each
+from deworldsg_ros.scene.surface import even_moments, hash_each
 
 
 def warm_up_graph() -> None:
@@ -16,6 +16,7 @@ def warm_up_graph() -> None:
     graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
     seen = (np.zeros(3), np.eye(3), np.ones(1), 1, hash_each((np.zeros((1, 3), np.float32),))[0])
     graph.observe(graph.add_node(*seen), *seen)
+    even_moments(np.zeros((1, 3), np.float32))
 
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:

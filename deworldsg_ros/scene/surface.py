@@ -17,9 +17,9 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt64 = NDArray[np.uint64]
 
-# Edge of the cells that make a surface even: about the distance of the points that are kept of an
-# object of half a metre.
-EVEN_CELL_M = 0.02
+# Within this distance points of a surface are of one part of it: half a cell of the surface map.
+# With more, a stray point weighs as much as a patch.
+EVEN_RADIUS_M = 0.015
 
 # The constants of SplitMix64.
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -128,14 +128,32 @@ def _union(hashes, points, new_hashes, new_points, capacity):  # type: ignore[no
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
     """Mean (3,) and covariance (3, 3) of a surface, of which every part counts once.
 
-    Points (n, 3), n >= 1, lie densely where a camera looked long or from near. Counted here are the
-    cells of `EVEN_CELL_M` that they fall into; the covariance includes that of a cell.
+    Points (n, 3), n >= 1, lie densely where a camera looked long or from near: each weighs the less
+    the more there are within `EVEN_RADIUS_M` of it. The covariance includes that of such a ball.
     """
-    cells = np.unique(np.floor(points_world / EVEN_CELL_M), axis=0)
-    centres = (cells + 0.5) * EVEN_CELL_M
-    mean = centres.mean(axis=0)
-    offsets = centres - mean
-    return mean, offsets.T @ offsets / len(centres) + EVEN_CELL_M**2 / 12 * np.eye(3)
+    points = points_world.astype(np.float64)
+    weights = 1.0 / _neighbours(np.ascontiguousarray(points_world), EVEN_RADIUS_M)
+    weights /= weights.sum()
+    mean = weights @ points
+    offsets = points - mean
+    covariance = (weights[:, None] * offsets).T @ offsets + EVEN_RADIUS_M**2 / 5 * np.eye(3)
+    return mean, (covariance + covariance.T) / 2
+
+
+@njit(cache=True, nogil=True)
+def _neighbours(points, radius):  # type: ignore[no-untyped-def]
+    """Number of points within a radius of each point, itself included."""
+    counts = np.ones(len(points))
+    for a in range(len(points)):
+        for b in range(a + 1, len(points)):
+            squared = 0.0
+            for axis in range(3):
+                step = np.float64(points[a, axis]) - np.float64(points[b, axis])
+                squared += step * step
+            if squared <= radius * radius:
+                counts[a] += 1.0
+                counts[b] += 1.0
+    return counts
 
 
 class SurfaceReservoir:
