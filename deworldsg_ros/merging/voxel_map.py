@@ -21,6 +21,8 @@ Float64 = NDArray[np.float64]
 OWNERS = 4
 # An owner of fewer cells than this says too little by lying within a set.
 MIN_REVERSE_CELLS = 4
+# The number of a query is kept in 32 bits.
+_LAST_QUERY = 2**31 - 1
 _EMPTY = np.int64(-1)
 _FIRST_CAPACITY = 1 << 14
 # Cell indices lie in ±2^20: with cells of 3 cm that is 31 km around the origin.
@@ -114,14 +116,10 @@ class VoxelMap:
         Returns:
             The S owners that any set met, ascending, and the shares (n, S) float64 in [0, 1].
         """
+        if self._query > _LAST_QUERY - len(sets.starts):
+            self._owners[:, OWNERS:] = self._query = 0
         shares: Float64 = _shares(
-            self._keys,
-            self._owners,
-            self._touched,
-            self._query,
-            sets.cells,
-            sets.starts,
-            self._counts,
+            self._keys, self._owners, self._query, sets.cells, sets.starts, self._counts
         )
         self._query += len(shares)
         owners = np.flatnonzero(shares.any(axis=0))
@@ -179,9 +177,9 @@ class VoxelMap:
 
     def _allocate(self, capacity: int) -> None:
         self._keys = np.full(capacity, _EMPTY, np.int64)
-        self._owners: Int32 = np.full((capacity, OWNERS), -1, np.int32)
-        # The query by which each entry was met last.
-        self._touched: Int64 = np.zeros((capacity, OWNERS), np.int64)
+        # The owners of each cell, -1 after the last, and the query by which each was met last:
+        # side by side, because what costs is to fetch them.
+        self._owners: Int32 = np.full((capacity, 2 * OWNERS), -1, np.int32)
 
     def _grow(self, cells: int) -> None:
         keys, owners = self._keys, self._owners
@@ -226,6 +224,7 @@ def _add(keys, owners, counts, limit, who, cells, starts):  # type: ignore[no-un
                 keys[slot] = cell
                 created += 1
             owners[slot, place] = owner
+            owners[slot, OWNERS + place] = 0
             counts[owner] += 1
             new[new_count] = cell
             new_count += 1
@@ -238,6 +237,7 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
     cells = np.empty(len(points), np.int64)
     new_starts = np.zeros(len(starts), np.int64)
     kept = 0
+    cells_per_m = 1.0 / cell_m
     for index in range(len(starts) - 1):
         capacity = 16
         while capacity < 2 * (starts[index + 1] - starts[index]):
@@ -247,7 +247,7 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
             cell = np.int64(0)
             inside = True
             for axis in range(3):
-                step = np.int64(np.floor(np.float64(points[point, axis]) / cell_m))
+                step = np.int64(np.floor(np.float64(points[point, axis]) * cells_per_m))
                 inside = bool(inside and -_BIAS <= step < _BIAS)
                 cell = (cell << 21) | (step + _BIAS)
             if inside:
@@ -261,7 +261,7 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignore[no-untyped-def]
+def _shares(keys, owners, query, cells, starts, counts):  # type: ignore[no-untyped-def]
     shares = np.zeros((len(starts) - 1, len(counts)))
     on_owner = np.zeros(len(counts), np.int64)
     of_owner = np.zeros(len(counts), np.int64)
@@ -279,9 +279,9 @@ def _shares(keys, owners, touched, query, cells, starts, counts):  # type: ignor
                 for place in range(OWNERS):
                     owner = owners[slot, place]
                     if owner < 0:
-                        continue
-                    if touched[slot, place] != query:
-                        touched[slot, place] = query
+                        break
+                    if owners[slot, OWNERS + place] != query:
+                        owners[slot, OWNERS + place] = query
                         of_owner[owner] += 1
                     if met_at[owner] != at:
                         met_at[owner] = at
@@ -335,9 +335,15 @@ def _contest(keys, owners, owner_count, who, cells, starts):  # type: ignore[no-
 def _remove(keys, owners, owner, cells):  # type: ignore[no-untyped-def]
     for cell in cells:
         slot = _slot(keys, cell)
-        for index in range(OWNERS):
+        last = OWNERS - 1
+        while last >= 0 and owners[slot, last] < 0:
+            last -= 1
+        for index in range(last + 1):
             if owners[slot, index] == owner:
-                owners[slot, index] = -1
+                owners[slot, index] = owners[slot, last]
+                owners[slot, OWNERS + index] = owners[slot, OWNERS + last]
+                owners[slot, last] = -1
+                break
 
 
 @njit(cache=True, nogil=True)

@@ -345,9 +345,10 @@ class SceneGraph:
         nodes.fuse(rows, means_world, covariances_world, class_probabilities, weights, observations)
         for row, surface in zip(rows, surfaces):
             nodes.surfaces[row].add(surface)
-            nodes.revisions[row] = self._changed()
-            nodes.first_seen_ns[row] = min(int(nodes.first_seen_ns[row]), first_seen_ns)
-            nodes.last_seen_ns[row] = max(int(nodes.last_seen_ns[row]), last_seen_ns)
+        nodes.revisions[rows] = self.revision + 1 + np.arange(len(rows))
+        self.revision += len(rows)
+        nodes.first_seen_ns[rows] = np.minimum(nodes.first_seen_ns[rows], first_seen_ns)
+        nodes.last_seen_ns[rows] = np.maximum(nodes.last_seen_ns[rows], last_seen_ns)
 
     def _forget(self, node_id: int, successor: int) -> None:
         self.nodes.remove(node_id)
