@@ -143,9 +143,10 @@ def test_clip_does_not_depend_on_when_it_is_encoded():
     assert (early.requests[0].clip == late.requests[0].clip).all()
 
 
-def test_pair_whose_image_never_came_is_found_and_its_clip_counted():
+@pytest.mark.parametrize("image", [None, picture(3)[::2, ::2]])
+def test_pair_whose_image_never_came_or_does_not_fit_is_found_and_its_clip_counted(image):
     stage = reasoner()
-    assert len(stage.observe(pair_graph(3)).pairs) == 2
+    assert len(stage.observe(pair_graph(3), image).pairs) == 2
     assert stage.counters().dropped == {"no_frame": 1} and stage.counters().queued == 0
 
 

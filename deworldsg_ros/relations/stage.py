@@ -42,8 +42,8 @@ class RelationCounters:
         encoded: clips that the world model answered.
         dropped: clips that were not encoded, by reason: those of `ClipPolicy.judge` and of
             `ClipQueue`, ``world_model_error`` (the model failed on it), ``cleared`` (by a reset
-            or at the end), and ``no_frame`` (never queued, because the frame's image did not come
-            or came too late).
+            or at the end), and ``no_frame`` (never queued, because the frame's image did not come,
+            came too late, or is of another size).
     """
 
     queued: int
@@ -206,7 +206,8 @@ class RelationReasoner:
         # One clip serves both directions.
         once = np.flatnonzero(pairs[:, 0] < pairs[:, 1])
         with self._lock:
-            if rgb is not None:
+            # In an image of another size, the boxes are elsewhere.
+            if rgb is not None and rgb.shape[:2] == (local.height, local.width):
                 self._keep(local.stamp_ns, rgb)
             self._policy.advance(local.stamp_ns)
             stamps_ns = self._frames.window(local.stamp_ns, self._config.clip_length)
