@@ -147,6 +147,9 @@ def test_the_papers_perception_as_one_stage(folder, tmp_path):
         decoder_layers=3,
         max_objects=8,
         score_threshold=0.0,
+        # Random weights put their boxes anywhere.
+        join_nested=False,
+        drop_views=False,
     )
     perception = build_perception(config, world_up="z")
     depth_m = np.full((48, 64), 1.5, np.float32)
