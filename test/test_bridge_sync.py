@@ -198,6 +198,22 @@ def test_an_odometry_of_the_robot_is_carried_over_to_its_camera() -> None:
     assert not assembler.drops
 
 
+def test_tf_does_not_take_the_place_of_an_odometry_that_starts_again() -> None:
+    assembler = robot()
+    assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
+    assert len(assembler.pop_ready(0)) == 1
+    again_ns = T0 - 100 * SECOND
+    for event in complete(again_ns):
+        if event.method != "add_pose":
+            add(assembler, event)
+    assembler.add_pose(odometry(again_ns, float("nan"), "base_link"), again_ns)
+    assembler.add_transforms(tf(transform("map", "base_link", np.eye(4), again_ns)))
+    assert assembler.pop_ready(0) == []
+    assembler.add_pose(odometry(again_ns, 1.0, "base_link"), again_ns)
+    (frame,) = assembler.pop_ready(0)
+    assert frame.T_world_camera[0, 3] == pytest.approx(1.3)
+
+
 def test_a_camera_whose_mounting_nobody_tells_gives_no_frame() -> None:
     assembler = robot()
     assert assembler.flush() == []

@@ -33,9 +33,6 @@ class PoseStream:
         self.world_frame = world_frame
         self.transforms = transforms
 
-    def __len__(self) -> int:
-        return len(self._buffer)
-
     def add(self, message: Any, stamp_ns: int) -> None:
         """Keep a pose.
 

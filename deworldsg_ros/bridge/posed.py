@@ -70,6 +70,8 @@ class PosedAssembler(Assembler[T, Out]):
         self._pose_slop_ns = round(inputs.pose_slop_s * 1e9)
         self._poses = PoseStream(self._pose_slop_ns, inputs.world_frame)
         self._transforms = TransformTree(self._pose_slop_ns, inputs.world_frame)
+        # Then TF is not their place, not even where they start again.
+        self._had_poses = False
 
     def add_depth(self, message: Any, stamp_ns: int) -> None:
         """Keep a depth image, Image or CompressedImage."""
@@ -99,6 +101,7 @@ class PosedAssembler(Assembler[T, Out]):
         self._hear_pose(stamp_ns)
         try:
             self._poses.add(message, stamp_ns)
+            self._had_poses = True
         except RefusedInput as refusal:
             self._drop(refusal.reason, str(refusal))
 
@@ -133,7 +136,7 @@ class PosedAssembler(Assembler[T, Out]):
 
     def _source(self) -> PoseStream | TransformTree:
         wanted = self._inputs.pose_source
-        if wanted == "tf" or (wanted == "auto" and not len(self._poses) and len(self._transforms)):
+        if wanted == "tf" or (wanted == "auto" and not self._had_poses and len(self._transforms)):
             return self._transforms
         return self._poses
 
