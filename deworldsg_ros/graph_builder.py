@@ -5,6 +5,7 @@ The graph node and the in-process pipeline both run this, so that they end with 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -46,7 +47,8 @@ class GraphBuilder:
         )
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         self._newest_ns: int | None = None
-        self._associations: list[wire.Association] = []
+        # Of frames that nothing remembers any more, nobody need be told.
+        self._associations: deque[wire.Association] = deque(maxlen=self.graph.remembered_frames)
         self._published = self._message(0, self._output.surface_points)
 
     def integrate(self, local: LocalGraph) -> list[int]:
@@ -120,7 +122,7 @@ class GraphBuilder:
         if same and not removed:
             return None
         message = diff(self._published, current, removed, self._associations)
-        self._associations = []
+        self._associations.clear()
         self._published = current
         return message
 

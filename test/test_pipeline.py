@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -177,6 +178,16 @@ def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> Non
         replica.apply(sent)
         assert replica.message() == builder.snapshot()
     assert builder.update() is None
+
+
+def test_an_update_after_long_tells_of_the_frames_that_are_remembered() -> None:
+    builder = GraphBuilder(PAPER, VOCABULARY, "map")
+    seen = local_graph(0)
+    for stamp_ns in range(1100):
+        builder.integrate(replace(seen, stamp_ns=stamp_ns))
+    update = builder.update()
+    assert update is not None and len(update.associations) == builder.graph.remembered_frames
+    assert wire.ns_from_stamp(update.associations[-1].stamp) == 1099
 
 
 @pytest.mark.parametrize("index", [3, 2])
