@@ -163,8 +163,7 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     even_gaussians: Annotated[
         bool,
         _number(
-            "published Gaussians count every part of a surface once, instead of every pixel "
-            "(surface rule)"
+            "published Gaussians do not lean to what of a surface was seen most (surface rule)"
         ),
     ] = True
     align_poses: Annotated[

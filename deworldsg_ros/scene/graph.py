@@ -29,8 +29,8 @@ class SceneGraph:
         frame_id: world frame.
         surface_point_capacity: most surface points kept a node.
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
-        even_gaussians: messages show the moments of a node's surface, of which every part counts
-            once, instead of the pooled Gaussian (`scene.surface.even_moments`).
+        even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
+            Gaussian.
         nodes: the nodes as parallel arrays; read only.
         revision: number of changes so far.
     """

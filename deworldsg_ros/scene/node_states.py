@@ -16,8 +16,7 @@ class NodeStateCache:
     """The newest message of each node, in each form asked for, with the revision it shows.
 
     Args:
-        even_gaussians: show the moments of a node's surface, of which every part counts once,
-            instead of the pooled Gaussian.
+        even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
     """
 
     def __init__(self, even_gaussians: bool = False) -> None:

@@ -18,7 +18,6 @@ Float64 = NDArray[np.float64]
 UInt64 = NDArray[np.uint64]
 
 # Within this distance points of a surface are of one part of it: half a cell of the surface map.
-# With more, a stray point weighs as much as a patch.
 EVEN_RADIUS_M = 0.015
 
 # The constants of SplitMix64.
@@ -126,13 +125,14 @@ def _union(hashes, points, new_hashes, new_points, capacity):  # type: ignore[no
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
-    """Mean (3,) and covariance (3, 3) of a surface, of which every part counts once.
+    """Mean (3,) and covariance (3, 3) of a surface that was not seen evenly.
 
-    Points (n, 3), n >= 1, lie densely where a camera looked long or from near: each weighs the less
-    the more there are within `EVEN_RADIUS_M` of it. The covariance includes that of such a ball.
+    Points (n, 3), n >= 1, lie densely where a camera looked long or from near: each weighs with the
+    inverse square root of the number within `EVEN_RADIUS_M` of it. The inverse itself would count
+    every part once, a stray point as much as a patch. The covariance includes that of such a ball.
     """
     points = points_world.astype(np.float64)
-    weights = 1.0 / _neighbours(np.ascontiguousarray(points_world), EVEN_RADIUS_M)
+    weights = _neighbours(np.ascontiguousarray(points_world), EVEN_RADIUS_M) ** -0.5
     weights /= weights.sum()
     mean = weights @ points
     offsets = points - mean
