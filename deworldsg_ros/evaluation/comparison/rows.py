@@ -108,7 +108,14 @@ SWITCHES = (
     ("cell2", "cells of 2 cm", ("merging.cell_m=0.02",)),
     ("cell5", "cells of 5 cm", ("merging.cell_m=0.05",)),
     ("class", "classes have to agree", ("merging.overlap_threshold_other_class=1.0",)),
-    ("blind", "classes play no part", ("merging.overlap_threshold_other_class=0.3",)),
+    (
+        "blind",
+        "classes play no part",
+        ("merging.overlap_threshold_other_class=0.3", "merging.size_ratio_other_class=1000.0"),
+    ),
+    ("size", "other class, any size", ("merging.size_ratio_other_class=1000.0",)),
+    ("pooled", "pooled Gaussians shown", ("merging.even_gaussians=false",)),
+    ("align", "frames laid on the graph", ("merging.align_poses=true",)),
     ("contest", "cells not contested", ("merging.contest_cells=false",)),
     (
         "sure",
