@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.gaussian import Float64, transform
 from deworldsg_ros.scene.graph import SceneGraph
 
 # Points of a frame that are compared, and of each node; both are uniform draws.
@@ -100,14 +100,14 @@ class PoseAlignment:
 
 def moved(local: LocalGraph, T: Float64) -> LocalGraph:
     """A local graph as it would be if the camera's pose were T · T_world_camera."""
-    rotation, translation = T[:3, :3], T[:3, 3]
+    means_world, covariances_world = transform(local.means_world, local.covariances_world, T)
     return replace(
         local,
         T_world_camera=T @ local.T_world_camera,
-        means_world=local.means_world @ rotation.T + translation,
-        covariances_world=rotation @ local.covariances_world @ rotation.T,
+        means_world=means_world,
+        covariances_world=covariances_world,
         surface_points_world=tuple(
-            (points @ rotation.T + translation).astype(np.float32)
+            (points @ T[:3, :3].T + T[:3, 3]).astype(np.float32)
             for points in local.surface_points_world
         ),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from deworldsg_ros.scene import storage, wire
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.gaussian import Float64, transform
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import Int64, NodeTable
 from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, SurfaceReservoir, hash_each
@@ -223,17 +223,15 @@ class SceneGraph:
         The transform takes points of the world as it was into the world as it is.
         """
         nodes, row = self.nodes, self.nodes.row(node_id)
-        rotation, translation = T_correction[:3, :3], T_correction[:3, 3]
-        covariance = rotation @ nodes.covariances[row] @ rotation.T
         nodes.put(
             row,
-            rotation @ nodes.means[row] + translation,
-            (covariance + covariance.T) / 2,
+            *transform(nodes.means[row], nodes.covariances[row], T_correction),
             nodes.class_probabilities[row].copy(),
             float(nodes.weights[row]),
             int(nodes.observations[row]),
         )
-        points = nodes.surfaces[row].points_world.astype(np.float64) @ rotation.T + translation
+        points = nodes.surfaces[row].points_world.astype(np.float64) @ T_correction[:3, :3].T
+        points += T_correction[:3, 3]
         moved = SurfaceReservoir(self.surface_point_capacity)
         moved.add(hash_each((points.astype(np.float32),))[0])
         nodes.surfaces[row] = moved
