@@ -63,7 +63,8 @@ class SurfaceMerging:
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
         look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
         self._existence.warm_up()
-        self._alignment.warm_up()
+        if self._config.align_poses:
+            self._alignment.warm_up()
         warm_up_fit()
         warm_up_graph()
 
