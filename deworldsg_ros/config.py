@@ -16,138 +16,137 @@ import msgspec
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
-def _number(description: str, **limits: Any) -> Any:
+def option(description: str, **limits: Any) -> Any:
+    """What a field is, and its limits (`ge`, `gt`, `le`, `lt`, …), for `Annotated`."""
     return msgspec.Meta(description=description, **limits)
 
 
 class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage a: image → 2D scene graph and instance labels."""
 
-    detector: Annotated[str, _number("detector backend")] = "nanodet"
-    segmenter: Annotated[str, _number("box-conditioned segmenter backend")] = "rgbd"
-    relation_head: Annotated[str, _number("relation head backend")] = "geometric"
+    detector: Annotated[str, option("detector backend")] = "nanodet"
+    segmenter: Annotated[str, option("box-conditioned segmenter backend")] = "rgbd"
+    relation_head: Annotated[str, option("relation head backend")] = "geometric"
     predicate_set: Annotated[
         Literal["replica_ssg", "3dssg", "checkpoint"],
-        _number(
+        option(
             "predicates of the graph: ReplicaSSG (Visual Genome, 50), 3DSSG (7), or those of the "
             "relation head's checkpoint"
         ),
     ] = "replica_ssg"
     score_threshold: Annotated[
         float,
-        _number(
+        option(
             "least detection score (the paper: 0.7); -1 = the backend's own default", ge=-1, le=1
         ),
     ] = -1.0
-    max_objects: Annotated[int, _number("most objects kept a frame, best first", ge=1, le=300)] = 50
-    top_relations: Annotated[int, _number("relations kept a frame", ge=0, le=1000)] = 10
+    max_objects: Annotated[int, option("most objects kept a frame, best first", ge=1, le=300)] = 50
+    top_relations: Annotated[int, option("relations kept a frame", ge=0, le=1000)] = 10
     join_nested: Annotated[
-        bool, _number("one thing that is detected whole and in part in a frame is one object")
+        bool, option("one thing that is detected whole and in part in a frame is one object")
     ] = True
     drop_views: Annotated[
-        bool, _number("a box that reaches all four borders of the image is no object")
+        bool, option("a box that reaches all four borders of the image is no object")
     ] = True
-    threads: Annotated[int, _number("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
+    threads: Annotated[int, option("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
     detector_path: Annotated[
-        str, _number("checkpoint of the detector rtdetr: a folder, or a hub id")
+        str, option("checkpoint of the detector rtdetr: a folder, or a hub id")
     ] = ""
     segmenter_path: Annotated[
-        str, _number("checkpoint of the segmenter sam2 or sam: a folder, or a hub id")
+        str, option("checkpoint of the segmenter sam2 or sam: a folder, or a hub id")
     ] = ""
     relation_head_path: Annotated[
-        str, _number("checkpoint of the relation head egtr; empty = the detector's")
+        str, option("checkpoint of the relation head egtr; empty = the detector's")
     ] = ""
     local_files_only: Annotated[
-        bool, _number("take a hub id from the local cache only, never from the network")
+        bool, option("take a hub id from the local cache only, never from the network")
     ] = True
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        _number("where rtdetr, egtr, sam2 and sam run; auto = CUDA where there is one"),
+        option("where rtdetr, egtr, sam2 and sam run; auto = CUDA where there is one"),
     ] = "auto"
     class_scores: Annotated[
         Literal["auto", "softmax", "sigmoid"],
-        _number("how rtdetr's class logits are read; auto = as the checkpoint's card says"),
+        option("how rtdetr's class logits are read; auto = as the checkpoint's card says"),
     ] = "auto"
     class_temperature: Annotated[
         float,
-        _number("temperature of rtdetr's class distribution; 0 = the checkpoint's", ge=0, le=100),
+        option("temperature of rtdetr's class distribution; 0 = the checkpoint's", ge=0, le=100),
     ] = 0.0
     decoder_layers: Annotated[
         int,
-        _number("layers of rtdetr's decoder that are run; 0 = the checkpoint's", ge=0, le=64),
+        option("layers of rtdetr's decoder that are run; 0 = the checkpoint's", ge=0, le=64),
     ] = 0
     sam_image_size: Annotated[
         int,
-        _number("edge of sam2's square input, pixels, by 32; 0 = the checkpoint's", ge=0, le=4096),
+        option("edge of sam2's square input, pixels, by 32; 0 = the checkpoint's", ge=0, le=4096),
     ] = 0
     sam_box_batch: Annotated[
-        int, _number("boxes that sam2 and sam decode at once", ge=1, le=1024)
+        int, option("boxes that sam2 and sam decode at once", ge=1, le=1024)
     ] = 16
 
 
 class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage b: depth refinement and Gaussians (Eq. 1-4)."""
 
-    tau: Annotated[float, _number("relative tolerance to the local median, Eq. 1", ge=0, le=1)] = (
+    tau: Annotated[float, option("relative tolerance to the local median, Eq. 1", ge=0, le=1)] = (
         0.05
     )
     epsilon_m: Annotated[
-        float, _number("absolute tolerance to the local median, metres, Eq. 1", ge=0, le=1)
+        float, option("absolute tolerance to the local median, metres, Eq. 1", ge=0, le=1)
     ] = 1e-3
     gamma_base_m: Annotated[
-        float, _number("least separation of depth clusters, metres, Eq. 2", gt=0, le=10)
+        float, option("least separation of depth clusters, metres, Eq. 2", gt=0, le=10)
     ] = 0.03
-    alpha: Annotated[float, _number("factor of the median depth step, Eq. 2", ge=0, le=1000)] = 10.0
-    beta: Annotated[float, _number("factor of the reference depth, Eq. 2", ge=0, le=1)] = 0.02
+    alpha: Annotated[float, option("factor of the median depth step, Eq. 2", ge=0, le=1000)] = 10.0
+    beta: Annotated[float, option("factor of the reference depth, Eq. 2", ge=0, le=1)] = 0.02
     min_pixels: Annotated[
-        int, _number("valid pixels below which an object is no observation", ge=2, le=100000)
+        int, option("valid pixels below which an object is no observation", ge=2, le=100000)
     ] = 10
     covariance_ridge_m2: Annotated[
-        float, _number("ridge of the covariance, square metres, Eq. 4", gt=0, le=1)
+        float, option("ridge of the covariance, square metres, Eq. 4", gt=0, le=1)
     ] = 1e-6
     surface_points: Annotated[
-        int, _number("surface points sampled an object and frame", ge=0, le=4096)
+        int, option("surface points sampled an object and frame", ge=0, le=4096)
     ] = 200
     depth_grid_stride_px: Annotated[
         int,
-        _number("pixels between depth samples that tell what was seen through; 0 = none", ge=0),
+        option("pixels between depth samples that tell what was seen through; 0 = none", ge=0),
     ] = 8
     regions: Annotated[
         Literal["masks", "boxes"],
-        _number("pixels that are an object's: of its mask, or of its box (ablation)"),
+        option("pixels that are an object's: of its mask, or of its box (ablation)"),
     ] = "masks"
-    refine: Annotated[bool, _number("refine depth by Eq. 1 and 2; false is an ablation")] = True
+    refine: Annotated[bool, option("refine depth by Eq. 1 and 2; false is an ablation")] = True
 
 
 class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage c: association and fusion (Eq. 5-7)."""
 
     hellinger_threshold: Annotated[
-        float, _number("Hellinger distance below which nodes may merge, Eq. 6", gt=0, lt=1)
+        float, option("Hellinger distance below which nodes may merge, Eq. 6", gt=0, lt=1)
     ] = 0.7
     class_distance_threshold: Annotated[
-        float, _number("class distance below which nodes may merge, Eq. 6", gt=0, le=1)
+        float, option("class distance below which nodes may merge, Eq. 6", gt=0, le=1)
     ] = 0.8
     association: Annotated[
         Literal["paper", "surface"],
-        _number("rule that finds an object's node: the paper's Eq. 5-6, or overlap of surfaces"),
+        option("rule that finds an object's node: the paper's Eq. 5-6, or overlap of surfaces"),
     ] = "surface"
     cell_m: Annotated[
-        float, _number("edge of a cell of the surface map, metres (surface rule)", gt=0, le=1)
+        float, option("edge of a cell of the surface map, metres (surface rule)", gt=0, le=1)
     ] = 0.03
     overlap_threshold: Annotated[
         float,
-        _number("share of overlap that makes two one, classes agreeing (surface rule)", gt=0, le=1),
+        option("share of overlap that makes two one, classes agreeing (surface rule)", gt=0, le=1),
     ] = 0.3
     overlap_threshold_other_class: Annotated[
         float,
-        _number(
-            "share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1
-        ),
+        option("share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1),
     ] = 0.55
     size_ratio_other_class: Annotated[
         float,
-        _number(
+        option(
             "most times that one is larger across than the other where the classes of two that are "
             "one do not agree (surface rule)",
             ge=1,
@@ -155,30 +154,28 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
     contest_cells: Annotated[
         bool,
-        _number(
+        option(
             "what a frame shows to be one object is no longer part of another that it shows, too "
             "(surface rule)"
         ),
     ] = True
     even_gaussians: Annotated[
         bool,
-        _number(
-            "published Gaussians do not lean to what of a surface was seen most (surface rule)"
-        ),
+        option("published Gaussians do not lean to what of a surface was seen most (surface rule)"),
     ] = True
     align_poses: Annotated[
         bool,
-        _number(
+        option(
             "each frame is laid on the graph before it is merged: for poses that drift "
             "(surface rule)"
         ),
     ] = False
     confirm_observations: Annotated[
-        int, _number("frames that make a node sure (surface rule)", ge=1, le=1000)
+        int, option("frames that make a node sure (surface rule)", ge=1, le=1000)
     ] = 3
     confirm_score: Annotated[
         float,
-        _number(
+        option(
             "detection score that a node has to have once, or it takes four times as many frames "
             "to be sure (surface rule); 0 = none",
             ge=0,
@@ -187,7 +184,7 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.45
     baseline_deg: Annotated[
         float,
-        _number(
+        option(
             "movement of the camera, seen from a node, that makes another look at it; where the "
             "camera moves, a node is not sure before that, or half a second (surface rule)",
             ge=0,
@@ -196,7 +193,7 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 0.5
     min_detection_rate: Annotated[
         float,
-        _number(
+        option(
             "share of the looks at a node in full view that have to detect it, or it is tentative "
             "again (surface rule); 0 = none",
             ge=0,
@@ -204,68 +201,66 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.4
     expire_tentative_s: Annotated[
-        float, _number("time unseen after which a tentative node goes (surface rule)", gt=0)
+        float, option("time unseen after which a tentative node goes (surface rule)", gt=0)
     ] = 10.0
     absent_frames: Annotated[
         int,
-        _number("frames that see through a node before it is gone; 0 = never (surface rule)", ge=0),
+        option("frames that see through a node before it is gone; 0 = never (surface rule)", ge=0),
     ] = 5
     lost_s: Annotated[
         float,
-        _number("time in which a moved object may take up its id again (surface rule)", ge=0),
+        option("time in which a moved object may take up its id again (surface rule)", ge=0),
     ] = 30.0
-    surface_points: Annotated[int, _number("surface points kept a node", ge=0, le=100000)] = 512
+    surface_points: Annotated[int, option("surface points kept a node", ge=0, le=100000)] = 512
 
 
 class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage d: pairing, world-model evidence and fusion (Eq. 8-10)."""
 
-    world_model: Annotated[str, _number("world model backend; none = visual evidence only")] = (
-        "none"
-    )
+    world_model: Annotated[str, option("world model backend; none = visual evidence only")] = "none"
     geo_cost_threshold: Annotated[
-        float, _number("geometric cost below which a pair is a neighbour, Eq. 8", gt=0, le=100)
+        float, option("geometric cost below which a pair is a neighbour, Eq. 8", gt=0, le=100)
     ] = 0.45
-    clip_length: Annotated[int, _number("frames of a clip", ge=1, le=256)] = 16
+    clip_length: Annotated[int, option("frames of a clip", ge=1, le=256)] = 16
     entropy_threshold_nats: Annotated[
-        float, _number("visual entropy above which the prior enters, nats", ge=0, le=10)
+        float, option("visual entropy above which the prior enters, nats", ge=0, le=10)
     ] = 1.0
-    fusion_alpha: Annotated[float, _number("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
+    fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
     encode: Annotated[
         Literal["uncertain", "all"],
-        _number(
+        option(
             "clips that the world model looks at: of pairs whose edges are uncertain, or all of "
             "every frame"
         ),
     ] = "uncertain"
     clips_per_s: Annotated[
         float,
-        _number("most clips encoded a second, by the images' stamps; 0 = unlimited", ge=0, le=1000),
+        option("most clips encoded a second, by the images' stamps; 0 = unlimited", ge=0, le=1000),
     ] = 10.0
-    queue_size: Annotated[
-        int, _number("clips that may wait for the world model", ge=1, le=4096)
-    ] = 256
-    seed: Annotated[int, _number("seed of the deterministic world model", ge=0)] = 0
+    queue_size: Annotated[int, option("clips that may wait for the world model", ge=1, le=4096)] = (
+        256
+    )
+    seed: Annotated[int, option("seed of the deterministic world model", ge=0)] = 0
     model_path: Annotated[
-        str, _number("checkpoint of the world model's backbone: a folder, or a hub id")
+        str, option("checkpoint of the world model's backbone: a folder, or a hub id")
     ] = ""
-    probe_path: Annotated[str, _number("folder of the trained probe")] = ""
+    probe_path: Annotated[str, option("folder of the trained probe")] = ""
     local_files_only: Annotated[
-        bool, _number("take a hub id from the local cache only, never from the network")
+        bool, option("take a hub id from the local cache only, never from the network")
     ] = True
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        _number("where the world model runs; auto = CUDA where there is one"),
+        option("where the world model runs; auto = CUDA where there is one"),
     ] = "auto"
     image_size: Annotated[
         int,
-        _number("edge of the backbone's square input, pixels; 0 = the checkpoint's", ge=0, le=1024),
+        option("edge of the backbone's square input, pixels; 0 = the checkpoint's", ge=0, le=1024),
     ] = 0
     quantise: Annotated[
-        bool, _number("linear layers of the backbone in 8-bit integers, on the CPU only")
+        bool, option("linear layers of the backbone in 8-bit integers, on the CPU only")
     ] = False
     batch_size: Annotated[
-        int, _number("clips encoded at once; more than 1 pays on CUDA only", ge=1, le=256)
+        int, option("clips encoded at once; more than 1 pays on CUDA only", ge=1, le=256)
     ] = 1
 
 
@@ -274,42 +269,40 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     transport: Annotated[
         Literal["auto", "raw", "compressed"],
-        _number("Image or CompressedImage topics; auto = whichever is published"),
+        option("Image or CompressedImage topics; auto = whichever is published"),
     ] = "auto"
     reliability: Annotated[
         Literal["auto", "reliable", "best_effort"],
-        _number("QoS of the image topics; auto = reliable where every publisher offers it"),
+        option("QoS of the image topics; auto = reliable where every publisher offers it"),
     ] = "auto"
     pose_source: Annotated[
         Literal["auto", "pose", "odometry", "tf"],
-        _number(
-            "PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"
-        ),
+        option("PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"),
     ] = "auto"
     world_frame: Annotated[
-        str, _number("world frame that poses must have; empty = that of the first pose")
+        str, option("world frame that poses must have; empty = that of the first pose")
     ] = ""
     world_up: Annotated[
         Literal["auto", "z", "y", "-y"],
-        _number("axis of the world frame that points up; auto = z if the poses agree, else theirs"),
+        option("axis of the world frame that points up; auto = z if the poses agree, else theirs"),
     ] = "auto"
     slop_s: Annotated[
-        float, _number("most difference of the stamps of RGB and depth, seconds", ge=0, le=1)
+        float, option("most difference of the stamps of RGB and depth, seconds", ge=0, le=1)
     ] = 0.02
     pose_slop_s: Annotated[
-        float, _number("most time between an image and the nearest pose, seconds", ge=0, le=10)
+        float, option("most time between an image and the nearest pose, seconds", ge=0, le=10)
     ] = 0.1
     max_step_m: Annotated[
-        float, _number("camera movement between frames above which it is a jump, metres", gt=0)
+        float, option("camera movement between frames above which it is a jump, metres", gt=0)
     ] = 1.0
     # Hands and heads turn at 300 degrees a second at the most, and an image is blurred far below.
     max_turn_deg_s: Annotated[
-        float, _number("camera rotation above which it is a jump, degrees a second", gt=0)
+        float, option("camera rotation above which it is a jump, degrees a second", gt=0)
     ] = 360.0
     depth_scale: Annotated[
-        float, _number("metres of one unit of a 16UC1 depth image", gt=0, le=1)
+        float, option("metres of one unit of a 16UC1 depth image", gt=0, le=1)
     ] = 0.001
-    max_depth_m: Annotated[float, _number("depth beyond which is invalid, metres", gt=0)] = 10.0
+    max_depth_m: Annotated[float, option("depth beyond which is invalid, metres", gt=0)] = 10.0
 
 
 class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -317,45 +310,45 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     method: Annotated[
         Literal["rgbd", "depth"],
-        _number("align colour and depth, or depth alone (twice as fast, drifts more)"),
+        option("align colour and depth, or depth alone (twice as fast, drifts more)"),
     ] = "rgbd"
     max_depth_m: Annotated[
-        float, _number("depth beyond which is not aligned, metres", gt=0, le=100)
+        float, option("depth beyond which is not aligned, metres", gt=0, le=100)
     ] = 4.0
     max_step_m: Annotated[
-        float, _number("camera movement between frames above which it is lost, metres", gt=0, le=10)
+        float, option("camera movement between frames above which it is lost, metres", gt=0, le=10)
     ] = 0.3
     max_rotation_deg: Annotated[
-        float, _number("rotation between frames above which it is lost, degrees", gt=0, le=180)
+        float, option("rotation between frames above which it is lost, degrees", gt=0, le=180)
     ] = 30.0
     min_fit: Annotated[
-        float, _number("share of the depth that has to fit, or the frame is lost", ge=0, le=1)
+        float, option("share of the depth that has to fit, or the frame is lost", ge=0, le=1)
     ] = 0.6
     keyframe_m: Annotated[
-        float, _number("movement up to which the same frame stays the reference, metres", ge=0)
+        float, option("movement up to which the same frame stays the reference, metres", ge=0)
     ] = 0.02
     keyframe_deg: Annotated[
-        float, _number("rotation up to which the same frame stays the reference, degrees", ge=0)
+        float, option("rotation up to which the same frame stays the reference, degrees", ge=0)
     ] = 1.0
     restart_after: Annotated[
-        int, _number("lost frames before it starts anew at the last known pose", ge=1, le=100000)
+        int, option("lost frames before it starts anew at the last known pose", ge=1, le=100000)
     ] = 15
-    frame_id: Annotated[str, _number("world frame of the poses, where nothing gives one")] = "odom"
+    frame_id: Annotated[str, option("world frame of the poses, where nothing gives one")] = "odom"
     publish_tf: Annotated[
-        bool, _number("also publish what the camera is mounted on to /tf (needs tf2_msgs)")
+        bool, option("also publish what the camera is mounted on to /tf (needs tf2_msgs)")
     ] = False
 
 
 class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What goes out on /scene_graph."""
 
-    rate_hz: Annotated[float, _number("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
-    top_k: Annotated[int, _number("classes or predicates told a node or edge", ge=1, le=1000)] = 5
+    rate_hz: Annotated[float, option("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
+    top_k: Annotated[int, option("classes or predicates told a node or edge", ge=1, le=1000)] = 5
     tentative_nodes: Annotated[
-        bool, _number("also nodes that were seen too rarely to be sure of (paper: there are none)")
+        bool, option("also nodes that were seen too rarely to be sure of (paper: there are none)")
     ] = False
     surface_points: Annotated[
-        bool, _number("surface points of each node in /scene_graph (large)")
+        bool, option("surface points of each node in /scene_graph (large)")
     ] = False
 
 
