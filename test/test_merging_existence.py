@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from merging_support import VOCABULARY
@@ -38,6 +40,12 @@ class Walk:
             changes["scores"] = np.array([score])
         objects = [(HERE, CUP)] if found else []
         self.merging.merge(self.graph, frame(self.stamp, *objects, **changes))
+
+    def reload(self, path: Path) -> None:
+        """Go on with the graph as it was saved, and nothing else."""
+        self.graph.save(path)
+        self.graph = SceneGraph.load(path)
+        self.merging = SurfaceMerging(MergingConfig(association="surface"))
 
     @property
     def told(self) -> list[int]:
@@ -134,9 +142,7 @@ def test_a_loaded_node_is_sure_and_stays_in_what_it_was(tmp_path):
     walk = Walk()
     for _ in range(3):
         walk.see(found=True)
-    walk.graph.save(tmp_path / "graph.npz")
-    walk.graph = SceneGraph.load(tmp_path / "graph.npz")
-    walk.merging = SurfaceMerging(MergingConfig(association="surface"))
+    walk.reload(tmp_path / "graph.npz")
     walk.see(found=False)
     assert walk.told == [1]
     walk.see(found=True)
@@ -147,9 +153,7 @@ def test_a_loaded_node_was_missed_in_no_look_before(tmp_path):
     walk = Walk()
     for _ in range(3):
         walk.see(found=True)
-    walk.graph.save(tmp_path / "graph.npz")
-    walk.graph = SceneGraph.load(tmp_path / "graph.npz")
-    walk.merging = SurfaceMerging(MergingConfig(association="surface"))
+    walk.reload(tmp_path / "graph.npz")
     walk.see(found=True)
     for _ in range(3):
         walk.see(found=False)
