@@ -65,6 +65,7 @@ def test_version_and_help(tmp_path):
         (["config", "--set", "tau"], "section.field=value"),
         (["config", "--config", "nowhere.yaml"], "nowhere.yaml"),
         (["run", ".", "--out", "x", "--intrinsics", "1,2"], "FX,FY,CX,CY"),
+        (["run", ".", "--out", "x", "--intrinsics", "nan,1,2,3"], "FX and FY above 0"),
         (["dance"], "dance"),
     ],
 )

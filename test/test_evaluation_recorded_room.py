@@ -109,6 +109,10 @@ def test_a_recording_without_ground_truth_says_what_is_missing(tmp_path: Path) -
     (tmp_path / "room.gt.json").write_text('{"objects": [{}]}')
     with pytest.raises(RecordingError, match=r"room\.gt\.json: KeyError"):
         open_annotations(tmp_path / "room", "recording")
+    truth = {"objects": [], "relations": [], "first_stamp_ns": 0, "rate_hz": 0, "frames": 1}
+    (tmp_path / "room.gt.json").write_text(json.dumps(truth))
+    with pytest.raises(RecordingError, match=r"rate_hz is 0.0: wanted more than 0"):
+        open_annotations(tmp_path / "room", "recording")
 
 
 def test_other_layouts_are_data_sets(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -56,9 +57,11 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float] | None:
         return None
     try:
         fx, fy, cx, cy = map(float, text.split(","))
+        if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx + cy)):
+            raise ValueError
     except ValueError as error:
         raise RecordingError(
-            f"intrinsics '{text}': wanted FX,FY,CX,CY, four numbers in pixels"
+            f"intrinsics '{text}': wanted FX,FY,CX,CY, four numbers in pixels, FX and FY above 0"
         ) from error
     return fx, fy, cx, cy
 

@@ -79,6 +79,8 @@ class RecordedRoom(Annotations):
             self._named = [line for line in lines if {*line[:2]} <= known.keys()]
             relations = [(s, o, REPLICA_SSG_PREDICATES.index(name)) for s, o, name in self._named]
             first_ns, rate_hz = int(content["first_stamp_ns"]), float(content["rate_hz"])
+            if not rate_hz > 0:
+                raise ValueError(f"rate_hz is {rate_hz}: wanted more than 0")
             self.frame_numbers = {
                 first_ns + round(number * 1e9 / rate_hz): number
                 for number in range(int(content["frames"]))
