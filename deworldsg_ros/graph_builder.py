@@ -5,17 +5,20 @@ The graph node and the in-process pipeline both run this, so that they end with 
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
 from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.scene import wire
+from deworldsg_ros.scene import storage, wire
 from deworldsg_ros.scene.camera import Float64, check_pose
 from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.delta import diff
@@ -23,6 +26,9 @@ from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
+
+# Before the names of what the merging remembers, in a map.
+MEMORY = "merging."
 
 
 class GraphBuilder:
@@ -38,18 +44,61 @@ class GraphBuilder:
         self._relations = config.relations
         self._output = config.output
         self._merging = build_merging(config.merging)
-        self.graph = SceneGraph(
-            vocabulary,
-            frame_id,
-            config.merging.surface_points,
-            even_gaussians=config.merging.association == "surface"
-            and config.merging.even_gaussians,
-        )
+        self.graph = SceneGraph(vocabulary, frame_id, **_graph_settings(config.merging))
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         self._newest_ns: int | None = None
+        # Newest stamp of the map that this goes on with; frames to come may be older.
+        self._map_ns = 0
         # Of frames that nothing remembers any more, nobody need be told.
         self._associations: deque[wire.Association] = deque(maxlen=self.graph.remembered_frames)
         self._published = self._message(0, self._output.surface_points)
+
+    @classmethod
+    def from_map(cls, config: Config, path: Path) -> GraphBuilder:
+        """Go on with the graph of a map that `save_map` wrote; the first `update` tells all of it.
+
+        What was tentative then is left behind: nobody was told of it.
+
+        Raises:
+            RefusedInput: ``invalid_graph_file``.
+        """
+        state = storage.read(path)
+        graph = storage.graph_of(state, str(path), **_graph_settings(config.merging))
+        builder = cls(config, graph.vocabulary, graph.frame_id)
+        builder.graph = graph
+        try:
+            prior = ClassPairPrior.from_state(json.loads(state["prior"].tobytes()))
+            if (prior.class_count, prior.predicate_count) != (
+                builder.prior.class_count,
+                builder.prior.predicate_count,
+            ):
+                raise ValueError("of other classes or predicates than the graph's")
+            for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
+                graph.remove_node(node_id)
+            graph.take_removals()
+            builder._merging.restore(
+                graph,
+                {
+                    name.removeprefix(MEMORY): values
+                    for name, values in state.items()
+                    if name.startswith(MEMORY)
+                },
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise RefusedInput("invalid_graph_file", f"map {path}: {error!r}") from error
+        builder.prior = prior
+        builder._map_ns = int(graph.nodes.last_seen_ns.max(initial=0))
+        return builder
+
+    def save_map(self, path: Path) -> None:
+        """Write all that a later run needs to go on: graph, memory of the merging, and priors.
+
+        Raises:
+            OSError: where it cannot be written; what was there is then still there.
+        """
+        prior = np.frombuffer(json.dumps(self.prior.to_state()).encode(), np.uint8)
+        memory = {MEMORY + name: values for name, values in self._merging.memory().items()}
+        storage.write(path, {**storage.state_of(self.graph), **memory, "prior": prior})
 
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.
@@ -141,7 +190,7 @@ class GraphBuilder:
         pairs = [pair for pair in sorted(self.graph.edges) if pair[0] in nodes and pair[1] in nodes]
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
-            stamp=wire.stamp_from_ns(self._newest_ns or 0),
+            stamp=wire.stamp_from_ns(self._newest_ns or self._map_ns),
             frame_id=self.graph.frame_id,
             sequence=sequence,
             nodes=list(nodes.values()),
@@ -207,3 +256,10 @@ class GraphBuilder:
                 f"{len(known.predicates)}, or others of that number (do all nodes run with one "
                 "configuration?)",
             )
+
+
+def _graph_settings(merging: MergingConfig) -> dict[str, Any]:
+    return {
+        "surface_point_capacity": merging.surface_points,
+        "even_gaussians": merging.association == "surface" and merging.even_gaussians,
+    }

@@ -80,6 +80,11 @@ class Pipeline:
         }
         watch_parts(self.perception, self.times_s)
 
+    def go_on_with(self, builder: GraphBuilder) -> None:
+        """Take frames into a graph that is there already, e.g. that of a map."""
+        self.builder = builder
+        self.relations.watch(LiveGraph(builder.graph))
+
     def process(self, frame: RgbdFrame) -> FrameResult:
         """Take one frame into the graph.
 
@@ -98,8 +103,8 @@ class Pipeline:
                 frame.frame_id,
             )
         if self.builder is None:
-            self.builder = GraphBuilder(self.config, local.vocabulary, local.frame_id)
-            self.relations.watch(LiveGraph(self.builder.graph))
+            self.go_on_with(GraphBuilder(self.config, local.vocabulary, local.frame_id))
+        assert self.builder is not None
         with timed(self.times_s["merging"]):
             node_ids = self.builder.integrate(local)
         with timed(self.times_s["relations"]):

@@ -46,6 +46,7 @@ class Walk:
         self.graph.save(path)
         self.graph = SceneGraph.load(path)
         self.merging = SurfaceMerging(MergingConfig(association="surface"))
+        self.merging.restore(self.graph, {})
 
     @property
     def told(self) -> list[int]:

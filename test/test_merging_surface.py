@@ -227,16 +227,6 @@ def test_the_result_does_not_depend_on_the_world_frame() -> None:
     assert results[0][1] == pytest.approx(results[1][1], abs=1e-5)
 
 
-def test_a_loaded_graph_goes_on(graph, merging, tmp_path) -> None:
-    for stamp in range(3):
-        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
-    graph.save(tmp_path / "graph.npz")
-    loaded = SceneGraph.load(tmp_path / "graph.npz")
-    assert loaded.nodes.confirmed.tolist() == [True]
-    again = SurfaceMerging(CONFIG)
-    assert again.merge(loaded, frame(5, (WHOLE, TABLE))) == [1]
-
-
 def test_what_does_not_fit_is_refused_and_changes_nothing(graph, merging) -> None:
     merging.merge(graph, frame(0, (WHOLE, TABLE)))
     revision = graph.revision

@@ -29,6 +29,13 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     save_path: Annotated[
         str, msgspec.Meta(description="file that graph_node's service ~/save writes")
     ] = "scene_graph.json"
+    map_path: Annotated[
+        str,
+        msgspec.Meta(
+            description="map that graph_node goes on with, where the file is there, and that "
+            "~/save and a clean end write; empty = none. Poses have to be in the same world frame"
+        ),
+    ] = ""
 
 
 class Parameters(Config, frozen=True, forbid_unknown_fields=True):

@@ -99,6 +99,15 @@ SaveTrajectory = Annotated[
     Optional[Path],
     typer.Option("--save-trajectory", metavar="FILE", help="write the poses used, as TUM"),
 ]
+MapFile = Annotated[
+    Optional[Path],
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="go on with the graph of this map where the file is there, and write it at the end; "
+        "the poses have to be in the same world frame",
+    ),
+]
 Temporal = Annotated[
     bool,
     typer.Option("--temporal", help="measure how steady the graph was, into run.json"),
@@ -155,6 +164,7 @@ def run(
     odometry: OdometryPoses = False,
     pose_noise: PoseNoiseText = "",
     save_trajectory: SaveTrajectory = None,
+    map_path: MapFile = None,
     temporal: Temporal = False,
     timings: Timings = False,
 ) -> None:
@@ -175,6 +185,7 @@ def run(
             poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
             temporal=temporal,
             trajectory_out=save_trajectory,
+            map_path=map_path,
             timings=timings,
             console=Console(),
         )

@@ -24,6 +24,7 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.temporal import UpdateLog
+from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
@@ -48,6 +49,7 @@ def run_recording(
     poses: PoseChoice,
     temporal: bool,
     trajectory_out: Path | None,
+    map_path: Path | None = None,
     timings: bool = False,
     console: Console,
 ) -> None:
@@ -68,6 +70,9 @@ def run_recording(
         with working(console, LOADING):
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
+        if map_path is not None and map_path.exists():
+            pipeline.go_on_with(GraphBuilder.from_map(config, map_path))
+            console.print(f"going on with {map_path}", highlight=False, soft_wrap=True)
         started_s = time.perf_counter()
         updates = UpdateLog(config.output.rate_hz) if temporal else None
         path_taken, refused = _process(recording, pipeline, poses, max_frames, console, updates)
@@ -85,6 +90,8 @@ def run_recording(
     outputs.show_graph(out, graph, console, T_world_cameras, config.inputs.world_up)
     if trajectory_out is not None:
         write_tum(trajectory_out, list(path_taken), T_world_cameras)
+    if map_path is not None and pipeline.builder is not None:
+        outputs.write_map(map_path, pipeline.builder)
     clips = pipeline.relations.counters()
     if failed := clips.dropped.get("world_model_error"):
         drops["world model"] = {"world_model_error": failed}

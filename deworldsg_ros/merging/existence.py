@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.scene.gaussian import Float64
@@ -105,8 +106,17 @@ class Existence:
         again = node["looks"] or not node["moving"] or waited
         return bool(again and node["detections"] >= wanted and not self._doubtful(owner))
 
-    def restore(self, owner: int, detections: int) -> None:
-        """Take in a node of a graph that was loaded."""
+    def records(self, owners: list[int]) -> NDArray[np.void]:
+        """What is known of owners (n), as plain values for `restore`."""
+        return self._nodes[owners]
+
+    def restore(self, owners: list[int], records: NDArray[np.void]) -> None:
+        """Go on from the `records` of an earlier run."""
+        self._make_room(max(owners, default=-1) + 1)
+        self._nodes[owners] = records
+
+    def presume(self, owner: int, detections: int) -> None:
+        """Take in a confirmed node of which only the number of detections is known."""
         self._make_room(owner + 1)
         node = self._nodes[owner]
         node["detections"], node["best_score"] = detections, 1.0

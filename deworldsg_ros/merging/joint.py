@@ -22,6 +22,15 @@ class JointEvidence:
         self._counts: dict[Pair, int] = {}
         self._due: list[Pair] = []
 
+    @property
+    def counts(self) -> dict[Pair, int]:
+        """Frames for, less those against, the unity of each pair of owners (smaller first)."""
+        return dict(self._counts)
+
+    def restore(self, counts: dict[Pair, int]) -> None:
+        """Go on from the `counts` of an earlier run."""
+        self._counts = {(min(pair), max(pair)): count for pair, count in counts.items()}
+
     def note(self, owners: list[int], shares: Float64, values: Float64, matched: list[int]) -> None:
         """Take in one frame of n objects that met k owners.
 

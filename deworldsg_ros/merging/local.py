@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.surface import even_moments, hash_each
+
+# What a rule remembers beside the graph.
+Memory = dict[str, NDArray[Any]]
 
 
 def warm_up_graph() -> None:

@@ -11,9 +11,6 @@ class Owners:
         self._nodes: list[int] = []
         self._free: list[int] = []
 
-    def __bool__(self) -> bool:
-        return bool(self._of)
-
     def take(self, node_id: int) -> int:
         """Give a node an index."""
         if self._free:
@@ -31,6 +28,11 @@ class Owners:
         self._nodes[owner] = 0
         self._free.append(owner)
         return owner
+
+    @property
+    def ids(self) -> dict[int, int]:
+        """The index of each node that has one, by the node's id."""
+        return dict(self._of)
 
     def rename(self, old_id: int, new_id: int) -> None:
         """Give another node the index that a node has."""

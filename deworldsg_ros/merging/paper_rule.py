@@ -5,7 +5,7 @@ from __future__ import annotations
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.gates import bhattacharyya_bound
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
-from deworldsg_ros.merging.local import add_relations, check_fits, warm_up_graph
+from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
@@ -54,6 +54,13 @@ class PaperMerging:
         graph.remember_frame(local.stamp_ns, node_ids)
         add_relations(graph, local, node_ids)
         return node_ids
+
+    def memory(self) -> Memory:
+        """Nothing: the graph is all that the rule knows."""
+        return {}
+
+    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+        """Nothing is needed."""
 
     def _place(
         self,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging.local import Memory
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.scene.frame_graph import LocalGraph
@@ -27,6 +28,22 @@ class Merging(Protocol):
         Raises:
             RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` where the local graph
                 does not speak of the same classes and predicates, or the same world frame.
+        """
+        ...
+
+    def memory(self) -> Memory:
+        """What it remembers beside the graph, for `restore`."""
+        ...
+
+    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+        """Go on with a graph of an earlier run; before the first frame.
+
+        Args:
+            graph: may lack nodes that are remembered.
+            memory: of the rule that made it, which may have been another.
+
+        Raises:
+            KeyError, ValueError, TypeError, IndexError: where this is no memory.
         """
         ...
 

@@ -17,7 +17,7 @@ from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
 from deworldsg_ros.merging.joint import JointEvidence
-from deworldsg_ros.merging.local import add_relations, check_fits, warm_up_graph
+from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
 from deworldsg_ros.merging.voxel_map import CellSets, Int64, VoxelMap
@@ -74,8 +74,6 @@ class SurfaceMerging:
         Two objects of one frame are never one node: they stay two even where both overlap it.
         """
         check_fits(graph, local)
-        if not self._owners and len(graph) > len(self._lost):
-            self._restore(graph)
         if self._config.align_poses:
             local = self._alignment.align(graph, local)
         cells = self._map.cells_of(local.surface_points_world)
@@ -96,6 +94,50 @@ class SurfaceMerging:
         graph.remember_frame(local.stamp_ns, node_ids)
         add_relations(graph, local, node_ids)
         return node_ids
+
+    def memory(self) -> Memory:
+        """See `Merging.memory`."""
+        node_ids = list(self._owners.ids)
+        owners = list(self._owners.ids.values())
+        cells = [self._map.cells(owner) for owner in owners]
+        counts = self._joint.counts
+        pairs = [[*map(self._owners.node, pair), count] for pair, count in counts.items()]
+        return {
+            "cell_m": np.array(self._map.cell_m),
+            "node_ids": np.array(node_ids, np.int64),
+            "cells": np.concatenate([np.zeros(0, np.int64), *cells]),
+            "cell_counts": np.array([len(item) for item in cells], np.int64),
+            "existence": self._existence.records(owners),
+            "joint": np.array(pairs, np.int64).reshape(-1, 3),
+        }
+
+    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+        """See `Merging.restore`."""
+        nodes = graph.nodes
+        owner_of = {node_id: self._owners.take(node_id) for node_id in nodes.ids.tolist()}
+        owners = list(owner_of.values())
+        self._changed.update(owners)
+        # Of the paper's rule there is none, and cells of another size say nothing.
+        if not memory or memory["cell_m"] != self._map.cell_m:
+            surfaces = [surface.points_world for surface in nodes.surfaces]
+            self._map.add(owners, self._map.cells_of(surfaces))
+            for owner, observations in zip(owners, nodes.observations.tolist()):
+                self._existence.presume(owner, observations)
+            return
+        kept = [row for row, node_id in enumerate(memory["node_ids"]) if node_id in owner_of]
+        owners = [owner_of[node_id] for node_id in memory["node_ids"][kept].tolist()]
+        self._existence.restore(owners, memory["existence"][kept])
+        stops = np.cumsum(memory["cell_counts"])
+        for owner, row in zip(owners, kept):
+            cells = memory["cells"][stops[row] - memory["cell_counts"][row] : stops[row]]
+            self._map.add([owner], CellSets(cells, np.array([0, len(cells)])))
+        self._joint.restore(
+            {
+                (owner_of[a], owner_of[b]): count
+                for a, b, count in memory["joint"].tolist()
+                if a in owner_of and b in owner_of
+            }
+        )
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Follow nodes that a correction (4, 4) has moved in the graph."""
@@ -246,16 +288,6 @@ class SurfaceMerging:
                 self._free(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
-
-    def _restore(self, graph: SceneGraph) -> None:
-        """Take the nodes of a graph that was loaded, by their surface points."""
-        owners = [self._owners.take(node_id) for node_id in graph.nodes.ids.tolist()]
-        self._map.add(
-            owners, self._map.cells_of([surface.points_world for surface in graph.nodes.surfaces])
-        )
-        self._changed.update(owners)
-        for owner, observations in zip(owners, graph.nodes.observations.tolist()):
-            self._existence.restore(owner, observations)
 
     def _owner(self, node_id: int) -> int:
         owner = self._owners.of(node_id)

@@ -79,9 +79,13 @@ class VoxelMap:
         points = np.concatenate([np.zeros((0, 3), np.float32), *point_sets])
         return CellSets(*_cells_of(points, np.array([0, *np.cumsum(counts)]), self.cell_m))
 
+    def cells(self, owner: int) -> Int64:
+        """An owner's cells, (n,) packed indices."""
+        return np.concatenate([np.zeros(0, np.int64), *self._cells_of.get(owner, [])])
+
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
-        keys = np.concatenate([np.zeros(0, np.int64), *self._cells_of.get(owner, [])])
+        keys = self.cells(owner)
         indices = np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=1) - _BIAS
         return ((indices + 0.5) * self.cell_m).astype(np.float32)
 

@@ -21,7 +21,7 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.view.markers import markers
 
 SILENCE_S = 2.0
@@ -34,8 +34,10 @@ class GraphNode(StageNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
         build_merging(self.parameters.merging).warm_up()
-        # The first local graph tells the world frame and the vocabulary.
+        # The map, or the first local graph, tells the world frame and the vocabulary.
         self._builder: GraphBuilder | None = None
+        map_path = self.parameters.node.map_path
+        self._map_path = Path(map_path).absolute() if map_path else None
         self._pending = PendingEvidence()
         self._newest_ns = 0
         self._changed_s: float | None = None
@@ -55,6 +57,27 @@ class GraphNode(StageNode):
             PoseStamped, CORRECTION_TOPIC, self.guarded(self._correct), reliable(10)
         )
         self.every(1.0 / self.parameters.output.rate_hz, self._publish)
+        if self._map_path is not None and self._map_path.exists():
+            self._go_on_with(self._map_path)
+
+    def _go_on_with(self, path: Path) -> None:
+        """Begin with the graph of a map; raises ConfigurationError where there is none in it."""
+        try:
+            self._builder = GraphBuilder.from_map(self.parameters, path)
+        except RefusedInput as refusal:
+            raise ConfigurationError(f"map_path: {refusal}") from refusal
+        graph = self._builder.graph
+        self.get_logger().info(
+            f"map {path}: {len(graph)} nodes in frame '{graph.frame_id}'; going on with it"
+        )
+        self._note_change()
+
+    def close(self) -> None:
+        """Write the map."""
+        if self._map_path is not None:
+            _, message = self._save_map(self._map_path)
+            self.get_logger().info(message)
+        super().close()
 
     def _integrate(self, message: wire.LocalGraphMessage) -> None:
         self._heard_s = time.monotonic()
@@ -112,13 +135,26 @@ class GraphNode(StageNode):
         self.health.published(time.monotonic() - changed_s)
 
     def _save(self, request: Any, response: Any) -> Any:
-        """Write the whole graph, with surface points, to the file that `save_path` names."""
+        """Write the whole graph, with surface points, to `save_path`; and the map."""
         response.message = "refused: see /diagnostics"
         with self.refusing():
             response.success, response.message = self._save_to(
                 Path(self.parameters.node.save_path).absolute()
             )
+            if response.success and self._map_path is not None:
+                response.success, message = self._save_map(self._map_path)
+                response.message += f"; {message}"
         return response
+
+    def _save_map(self, path: Path) -> tuple[bool, str]:
+        if self._builder is None:
+            return False, "no map was written: no local graph has come"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._builder.save_map(path)
+        except OSError as error:
+            return False, f"map {path}: {error}"
+        return True, f"map {path}: {len(self._builder.graph)} nodes"
 
     def _save_to(self, path: Path) -> tuple[bool, str]:
         if self._builder is None:

@@ -47,6 +47,7 @@ class SceneGraph:
         self.frame_id = frame_id
         self.surface_point_capacity = surface_point_capacity
         self.remembered_frames = remembered_frames
+        self.even_gaussians = even_gaussians
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.revision = 0
         self._edges = EdgeMap(len(vocabulary.predicates))

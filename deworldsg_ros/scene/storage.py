@@ -51,6 +51,7 @@ def state_of(graph: SceneGraph) -> State:
         "frame_id": graph.frame_id,
         "surface_point_capacity": graph.surface_point_capacity,
         "remembered_frames": graph.remembered_frames,
+        "even_gaussians": graph.even_gaussians,
         "revision": graph.revision,
         "next_id": graph._next_id,
     }
@@ -81,29 +82,29 @@ def state_of(graph: SceneGraph) -> State:
     }
 
 
-def graph_of(state: State, source: str) -> SceneGraph:
-    """The graph of a state.
+def graph_of(state: State, source: str, **settings: Any) -> SceneGraph:
+    """The graph of a state; settings of `SceneGraph` take the place of those saved.
 
     Raises:
         RefusedInput: ``invalid_graph_file``, with `source`, where the state is not one.
     """
     try:
-        return _graph_of(state)
+        return _graph_of(state, settings)
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise RefusedInput("invalid_graph_file", f"graph file {source}: {error}") from error
 
 
-def _graph_of(state: State) -> SceneGraph:
+def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
     from deworldsg_ros.scene.graph import SceneGraph
 
     header = json.loads(state["header"].tobytes())
     if header.get("version", 0) > FORMAT_VERSION:
         raise ValueError(f"version {header['version']}: wanted {FORMAT_VERSION} or older")
+    saved = ("surface_point_capacity", "remembered_frames", "even_gaussians")
     graph = SceneGraph(
         Vocabulary(tuple(header["classes"]), tuple(header["predicates"])),
         header["frame_id"],
-        header["surface_point_capacity"],
-        header["remembered_frames"],
+        **{name: header[name] for name in saved if name in header} | settings,
     )
     nodes = graph.nodes
     points = hash_each(tuple(_split(state["surface_points"], state["surface_point_counts"])))

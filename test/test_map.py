@@ -1,0 +1,144 @@
+"""A graph that was saved as a map goes on as if it had never been away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from merging_support import VOCABULARY, random_local_graphs
+from test_merging_surface import CUP, TABLE, WHOLE, frame, slab
+
+from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import RelationEvidence
+from deworldsg_ros.scene.storage import state_of
+
+MUG = slab((0.5, 0, 1.05), (0.08, 0.08, 0.1))
+
+
+def builder_of(**merging: object) -> GraphBuilder:
+    return GraphBuilder(config_of(**merging), VOCABULARY, "world")
+
+
+def config_of(**merging: object) -> Config:
+    return Config(merging=MergingConfig(**merging))  # type: ignore[arg-type]
+
+
+def saved(builder: GraphBuilder, folder: Path) -> Path:
+    builder.save_map(folder / "room.map")
+    return folder / "room.map"
+
+
+@pytest.mark.parametrize("association", ["surface", "paper"])
+@pytest.mark.parametrize("seed", range(4))
+def test_going_on_is_as_never_having_stopped(tmp_path, association, seed):
+    # Nothing is tentative, which a map leaves out.
+    config = config_of(
+        association=association, confirm_observations=1, confirm_score=0.0, min_detection_rate=0.0
+    )
+    frames = random_local_graphs(np.random.default_rng(seed), 60)
+    whole = GraphBuilder(config, VOCABULARY, "world")
+    for local in frames[:30]:
+        whole.integrate(local)
+    again = GraphBuilder.from_map(config, saved(whole, tmp_path))
+    assert again.full().nodes == whole.full().nodes
+    whole.graph.take_removals()
+    for local in frames[30:]:
+        assert again.integrate(local) == whole.integrate(local)
+    one, other = state_of(again.graph), state_of(whole.graph)
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_what_is_tentative_stays_behind_and_ids_go_on(tmp_path):
+    builder = builder_of()
+    for stamp in range(1, 5):
+        builder.integrate(frame(stamp, (WHOLE, TABLE)))
+    assert builder.integrate(frame(5, (WHOLE, TABLE), (MUG, CUP))) == [1, 2]
+    again = GraphBuilder.from_map(Config(), saved(builder, tmp_path))
+    assert again.graph.nodes.ids.tolist() == [1]
+    # Older than the map: another recording of the place.
+    assert again.integrate(frame(2, (WHOLE, TABLE), (MUG, CUP))) == [1, 3]
+
+
+def test_the_first_update_tells_of_all_of_it(tmp_path):
+    builder = builder_of()
+    for stamp in range(1, 5):
+        builder.integrate(frame(stamp, (WHOLE, TABLE)))
+    again = GraphBuilder.from_map(Config(), saved(builder, tmp_path))
+    update = again.update()
+    assert update is not None
+    assert [node.id for node in update.nodes] == [1]
+    assert update.stamp == builder.full().stamp
+    assert not update.removed_nodes
+
+
+def test_priors_are_kept(tmp_path):
+    builder = builder_of()
+    builder.integrate(frame(1, (WHOLE, TABLE), (MUG, CUP)))
+    builder.add_evidence(
+        RelationEvidence(
+            stamp_ns=10**8,
+            vocabulary=VOCABULARY,
+            pairs=np.array([[1, 0]]),
+            pair_classes=np.array([[CUP, TABLE]]),
+            geo_costs=np.zeros(1),
+            predictions=np.array([[0.7, 0.2, 0.1]]),
+            source="test",
+        )
+    )
+    again = GraphBuilder.from_map(Config(), saved(builder, tmp_path))
+    np.testing.assert_allclose(again.prior.mean(CUP, TABLE), [0.7, 0.2, 0.1])
+
+
+@pytest.mark.parametrize("merging", [{"association": "paper"}, {"cell_m": 0.02}])
+def test_the_map_of_another_rule_is_known_again(tmp_path, merging):
+    builder = builder_of(**merging)
+    for stamp in range(1, 5):
+        builder.integrate(frame(stamp, (WHOLE, TABLE)))
+    again = GraphBuilder.from_map(Config(), saved(builder, tmp_path))
+    assert again.integrate(frame(6, (WHOLE, TABLE))) == [1]
+
+
+def test_files_that_are_no_map_are_refused(tmp_path):
+    builder = builder_of()
+    builder.graph.save(tmp_path / "graph.map")  # without priors
+    (tmp_path / "text.map").write_text("hello")
+    for name in ("graph.map", "text.map"):
+        with pytest.raises(RefusedInput, match=name) as refused:
+            GraphBuilder.from_map(Config(), tmp_path / name)
+        assert refused.value.reason == "invalid_graph_file"
+
+
+def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
+    rclpy = pytest.importorskip("rclpy")
+    from nodes_bench import Bench, works
+    from nodes_bench import local_graph as message_of
+    from std_msgs.msg import String
+
+    from deworldsg_ros.nodes.graph_node import GraphNode
+    from deworldsg_ros.scene.errors import ConfigurationError
+
+    values = {"map_path": str(tmp_path / "maps" / "room.map"), "output.tentative_nodes": True}
+    values |= {"merging.association": "paper"}
+    options = {
+        "parameter_overrides": [
+            rclpy.parameter.Parameter(name, value=value) for name, value in values.items()
+        ]
+    }
+    topics = {"deworldsg/local_graph": String}
+    for _ in range(2):  # the second walk sees what the first one saw
+        at = Bench(GraphNode, topics, **options)
+        works(at, lambda at=at: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
+        at.expect(lambda at=at: at.node.more_values().get("nodes") == "1", "one node")
+        at.close()
+    config = msgspec.convert({"merging": {"association": "paper"}}, Config)
+    graph = GraphBuilder.from_map(config, tmp_path / "maps" / "room.map").graph
+    assert graph.nodes.ids.tolist() == [1]
+    assert graph.nodes.observations.tolist() >= [2]
+    (tmp_path / "maps" / "room.map").write_text("no map")
+    with pytest.raises(ConfigurationError, match=r"map_path: .*room\.map"):
+        Bench(GraphNode, topics, **options)
