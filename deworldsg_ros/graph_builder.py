@@ -23,7 +23,7 @@ from deworldsg_ros.scene.camera import Float64, check_pose
 from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -60,13 +60,13 @@ class GraphBuilder:
         What was tentative then is left behind: nobody was told of it.
 
         Raises:
-            RefusedInput: ``invalid_graph_file``.
+            ConfigurationError: where the file is no such map.
         """
-        state = storage.read(path)
-        graph = storage.graph_of(state, str(path), **_graph_settings(config.merging))
-        builder = cls(config, graph.vocabulary, graph.frame_id)
-        builder.graph = graph
         try:
+            state = storage.read(path)
+            graph = storage.graph_of(state, str(path), **_graph_settings(config.merging))
+            builder = cls(config, graph.vocabulary, graph.frame_id)
+            builder.graph = graph
             prior = ClassPairPrior.from_state(json.loads(state["prior"].tobytes()))
             if (prior.class_count, prior.predicate_count) != (
                 builder.prior.class_count,
@@ -84,8 +84,8 @@ class GraphBuilder:
                     if name.startswith(MEMORY)
                 },
             )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise RefusedInput("invalid_graph_file", f"map {path}: {error!r}") from error
+        except (RefusedInput, KeyError, TypeError, ValueError, IndexError) as error:
+            raise ConfigurationError(f"map {path} cannot be used: {error}") from error
         builder.prior = prior
         builder._map_ns = int(graph.nodes.last_seen_ns.max(initial=0))
         return builder

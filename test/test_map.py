@@ -12,7 +12,7 @@ from test_merging_surface import CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 from deworldsg_ros.scene.storage import state_of
 
@@ -108,9 +108,8 @@ def test_files_that_are_no_map_are_refused(tmp_path):
     builder.graph.save(tmp_path / "graph.map")  # without priors
     (tmp_path / "text.map").write_text("hello")
     for name in ("graph.map", "text.map"):
-        with pytest.raises(RefusedInput, match=name) as refused:
+        with pytest.raises(ConfigurationError, match=name):
             GraphBuilder.from_map(Config(), tmp_path / name)
-        assert refused.value.reason == "invalid_graph_file"
 
 
 def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
@@ -120,7 +119,6 @@ def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
     from std_msgs.msg import String
 
     from deworldsg_ros.nodes.graph_node import GraphNode
-    from deworldsg_ros.scene.errors import ConfigurationError
 
     values = {"map_path": str(tmp_path / "maps" / "room.map"), "output.tentative_nodes": True}
     values |= {"merging.association": "paper"}
@@ -140,5 +138,5 @@ def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
     assert graph.nodes.ids.tolist() == [1]
     assert graph.nodes.observations.tolist() >= [2]
     (tmp_path / "maps" / "room.map").write_text("no map")
-    with pytest.raises(ConfigurationError, match=r"map_path: .*room\.map"):
+    with pytest.raises(ConfigurationError, match=r"map .*room\.map"):
         Bench(GraphNode, topics, **options)

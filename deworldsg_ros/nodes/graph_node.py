@@ -21,7 +21,7 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
-from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.view.markers import markers
 
 SILENCE_S = 2.0
@@ -62,10 +62,7 @@ class GraphNode(StageNode):
 
     def _go_on_with(self, path: Path) -> None:
         """Begin with the graph of a map; raises ConfigurationError where there is none in it."""
-        try:
-            self._builder = GraphBuilder.from_map(self.parameters, path)
-        except RefusedInput as refusal:
-            raise ConfigurationError(f"map_path: {refusal}") from refusal
+        self._builder = GraphBuilder.from_map(self.parameters, path)
         graph = self._builder.graph
         self.get_logger().info(
             f"map {path}: {len(graph)} nodes in frame '{graph.frame_id}'; going on with it"
