@@ -122,6 +122,8 @@ def run_recording(
     if timings:
         _print_timings(console, pipeline.times_s, processed)
     outputs.print_files(console, out)
+    if map_path is not None:
+        console.print(f"  {map_path}  [dim]the map[/]", highlight=False, soft_wrap=True)
 
 
 def _process(
