@@ -162,10 +162,10 @@ def write(path: str | Path, state: State) -> None:
 def read(path: str | Path) -> State:
     """Read a state; raises RefusedInput ``invalid_graph_file``."""
     try:
-        archive = np.load(Path(path), allow_pickle=False)
-        if not isinstance(archive, np.lib.npyio.NpzFile):
-            raise ValueError("one array, wanted an archive of them")
-        with archive:
+        with Path(path).open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise ValueError("no archive of arrays (.npz)")
+        with np.load(Path(path), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
         raise RefusedInput("invalid_graph_file", f"graph file {path}: {error}") from error
