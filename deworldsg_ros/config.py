@@ -226,6 +226,13 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, option("visual entropy above which the prior enters, nats", ge=0, le=10)
     ] = 1.0
     fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
+    outlier_rate: Annotated[
+        float,
+        option("share of frames whose relations say nothing; 0 = sum logits, Eq. 9", ge=0, le=0.9),
+    ] = 0.1
+    consistent_directions: Annotated[
+        bool, option("predicates of a pair's two directions do not contradict each other")
+    ] = True
     encode: Annotated[
         Literal["uncertain", "all"],
         option(

@@ -16,6 +16,7 @@ import numpy as np
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
+from deworldsg_ros.relations.consistency import Consistency
 from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import storage, wire
@@ -46,6 +47,7 @@ class GraphBuilder:
         self._merging = build_merging(config.merging)
         self.graph = SceneGraph(vocabulary, frame_id, **_graph_settings(config.merging))
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
+        self._consistency = Consistency(vocabulary.predicates)
         self._newest_ns: int | None = None
         # Newest stamp of the map that this goes on with; frames to come may be older.
         self._map_ns = 0
@@ -112,7 +114,7 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
-        node_ids = self._merging.merge(self.graph, local)
+        node_ids = self._merging.merge(self.graph, local, self._relations.outlier_rate)
         self._newest_ns = local.stamp_ns
         self._associations.append(
             wire.Association(wire.stamp_from_ns(local.stamp_ns), list(node_ids))
@@ -202,16 +204,19 @@ class GraphBuilder:
         if not pairs:
             return []
         evidence = [self.graph.edges[pair] for pair in pairs]
+        logits = np.array([item.visual_logits for item in evidence])
         has_visual = np.array([item.frames > 0 for item in evidence])
         priors, has_prior = self.prior.lookup(self._classes_of(pairs))
         fused = fuse_edges(
-            np.array([item.visual_logits for item in evidence]),
+            logits,
             has_visual,
             priors,
             has_prior,
             self._relations.fusion_alpha,
             self._relations.entropy_threshold_nats,
         )
+        if self._relations.consistent_directions:
+            fused = self._consistency.reconcile(pairs, logits, has_visual, fused)
         known = np.flatnonzero(fused.known)
         chosen = choose_directions(
             [pairs[row] for row in known.tolist()], has_visual[known], fused.probabilities[known]

@@ -31,6 +31,10 @@ from deworldsg_ros.scene.replica import GraphReplica
 CONFIGURATIONS = Path(__file__).parents[1] / "config"
 # Every object is published as soon as it is seen, which makes for short tests.
 PAPER = load_config(CONFIGURATIONS / "paper.yaml")
+ASKING = msgspec.structs.replace(
+    PAPER,
+    relations=RelationsConfig(world_model="fake", outlier_rate=0.0, consistent_directions=False),
+)
 VOCABULARY = Vocabulary(("cup", "table", "chair"), ("on", "near", "under"))
 INTRINSICS = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
 # Box in the image, depth and class of each object; the cup is close to the table, the chair far.
@@ -112,8 +116,7 @@ def test_no_graph_before_the_first_frame() -> None:
 
 
 def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
-    config = msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake"))
-    pipeline = Pipeline(config, Scripted(logits=(0.001, 0.0, 0.0)))
+    pipeline = Pipeline(ASKING, Scripted(logits=(0.001, 0.0, 0.0)))
     for index in range(3):
         pipeline.process(frame(index))
     builder = pipeline.builder
@@ -131,9 +134,7 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
 
 def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
     sure = Pipeline(PAPER, Scripted())
-    asked = Pipeline(
-        msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake")), Scripted()
-    )
+    asked = Pipeline(ASKING, Scripted())
     for index in range(3):
         sure.process(frame(index))
         asked.process(frame(index))
@@ -141,10 +142,9 @@ def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
 
 
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
-    config = msgspec.structs.replace(PAPER, relations=RelationsConfig(world_model="fake"))
-    pipeline = Pipeline(config, Scripted())
-    late = GraphBuilder(config, VOCABULARY, "map")
-    reasoner = RelationReasoner(config.relations, build_world_model(config.relations))
+    pipeline = Pipeline(ASKING, Scripted())
+    late = GraphBuilder(ASKING, VOCABULARY, "map")
+    reasoner = RelationReasoner(ASKING.relations, build_world_model(ASKING.relations))
     evidence = []
     for index in range(8):
         pipeline.process(frame(index))
@@ -244,4 +244,6 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
         ("merging", "association"),
         ("relations", "encode"),
         ("relations", "clips_per_s"),
+        ("relations", "outlier_rate"),
+        ("relations", "consistent_directions"),
     }

@@ -24,18 +24,11 @@ class PaperMerging:
         warm_up()
         warm_up_graph()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
-        """Merge one frame into the graph.
+    def merge(self, graph: SceneGraph, local: LocalGraph, outlier_rate: float = 0.0) -> list[int]:
+        """Merge one frame into the graph; see `Merging.merge`.
 
         Objects are taken in row order, and meet the nodes that earlier rows founded. Relations
         follow when all objects have found their nodes.
-
-        Returns:
-            The id of the node that each row became, after all merges of this frame.
-
-        Raises:
-            RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` where the local graph
-                does not speak of the same classes and predicates, or the same world frame.
         """
         check_fits(graph, local)
         surfaces = hash_each(local.surface_points_world)
@@ -52,7 +45,7 @@ class PaperMerging:
         ]
         node_ids = [graph.resolve(node_id) for node_id in placed]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids)
+        add_relations(graph, local, node_ids, outlier_rate)
         return node_ids
 
     def memory(self) -> Memory:

@@ -68,7 +68,7 @@ class SurfaceMerging:
         warm_up_fit()
         warm_up_graph()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+    def merge(self, graph: SceneGraph, local: LocalGraph, outlier_rate: float = 0.0) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
 
         Two objects of one frame are never one node: they stay two even where both overlap it.
@@ -92,7 +92,7 @@ class SurfaceMerging:
         self._expire(graph, local.stamp_ns)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids)
+        add_relations(graph, local, node_ids, outlier_rate)
         return node_ids
 
     def memory(self) -> Memory:

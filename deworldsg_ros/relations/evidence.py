@@ -22,6 +22,7 @@ __all__ = [
     "fuse_distributions",
     "fuse_edge",
     "fuse_edges",
+    "opposite_rows",
     "visual_distribution",
 ]
 
@@ -188,6 +189,24 @@ def fuse_edge(
     return FusedEdge(fused.probabilities[0], fused.provenances()[0], float(fused.entropies_nats[0]))
 
 
+def opposite_rows(edges: Int64 | Sequence[tuple[int, int]]) -> tuple[Int64, Int64]:
+    """Rows of the pairs of which both directions are among the edges.
+
+    Args:
+        edges: (E, 2) subject and object ids, each directed edge at most once, any order.
+
+    Returns:
+        (P,) int64 each: the rows with the smaller subject id, and those of the opposite direction.
+    """
+    ids = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
+    low, high = ids.min(axis=1), ids.max(axis=1)
+    # Both directions of a pair become neighbours in this order, the smaller subject first.
+    order = np.lexsort((ids[:, 0], high, low))
+    first, second = order[:-1], order[1:]
+    both = (low[first] == low[second]) & (high[first] == high[second])
+    return first[both], second[both]
+
+
 def choose_directions(
     edges: Int64 | Sequence[tuple[int, int]], has_visual: Bool, probabilities: Float64
 ) -> Bool:
@@ -207,17 +226,8 @@ def choose_directions(
         (E,) bool; true for every edge with visual evidence, or whose reverse is not among the
         edges.
     """
-    ids = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    kept = np.ones(len(ids), dtype=np.bool_)
-    if not len(ids):
-        return kept
-    low, high = ids.min(axis=1), ids.max(axis=1)
-    forward = ids[:, 0] < ids[:, 1]
-    # Both directions of a pair become neighbours in this order, the smaller subject first.
-    order = np.lexsort((~forward, high, low))
-    first, second = order[:-1], order[1:]
-    both = (low[first] == low[second]) & (high[first] == high[second])
-    first, second = first[both], second[both]
+    first, second = opposite_rows(edges)
+    kept = np.ones(len(has_visual), dtype=np.bool_)
     seen_first, seen_second = has_visual[first], has_visual[second]
     greatest = probabilities.max(axis=1)
     # Where neither was seen, one goes; where one was, the other goes; where both were, both stay.
