@@ -88,17 +88,48 @@ def test_a_frame_that_shows_two_outweighs_ten_that_show_one_on_both() -> None:
     both = np.ones((1, 2))
     evidence = JointEvidence()
     for _ in range(2):
-        evidence.note([4, 7], both, both, [0])
+        evidence.note([4], [4, 7], both, [0])
         assert evidence.take() is None
-    evidence.note([4, 7], both, both, [0])
+    evidence.note([4], [4, 7], both, [0])
     assert evidence.take() == (4, 7)
     evidence.forget(7)
 
-    evidence.note([4, 7], np.array([[1.0, 0.1], [0.0, 1.0]]), np.eye(2), [0, 1])
+    # Side by side in one frame, wherever in it: they need not touch.
+    evidence.note([4, 7], [4, 7], np.eye(2), [0, 1])
     for _ in range(12):
-        evidence.note([4, 7], both, both, [0])
+        evidence.note([4], [4, 7], both, [0])
     assert evidence.take() is None
-    evidence.note([4, 7], both, both, [0])
+    assert evidence.counts == {(4, 7): 2}
+    evidence.note([4], [4, 7], both, [0])
     assert evidence.take() == (4, 7)
     evidence.forget(7)
     assert evidence.take() is None
+    assert evidence.counts == {}
+
+
+def test_a_new_node_is_another_than_those_of_its_frame() -> None:
+    evidence = JointEvidence()
+    evidence.note([2, 5], [2], np.array([[1.0], [0.5]]), [0, -1])
+    assert evidence.counts == {(2, 5): -10}
+
+
+def test_what_two_parts_were_seen_beside_their_whole_was() -> None:
+    evidence = JointEvidence()
+    evidence.note([1, 3], [], np.zeros((2, 0)), [-1, -1])
+    evidence.note([2, 3], [3], np.array([[0.0], [1.0]]), [-1, 0])
+    evidence.merge(1, 2)
+    assert evidence.counts == {(1, 3): -20}
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_evidence_goes_on_from_its_counts(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    evidence, restored = JointEvidence(), JointEvidence()
+    for _ in range(30):
+        owners = rng.permutation(6)[: rng.integers(1, 5)].tolist()
+        values = rng.integers(0, 2, (len(owners), len(owners) + 1)).astype(float)
+        columns = list(range(len(owners)))
+        evidence.note(owners, [*owners, 6], values, columns)
+    restored.restore(evidence.counts)
+    assert restored.counts == evidence.counts

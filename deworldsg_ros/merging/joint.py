@@ -1,6 +1,8 @@
-"""Evidence that two nodes are parts of one object, or that they are two that touch."""
+"""Evidence that two nodes are parts of one object, or that they are two."""
 
 from __future__ import annotations
+
+from collections import Counter
 
 import numpy as np
 
@@ -16,56 +18,82 @@ APART_FRAMES = 10
 
 
 class JointEvidence:
-    """Counts, for pairs of owners whose surfaces touch, the frames for and against their unity."""
+    """Counts, for pairs of owners, the frames for and against their unity.
+
+    That one frame showed both counts wherever they were in it: when a mask later takes in both,
+    or a pose is wrong, they are known to be two.
+    """
 
     def __init__(self) -> None:
-        self._counts: dict[Pair, int] = {}
+        # Frames in which an object lay on both of a pair, the smaller owner first.
+        self._together: Counter[Pair] = Counter()
+        # By owner, the frames that showed it (under itself), and it and each other.
+        self._apart: dict[int, Counter[int]] = {}
         self._due: list[Pair] = []
 
     @property
     def counts(self) -> dict[Pair, int]:
         """Frames for, less those against, the unity of each pair of owners (smaller first)."""
-        return dict(self._counts)
+        pairs = {(a, b) for a, others in self._apart.items() for b in others if a < b}
+        return {pair: self._balance(pair) for pair in sorted(pairs.union(self._together))}
 
     def restore(self, counts: dict[Pair, int]) -> None:
         """Go on from the `counts` of an earlier run."""
-        self._counts = {(min(pair), max(pair)): count for pair, count in counts.items()}
+        for (a, b), count in counts.items():
+            frames = max(-(count // APART_FRAMES), 0)
+            self._add_apart(a, b, frames)
+            self._together[min(a, b), max(a, b)] = count + APART_FRAMES * frames
 
-    def note(self, owners: list[int], shares: Float64, values: Float64, matched: list[int]) -> None:
+    def note(
+        self, places: list[int], owners: list[int], values: Float64, matched: list[int]
+    ) -> None:
         """Take in one frame of n objects that met k owners.
 
         Args:
+            places: the owner that each object became, of those met or a new one.
             owners: the k owners.
-            shares: (n, k) how far each object lay on each of them.
-            values: (n, k) how well it fits; 0 where it cannot be the same.
-            matched: column of the owner that each object became; -1 = none of them.
+            values: (n, k) how well each object fits each of them; 0 where it cannot be the same.
+            matched: column of the owner that each object became; -1 = a new one.
         """
+        for owner in places:
+            self._apart.setdefault(owner, Counter()).update(places)
         taken = set(matched)
-        changes: dict[Pair, int] = {}
-        for row, column in zip(*(places.tolist() for places in np.nonzero(shares))):
-            match = matched[row]
-            if match < 0 or match == column:
-                continue
-            a, b = owners[match], owners[column]
-            pair = (a, b) if a < b else (b, a)
-            if column in taken:
-                changes[pair] = -APART_FRAMES
-            elif values[row, column] > 0:
-                changes[pair] = 1
-        for pair, change in changes.items():
-            self._counts[pair] = count = self._counts.get(pair, 0) + change
-            if count >= ENOUGH_FRAMES:
-                self._due.append(pair)
+        pairs = set()
+        for row, column in zip(*(ends.tolist() for ends in np.nonzero(values))):
+            if matched[row] >= 0 and column not in taken:
+                a, b = owners[matched[row]], owners[column]
+                pairs.add((min(a, b), max(a, b)))
+        self._together.update(pairs)
+        self._due += [pair for pair in sorted(pairs) if self._balance(pair) >= ENOUGH_FRAMES]
 
     def take(self) -> Pair | None:
-        """The next pair that is one object, after which one of the two has to be forgotten."""
+        """The next pair that is one object, after which the two have to be merged."""
         while self._due:
             pair = self._due.pop()
-            if pair in self._counts:
+            if pair in self._together:
                 return pair
         return None
 
+    def merge(self, kept: int, gone: int) -> None:
+        """Count two owners, which are one object, as one."""
+        for other, frames in self._apart.get(gone, Counter()).items():
+            if other not in (kept, gone):
+                self._add_apart(kept, other, frames)
+        self.forget(gone)
+
     def forget(self, owner: int) -> None:
         """Drop what is known of an owner that is gone."""
-        for pair in [pair for pair in self._counts if owner in pair]:
-            del self._counts[pair]
+        for other in self._apart.pop(owner, ()):
+            if other != owner:
+                del self._apart[other][owner]
+        for pair in [pair for pair in self._together if owner in pair]:
+            del self._together[pair]
+
+    def _balance(self, pair: Pair) -> int:
+        a, b = pair
+        apart = self._apart[a][b] if a in self._apart else 0
+        return self._together[pair] - APART_FRAMES * apart
+
+    def _add_apart(self, a: int, b: int, frames: int) -> None:
+        for one, other in ((a, b), (b, a)):
+            self._apart.setdefault(one, Counter())[other] += frames

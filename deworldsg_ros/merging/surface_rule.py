@@ -85,7 +85,7 @@ class SurfaceMerging:
         if self._config.contest_cells:
             self._contest(graph, cells, places)
         node_ids = self._place(graph, local, cells, places)
-        self._joint.note(owners, shares, values, matched)
+        self._joint.note([self._owner(node_id) for node_id in node_ids], owners, values, matched)
         self._merge_grown(graph)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         self._look_for_absent(graph, local, node_ids)
@@ -272,8 +272,10 @@ class SurfaceMerging:
             a_id, b_id = (self._owners.node(owner) for owner in pair)
             kept_id = graph.merge_nodes(a_id, b_id)
             kept = self._owner(kept_id)
-            self._existence.merge(kept, self._owner(b_id if kept_id == a_id else a_id))
-            cells = self._free(b_id if kept_id == a_id else a_id)
+            gone_id = b_id if kept_id == a_id else a_id
+            self._existence.merge(kept, self._owner(gone_id))
+            self._joint.merge(kept, self._owner(gone_id))
+            cells = self._free(gone_id)
             self._map.add([kept], CellSets(cells, np.array([0, len(cells)])))
             self._changed.add(kept)
 
