@@ -26,7 +26,6 @@ from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, hellinger_distance, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import hash_each
 
 CLASSES = 80
 PREDICATES = 50
@@ -76,7 +75,7 @@ def graph_of(world: World) -> SceneGraph:
     graph = SceneGraph(VOCABULARY, "world")
     rows = np.arange(len(world.means))
     rng = np.random.default_rng(1)
-    surfaces = hash_each(tuple(world.surface_points(row, rng) for row in rows))
+    surfaces = [world.surface_points(row, rng) for row in rows]
     for row, probabilities in zip(rows, world.probabilities(rows)):
         graph.add_node(world.means[row], world.covariances[row], probabilities, 0, surfaces[row])
     for subject in range(1, len(rows) + 1):

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import hash_each
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 
@@ -123,7 +122,7 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
         live = graph.nodes.ids.tolist()
         ever = int(max([*live, 1]))
         gaussian = (rng.normal(size=3), random_covariances(rng, 1)[0], random_classes(rng, 1)[0])
-        points = hash_each((rng.normal(size=(4, 3)).astype(np.float32),))[0]
+        points = rng.normal(size=(4, 3)).astype(np.float32)
         action = rng.choice(
             ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "frame"]
         )

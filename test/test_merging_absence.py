@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from merging_support import VOCABULARY
+from hypothesis import given, settings
+from merging_support import VOCABULARY, seeds
 from test_merging_surface import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
-from deworldsg_ros.merging.absence import look
+from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.nodes import NodeTable
 
 CAMERA = Intrinsics(300.0, 300.0, 319.5, 239.5, 640, 480)
 WALL_M = 1.0  # the table top, seen from in front; cups float before it
@@ -153,22 +155,45 @@ def test_zero_frames_turns_negative_evidence_off() -> None:
     assert scene.told() == {1: "table", 2: "cup"}
 
 
-@pytest.mark.parametrize(
-    ("z_m", "through", "present"), [(0.7, True, False), (1.0, False, True), (1.5, False, False)]
-)
-def test_points_before_on_and_behind_what_was_measured(z_m, through, present) -> None:
-    points = np.zeros((1, 10, 3), np.float32)
-    points[0, :, 0] = np.linspace(-0.2, 0.2, 10)
-    points[0, :, 2] = z_m
-    seen_through, there, whole = look(points, np.array([10]), np.eye(4), depth_grid())
-    assert (seen_through[0], there[0], whole[0]) == (through, present, present)
-    seen_through, there, whole = look(points, np.array([0]), np.eye(4), depth_grid())
-    assert not seen_through[0] and not there[0] and not whole[0]
+def watched(points: np.ndarray, enough_frames: int = 1) -> SeenThrough:
+    """Negative evidence of one node with these surface points, owner 0."""
+    nodes = NodeTable(1, SAMPLED_POINTS)
+    nodes.set_surface(nodes.append(1), points.astype(np.float32))
+    through = SeenThrough(enough_frames)
+    through.renew([0], nodes, [0])
+    return through
 
 
-def test_what_the_image_cuts_is_not_in_full_view() -> None:
-    points = np.zeros((1, 10, 3), np.float32)
-    points[0, :, 0] = np.linspace(-1.4, 0.6, 10)  # the image ends at 1.07 m to the left
-    points[0, :, 2] = WALL_M
-    _, there, whole = look(points, np.array([10]), np.eye(4), depth_grid())
-    assert there[0] and not whole[0]
+@pytest.mark.parametrize(("z_m", "gone", "missed"), [(0.7, [0], []), (1.0, [], [0]), (1.5, [], [])])
+def test_points_before_on_and_behind_what_was_measured(z_m, gone, missed) -> None:
+    points = np.stack([np.linspace(-0.2, 0.2, 10), np.zeros(10), np.full(10, z_m)], axis=1)
+    assert watched(points).look(np.eye(4), depth_grid(), []) == (gone, missed)
+    assert watched(points).look(np.eye(4), depth_grid(), [0]) == ([], [])
+    assert watched(points[:0]).look(np.eye(4), depth_grid(), []) == ([], [])
+
+
+def test_what_the_image_cuts_is_there_but_not_in_full_view() -> None:
+    # The image ends at 1.07 m to the left, and nearer to the camera sooner.
+    points = np.stack([np.linspace(-1.4, 0.6, 10), np.zeros(10), np.full(10, WALL_M)], axis=1)
+    through = watched(points, enough_frames=2)
+    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([], [])
+    assert through.look(np.eye(4), depth_grid(), []) == ([], [])
+    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([], [])
+    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([0], [])
+
+
+@given(seeds)
+@settings(max_examples=100)
+def test_a_node_counts_wherever_half_of_it_is_in_the_image(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform((-3.5, -2.6, -0.5), (3.5, 2.6, 3.0))
+    # A part of it lies apart, so that its middle is elsewhere.
+    apart = rng.random((40, 1)) < 0.45
+    points = centre + rng.uniform(-0.2, 0.2, (40, 3)) + apart * rng.uniform(-6, 6, 3)
+    points = points.astype(np.float32)
+    x, y, z = points.astype(np.float64).T
+    inside = z >= 0.1
+    z = np.where(inside, z, 1.0)
+    inside &= (np.abs(300 * x / z + 319.5 - 320) < 320) & (np.abs(300 * y / z + 239.5 - 240) < 240)
+    gone, _ = watched(points).look(np.eye(4), depth_grid(background_m=60.0), [])
+    assert gone == ([0] if inside.sum() >= 20 else [])

@@ -63,7 +63,7 @@ def test_the_whole_rule_is_that_of_the_reference(seed: int) -> None:
             graph.nodes.class_probabilities[row], node["classes"], rtol=0, atol=1e-12
         )
         assert graph.nodes.weights[row] == node["weight"]
-        points = graph.nodes.surfaces[row].points_world.tolist()
+        points = graph.nodes.surface(row).tolist()
         assert {tuple(point) for point in points} == node["points"]
     assert set(graph.edges) == set(reference.edges)
     for pair, edge in reference.edges.items():
@@ -146,7 +146,7 @@ def test_a_still_camera_ends_with_one_node_an_object_after_200_frames() -> None:
     np.testing.assert_allclose(
         graph.nodes.means, [surface.mean(axis=0) for surface in surfaces], atol=1e-3
     )
-    assert [len(item.points_world) for item in graph.nodes.surfaces] == [100] * objects
+    assert graph.nodes.surface_counts.tolist() == [100] * objects
 
 
 def test_exactly_equal_observations_merge() -> None:

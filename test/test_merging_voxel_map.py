@@ -107,12 +107,15 @@ def test_growing_loses_nothing_and_a_removed_owner_is_gone() -> None:
     sets = surfaces.cells_of([rng.uniform(-5, 5, (30_000, 3)) for _ in range(2)])
     surfaces.add([0, 1], sets)
     assert surfaces.shares(sets)[1].diagonal().tolist() == [1.0, 1.0]
+    count = surfaces.cell_count(0)
     removed = surfaces.remove(0)
-    assert np.sort(removed).tolist() == np.sort(sets.of(0)).tolist()
     assert surfaces.cell_count(0) == 0
     after = dense(*surfaces.shares(sets), 2)
     assert after[0, 0] == after[1, 0] == 0.0
     assert after[1, 1] == 1.0
+    surfaces.add([2], removed)
+    assert surfaces.cell_count(2) == count
+    assert dense(*surfaces.shares(sets), 3)[0].tolist() == [0.0, after[0, 1], 1.0]
 
 
 def test_an_owner_has_at_most_so_many_cells() -> None:
@@ -125,4 +128,5 @@ def test_an_owner_has_at_most_so_many_cells() -> None:
 def test_points_beyond_the_map_are_left_out() -> None:
     surfaces = VoxelMap(0.01)
     points = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 0]], np.float32)
-    assert len(surfaces.cells_of([points]).of(0)) == 1
+    surfaces.add([0], surfaces.cells_of([points]))
+    assert surfaces.centres(0) == pytest.approx(np.full((1, 3), 0.005))

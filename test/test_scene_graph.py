@@ -20,7 +20,6 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.storage import state_of
-from deworldsg_ros.scene.surface import hash_each
 
 SURE = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -90,7 +89,7 @@ def test_observing_many_is_observing_each() -> None:
     rng = np.random.default_rng(0)
     means, covariances = rng.normal(size=(3, 3)), random_covariances(rng, 3)
     classes, weights = random_classes(rng, 3), rng.uniform(0.1, 3, 3)
-    surfaces = hash_each(tuple(rng.normal(size=(3, 5, 3)).astype(np.float32)))
+    surfaces = rng.normal(size=(3, 5, 3)).astype(np.float32)
     one, many = graph_of(4), graph_of(4)
     many.observe_each([4, 1, 3], means, covariances, classes, 9, surfaces, weights)
     for index, node_id in enumerate([4, 1, 3]):
@@ -235,9 +234,8 @@ def test_tentative_nodes_are_told_only_on_request() -> None:
 def test_the_message_of_a_node() -> None:
     graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=2)
     points = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], np.float32)
-    surface = hash_each((points,))[0]
     classes = np.array([0.1, 0.4, 0.4, 0.1])
-    graph.add_node(np.array([1.0, 2, 3]), np.diag([1.0, 2, 3]), classes, 1_500_000_000, surface)
+    graph.add_node(np.array([1.0, 2, 3]), np.diag([1.0, 2, 3]), classes, 1_500_000_000, points)
     state = graph.node_states(3, with_points=True)[1]
     assert state.label == "table"  # of equals the first
     assert [belief.label for belief in state.classes] == ["table", "chair", "cup"]
@@ -278,7 +276,7 @@ def test_invariants_hold_through_any_edits(seed: int) -> None:
         for node_id in live:
             for partner in graph._edges.partners(node_id):
                 assert {(node_id, partner), (partner, node_id)} & graph.edges.keys()
-        assert all(len(surface.points_world) <= 6 for surface in graph.nodes.surfaces)
+        assert (graph.nodes.surface_counts <= 6).all()
         assert len(graph._frames) <= 3
 
 

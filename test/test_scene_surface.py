@@ -8,36 +8,39 @@ from hypothesis import given
 from hypothesis import strategies as st
 from merging_support import seeds
 
-from deworldsg_ros.scene.surface import (
-    EMPTY_SAMPLE,
-    HashedPoints,
-    SurfaceReservoir,
-    content_hashes,
-    even_moments,
-    hash_each,
-    merge_samples,
-)
+from deworldsg_ros.scene.surface import add_points, even_moments
 
 
-def hashed(points: np.ndarray) -> HashedPoints:
-    return hash_each((points.astype(np.float32),))[0]
+class Samples:
+    """Some samples of surface points, as a table of nodes keeps them."""
+
+    def __init__(self, count: int, capacity: int) -> None:
+        self.hashes = np.zeros((count, capacity), np.uint64)
+        self.points_world = np.zeros((count, capacity, 3), np.float32)
+        self.counts = np.zeros(count, np.int64)
+
+    def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
+        add_points(self.hashes, self.points_world, self.counts, rows, point_sets)
+
+    def of(self, row: int) -> tuple[list[int], list[list[float]]]:
+        count = self.counts[row]
+        return self.hashes[row, :count].tolist(), self.points_world[row, :count].tolist()
+
+    def points(self, row: int) -> np.ndarray:
+        return self.points_world[row, : self.counts[row]]
 
 
-def sample_of(points: np.ndarray, capacity: int) -> HashedPoints:
-    return merge_samples(EMPTY_SAMPLE, hashed(points), capacity)
-
-
-def same(a: HashedPoints, b: HashedPoints) -> bool:
-    return np.array_equal(a.hashes, b.hashes) and np.array_equal(a.points_world, b.points_world)
+def sample_of(points: np.ndarray, capacity: int) -> Samples:
+    samples = Samples(1, capacity)
+    samples.add([0], [points.astype(np.float32)])
+    return samples
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_few_points_are_all_kept(count: int) -> None:
     points = np.random.default_rng(0).normal(size=(count, 3))
     sample = sample_of(points, 3)
-    assert sample.points_world.shape == (count, 3)
-    assert sample.points_world.dtype == np.float32
-    assert sorted(sample.points_world.tolist()) == sorted(points.astype(np.float32).tolist())
+    assert sorted(sample.of(0)[1]) == sorted(points.astype(np.float32).tolist())
 
 
 @given(seeds, st.integers(0, 20), st.integers(0, 60))
@@ -45,63 +48,36 @@ def test_it_is_bounded_and_depends_on_the_set_alone(seed: int, capacity: int, co
     rng = np.random.default_rng(seed)
     # A coarse grid: many points come more than once.
     points = rng.integers(0, 3, (count, 3)).astype(np.float32) / 7
-    whole = sample_of(points, capacity)
-    assert len(whole.hashes) == min(capacity, len(np.unique(points, axis=0)))
-    assert (np.diff(whole.hashes.astype(object)) > 0).all()
-    np.testing.assert_array_equal(content_hashes(whole.points_world), whole.hashes)
-    # In any order, in parts, and by way of merged parts.
-    shuffled = points[rng.permutation(count)]
-    cuts = np.sort(rng.integers(0, count + 1, 2))
-    parts = np.split(shuffled, cuts)
-    frame_by_frame = SurfaceReservoir(capacity)
-    for part in parts:
-        frame_by_frame.add(hashed(part))
-        if rng.random() < 0.5:  # looking at it changes nothing
-            assert len(frame_by_frame.points_world) <= capacity
-    assert same(frame_by_frame.sample, whole)
-    first, second, third = (sample_of(part, capacity) for part in parts)
-    assert same(merge_samples(merge_samples(third, first, capacity), second, capacity), whole)
-    assert same(merge_samples(third, merge_samples(second, first, capacity), capacity), whole)
-    assert same(merge_samples(whole, whole, capacity), whole)
+    hashes, kept = sample_of(points, capacity).of(0)
+    assert len(hashes) == min(capacity, len(np.unique(points, axis=0)))
+    assert (np.diff(np.array(hashes, object)) > 0).all()
+    # In any order, in parts, several samples at a time, and by way of merged parts.
+    first, second, third = np.split(
+        points[rng.permutation(count)], np.sort(rng.integers(0, count + 1, 2))
+    )
+    parts = Samples(4, capacity)
+    parts.add([2, 0], [third, first])
+    parts.add([0, 1], [second, second])
+    parts.add([0], [third])
+    parts.add([3, 1], [parts.points(2), parts.points(2)])
+    parts.add([3], [parts.points(1)])
+    parts.add([3], [first])
+    parts.add([0], [parts.points(0)])
+    assert parts.of(0) == parts.of(3) == (hashes, kept)
 
 
 def test_hashes_depend_on_values_and_axes() -> None:
-    points = np.array([[1, 2, 3], [3, 2, 1], [0, 0, 0], [1, 2, 3]], np.float32)
-    hashes = content_hashes(points)
-    assert hashes[0] == hashes[3]
-    assert len(set(hashes.tolist())) == 3
-    assert content_hashes(-np.zeros((1, 3), np.float32)) == hashes[2]
-    assert len(content_hashes(np.zeros((0, 3), np.float32))) == 0
+    points = np.array([[1, 2, 3], [3, 2, 1], [0, 0, 0], [1, 2, 3], [-0.0, 0, -0.0]], np.float32)
+    hashes, kept = sample_of(points, 10).of(0)
+    assert len(set(hashes)) == 3
+    assert sorted(kept) == [[0, 0, 0], [1, 2, 3], [3, 2, 1]]
 
 
 def test_the_draw_is_uniform_over_the_surface() -> None:
     grid = np.stack(np.meshgrid(np.arange(100), np.arange(100), [0]), -1).reshape(-1, 3)
-    kept = sample_of(grid.astype(np.float32) * np.float32(0.01), 1000).points_world
+    kept = sample_of(grid * 0.01, 1000).points(0)
     quarters = np.histogram2d(kept[:, 0], kept[:, 1], bins=2)[0]
     assert (np.abs(quarters - 250) < 60).all()
-
-
-def test_each_set_of_a_frame_is_hashed_alike() -> None:
-    rng = np.random.default_rng(1)
-    sets = tuple(rng.normal(size=(count, 3)).astype(np.float32) for count in (4, 0, 7))
-    for points, together in zip(sets, hash_each(sets)):
-        assert same(together, hashed(points))
-    assert hash_each(()) == []
-
-
-def test_some_points_are_points_of_the_surface() -> None:
-    rng = np.random.default_rng(5)
-    reservoir = SurfaceReservoir(20)
-    assert reservoir.some_points(8).shape == (0, 3)
-    known: set[tuple[float, ...]] = set()
-    for count in (3, 30, 10):
-        points = rng.normal(size=(count, 3)).astype(np.float32)
-        known |= set(map(tuple, points.tolist()))
-        reservoir.add(hash_each((points,))[0])
-        some = reservoir.some_points(8)
-        assert len(some) == min(8, len(known))
-        assert set(map(tuple, some.tolist())) <= known
-    assert len(reservoir.points_world) == 20
 
 
 def test_even_moments_lean_less_to_where_points_are_dense() -> None:

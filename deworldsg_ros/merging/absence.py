@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, Float64
-
-Float32 = NDArray[np.float32]
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.nodes import NodeTable
 
 # A surface this far, and this share of its depth, in front of what was measured was seen through:
 # well beyond the noise of depth cameras, poses and the grid's step at an edge.
@@ -23,6 +22,8 @@ MIN_VISIBLE_SHARE = 0.5
 DECISIVE_SHARE = 0.7
 # A node with this share of its points in the image is in full view of the camera.
 WHOLE_SHARE = 0.9
+# Nearer than this nothing is measured.
+NEAR_M = 0.1
 # Surface points of a node that the depth image is compared with.
 SAMPLED_POINTS = 48
 
@@ -38,19 +39,30 @@ class SeenThrough:
         self._enough_frames = enough_frames
         self._points_world = np.zeros((0, SAMPLED_POINTS, 3), np.float32)
         self._point_counts = np.zeros(0, np.int64)
+        # Centre and radius of a ball around the points of each.
+        self._balls_world = np.zeros((0, 4))
         self._frames = np.zeros(0, np.int64)
 
-    def renew(self, owner: int, points_world: Float32) -> None:
-        """Take a few of these surface points (k, 3) for those of the node."""
-        if owner >= len(self._frames):
-            more = max(64, owner)
+    def renew(self, owners: list[int], nodes: NodeTable, rows: list[int]) -> None:
+        """Take a few surface points of some nodes, by owner and row, for what is to be seen."""
+        if not owners:
+            return
+        if max(owners) >= len(self._frames):
+            more = 64 + max(owners)
             self._points_world = np.pad(self._points_world, ((0, more), (0, 0), (0, 0)))
             self._point_counts = np.pad(self._point_counts, (0, more))
+            self._balls_world = np.pad(self._balls_world, ((0, more), (0, 0)))
             self._frames = np.pad(self._frames, (0, more))
-        points = points_world[:SAMPLED_POINTS]
-        self._points_world[owner, : len(points)] = points
-        self._point_counts[owner] = len(points)
-        self._frames[owner] = 0
+        _renew(
+            self._points_world,
+            self._point_counts,
+            self._balls_world,
+            self._frames,
+            np.array(owners, np.int64),
+            nodes.surface_points_world,
+            nodes.surface_counts,
+            np.array(rows, np.int64),
+        )
 
     def forget(self, owner: int) -> None:
         """Drop what is known of an owner that is gone."""
@@ -65,99 +77,136 @@ class SeenThrough:
         Returns:
             The owners that are gone, and those that were there in full view but not seen.
         """
-        through, present, whole = look(self._points_world, self._point_counts, T_world_camera, grid)
-        seen = [owner for owner in seen if owner < len(present)]
-        present[seen] = True
-        whole[seen] = False
-        self._frames[through] += 1
-        self._frames[present] = 0
-        gone = self._frames >= self._enough_frames if self._enough_frames else through & False
-        return np.flatnonzero(gone).tolist(), np.flatnonzero(whole).tolist()
+        camera = grid.intrinsics
+        gone, missed = _look(
+            self._points_world,
+            self._point_counts,
+            self._balls_world,
+            self._frames,
+            self._enough_frames,
+            np.array(seen, np.int64),
+            invert_pose(T_world_camera),
+            grid.depth_mm,
+            grid.stride_px,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+        )
+        return gone.tolist(), missed.tolist()
 
 
-def look(
-    points_world: Float32, point_counts: Int64, T_world_camera: Float64, grid: DepthGrid
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which nodes' surfaces were seen through, which were there, and which of these in full view.
+@njit(cache=True, nogil=True)
+def _renew(kept_points, kept_counts, balls, frames, owners, points, counts, rows):  # type: ignore[no-untyped-def]
+    for index in range(len(owners)):
+        owner, row = owners[index], rows[index]
+        count = min(counts[row], SAMPLED_POINTS)
+        kept_counts[owner] = count
+        frames[owner] = 0
+        for axis in range(4):
+            balls[owner, axis] = 0.0
+        for place in range(count):
+            for axis in range(3):
+                kept_points[owner, place, axis] = points[row, place, axis]
+                balls[owner, axis] += points[row, place, axis] / count
+        for place in range(count):
+            squared = 0.0
+            for axis in range(3):
+                squared += (points[row, place, axis] - balls[owner, axis]) ** 2
+            # Wider by more than rounding.
+            radius = 1.000001 * math.sqrt(squared) + 1e-6
+            balls[owner, 3] = max(balls[owner, 3], radius)
 
-    Args:
-        points_world: (S, K, 3) float32 surface points of S nodes, metres.
-        point_counts: (S,) how many of the K are filled.
-        T_world_camera: (4, 4) pose of the depth image.
-        grid: the depth image.
 
-    Returns:
-        seen_through (S,), present (S,) and whole (S,) bool; all false where too little was visible,
-        because it is out of view, occluded or without valid depth.
-    """
-    camera = grid.intrinsics
-    through, there, inside = _count(
-        points_world,
-        point_counts,
-        invert_pose(T_world_camera),
-        grid.depth_mm,
-        grid.stride_px,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
-    )
-    visible = through + there
-    enough = (visible >= MIN_VISIBLE_POINTS) & (visible >= MIN_VISIBLE_SHARE * point_counts)
-    present = enough & (there >= DECISIVE_SHARE * visible)
+@njit(cache=True, nogil=True)
+def _in_camera(T, x, y, z):  # type: ignore[no-untyped-def]
     return (
-        enough & (through >= DECISIVE_SHARE * visible),
-        present,
-        present & (inside >= WHOLE_SHARE * point_counts),
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
     )
 
 
 @njit(cache=True, nogil=True)
-def _count(points, counts, T_camera_world, depth_mm, stride, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
-    through = np.zeros(len(points), np.int64)
-    there = np.zeros(len(points), np.int64)
-    inside = np.zeros(len(points), np.int64)
+def _beside_view(ball, T_camera_world, width_px, height_px, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+    """Whether all of a ball is behind the camera, or beyond one side of the image."""
+    x, y, z = _in_camera(T_camera_world, ball[0], ball[1], ball[2])
+    radius = ball[3]
+    right, below = cx - width_px, cy - height_px
+    return (
+        z < NEAR_M - radius
+        or fx * x + cx * z < -radius * math.hypot(fx, cx)
+        or fx * x + right * z > radius * math.hypot(fx, right)
+        or fy * y + cy * z < -radius * math.hypot(fy, cy)
+        or fy * y + below * z > radius * math.hypot(fy, below)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _look(  # type: ignore[no-untyped-def]
+    points,
+    counts,
+    balls,
+    frames,
+    enough_frames,
+    seen,
+    T_camera_world,
+    depth_mm,
+    stride,
+    fx,
+    fy,
+    cx,
+    cy,
+):
+    found = np.zeros(len(points), np.bool_)
+    for owner in seen:
+        if owner < len(points):
+            found[owner] = True
+            frames[owner] = 0
+    gone = np.zeros(len(points), np.bool_)
+    missed = np.zeros(len(points), np.bool_)
     rows, columns = depth_mm.shape
     for node in range(len(points)):
+        gone[node] = 0 < enough_frames <= frames[node]
+        if found[node] or _beside_view(
+            balls[node], T_camera_world, columns * stride, rows * stride, fx, fy, cx, cy
+        ):
+            continue
+        through = there = inside = 0
         most_hidden = (1.0 - MIN_VISIBLE_SHARE) * counts[node]
         for index in range(counts[node]):
             # Of a node that is too little visible the rest of the points tell nothing.
-            if index - through[node] - there[node] > most_hidden:
+            if index - through - there > most_hidden:
                 break
-            x = np.float64(points[node, index, 0])
-            y = np.float64(points[node, index, 1])
-            z = np.float64(points[node, index, 2])
-            z_camera = (
-                T_camera_world[2, 0] * x
-                + T_camera_world[2, 1] * y
-                + T_camera_world[2, 2] * z
-                + T_camera_world[2, 3]
+            x, y, z = _in_camera(
+                T_camera_world,
+                np.float64(points[node, index, 0]),
+                np.float64(points[node, index, 1]),
+                np.float64(points[node, index, 2]),
             )
-            if z_camera < 0.1:
+            if z < NEAR_M:
                 continue
-            x_camera = (
-                T_camera_world[0, 0] * x
-                + T_camera_world[0, 1] * y
-                + T_camera_world[0, 2] * z
-                + T_camera_world[0, 3]
-            )
-            y_camera = (
-                T_camera_world[1, 0] * x
-                + T_camera_world[1, 1] * y
-                + T_camera_world[1, 2] * z
-                + T_camera_world[1, 3]
-            )
-            column = int(np.floor((fx * x_camera / z_camera + cx) / stride))
-            row = int(np.floor((fy * y_camera / z_camera + cy) / stride))
+            column = int(np.floor((fx * x / z + cx) / stride))
+            row = int(np.floor((fy * y / z + cy) / stride))
             if column < 0 or row < 0 or column >= columns or row >= rows:
                 continue
-            inside[node] += 1
+            inside += 1
             measured_m = depth_mm[row, column] * 0.001
             if measured_m == 0.0:
                 continue
-            tolerance_m = THROUGH_M + THROUGH_SHARE * z_camera
-            if measured_m > z_camera + tolerance_m:
-                through[node] += 1
-            elif measured_m > z_camera - tolerance_m:
-                there[node] += 1
-    return through, there, inside
+            tolerance_m = THROUGH_M + THROUGH_SHARE * z
+            if measured_m > z + tolerance_m:
+                through += 1
+            elif measured_m > z - tolerance_m:
+                there += 1
+        visible = through + there
+        if visible < MIN_VISIBLE_POINTS or visible < MIN_VISIBLE_SHARE * counts[node]:
+            continue
+        if through >= DECISIVE_SHARE * visible:
+            frames[node] += 1
+            gone[node] = 0 < enough_frames <= frames[node]
+        if there >= DECISIVE_SHARE * visible:
+            frames[node] = 0
+            gone[node] = False
+            missed[node] = inside >= WHOLE_SHARE * counts[node]
+    return np.flatnonzero(gone), np.flatnonzero(missed)

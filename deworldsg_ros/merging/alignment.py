@@ -93,7 +93,7 @@ class PoseAlignment:
         observations = int(graph.nodes.observations[row])
         then, planes = self._planes.get(node_id, (0, np.zeros((0, 6))))
         if observations >= RENEW_FACTOR * then:
-            planes = _planes(graph.nodes.surfaces[row].points_world.astype(np.float64), NODE_POINTS)
+            planes = _planes(graph.nodes.surface(row).astype(np.float64), NODE_POINTS)
             self._planes[node_id] = observations, planes
         return planes
 

@@ -12,7 +12,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import even_moments, hash_each
+from deworldsg_ros.scene.surface import even_moments
 
 # What a rule remembers beside the graph.
 Memory = dict[str, NDArray[Any]]
@@ -21,7 +21,7 @@ Memory = dict[str, NDArray[Any]]
 def warm_up_graph() -> None:
     """Compile what changes a scene graph, or load it from the cache."""
     graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
-    seen = (np.zeros(3), np.eye(3), np.ones(1), 1, hash_each((np.zeros((1, 3), np.float32),))[0])
+    seen = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
     graph.observe(graph.add_node(*seen), *seen)
     even_moments(np.zeros((1, 3), np.float32))
 

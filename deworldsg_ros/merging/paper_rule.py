@@ -9,7 +9,7 @@ from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import HashedPoints, hash_each
+from deworldsg_ros.scene.surface import Float32
 
 
 class PaperMerging:
@@ -31,7 +31,6 @@ class PaperMerging:
         follow when all objects have found their nodes.
         """
         check_fits(graph, local)
-        surfaces = hash_each(local.surface_points_world)
         placed = [
             self._place(
                 graph,
@@ -39,7 +38,7 @@ class PaperMerging:
                 local.covariances_world[row],
                 local.class_probabilities[row],
                 local.stamp_ns,
-                surfaces[row],
+                local.surface_points_world[row],
             )
             for row in range(len(local))
         ]
@@ -62,7 +61,7 @@ class PaperMerging:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: HashedPoints,
+        surface_points_world: Float32,
     ) -> int:
         nodes = graph.nodes
         row = nearest_row(
@@ -77,10 +76,17 @@ class PaperMerging:
         )
         if row < 0:
             return graph.add_node(
-                mean_world, covariance_world, class_probabilities, stamp_ns, surface
+                mean_world, covariance_world, class_probabilities, stamp_ns, surface_points_world
             )
         node_id = int(nodes.ids[row])
-        graph.observe(node_id, mean_world, covariance_world, class_probabilities, stamp_ns, surface)
+        graph.observe(
+            node_id,
+            mean_world,
+            covariance_world,
+            class_probabilities,
+            stamp_ns,
+            surface_points_world,
+        )
         return self._merge_on(graph, node_id)
 
     def _merge_on(self, graph: SceneGraph, node_id: int) -> int:

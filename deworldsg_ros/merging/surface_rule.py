@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough, look
+from deworldsg_ros.merging.absence import SeenThrough
 from deworldsg_ros.merging.alignment import PoseAlignment
 from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.fit import fit, one_to_one
@@ -20,12 +20,12 @@ from deworldsg_ros.merging.joint import JointEvidence
 from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
-from deworldsg_ros.merging.voxel_map import CellSets, Int64, VoxelMap
+from deworldsg_ros.merging.voxel_map import CellSets, VoxelMap
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import hash_each
+from deworldsg_ros.scene.nodes import NodeTable
 
 # Gaussians are weighted by their number of pixels; this many make an observation of weight 1.
 PIXELS_OF_UNIT_WEIGHT = 1000.0
@@ -61,7 +61,11 @@ class SurfaceMerging:
         known.contest([0], sets, 0.0)
         known.remove(0)
         grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
-        look(np.zeros((1, 1, 3), np.float32), np.ones(1, np.int64), np.eye(4), grid)
+        absence = SeenThrough(1)
+        nodes = NodeTable(1, 1)
+        nodes.append(1)
+        absence.renew([0], nodes, [0])
+        absence.look(np.eye(4), grid, [])
         self._existence.warm_up()
         if self._config.align_poses:
             self._alignment.warm_up()
@@ -99,14 +103,15 @@ class SurfaceMerging:
         """See `Merging.memory`."""
         node_ids = list(self._owners.ids)
         owners = list(self._owners.ids.values())
-        cells = [self._map.cells(owner) for owner in owners]
+        sets = [self._map.cells(owner) for owner in owners]
         counts = self._joint.counts
         pairs = [[*map(self._owners.node, pair), count] for pair, count in counts.items()]
         return {
             "cell_m": np.array(self._map.cell_m),
             "node_ids": np.array(node_ids, np.int64),
-            "cells": np.concatenate([np.zeros(0, np.int64), *cells]),
-            "cell_counts": np.array([len(item) for item in cells], np.int64),
+            "blocks": np.concatenate([np.zeros(0, np.int64), *(cells.blocks for cells in sets)]),
+            "masks": np.concatenate([np.zeros(0, np.uint64), *(cells.masks for cells in sets)]),
+            "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
             "existence": self._existence.records(owners),
             "joint": np.array(pairs, np.int64).reshape(-1, 3),
         }
@@ -119,7 +124,7 @@ class SurfaceMerging:
         self._changed.update(owners)
         # Of the paper's rule there is none, and cells of another size say nothing.
         if not memory or memory["cell_m"] != self._map.cell_m:
-            surfaces = [surface.points_world for surface in nodes.surfaces]
+            surfaces = [nodes.surface(row) for row in range(len(nodes))]
             self._map.add(owners, self._map.cells_of(surfaces))
             for owner, observations in zip(owners, nodes.observations.tolist()):
                 self._existence.presume(owner, observations)
@@ -127,10 +132,12 @@ class SurfaceMerging:
         kept = [row for row, node_id in enumerate(memory["node_ids"]) if node_id in owner_of]
         owners = [owner_of[node_id] for node_id in memory["node_ids"][kept].tolist()]
         self._existence.restore(owners, memory["existence"][kept])
-        stops = np.cumsum(memory["cell_counts"])
+        counts = memory["block_counts"]
+        stops = np.cumsum(counts)
         for owner, row in zip(owners, kept):
-            cells = memory["cells"][stops[row] - memory["cell_counts"][row] : stops[row]]
-            self._map.add([owner], CellSets(cells, np.array([0, len(cells)])))
+            own = slice(stops[row] - counts[row], stops[row])
+            cells = memory["blocks"][own], memory["masks"][own], np.array([0, counts[row]])
+            self._map.add([owner], CellSets(*cells))
         self._joint.restore(
             {
                 (owner_of[a], owner_of[b]): count
@@ -149,11 +156,12 @@ class SurfaceMerging:
                 continue
             centres = self._map.centres(owner).astype(np.float64)
             centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
-            points = graph.nodes.surfaces[graph.nodes.row(node_id)].points_world
+            row = graph.nodes.row(node_id)
+            points = graph.nodes.surface(row)
             cells = self._map.cells_of([np.concatenate((centres.astype(np.float32), points))])
             self._map.remove(owner)
             self._map.add([owner], cells)
-            self._through.renew(owner, points)
+            self._through.renew([owner], graph.nodes, [row])
 
     def _contest(self, graph: SceneGraph, cells: CellSets, owners: list[int]) -> None:
         """Correct nodes that have a part of what this frame shows to be another.
@@ -168,7 +176,7 @@ class SurfaceMerging:
     ) -> list[int]:
         """Fuse each object into the node of its owner; without one (-1), found a tentative node."""
         weights = local.pixel_counts / PIXELS_OF_UNIT_WEIGHT
-        surfaces = hash_each(local.surface_points_world)
+        surfaces = local.surface_points_world
         known = [row for row, owner in enumerate(owners) if owner >= 0]
         node_ids = [self._owners.node(owner) if owner >= 0 else 0 for owner in owners]
         graph.observe_each(
@@ -226,9 +234,9 @@ class SurfaceMerging:
         if local.depth_grid is None:
             return
         # What is seen need not be looked for: its points are renewed when it is out of sight.
-        for owner in self._changed - seen:
-            surface = graph.nodes.surfaces[graph.nodes.row(self._owners.node(owner))]
-            self._through.renew(owner, surface.some_points(SAMPLED_POINTS))
+        changed = list(self._changed - seen)
+        rows = [graph.nodes.row(self._owners.node(owner)) for owner in changed]
+        self._through.renew(changed, graph.nodes, rows)
         self._changed = seen
         gone, missed = self._through.look(local.T_world_camera, local.depth_grid, list(seen))
         self._doubt(graph, missed, local.T_world_camera[:3, 3])
@@ -276,7 +284,7 @@ class SurfaceMerging:
             self._existence.merge(kept, self._owner(gone_id))
             self._joint.merge(kept, self._owner(gone_id))
             cells = self._free(gone_id)
-            self._map.add([kept], CellSets(cells, np.array([0, len(cells)])))
+            self._map.add([kept], cells)
             self._changed.add(kept)
 
     def _expire(self, graph: SceneGraph, stamp_ns: int) -> None:
@@ -296,7 +304,7 @@ class SurfaceMerging:
         assert owner is not None, f"node {node_id} has no owner index"
         return owner
 
-    def _free(self, node_id: int) -> Int64:
+    def _free(self, node_id: int) -> CellSets:
         """Forget a node that is gone; returns the cells it had."""
         owner = self._owners.free(node_id)
         self._doubted.discard(node_id)

@@ -1,12 +1,14 @@
 """Which nodes' surfaces pass through which cells of space: a sparse hash of small cubes.
 
-A cell knows up to four nodes ("owners"). Everything is linear in
-the number of points asked about, whatever the size of the map.
+Cells are kept in blocks of 4 x 4 x 4, one bit each, so that neighbours are found by shifts. A cell
+knows up to four nodes ("owners"). Everything is linear in the number of points asked about,
+whatever the size of the map.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -15,37 +17,47 @@ from numpy.typing import NDArray
 
 Int64 = NDArray[np.int64]
 Int32 = NDArray[np.int32]
+UInt64 = NDArray[np.uint64]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
-OWNERS = 4
 # An owner of fewer cells than this says too little by lying within a set.
 MIN_REVERSE_CELLS = 4
-# The number of a query is kept in 32 bits.
-_LAST_QUERY = 2**31 - 1
 _EMPTY = np.int64(-1)
-_FIRST_CAPACITY = 1 << 14
+_FIRST_CAPACITY = 1 << 12
 # Cell indices lie in ±2^20: with cells of 3 cm that is 31 km around the origin.
 _BIAS = 1 << 20
 _MASK = (1 << 21) - 1
-# From a cell to itself and to those that share a face with it.
-STEPS = np.array([0, 1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
+# The six faces of a block: the cells along each, how far their bits are turned to the right to
+# become the cells of the next block that they touch, and the way to that block.
+_FACES = np.array(
+    [
+        0x8888888888888888,
+        0x1111111111111111,
+        0xF000F000F000F000,
+        0x000F000F000F000F,
+        0xFFFF000000000000,
+        0x000000000000FFFF,
+    ],
+    np.uint64,
+)
+_TURNS = np.array([3, 61, 12, 52, 48, 16], np.uint64)
+_STEPS = np.array([1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
 
 
 class CellSets(NamedTuple):
-    """Distinct cells of several sets of points, one after the other.
+    """Cells of several sets of points, one after the other.
 
     Attributes:
-        cells: packed cell indices; those of set k are cells[starts[k] : starts[k + 1]].
+        blocks: (m,) int64, packed indices of blocks; those of set k, all different, are
+            blocks[starts[k] : starts[k + 1]].
+        masks: (m,) uint64, the cells of each: bit 16 x + 4 y + z.
         starts: (n + 1,) int64.
     """
 
-    cells: Int64
+    blocks: Int64
+    masks: UInt64
     starts: Int64
-
-    def of(self, index: int) -> Int64:
-        """Cells of one set."""
-        return self.cells[self.starts[index] : self.starts[index + 1]]
 
 
 class VoxelMap:
@@ -61,54 +73,53 @@ class VoxelMap:
         self._cells_per_owner = cells_per_owner
         self._allocate(_FIRST_CAPACITY)
         self._used = 0
-        self._query = 0
-        self._cells_of: dict[int, list[Int64]] = {}
+        self._blocks_of: dict[int, list[Int64]] = {}
         self._counts = np.zeros(64, np.int64)
-
-    def __len__(self) -> int:
-        """Number of cells that have, or had, an owner."""
-        return self._used
 
     def cell_count(self, owner: int) -> int:
         """Number of cells of an owner."""
         return int(self._counts[owner]) if owner < len(self._counts) else 0
 
     def cells_of(self, point_sets: Sequence[Float32]) -> CellSets:
-        """Distinct cells of each set of points (k, 3), metres."""
-        counts = [len(points) for points in point_sets]
+        """Cells of each set of points (k, 3), metres."""
         points = np.concatenate([np.zeros((0, 3), np.float32), *point_sets])
-        return CellSets(*_cells_of(points, np.array([0, *np.cumsum(counts)]), self.cell_m))
+        starts = np.array([0, *accumulate(map(len, point_sets))])
+        return CellSets(*_cells_of(points, starts, self.cell_m))
 
-    def cells(self, owner: int) -> Int64:
-        """An owner's cells, (n,) packed indices."""
-        return np.concatenate([np.zeros(0, np.int64), *self._cells_of.get(owner, [])])
+    def cells(self, owner: int) -> CellSets:
+        """An owner's cells, as one set."""
+        blocks, slots = self._slots_of(owner)
+        return CellSets(blocks, self._masks[slots], np.array([0, len(blocks)]))
 
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
-        keys = self.cells(owner)
-        indices = np.stack([keys >> 42, (keys >> 21) & _MASK, keys & _MASK], axis=1) - _BIAS
-        return ((indices + 0.5) * self.cell_m).astype(np.float32)
+        blocks, masks, _ = self.cells(owner)
+        bits = np.arange(64, dtype=np.uint64)
+        rows, places = np.nonzero((masks[:, None] >> bits) & np.uint64(1))
+        corners = np.stack([blocks >> 42, (blocks >> 21) & _MASK, blocks & _MASK], axis=1)[rows]
+        within = np.stack([places >> 4, (places >> 2) & 3, places & 3], axis=1)
+        return ((4 * corners + within - _BIAS + 0.5) * self.cell_m).astype(np.float32)
 
     def add(self, owners: Sequence[int], sets: CellSets) -> None:
         """Note that each owner was seen in the cells of its set."""
         if not len(owners):
             return
         self._make_room(max(owners) + 1)
-        if 2 * (self._used + len(sets.cells)) > len(self._keys):
-            self._grow(self._used + len(sets.cells))
-        new, starts, created = _add(
+        if 2 * (self._used + len(sets.blocks)) > len(self._keys):
+            self._grow(self._used + len(sets.blocks))
+        new, starts, self._used = _add(
             self._keys,
+            self._masks,
             self._owners,
             self._counts,
             self._cells_per_owner,
+            self._used,
             np.array(owners, np.int64),
-            sets.cells,
-            sets.starts,
+            *sets,
         )
-        self._used += created
         for owner, start, stop in zip(owners, starts[:-1].tolist(), starts[1:].tolist()):
             if stop > start:
-                self._cells_of.setdefault(owner, []).append(new[start:stop].copy())
+                self._blocks_of.setdefault(owner, []).append(new[start:stop].copy())
 
     def shares(self, sets: CellSets) -> tuple[list[int], Float64]:
         """How far the surface of each set coincides with that of each owner.
@@ -120,14 +131,10 @@ class VoxelMap:
         Returns:
             The S owners that any set met, ascending, and the shares (n, S) float64 in [0, 1].
         """
-        if self._query > _LAST_QUERY - len(sets.starts):
-            self._owners[:, OWNERS:] = self._query = 0
-        shares: Float64 = _shares(
-            self._keys, self._owners, self._query, sets.cells, sets.starts, self._counts
+        owners, shares = _shares(
+            self._keys, self._masks, self._owners, self._marks, self._counts, self._used, *sets
         )
-        self._query += len(shares)
-        owners = np.flatnonzero(shares.any(axis=0))
-        return owners.tolist(), shares[:, owners]
+        return owners.tolist(), shares
 
     def contest(
         self, owners: Sequence[int], sets: CellSets, least_share: float
@@ -143,102 +150,93 @@ class VoxelMap:
             The share of its cells that each owner lost, of those that lost some.
         """
         self._make_room(max(owners, default=-1) + 1)
-        cells, losers = _contest(
+        lost = _contest(
             self._keys,
+            self._masks,
             self._owners,
-            len(self._counts),
+            self._marks,
+            self._counts,
+            self._used,
             np.array(owners, np.int64),
-            sets.cells,
-            sets.starts,
+            *sets,
+            least_share,
         )
-        if not len(losers):
-            return {}
-        # Counted once for each of the others that is shown there.
-        at_most = np.bincount(losers, minlength=len(self._counts))
-        shares = {}
-        for owner in np.flatnonzero(at_most > least_share * self._counts).tolist():
-            lost = np.unique(cells[losers == owner])
-            share = len(lost) / int(self._counts[owner])
-            if share > least_share:
-                known = np.concatenate(self._cells_of[owner])
-                _remove(self._keys, self._owners, owner, lost)
-                self._cells_of[owner] = [np.setdiff1d(known, lost, assume_unique=True)]
-                self._counts[owner] -= len(lost)
-                shares[owner] = share
-        return shares
+        losers = np.flatnonzero(lost)
+        shares = lost[losers] / (lost[losers] + self._counts[losers])
+        return dict(zip(losers.tolist(), shares.tolist()))
 
-    def remove(self, owner: int) -> Int64:
-        """Forget an owner; returns the cells it had."""
-        cells = np.concatenate([np.zeros(0, np.int64), *self._cells_of.pop(owner, [])])
-        if len(cells):
+    def remove(self, owner: int) -> CellSets:
+        """Forget an owner; returns the cells it had, as one set."""
+        cells = self.cells(owner)
+        _, slots = self._slots_of(owner)
+        self._masks[slots] = 0
+        self._owners[slots] = -1
+        if self._blocks_of.pop(owner, None) is not None:
             self._counts[owner] = 0
-        _remove(self._keys, self._owners, owner, cells)
         return cells
+
+    def _slots_of(self, owner: int) -> tuple[Int64, Int64]:
+        """Blocks that an owner has cells in, and the slots of these."""
+        blocks = np.concatenate([np.zeros(0, np.int64), *self._blocks_of.get(owner, [])])
+        return blocks, _slots_of(self._keys, self._owners, owner, blocks)
 
     def _make_room(self, owner_count: int) -> None:
         if owner_count > len(self._counts):
             self._counts = np.pad(self._counts, (0, 2 * owner_count - len(self._counts)))
 
     def _allocate(self, capacity: int) -> None:
+        # A slot is an owner's cells in a block. The slots of a block lie between the place where it
+        # belongs and the next empty slot.
         self._keys = np.full(capacity, _EMPTY, np.int64)
-        # The owners of each cell, -1 after the last, and the query by which each was met last:
-        # side by side, because what costs is to fetch them.
-        self._owners: Int32 = np.full((capacity, 2 * OWNERS), -1, np.int32)
+        self._masks = np.zeros(capacity, np.uint64)
+        self._owners: Int32 = np.full(capacity, -1, np.int32)
+        # Cells of each slot that a query has met; zero between queries.
+        self._marks = np.zeros(capacity, np.uint64)
 
-    def _grow(self, cells: int) -> None:
-        keys, owners = self._keys, self._owners
+    def _grow(self, slots: int) -> None:
+        keys, masks, owners = self._keys, self._masks, self._owners
         capacity = len(keys)
-        while capacity < 3 * cells:
+        while capacity < 3 * slots:
             capacity *= 2
         self._allocate(capacity)
-        self._used = _rehash(keys, owners, self._keys, self._owners)
+        self._used = _rehash(keys, masks, owners, self._keys, self._masks, self._owners)
 
 
 @njit(cache=True, nogil=True)
-def _slot(keys, key):  # type: ignore[no-untyped-def]
-    """Slot of a key, or of the empty place where it belongs."""
-    mask = len(keys) - 1
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64(mixed >> np.uint64(32)) & mask
-    while keys[slot] != key and keys[slot] != -1:
-        slot = (slot + 1) & mask
-    return slot
+def _place(keys, block):  # type: ignore[no-untyped-def]
+    """Slot where a block belongs; it is in this or one of the next before an empty one."""
+    mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(32)) & (len(keys) - 1)
 
 
 @njit(cache=True, nogil=True)
-def _add(keys, owners, counts, limit, who, cells, starts):  # type: ignore[no-untyped-def]
-    new = np.empty(len(cells), np.int64)
-    new_starts = np.zeros(len(starts), np.int64)
-    new_count = 0
-    created = 0
-    for index in range(len(who)):
-        owner = who[index]
-        for cell in cells[starts[index] : starts[index + 1]]:
-            slot = _slot(keys, cell)
-            known = False
-            place = -1
-            for candidate in range(OWNERS):
-                known = bool(known or owners[slot, candidate] == owner)
-                if place < 0 and owners[slot, candidate] < 0:
-                    place = candidate
-            # Four nodes may know a cell; a fifth does not.
-            if known or place < 0 or counts[owner] >= limit:
-                continue
-            if keys[slot] != cell:
-                keys[slot] = cell
-                created += 1
-            owners[slot, place] = owner
-            owners[slot, OWNERS + place] = 0
-            counts[owner] += 1
-            new[new_count] = cell
-            new_count += 1
-        new_starts[index + 1] = new_count
-    return new[:new_count].copy(), new_starts, created
+def _count(mask):  # type: ignore[no-untyped-def]
+    """Number of bits that are set."""
+    mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    pairs = np.uint64(0x3333333333333333)
+    mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
+    mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit(cache=True, nogil=True)
+def _turned(mask, by):  # type: ignore[no-untyped-def]
+    return (mask >> by) | (mask << (np.uint64(64) - by))
+
+
+@njit(cache=True, nogil=True)
+def _grown(mask):  # type: ignore[no-untyped-def]
+    """Cells of a block with those of the same block that share a face with them."""
+    z, y, x = np.uint64(1), np.uint64(4), np.uint64(16)
+    grown = mask | (mask << x) | (mask >> x)
+    grown |= ((mask & ~_FACES[0]) << z) | ((mask & ~_FACES[1]) >> z)
+    return grown | ((mask & ~_FACES[2]) << y) | ((mask & ~_FACES[3]) >> y)
 
 
 @njit(cache=True, nogil=True)
 def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
-    cells = np.empty(len(points), np.int64)
+    blocks = np.empty(len(points), np.int64)
+    masks = np.zeros(len(points), np.uint64)
     new_starts = np.zeros(len(starts), np.int64)
     kept = 0
     cells_per_m = 1.0 / cell_m
@@ -246,123 +244,219 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
         capacity = 16
         while capacity < 2 * (starts[index + 1] - starts[index]):
             capacity *= 2
-        known = np.full(capacity, _EMPTY)
+        # Where each block is kept, by hash.
+        known = np.full(capacity, -1, np.int64)
         for point in range(starts[index], starts[index + 1]):
-            cell = np.int64(0)
+            block = np.int64(0)
+            bit = np.int64(0)
             inside = True
             for axis in range(3):
-                step = np.int64(np.floor(np.float64(points[point, axis]) * cells_per_m))
-                inside = bool(inside and -_BIAS <= step < _BIAS)
-                cell = (cell << 21) | (step + _BIAS)
-            if inside:
-                slot = _slot(known, cell)
-                if known[slot] != cell:
-                    known[slot] = cell
-                    cells[kept] = cell
-                    kept += 1
+                step = np.int64(np.floor(np.float64(points[point, axis]) * cells_per_m)) + _BIAS
+                inside = bool(inside and 0 <= step < 2 * _BIAS)
+                block = (block << 21) | (step >> 2)
+                bit = (bit << 2) | (step & 3)
+            if not inside:
+                continue
+            place = _place(known, block)
+            while known[place] >= 0 and blocks[known[place]] != block:
+                place = (place + 1) & (capacity - 1)
+            if known[place] < 0:
+                known[place] = kept
+                blocks[kept] = block
+                kept += 1
+            masks[known[place]] |= np.uint64(1) << np.uint64(bit)
         new_starts[index + 1] = kept
-    return cells[:kept].copy(), new_starts
+    return blocks[:kept].copy(), masks[:kept].copy(), new_starts
 
 
 @njit(cache=True, nogil=True)
-def _shares(keys, owners, query, cells, starts, counts):  # type: ignore[no-untyped-def]
-    shares = np.zeros((len(starts) - 1, len(counts)))
-    on_owner = np.zeros(len(counts), np.int64)
-    of_owner = np.zeros(len(counts), np.int64)
-    # The cell of the set that met an owner last: a cell meets an owner once.
-    met_at = np.full(len(counts), -1, np.int64)
-    for index in range(len(starts) - 1):
-        query += 1
-        on_owner[:] = 0
-        of_owner[:] = 0
+def _add(keys, masks, owners, counts, limit, used, who, blocks, set_masks, starts):  # type: ignore[no-untyped-def]
+    new = np.empty(len(blocks), np.int64)
+    new_starts = np.zeros(len(starts), np.int64)
+    new_count = 0
+    for index in range(len(who)):
+        owner = who[index]
         for at in range(starts[index], starts[index + 1]):
-            for step in STEPS:
-                slot = _slot(keys, cells[at] + step)
-                if keys[slot] == -1:
-                    continue
-                for place in range(OWNERS):
-                    owner = owners[slot, place]
-                    if owner < 0:
-                        break
-                    if owners[slot, OWNERS + place] != query:
-                        owners[slot, OWNERS + place] = query
-                        of_owner[owner] += 1
-                    if met_at[owner] != at:
-                        met_at[owner] = at
-                        on_owner[owner] += 1
-        cell_count = starts[index + 1] - starts[index]
-        for owner in range(len(counts)):
-            if on_owner[owner] > 0:
-                share = on_owner[owner] / cell_count
-                if counts[owner] >= MIN_REVERSE_CELLS:
-                    share = max(share, of_owner[owner] / counts[owner])
-                shares[index, owner] = share
-    return shares
+            own = free = -1
+            # Bits of the number of owners of each cell, which is at most four.
+            ones = twos = fours = np.uint64(0)
+            slot = _place(keys, blocks[at])
+            while keys[slot] != -1:
+                if owners[slot] < 0:
+                    free = slot
+                elif keys[slot] == blocks[at]:
+                    if owners[slot] == owner:
+                        own = slot
+                    carried = ones & masks[slot]
+                    ones ^= masks[slot]
+                    fours |= twos & carried
+                    twos ^= carried
+                slot = (slot + 1) & (len(keys) - 1)
+            # Four nodes may know a cell; a fifth does not.
+            seen = set_masks[at] & ~fours
+            if own >= 0:
+                seen &= ~masks[own]
+            while _count(seen) > limit - counts[owner]:
+                seen &= seen - np.uint64(1)
+            if seen == 0:
+                continue
+            if own < 0:
+                own = slot if free < 0 else free
+                used += int(free < 0)
+                keys[own] = blocks[at]
+                owners[own] = owner
+                new[new_count] = blocks[at]
+                new_count += 1
+            masks[own] |= seen
+            counts[owner] += _count(seen)
+        new_starts[index + 1] = new_count
+    return new[:new_count].copy(), new_starts, used
 
 
 @njit(cache=True, nogil=True)
-def _contest(keys, owners, owner_count, who, cells, starts):  # type: ignore[no-untyped-def]
-    set_of = np.full(owner_count, -1, np.int64)
-    ascending = cells.copy()
-    sorted_yet = np.zeros(len(who), np.bool_)
+def _shares(keys, masks, owners, marks, counts, used, blocks, set_masks, starts):  # type: ignore[no-untyped-def]
+    set_count = len(starts) - 1
+    on_owner = np.zeros((set_count, len(counts)), np.int64)
+    of_owner = np.zeros((set_count, len(counts)), np.int64)
+    met = np.zeros(len(counts), np.bool_)
+    # Cells of the present block of the set that lie on an owner, and which owners these are.
+    on_block = np.zeros(len(counts), np.uint64)
+    block_owners = np.empty(len(counts), np.int64)
+    marked = np.empty(used, np.int64)
+    for index in range(set_count):
+        marked_count = 0
+        for at in range(starts[index], starts[index + 1]):
+            owner_count = 0
+            # The block itself, then those that the set's cells touch through its faces.
+            for face in range(-1, 6):
+                block = blocks[at]
+                touching = _grown(set_masks[at])
+                if face >= 0:
+                    block += _STEPS[face]
+                    touching = _turned(set_masks[at] & _FACES[face], _TURNS[face])
+                    if touching == 0:
+                        continue
+                slot = _place(keys, block)
+                while keys[slot] != -1:
+                    of_block = touching & masks[slot]
+                    if keys[slot] == block and of_block != 0:
+                        owner = owners[slot]
+                        if marks[slot] == 0:
+                            marked[marked_count] = slot
+                            marked_count += 1
+                        marks[slot] |= of_block
+                        if on_block[owner] == 0:
+                            block_owners[owner_count] = owner
+                            owner_count += 1
+                        if face >= 0:
+                            on_block[owner] |= _turned(of_block, np.uint64(64) - _TURNS[face])
+                        else:
+                            on_block[owner] |= _grown(masks[slot]) & set_masks[at]
+                    slot = (slot + 1) & (len(keys) - 1)
+            for place in range(owner_count):
+                owner = block_owners[place]
+                on_owner[index, owner] += _count(on_block[owner])
+                on_block[owner] = 0
+                met[owner] = True
+        for place in range(marked_count):
+            slot = marked[place]
+            of_owner[index, owners[slot]] += _count(marks[slot])
+            marks[slot] = 0
+    columns = np.flatnonzero(met)
+    shares = np.zeros((set_count, len(columns)))
+    for index in range(set_count):
+        cell_count = 0
+        for at in range(starts[index], starts[index + 1]):
+            cell_count += _count(set_masks[at])
+        for column in range(len(columns)):
+            owner = columns[column]
+            if on_owner[index, owner] > 0:
+                share = on_owner[index, owner] / cell_count
+                if counts[owner] >= MIN_REVERSE_CELLS:
+                    share = max(share, of_owner[index, owner] / counts[owner])
+                shares[index, column] = share
+    return columns, shares
+
+
+@njit(cache=True, nogil=True)
+def _near(block, blocks, set_masks, start, stop):  # type: ignore[no-untyped-def]
+    """Cells of a block that are in a set, or have a face next to one that is."""
+    near = np.uint64(0)
+    for at in range(start, stop):
+        if blocks[at] == block:
+            near |= _grown(set_masks[at])
+        for face in range(6):
+            if blocks[at] + _STEPS[face] == block:
+                near |= _turned(set_masks[at] & _FACES[face], _TURNS[face])
+    return near
+
+
+@njit(cache=True, nogil=True)
+def _contest(  # type: ignore[no-untyped-def]
+    keys, masks, owners, marks, counts, used, who, blocks, set_masks, starts, least_share
+):
+    set_of = np.full(len(counts), -1, np.int64)
     for index in range(len(who)):
         if who[index] >= 0:
             set_of[who[index]] = index
-    lost = np.empty(len(cells) * OWNERS, np.int64)
-    losers = np.empty(len(cells) * OWNERS, np.int64)
-    count = 0
+    lost = np.zeros(len(counts), np.int64)
+    marked = np.empty(used, np.int64)
+    marked_count = 0
     for index in range(len(who)):
-        for cell in cells[starts[index] : starts[index + 1]]:
-            slot = _slot(keys, cell)
-            if keys[slot] == -1:
-                continue
-            for place in range(OWNERS):
-                owner = owners[slot, place]
-                if owner < 0 or owner == who[index] or set_of[owner] < 0:
-                    continue
-                own = ascending[starts[set_of[owner]] : starts[set_of[owner] + 1]]
-                if not sorted_yet[set_of[owner]]:
-                    own.sort()
-                    sorted_yet[set_of[owner]] = True
-                near = False
-                for step in STEPS:
-                    at = np.searchsorted(own, cell + step)
-                    near = bool(near or (at < len(own) and own[at] == cell + step))
-                if not near:
-                    lost[count] = cell
-                    losers[count] = owner
-                    count += 1
-    return lost[:count].copy(), losers[:count].copy()
+        for at in range(starts[index], starts[index + 1]):
+            slot = _place(keys, blocks[at])
+            while keys[slot] != -1:
+                owner = owners[slot]
+                shown = set_masks[at] & masks[slot] & ~marks[slot]
+                if (
+                    keys[slot] == blocks[at]
+                    and shown != 0
+                    and owner != who[index]
+                    and set_of[owner] >= 0
+                ):
+                    start, stop = starts[set_of[owner]], starts[set_of[owner] + 1]
+                    shown &= ~_near(blocks[at], blocks, set_masks, start, stop)
+                    if shown != 0 and marks[slot] == 0:
+                        marked[marked_count] = slot
+                        marked_count += 1
+                    marks[slot] |= shown
+                    lost[owner] += _count(shown)
+                slot = (slot + 1) & (len(keys) - 1)
+    for owner in range(len(counts)):
+        if lost[owner] <= least_share * counts[owner]:
+            lost[owner] = 0
+    for index in range(marked_count):
+        slot = marked[index]
+        if lost[owners[slot]] > 0:
+            masks[slot] &= ~marks[slot]
+        marks[slot] = 0
+    for owner in range(len(counts)):
+        counts[owner] -= lost[owner]
+    return lost
 
 
 @njit(cache=True, nogil=True)
-def _remove(keys, owners, owner, cells):  # type: ignore[no-untyped-def]
-    for cell in cells:
-        slot = _slot(keys, cell)
-        last = OWNERS - 1
-        while last >= 0 and owners[slot, last] < 0:
-            last -= 1
-        for index in range(last + 1):
-            if owners[slot, index] == owner:
-                owners[slot, index] = owners[slot, last]
-                owners[slot, OWNERS + index] = owners[slot, OWNERS + last]
-                owners[slot, last] = -1
-                break
+def _slots_of(keys, owners, owner, blocks):  # type: ignore[no-untyped-def]
+    slots = np.empty(len(blocks), np.int64)
+    for index in range(len(blocks)):
+        slot = _place(keys, blocks[index])
+        while keys[slot] != blocks[index] or owners[slot] != owner:
+            slot = (slot + 1) & (len(keys) - 1)
+        slots[index] = slot
+    return slots
 
 
 @njit(cache=True, nogil=True)
-def _rehash(keys, owners, new_keys, new_owners):  # type: ignore[no-untyped-def]
+def _rehash(keys, masks, owners, new_keys, new_masks, new_owners):  # type: ignore[no-untyped-def]
     used = 0
     for slot in range(len(keys)):
-        if keys[slot] == -1:
+        if owners[slot] < 0:
             continue
-        owned = False
-        for index in range(OWNERS):
-            owned = bool(owned or owners[slot, index] >= 0)
-        if owned:
-            place = _slot(new_keys, keys[slot])
-            new_keys[place] = keys[slot]
-            for index in range(OWNERS):
-                new_owners[place, index] = owners[slot, index]
-            used += 1
+        place = _place(new_keys, keys[slot])
+        while new_keys[place] != -1:
+            place = (place + 1) & (len(new_keys) - 1)
+        new_keys[place] = keys[slot]
+        new_masks[place] = masks[slot]
+        new_owners[place] = owners[slot]
+        used += 1
     return used

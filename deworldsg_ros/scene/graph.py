@@ -13,7 +13,7 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, transform
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.nodes import Int64, NodeTable
-from deworldsg_ros.scene.surface import EMPTY_SAMPLE, HashedPoints, SurfaceReservoir, hash_each
+from deworldsg_ros.scene.surface import NO_POINTS, Float32
 
 
 class SceneGraph:
@@ -72,7 +72,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: HashedPoints = EMPTY_SAMPLE,
+        surface_points_world: Float32 = NO_POINTS,
         weight: float = 1.0,
         confirmed: bool = True,
     ) -> int:
@@ -83,7 +83,7 @@ class SceneGraph:
             covariance_world: (3, 3) square metres, positive definite.
             class_probabilities: (C,), scaled to sum to one.
             stamp_ns: time of the observation.
-            surface: points of its surface.
+            surface_points_world: (k, 3) float32 points of its surface, metres.
             weight: w of Eq. 7, by which its Gaussian counts.
             confirmed: whether it is sure to be an object; otherwise it is tentative.
 
@@ -106,7 +106,7 @@ class SceneGraph:
             raise
         self._next_id += 1
         self.nodes.confirmed[row] = confirmed
-        self.nodes.surfaces[row].add(surface)
+        self.nodes.set_surface(row, surface_points_world)
         self.nodes.first_seen_ns[row] = self.nodes.last_seen_ns[row] = stamp_ns
         self.nodes.revisions[row] = self._changed()
         return node_id
@@ -118,7 +118,7 @@ class SceneGraph:
         covariance_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surface: HashedPoints = EMPTY_SAMPLE,
+        surface_points_world: Float32 = NO_POINTS,
         weight: float = 1.0,
     ) -> None:
         """Fuse one more observation into a live node (Eq. 7); arguments as in `add_node`."""
@@ -128,7 +128,7 @@ class SceneGraph:
             covariance_world[None],
             class_probabilities[None],
             stamp_ns,
-            [surface],
+            [surface_points_world],
             np.array([weight]),
         )
 
@@ -139,7 +139,7 @@ class SceneGraph:
         covariances_world: Float64,
         class_probabilities: Float64,
         stamp_ns: int,
-        surfaces: Sequence[HashedPoints],
+        surfaces: Sequence[Float32],
         weights: Float64,
     ) -> None:
         """Fuse one more observation into each of n different live nodes, as `observe` does."""
@@ -172,7 +172,7 @@ class SceneGraph:
             nodes.class_probabilities[[gone]],
             nodes.weights[[gone]],
             nodes.observations[[gone]],
-            [nodes.surfaces[gone].sample],
+            [nodes.surface(gone)],
             int(nodes.first_seen_ns[gone]),
             int(nodes.last_seen_ns[gone]),
         )
@@ -210,7 +210,7 @@ class SceneGraph:
             float(nodes.weights[new]),
             int(seen.sum()),
         )
-        nodes.surfaces[old] = nodes.surfaces[new]
+        nodes.set_surface(old, nodes.surface(new))
         nodes.confirmed[old] = nodes.confirmed[new]
         nodes.last_seen_ns[old] = nodes.last_seen_ns[new]
         nodes.revisions[old] = self._changed()
@@ -231,11 +231,9 @@ class SceneGraph:
             float(nodes.weights[row]),
             int(nodes.observations[row]),
         )
-        points = nodes.surfaces[row].points_world.astype(np.float64) @ T_correction[:3, :3].T
+        points = nodes.surface(row).astype(np.float64) @ T_correction[:3, :3].T
         points += T_correction[:3, 3]
-        moved = SurfaceReservoir(self.surface_point_capacity)
-        moved.add(hash_each((points.astype(np.float32),))[0])
-        nodes.surfaces[row] = moved
+        nodes.set_surface(row, points.astype(np.float32))
         nodes.revisions[row] = self._changed()
 
     def remove_node(self, node_id: int) -> None:
@@ -335,15 +333,14 @@ class SceneGraph:
         class_probabilities: Float64,
         weights: Float64,
         observations: Int64,
-        surfaces: Sequence[HashedPoints],
+        surfaces: Sequence[Float32],
         first_seen_ns: int,
         last_seen_ns: int,
     ) -> None:
         """Fuse something into each of n different rows."""
         nodes = self.nodes
         nodes.fuse(rows, means_world, covariances_world, class_probabilities, weights, observations)
-        for row, surface in zip(rows, surfaces):
-            nodes.surfaces[row].add(surface)
+        nodes.add_surfaces(rows, surfaces)
         nodes.revisions[rows] = self.revision + 1 + np.arange(len(rows))
         self.revision += len(rows)
         nodes.first_seen_ns[rows] = np.minimum(nodes.first_seen_ns[rows], first_seen_ns)

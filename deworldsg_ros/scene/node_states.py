@@ -59,7 +59,7 @@ def _state(
     # Stable: of equal probabilities the first class of the vocabulary comes first.
     order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
     beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
-    points = nodes.surfaces[row].points_world
+    points = nodes.surface(row)
     mean, covariance = nodes.means[row], nodes.covariances[row]
     if even and len(points):
         mean, covariance = even_moments(points)

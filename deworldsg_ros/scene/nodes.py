@@ -8,6 +8,7 @@ they are replaced when a node is added or removed, so do not keep them across su
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
-from deworldsg_ros.scene.surface import SurfaceReservoir
+from deworldsg_ros.scene.surface import Float32, UInt64, add_points
 
 Int64 = NDArray[np.int64]
 
@@ -38,7 +39,9 @@ class NodeTable:
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
         revisions: (n,) int64, graph revision at which the node last changed.
-        surfaces: n bounded samples of surface points.
+        surface_hashes: (n, K) uint64, and
+        surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
+        surface_counts: (n,) int64 points; see `surface`.
     """
 
     ids: Int64
@@ -53,10 +56,11 @@ class NodeTable:
     first_seen_ns: Int64
     last_seen_ns: Int64
     revisions: Int64
+    surface_hashes: UInt64
+    surface_points_world: Float32
+    surface_counts: Int64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
-        self.surfaces: list[SurfaceReservoir] = []
-        self._surface_point_capacity = surface_point_capacity
         self._rows: dict[int, int] = {}
         capacity = _FIRST_CAPACITY
         self._storage: dict[str, NDArray[Any]] = {
@@ -72,6 +76,9 @@ class NodeTable:
             "first_seen_ns": np.zeros(capacity, np.int64),
             "last_seen_ns": np.zeros(capacity, np.int64),
             "revisions": np.zeros(capacity, np.int64),
+            "surface_hashes": np.zeros((capacity, surface_point_capacity), np.uint64),
+            "surface_points_world": np.zeros((capacity, surface_point_capacity, 3), np.float32),
+            "surface_counts": np.zeros(capacity, np.int64),
         }
         self._show(0)
 
@@ -95,9 +102,9 @@ class NodeTable:
             for name, column in self._storage.items():
                 self._storage[name] = np.concatenate((column, np.zeros_like(column)))
         self._rows[node_id] = row
-        self.surfaces.append(SurfaceReservoir(self._surface_point_capacity))
         self._show(row + 1)
         self.ids[row] = node_id
+        self.surface_counts[row] = 0
         return row
 
     def put(
@@ -157,14 +164,31 @@ class NodeTable:
                 f"{self.ids[rows[refused]]}, gives one that is not positive definite"
             )
 
+    def surface(self, row: int) -> Float32:
+        """The surface points (k, 3) of a row, metres; a view."""
+        return self.surface_points_world[row, : self.surface_counts[row]]
+
+    def set_surface(self, row: int, points_world: Float32) -> None:
+        """Replace the surface points of a row by a sample of these (k, 3)."""
+        self.surface_counts[row] = 0
+        self.add_surfaces([row], [points_world])
+
+    def add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:
+        """Take surface points (k, 3) into the sample of each of n different rows."""
+        add_points(
+            self.surface_hashes,
+            self.surface_points_world,
+            self.surface_counts,
+            rows,
+            point_sets,
+        )
+
     def remove(self, node_id: int) -> None:
         """Remove a node; the last row takes its place."""
         row, last = self.row(node_id), len(self._rows) - 1
         moved = int(self.ids[last])
         for column in self._storage.values():
             column[row] = column[last]
-        self.surfaces[row] = self.surfaces[last]
-        self.surfaces.pop()
         self._rows[moved] = row
         del self._rows[node_id]
         self._show(last)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.surface import hash_each
 
 if TYPE_CHECKING:
     from deworldsg_ros.scene.graph import SceneGraph
@@ -57,7 +56,7 @@ def state_of(graph: SceneGraph) -> State:
     }
     edges = graph.edges
     frames = graph._frames
-    points = [surface.points_world for surface in nodes.surfaces]
+    points = [nodes.surface(row) for row in range(len(nodes))]
     return {
         "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
         **{name: getattr(nodes, name).copy() for name in _NODE_COLUMNS},
@@ -90,7 +89,7 @@ def graph_of(state: State, source: str, **settings: Any) -> SceneGraph:
     """
     try:
         return _graph_of(state, settings)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+    except (KeyError, ValueError, TypeError, IndexError, MemoryError) as error:
         raise RefusedInput("invalid_graph_file", f"graph file {source}: {error}") from error
 
 
@@ -107,7 +106,7 @@ def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
         **{name: header[name] for name in saved if name in header} | settings,
     )
     nodes = graph.nodes
-    points = hash_each(tuple(_split(state["surface_points"], state["surface_point_counts"])))
+    points = _split(state["surface_points"], state["surface_point_counts"])
     for index, node_id in enumerate(state["ids"].tolist()):
         row = nodes.append(node_id)
         nodes.put(
@@ -118,7 +117,7 @@ def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
             float(state["weights"][index]),
             int(state["observations"][index]),
         )
-        nodes.surfaces[row].add(points[index])
+        nodes.set_surface(row, points[index])
         for name in ("confirmed", "first_seen_ns", "last_seen_ns", "revisions"):
             getattr(nodes, name)[row] = state[name][index]
     for pair, logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(

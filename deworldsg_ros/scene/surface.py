@@ -7,7 +7,8 @@ a point was seen, or on which nodes were merged on the way; and it is a uniform 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 from numba import njit
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 UInt64 = NDArray[np.uint64]
+Int64 = NDArray[np.int64]
 
 # Within this distance points of a surface are of one part of it: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015
@@ -26,102 +28,92 @@ _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
 
 
-class HashedPoints(NamedTuple):
-    """Surface points with their content hashes, in any order.
+NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
 
-    Attributes:
-        hashes: (k,) uint64.
-        points_world: (k, 3) float32, metres.
+
+def add_points(
+    hashes: UInt64,
+    points_world: Float32,
+    counts: Int64,
+    rows: Sequence[int],
+    point_sets: Sequence[Float32],
+) -> None:
+    """Take a set of points (k, 3) into each of n different samples.
+
+    Args:
+        hashes: (S, K) uint64, the content hashes of S samples of at most K points; they ascend
+            strictly.
+        points_world: (S, K, 3) float32, the points, metres.
+        counts: (S,) int64, how many points each sample has.
+        rows: (n,) the samples that take something in.
+        point_sets: n sets of points.
     """
-
-    hashes: UInt64
-    points_world: Float32
-
-
-# A sample is a HashedPoints whose hashes ascend strictly.
-SurfaceSample = HashedPoints
-
-EMPTY_SAMPLE = SurfaceSample(np.zeros(0, np.uint64), np.zeros((0, 3), np.float32))
-
-
-def content_hashes(points: Float32) -> UInt64:
-    """64-bit hash (n,) of each point (n, 3), a function of its float32 values alone."""
-    # Adding zero turns -0.0 into 0.0: equal values hash alike.
-    bits = (np.ascontiguousarray(points, np.float32) + np.float32(0)).view(np.uint32)
-    hashes: UInt64 = _mix(bits)
-    return hashes
+    if not len(point_sets) or not hashes.shape[1]:
+        return
+    points = np.ascontiguousarray(np.concatenate(point_sets), np.float32)
+    _add(
+        hashes,
+        points_world.view(np.uint32),
+        counts,
+        np.array(rows, np.int64),
+        points.view(np.uint32),
+        np.array([0, *accumulate(map(len, point_sets))]),
+    )
 
 
 @njit(cache=True, nogil=True)
-def _mix(bits):  # type: ignore[no-untyped-def]
-    hashes = np.empty(len(bits), np.uint64)
-    for row in range(len(bits)):
-        state = np.uint64(0)
-        for axis in range(3):
-            state = (state ^ np.uint64(bits[row, axis])) + _GOLDEN_GAMMA
-            state = (state ^ (state >> np.uint64(30))) * _MIX_1
-            state = (state ^ (state >> np.uint64(27))) * _MIX_2
-            state ^= state >> np.uint64(31)
-        hashes[row] = state
-    return hashes
-
-
-def hash_each(point_sets: tuple[Float32, ...]) -> list[HashedPoints]:
-    """The hashes of each set of points (k, 3), computed in one pass."""
-    if not point_sets:
-        return []
-    points_world = np.concatenate(point_sets)
-    hashes = content_hashes(points_world)
-    stops = np.cumsum([len(points) for points in point_sets]).tolist()
-    return [
-        HashedPoints(hashes[start:stop], points_world[start:stop])
-        for start, stop in zip([0, *stops], stops)
-    ]
-
-
-def merge_samples(sample: SurfaceSample, points: HashedPoints, capacity: int) -> SurfaceSample:
-    """The sample of the union of a sample and more points, or another sample.
-
-    Between samples it is commutative, associative and idempotent. The points are copied: views
-    would keep the arrays of whole frames alive.
-    """
-    if capacity == 0:
-        return EMPTY_SAMPLE
-    return SurfaceSample(*_union(*sample, *points, capacity))
+def _hash(bits):  # type: ignore[no-untyped-def]
+    """64-bit hash of a point, a function of its three float32 values alone."""
+    state = np.uint64(0)
+    for axis in range(3):
+        # Equal values hash alike, and -0.0 is 0.0.
+        value = np.uint64(0) if bits[axis] == 0x80000000 else np.uint64(bits[axis])
+        state = (state ^ value) + _GOLDEN_GAMMA
+        state = (state ^ (state >> np.uint64(30))) * _MIX_1
+        state = (state ^ (state >> np.uint64(27))) * _MIX_2
+        state ^= state >> np.uint64(31)
+    return state
 
 
 @njit(cache=True, nogil=True)
-def _union(hashes, points, new_hashes, new_points, capacity):  # type: ignore[no-untyped-def]
-    full = len(hashes) >= capacity
-    # Of most frames nothing enters a sample that is full.
-    entering = np.empty(len(new_hashes), np.int64)
-    entering_count = 0
-    for row in range(len(new_hashes)):
-        entering[entering_count] = row
-        entering_count += int(not full or new_hashes[row] < hashes[-1])
-    if entering_count == 0:
-        return hashes, points
-    entering = entering[:entering_count]
-    order = entering[np.argsort(new_hashes[entering])]
-
-    size = min(capacity, len(hashes) + entering_count)
-    all_hashes = np.empty(size, np.uint64)
-    all_points = np.empty((size, 3), np.float32)
-    kept = old = new = 0
-    while kept < size and (old < len(hashes) or new < entering_count):
-        if new == entering_count or (old < len(hashes) and hashes[old] <= new_hashes[order[new]]):
-            all_hashes[kept] = hashes[old]
+def _add(hashes, bits, counts, rows, new_bits, starts):  # type: ignore[no-untyped-def]
+    capacity = hashes.shape[1]
+    all_hashes = np.empty(capacity, np.uint64)
+    all_bits = np.empty((capacity, 3), np.uint32)
+    entering = np.empty(len(new_bits), np.int64)
+    entering_hashes = np.empty(len(new_bits), np.uint64)
+    for index in range(len(rows)):
+        row = rows[index]
+        known = counts[row]
+        # Of most frames nothing enters a sample that is full.
+        count = 0
+        for place in range(starts[index], starts[index + 1]):
+            entering[count] = place
+            entering_hashes[count] = _hash(new_bits[place])
+            count += int(known < capacity or entering_hashes[count] < hashes[row, known - 1])
+        if count == 0:
+            continue
+        order = np.argsort(entering_hashes[:count])
+        size = min(capacity, known + count)
+        kept = old = new = 0
+        while kept < size and (old < known or new < count):
+            if new == count or (old < known and hashes[row, old] <= entering_hashes[order[new]]):
+                all_hashes[kept] = hashes[row, old]
+                for axis in range(3):
+                    all_bits[kept, axis] = bits[row, old, axis]
+                old += 1
+            else:
+                all_hashes[kept] = entering_hashes[order[new]]
+                for axis in range(3):
+                    all_bits[kept, axis] = new_bits[entering[order[new]], axis]
+                new += 1
+            # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
+            kept += int(kept == 0 or all_hashes[kept] != all_hashes[kept - 1])
+        counts[row] = kept
+        for place in range(kept):
+            hashes[row, place] = all_hashes[place]
             for axis in range(3):
-                all_points[kept, axis] = points[old, axis]
-            old += 1
-        else:
-            all_hashes[kept] = new_hashes[order[new]]
-            for axis in range(3):
-                all_points[kept, axis] = new_points[order[new], axis]
-            new += 1
-        # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
-        kept += int(kept == 0 or all_hashes[kept] != all_hashes[kept - 1])
-    return all_hashes[:kept], all_points[:kept]
+                bits[row, place, axis] = all_bits[place, axis]
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
@@ -154,26 +146,3 @@ def _neighbours(points, radius):  # type: ignore[no-untyped-def]
                 counts[a] += 1.0
                 counts[b] += 1.0
     return counts
-
-
-class SurfaceReservoir:
-    """A surface sample that grows: at all times that of all points added, in whatever order."""
-
-    __slots__ = ("_capacity", "sample")
-
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self.sample = EMPTY_SAMPLE
-
-    def add(self, points: HashedPoints) -> None:
-        """Take in points, which may be those of another sample."""
-        self.sample = merge_samples(self.sample, points, self._capacity)
-
-    @property
-    def points_world(self) -> Float32:
-        """(k, 3) float32, metres; in the sample's order."""
-        return self.sample.points_world
-
-    def some_points(self, count: int) -> Float32:
-        """As many points (k, 3) of the surface, or all."""
-        return self.sample.points_world[:count]
