@@ -17,7 +17,12 @@ from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.relations.consistency import Consistency
-from deworldsg_ros.relations.evidence import FusedEdges, choose_directions, fuse_edges
+from deworldsg_ros.relations.evidence import (
+    PROVENANCES,
+    FusedEdges,
+    choose_directions,
+    fuse_edges,
+)
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import storage, wire
 from deworldsg_ros.scene.camera import Float64, check_pose
@@ -48,6 +53,8 @@ class GraphBuilder:
         self.graph = SceneGraph(vocabulary, frame_id, **_graph_settings(config.merging))
         self.prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         self._consistency = Consistency(vocabulary.predicates)
+        # Of each pair what its edge was last made of, and the edge.
+        self._edges: dict[Pair, tuple[tuple[int, ...], wire.EdgeState | None]] = {}
         self._newest_ns: int | None = None
         # Newest stamp of the map that this goes on with; frames to come may be older.
         self._map_ns = 0
@@ -200,9 +207,42 @@ class GraphBuilder:
         )
 
     def _edge_states(self, pairs: Sequence[Pair]) -> list[wire.EdgeState]:
-        """Messages of the edges of which something is believed (Eq. 9-10)."""
+        """Messages of the edges of which something is believed; those that stay are the same."""
+        bases = self._bases_of(pairs)
+        stale = [
+            pair
+            for pair, basis in bases.items()
+            if pair not in self._edges or self._edges[pair][0] != basis
+        ]
+        made = self._make_edges(stale)
+        self._edges = {
+            pair: (basis, made[pair] if pair in made else self._edges[pair][1])
+            for pair, basis in bases.items()
+        }
+        return [state for _, state in self._edges.values() if state is not None]
+
+    def _bases_of(self, pairs: Sequence[Pair]) -> dict[Pair, tuple[int, ...]]:
+        """What each edge is made of, by revisions: evidence, classes, priors, of both directions.
+
+        Both directions, because the one has a say in what is told of the other.
+        """
         if not pairs:
-            return []
+            return {}
+        edges = self.graph.edges
+        classes = self._classes_of(pairs)
+        there, back = self.prior.revisions(classes), self.prior.revisions(classes[:, ::-1])
+        priors = np.column_stack([classes, there, back]).tolist()
+        reverse = [edges.get((object_, subject)) for subject, object_ in pairs]
+        return {
+            pair: (edges[pair].revision, other.revision if other else 0, *prior)
+            for pair, other, prior in zip(pairs, reverse, priors)
+        }
+
+    def _make_edges(self, pairs: Sequence[Pair]) -> dict[Pair, wire.EdgeState | None]:
+        """Messages of edges (Eq. 9-10); None where nothing is believed."""
+        made: dict[Pair, wire.EdgeState | None] = dict.fromkeys(pairs)
+        if not pairs:
+            return made
         evidence = [self.graph.edges[pair] for pair in pairs]
         logits = np.array([item.visual_logits for item in evidence])
         has_visual = np.array([item.frames > 0 for item in evidence])
@@ -221,10 +261,9 @@ class GraphBuilder:
         chosen = choose_directions(
             [pairs[row] for row in known.tolist()], has_visual[known], fused.probabilities[known]
         )
-        return [
-            self._edge_state(pairs[row], evidence[row], fused, row)
-            for row in known[chosen].tolist()
-        ]
+        for row in known[chosen].tolist():
+            made[pairs[row]] = self._edge_state(pairs[row], evidence[row], fused, row)
+        return made
 
     def _classes_of(self, pairs: Sequence[Pair]) -> np.ndarray:
         """Arg-max classes of the ends of each pair, (E, 2) int64."""
@@ -246,7 +285,7 @@ class GraphBuilder:
             predicate=beliefs[0].label,
             probability=beliefs[0].probability,
             predicates=beliefs,
-            provenance=fused.provenances()[row],
+            provenance=PROVENANCES[fused.provenance_codes[row]],
             entropy_nats=float(fused.entropies_nats[row]),
             observations=evidence.frames,
         )

@@ -6,21 +6,14 @@ import json
 import math
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.config import Config
-from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.perception.vocabularies import PREDICATE_SETS, REPLICA_SSG_PREDICATES
 from deworldsg_ros.relations.consistency import ORDERS, Consistency, contradictions
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_edges, visual_distribution
-from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.scene.wire import SceneGraphMessage
 
 PREDICATES = ("near", "on", "in", "above", "under", "with", "flurbs")
 NEAR, ON, IN, ABOVE, UNDER, WITH, FLURBS = range(7)
@@ -241,53 +234,6 @@ def test_a_predicate_that_goes_with_nothing_has_no_chance():
 def test_no_edges():
     after, _ = reconciled([], [])
     assert after.shape == (0, WIDTH)
-
-
-def builder_of_two(consistent: bool = True) -> GraphBuilder:
-    config = Config()
-    relations = msgspec.structs.replace(config.relations, consistent_directions=consistent)
-    config = msgspec.structs.replace(config, relations=relations)
-    builder = GraphBuilder(config, Vocabulary(("cup",), PREDICATES), "map")
-    for x_m in (0.0, 1.0):
-        builder.graph.add_node(np.array([x_m, 0, 0]), np.eye(3) * 1e-3, np.ones(1), 1)
-    return builder
-
-
-def stated(message: SceneGraphMessage) -> dict[tuple[int, int], tuple[str, float]]:
-    return {
-        (edge.subject, edge.object): (edge.predicate, round(edge.probability, 3))
-        for edge in message.edges
-    }
-
-
-def see(graph: SceneGraph, subject: int, object_: int, **certainties: float) -> None:
-    graph.add_visual(subject, object_, logits_of(**certainties), 1)
-
-
-def test_what_one_direction_learns_changes_the_other_in_the_updates() -> None:
-    builder, replica = builder_of_two(), GraphReplica()
-    seen = [(1, 2, {"on": 30, "near": 10}), (2, 1, {"on": 30, "near": 11}), (2, 1, {"on": 30})]
-    wanted = [
-        {(1, 2): ("on", 1.0)},
-        {(1, 2): ("on", 0.731), (2, 1): ("near", 0.731)},
-        {(1, 2): ("near", 1.0), (2, 1): ("on", 1.0)},
-    ]
-    for (subject, object_, certainties), edges in zip(seen, wanted):
-        see(builder.graph, subject, object_, **certainties)
-        update = builder.update()
-        assert update is not None
-        assert {(edge.subject, edge.object) for edge in update.edges} == set(edges)
-        replica.apply(update)
-        assert stated(builder.snapshot()) == edges
-        assert list(replica.edges.values()) == builder.snapshot().edges
-        assert builder.full().edges == builder.snapshot().edges
-
-
-def test_without_the_switch_each_direction_stands_alone() -> None:
-    builder = builder_of_two(consistent=False)
-    see(builder.graph, 1, 2, on=30)
-    see(builder.graph, 2, 1, on=30)
-    assert stated(builder.full()) == {(1, 2): ("on", 1.0), (2, 1): ("on", 1.0)}
 
 
 def test_the_gate_looks_at_each_direction_for_itself() -> None:

@@ -1,0 +1,126 @@
+"""The edges that are told: only those are made anew of which something changed."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.scene.wire import SceneGraphMessage
+
+VOCABULARY = Vocabulary(("cup", "table", "chair"), ("near", "on", "above", "under"))
+
+
+def builder_of(nodes: int, consistent: bool = True) -> GraphBuilder:
+    config = Config()
+    relations = msgspec.structs.replace(config.relations, consistent_directions=consistent)
+    builder = GraphBuilder(msgspec.structs.replace(config, relations=relations), VOCABULARY, "map")
+    for place in range(nodes):
+        add_node(builder, float(place))
+    return builder
+
+
+def add_node(builder: GraphBuilder, x_m: float, confirmed: bool = True) -> None:
+    classes = np.roll([0.6, 0.3, 0.1], int(x_m))
+    builder.graph.add_node(np.array([x_m, 0, 0]), np.eye(3) * 1e-3, classes, 1, confirmed=confirmed)
+
+
+def see(builder: GraphBuilder, subject: int, object_: int, **certainties: float) -> None:
+    logits = [certainties.get(name, 0.0) for name in VOCABULARY.predicates]
+    builder.graph.add_visual(subject, object_, np.array(logits), 1)
+
+
+def stated(message: SceneGraphMessage) -> dict[tuple[int, int], tuple[str, float]]:
+    return {
+        (edge.subject, edge.object): (edge.predicate, round(edge.probability, 3))
+        for edge in message.edges
+    }
+
+
+def test_what_one_direction_learns_changes_the_other_in_the_updates() -> None:
+    builder, replica = builder_of(2), GraphReplica()
+    seen = [(1, 2, {"on": 30, "near": 10}), (2, 1, {"on": 30, "near": 11}), (2, 1, {"on": 30})]
+    wanted = [
+        {(1, 2): ("on", 1.0)},
+        {(1, 2): ("on", 0.731), (2, 1): ("near", 0.731)},
+        {(1, 2): ("near", 1.0), (2, 1): ("on", 1.0)},
+    ]
+    for (subject, object_, certainties), edges in zip(seen, wanted):
+        see(builder, subject, object_, **certainties)
+        update = builder.update()
+        assert update is not None
+        assert {(edge.subject, edge.object) for edge in update.edges} == set(edges)
+        replica.apply(update)
+        assert stated(builder.snapshot()) == edges
+        assert list(replica.edges.values()) == builder.snapshot().edges
+
+
+def test_without_the_switch_each_direction_stands_alone() -> None:
+    builder = builder_of(2, consistent=False)
+    see(builder, 1, 2, on=30)
+    see(builder, 2, 1, on=30)
+    assert stated(builder.full()) == {(1, 2): ("on", 1.0), (2, 1): ("on", 1.0)}
+
+
+def test_an_edge_that_stays_is_the_same() -> None:
+    builder = builder_of(4)
+    see(builder, 1, 2, on=3)
+    see(builder, 3, 4, on=3)
+    before = builder.full().edges
+    see(builder, 3, 4, near=1)
+    after = builder.full().edges
+    assert after[0] is before[0] and after[1] is not before[1]
+
+
+def change(builder: GraphBuilder, generator: np.random.Generator) -> None:
+    """Anything that may change an edge, at random."""
+    graph = builder.graph
+    one, other = generator.choice(graph.nodes.ids, 2, replace=False).tolist()
+    kind = generator.choice(
+        ["see", "near", "predict", "observe", "confirm", "merge", "remove", "move", "add"],
+        p=[0.2, 0.2, 0.3, 0.1, 0.04, 0.04, 0.04, 0.04, 0.04],
+    )
+    if kind == "see":
+        graph.add_visual(one, other, generator.normal(0, 3, 4), 1)
+    elif kind == "near":
+        graph.add_neighbour(one, other, 1)
+        graph.add_neighbour(other, one, 1)
+    elif kind == "predict":
+        builder.prior.update(generator.integers(0, 3, (1, 2)), generator.dirichlet(np.ones(4), 1))
+    elif kind == "observe":
+        graph.observe(one, np.zeros(3), np.eye(3), generator.dirichlet(np.ones(3)), 2)
+    elif kind == "confirm":
+        graph.set_confirmed(one, bool(generator.integers(2)))
+    elif kind == "add" or len(graph) < 4:
+        add_node(builder, float(generator.integers(9)), bool(generator.integers(2)))
+    elif kind == "merge":
+        graph.merge_nodes(one, other)
+    elif kind == "remove":
+        graph.remove_node(one)
+    else:
+        graph.take_over(*sorted((one, other)))
+
+
+@pytest.mark.parametrize("consistent", [True, False])
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_edges_are_what_a_builder_without_a_past_makes_of_the_graph(
+    consistent: bool, seed: int
+) -> None:
+    builder, replica = builder_of(6, consistent), GraphReplica()
+    generator = np.random.default_rng(seed)
+    for _ in range(40):
+        change(builder, generator)
+        update = builder.update()
+        if update is not None:
+            replica.apply(update)
+        fresh = builder_of(0, consistent)
+        fresh.graph, fresh.prior = builder.graph, builder.prior
+        assert builder.full().edges == fresh.full().edges
+        assert replica.edges == {(e.subject, e.object): e for e in fresh.full().edges}
