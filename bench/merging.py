@@ -179,6 +179,7 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     graph = graph_of(world)
     config = MergingConfig(association=association)
     merging = build_merging(config)
+    merging.restore(graph, {})
     for local in frames:
         merging.merge(graph, local)
     held, peak = tracemalloc.get_traced_memory()
@@ -186,6 +187,7 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     graph = graph_of(world)
     before = len(graph)
     merging = build_merging(config)
+    merging.restore(graph, {})
     times = [milliseconds(lambda frame=local: merging.merge(graph, frame)) for local in frames]
     after = len(graph)
     dense = count**2 * PREDICATES * 8
