@@ -10,7 +10,8 @@ from test_merging_surface import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
-from deworldsg_ros.merging.absence import SAMPLED_POINTS, SeenThrough
+from deworldsg_ros.merging.absence import HALF, LITTLE, SAMPLED_POINTS, UNSEEN, SeenThrough
+from deworldsg_ros.merging.absence import WHOLE as ALL
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.graph import SceneGraph
@@ -80,6 +81,8 @@ def test_what_was_all_that_was_known_goes_for_good_when_its_time_is_over() -> No
 
 
 def test_an_object_that_is_there_but_not_detected_stays(scene) -> None:
+    for _ in range(8):
+        scene.see((WHOLE, TABLE), (HERE, CUP))
     for _ in range(50):
         scene.see((WHOLE, TABLE), grid=depth_grid(HERE))
     assert scene.told() == {1: "table", 2: "cup"}
@@ -164,22 +167,40 @@ def watched(points: np.ndarray, enough_frames: int = 1) -> SeenThrough:
     return through
 
 
-@pytest.mark.parametrize(("z_m", "gone", "missed"), [(0.7, [0], []), (1.0, [], [0]), (1.5, [], [])])
-def test_points_before_on_and_behind_what_was_measured(z_m, gone, missed) -> None:
+def look(through: SeenThrough, seen: list[int], background_m: float = WALL_M):
+    """Who is gone, and how much of owner 0 is in view."""
+    gone, views = through.look(np.eye(4), depth_grid(background_m=background_m), seen)
+    return gone, views[0]
+
+
+@pytest.mark.parametrize(
+    ("z_m", "gone", "view"), [(0.7, [0], UNSEEN), (1.0, [], ALL), (1.5, [], UNSEEN)]
+)
+def test_points_before_on_and_behind_what_was_measured(z_m, gone, view) -> None:
     points = np.stack([np.linspace(-0.2, 0.2, 10), np.zeros(10), np.full(10, z_m)], axis=1)
-    assert watched(points).look(np.eye(4), depth_grid(), []) == (gone, missed)
-    assert watched(points).look(np.eye(4), depth_grid(), [0]) == ([], [])
-    assert watched(points[:0]).look(np.eye(4), depth_grid(), []) == ([], [])
+    assert look(watched(points), []) == (gone, view)
+    assert look(watched(points), [0]) == ([], view)
+    assert look(watched(points[:0]), []) == ([], UNSEEN)
 
 
-def test_what_the_image_cuts_is_there_but_not_in_full_view() -> None:
+@pytest.mark.parametrize(
+    ("left_m", "view"), [(-1.0, ALL), (-1.7, HALF), (-2.4, LITTLE), (-2.8, UNSEEN)]
+)
+def test_what_the_image_cuts_is_in_view_in_part(left_m, view) -> None:
+    # The image ends at 1.07 m to the left.
+    x_m = np.linspace(left_m, left_m + 2, 40)
+    points = np.stack([x_m, np.zeros(40), np.full(40, WALL_M)], axis=1)
+    assert look(watched(points), []) == ([], view)
+
+
+def test_what_the_image_cuts_is_there_or_seen_through() -> None:
     # The image ends at 1.07 m to the left, and nearer to the camera sooner.
     points = np.stack([np.linspace(-1.4, 0.6, 10), np.zeros(10), np.full(10, WALL_M)], axis=1)
     through = watched(points, enough_frames=2)
-    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([], [])
-    assert through.look(np.eye(4), depth_grid(), []) == ([], [])
-    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([], [])
-    assert through.look(np.eye(4), depth_grid(background_m=3.0), []) == ([0], [])
+    assert look(through, [], background_m=3.0) == ([], UNSEEN)
+    assert look(through, []) == ([], HALF)
+    assert look(through, [], background_m=3.0) == ([], UNSEEN)
+    assert look(through, [], background_m=3.0) == ([0], UNSEEN)
 
 
 @given(seeds)

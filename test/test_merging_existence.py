@@ -12,6 +12,9 @@ from test_merging_surface import CUP, frame
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.merging.absence import HALF, LITTLE
+from deworldsg_ros.merging.absence import WHOLE as ALL
+from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.scene.graph import SceneGraph
 
 STEP_M = 0.05  # 4 degrees, seen from the cup
@@ -26,8 +29,16 @@ class Walk:
         self.stamp = 0
         self.x_m = 0.0
 
-    def see(self, *, found: bool, step_m: float = STEP_M, z_m: float = 0.0, score: float = 0.9):
-        """One frame in which the cup is there, detected or not."""
+    def see(
+        self,
+        *,
+        found: bool,
+        step_m: float = STEP_M,
+        z_m: float = 0.0,
+        score: float = 0.9,
+        part: np.ndarray = HERE,
+    ):
+        """One frame in which the cup is there, detected (as this part of it) or not."""
         self.stamp += 1
         self.x_m += step_m
         pose = np.eye(4)
@@ -38,7 +49,7 @@ class Walk:
         changes = {"T_world_camera": pose, "depth_grid": grid}
         if found:
             changes["scores"] = np.array([score])
-        objects = [(HERE, CUP)] if found else []
+        objects = [(part, CUP)] if found else []
         self.merging.merge(self.graph, frame(self.stamp, *objects, **changes))
 
     def reload(self, path: Path) -> None:
@@ -121,13 +132,88 @@ def test_what_is_in_doubt_keeps_its_id_however_long_it_is_not_seen():
 )
 def test_what_need_not_be_detected_stays(frames, step_m, z_m):
     walk = Walk()
-    for _ in range(6):
+    for _ in range(11):
         walk.see(found=True, step_m=0.0)
     for _ in range(frames):
         walk.see(found=False, step_m=step_m, z_m=z_m)
         if z_m:
             walk.x_m += 0.02
     assert walk.told == [1]
+
+
+@pytest.mark.parametrize(("found", "told"), [(10, []), (11, [1])])
+def test_what_was_found_for_a_moment_only_is_no_object_when_missed_since(found, told):
+    walk = Walk()
+    for _ in range(found):
+        walk.see(found=True, step_m=0.02)
+    for _ in range(4):
+        walk.see(found=False, step_m=0.02)
+    assert walk.told == [1]  # one look in two finds an object: 4 may miss it, but not 5
+    walk.see(found=False, step_m=0.02)
+    assert walk.told == told
+    walk.see(found=True, step_m=0.02)
+    assert walk.told == [1]
+
+
+def test_a_camera_that_stands_waits_for_an_error_to_come_again():
+    walk = Walk()
+    for _ in range(5):
+        walk.see(found=True, step_m=0.0)
+    for _ in range(20):
+        walk.see(found=False, step_m=0.0)
+    assert walk.told == [1]
+    for _ in range(10):
+        walk.see(found=False, step_m=0.0)
+    assert walk.told == [] and walk.graph.nodes.ids.tolist() == [1]
+
+
+def test_a_second_error_at_one_place_is_for_a_moment_too():
+    walk = Walk()
+    for _ in range(2):
+        for _ in range(5):
+            walk.see(found=True, step_m=0.02)
+        for _ in range(5):
+            walk.see(found=False, step_m=0.02)
+        assert walk.told == []
+
+
+def looked(existence: Existence, owner: int, stamp: int, view: int | None) -> list[int]:
+    """Another look at an owner, which finds it (None) or misses it in a view; who is in doubt."""
+    camera_world, means_world = np.array([0.1 * stamp, 0, 0]), np.array([[0.1 * stamp, 0, 1.0]])
+    if view is not None:
+        views = np.array([view])
+        return existence.missed([owner], views, means_world, camera_world, stamp * 10**8)
+    existence.detected([owner], means_world, np.ones(1), camera_world, stamp * 10**8)
+    existence.viewed([owner], np.array([ALL]))
+    return []
+
+
+@pytest.mark.parametrize(("view", "looks"), [(ALL, 2), (HALF, 5), (LITTLE, 5)])
+def test_where_objects_are_found_in_almost_every_look_fewer_misses_tell(view, looks):
+    existence = Existence(MergingConfig())
+    for stamp in range(50):
+        looked(existence, 0, stamp, None)
+    for stamp in range(50, 55):
+        looked(existence, 1, stamp, None)
+    missed = [looked(existence, 1, 55 + index, view) for index in range(looks)]
+    assert missed == [[]] * (looks - 1) + [[1]]
+
+
+def test_what_is_in_doubt_and_merged_into_what_was_never_sure_does_not_expire():
+    walk = Walk(expire_tentative_s=2.0)
+    left, right = (HERE[np.abs(HERE[:, 0] - x_m) < 0.01] for x_m in (0.26, 0.34))
+    walk.see(found=True, part=left, score=0.3)
+    for _ in range(3):
+        walk.see(found=True, part=right)
+    assert walk.told == [2]
+    for _ in range(12):
+        walk.see(found=False, step_m=0.02)
+    for _ in range(3):
+        walk.see(found=True, step_m=0.0)
+    assert walk.told == [] and walk.graph.nodes.ids.tolist() == [1]
+    for _ in range(25):
+        walk.see(found=False, step_m=0.0)
+    assert walk.graph.nodes.ids.tolist() == [1]
 
 
 def test_a_rate_of_zero_turns_it_off():

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.frame_graph import DepthGrid, Float64
+from deworldsg_ros.scene.frame_graph import DepthGrid, Float64, Int64
 from deworldsg_ros.scene.nodes import NodeTable
 
 # A surface this far, and this share of its depth, in front of what was measured was seen through:
@@ -20,8 +20,12 @@ MIN_VISIBLE_POINTS = 6
 MIN_VISIBLE_SHARE = 0.5
 # This share of the visible points has to be seen through, or to be there.
 DECISIVE_SHARE = 0.7
-# A node with this share of its points in the image is in full view of the camera.
+# A node with this share of its points in the image is in full view of the camera; one of which less
+# than this is visible is not in view.
 WHOLE_SHARE = 0.9
+LEAST_SHARE = 0.25
+# How much of a node is in view: nothing, less than half of it, half, or all.
+VIEWS = UNSEEN, LITTLE, HALF, WHOLE = range(4)
 # Nearer than this nothing is measured.
 NEAR_M = 0.1
 # Surface points of a node that the depth image is compared with.
@@ -71,14 +75,14 @@ class SeenThrough:
 
     def look(
         self, T_world_camera: Float64, grid: DepthGrid, seen: list[int]
-    ) -> tuple[list[int], list[int]]:
+    ) -> tuple[list[int], Int64]:
         """Take in one frame, in which some owners were seen.
 
         Returns:
-            The owners that are gone, and those that were there in full view but not seen.
+            The owners that are gone, and by owner how much of it is there in view.
         """
         camera = grid.intrinsics
-        gone, missed = _look(
+        gone, views = _look(
             self._points_world,
             self._point_counts,
             self._balls_world,
@@ -93,7 +97,7 @@ class SeenThrough:
             camera.cx,
             camera.cy,
         )
-        return gone.tolist(), missed.tolist()
+        return gone.tolist(), views
 
 
 @njit(cache=True, nogil=True)
@@ -164,16 +168,16 @@ def _look(  # type: ignore[no-untyped-def]
             found[owner] = True
             frames[owner] = 0
     gone = np.zeros(len(points), np.bool_)
-    missed = np.zeros(len(points), np.bool_)
+    views = np.full(len(points), UNSEEN)
     rows, columns = depth_mm.shape
     for node in range(len(points)):
         gone[node] = 0 < enough_frames <= frames[node]
-        if found[node] or _beside_view(
+        if _beside_view(
             balls[node], T_camera_world, columns * stride, rows * stride, fx, fy, cx, cy
         ):
             continue
         through = there = inside = 0
-        most_hidden = (1.0 - MIN_VISIBLE_SHARE) * counts[node]
+        most_hidden = (1.0 - LEAST_SHARE) * counts[node]
         for index in range(counts[node]):
             # Of a node that is too little visible the rest of the points tell nothing.
             if index - through - there > most_hidden:
@@ -200,13 +204,16 @@ def _look(  # type: ignore[no-untyped-def]
             elif measured_m > z - tolerance_m:
                 there += 1
         visible = through + there
-        if visible < MIN_VISIBLE_POINTS or visible < MIN_VISIBLE_SHARE * counts[node]:
+        if visible < MIN_VISIBLE_POINTS or visible < LEAST_SHARE * counts[node]:
             continue
-        if through >= DECISIVE_SHARE * visible:
+        half = visible >= MIN_VISIBLE_SHARE * counts[node]
+        if there >= DECISIVE_SHARE * visible:
+            views[node] = LITTLE
+            if half:
+                views[node] = WHOLE if inside >= WHOLE_SHARE * counts[node] else HALF
+                frames[node] = 0
+                gone[node] = False
+        elif half and through >= DECISIVE_SHARE * visible and not found[node]:
             frames[node] += 1
             gone[node] = 0 < enough_frames <= frames[node]
-        if there >= DECISIVE_SHARE * visible:
-            frames[node] = 0
-            gone[node] = False
-            missed[node] = inside >= WHOLE_SHARE * counts[node]
-    return np.flatnonzero(gone), np.flatnonzero(missed)
+    return np.flatnonzero(gone), views

@@ -22,7 +22,7 @@ from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
 from deworldsg_ros.merging.voxel_map import CellSets, VoxelMap
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
+from deworldsg_ros.scene.frame_graph import DepthGrid, Int64, LocalGraph
 from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.nodes import NodeTable
@@ -113,6 +113,7 @@ class SurfaceMerging:
             "masks": np.concatenate([np.zeros(0, np.uint64), *(cells.masks for cells in sets)]),
             "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
             "existence": self._existence.records(owners),
+            "looks_by_view": self._existence.by_view,
             "joint": np.array(pairs, np.int64).reshape(-1, 3),
         }
 
@@ -131,7 +132,8 @@ class SurfaceMerging:
             return
         kept = [row for row, node_id in enumerate(memory["node_ids"]) if node_id in owner_of]
         owners = [owner_of[node_id] for node_id in memory["node_ids"][kept].tolist()]
-        self._existence.restore(owners, memory["existence"][kept])
+        records = memory["existence"][kept]
+        self._existence.restore(owners, records, memory["looks_by_view"])
         counts = memory["block_counts"]
         stops = np.cumsum(counts)
         for owner, row in zip(owners, kept):
@@ -238,18 +240,24 @@ class SurfaceMerging:
         rows = [graph.nodes.row(self._owners.node(owner)) for owner in changed]
         self._through.renew(changed, graph.nodes, rows)
         self._changed = seen
-        gone, missed = self._through.look(local.T_world_camera, local.depth_grid, list(seen))
-        self._doubt(graph, missed, local.T_world_camera[:3, 3])
+        gone, views = self._through.look(local.T_world_camera, local.depth_grid, list(seen))
+        in_view = np.flatnonzero(views).tolist()
+        found = [owner for owner in in_view if owner in seen]
+        self._existence.viewed(found, views[found])
+        self._doubt(graph, local, [owner for owner in in_view if owner not in seen], views)
         for owner in gone:
             # Of two that are gone, the one may just have become the other.
             if self._owners.node(owner):
                 self._lose(graph, self._owners.node(owner), local.stamp_ns)
 
-    def _doubt(self, graph: SceneGraph, missed: list[int], camera_world: Float64) -> None:
-        """Hide the nodes that the detector fails to find although they are in full view."""
+    def _doubt(self, graph: SceneGraph, local: LocalGraph, missed: list[int], views: Int64) -> None:
+        """Hide the nodes that the detector fails to find although they are in view."""
         node_ids = [self._owners.node(owner) for owner in missed]
         rows = [graph.nodes.row(node_id) for node_id in node_ids]
-        for owner in self._existence.missed(missed, graph.nodes.means[rows], camera_world):
+        camera_world = local.T_world_camera[:3, 3]
+        for owner in self._existence.missed(
+            missed, views[missed], graph.nodes.means[rows], camera_world, local.stamp_ns
+        ):
             node_id = self._owners.node(owner)
             if graph.nodes.confirmed[graph.nodes.row(node_id)]:
                 graph.set_confirmed(node_id, False)
@@ -282,6 +290,8 @@ class SurfaceMerging:
             kept = self._owner(kept_id)
             gone_id = b_id if kept_id == a_id else a_id
             self._existence.merge(kept, self._owner(gone_id))
+            if gone_id in self._doubted and not graph.nodes.confirmed[graph.nodes.row(kept_id)]:
+                self._doubted.add(kept_id)
             self._joint.merge(kept, self._owner(gone_id))
             cells = self._free(gone_id)
             self._map.add([kept], cells)
