@@ -3,6 +3,7 @@
 from deworldsg_ros.relations.clip_policy import ClipPolicy
 from deworldsg_ros.relations.clip_queue import ClipQueue
 from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, union_box
+from deworldsg_ros.relations.consistency import Consistency, contradictions
 from deworldsg_ros.relations.evidence import (
     ClassPairPrior,
     FusedEdge,
@@ -31,6 +32,7 @@ __all__ = [
     "ClipPolicy",
     "ClipQueue",
     "ClipRequest",
+    "Consistency",
     "EvidenceWorker",
     "FrameBuffer",
     "FusedEdge",
@@ -46,6 +48,7 @@ __all__ = [
     "WorldModel",
     "build_world_model",
     "choose_directions",
+    "contradictions",
     "crop_clip",
     "entropy_nats",
     "fuse_distributions",
