@@ -169,6 +169,9 @@ def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart
     uncorrected = SceneGraph(VOCABULARY, "world")
     split_after_one_mask_over_two(uncorrected, contest_cells=False)
     assert means[0] < uncorrected.nodes.means[0, 0] - 0.005
+    # Of its surface nothing is left that lies on the other, but for a border of two cells.
+    assert graph.nodes.surface(0)[:, 0].max() < 2 * CONFIG.cell_m
+    assert uncorrected.nodes.surface(0)[:, 0].max() > 0.1
 
 
 def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:

@@ -46,6 +46,22 @@ def random_points(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 @given(seeds)
+@settings(max_examples=20)
+def test_an_owner_holds_the_points_that_lie_in_its_cells(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    surfaces = VoxelMap(CELL_M)
+    known = [random_points(rng, 20) for _ in range(2)]
+    surfaces.add([0, 1], surfaces.cells_of(known))
+    asked = random_points(rng, 40)
+    for owner in (0, 1):
+        cells = cells_of(known[owner])
+        expected = [tuple(c) in cells for c in np.floor(asked.astype(np.float64) / CELL_M)]
+        assert surfaces.holds(owner, asked).tolist() == expected
+        assert surfaces.holds(owner, known[owner]).all()
+    assert not surfaces.holds(0, np.full((1, 3), 1e6, np.float32)).any()
+
+
+@given(seeds)
 @settings(max_examples=30)
 def test_shares_equal_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)

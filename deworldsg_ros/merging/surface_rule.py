@@ -171,7 +171,9 @@ class SurfaceMerging:
         A Gaussian with so much of another object in it is worth less than those to come.
         """
         for owner, share in self._map.contest(owners, cells, CONTESTED_SHARE).items():
-            graph.discount(self._owners.node(owner), 1.0 - share)
+            node_id = self._owners.node(owner)
+            points = graph.nodes.surface(graph.nodes.row(node_id))
+            graph.correct(node_id, 1.0 - share, points[self._map.holds(owner, points)])
 
     def _place(
         self, graph: SceneGraph, local: LocalGraph, cells: CellSets, owners: list[int]

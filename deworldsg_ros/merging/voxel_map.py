@@ -20,6 +20,7 @@ Int32 = NDArray[np.int32]
 UInt64 = NDArray[np.uint64]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 # An owner of fewer cells than this says too little by lying within a set.
 MIN_REVERSE_CELLS = 4
@@ -165,6 +166,11 @@ class VoxelMap:
         shares = lost[losers] / (lost[losers] + self._counts[losers])
         return dict(zip(losers.tolist(), shares.tolist()))
 
+    def holds(self, owner: int, points: Float32) -> Bool:
+        """Which of the points (k, 3), metres, lie in cells of an owner, (k,)."""
+        held: Bool = _holds(self._keys, self._masks, self._owners, owner, points, self.cell_m)
+        return held
+
     def remove(self, owner: int) -> CellSets:
         """Forget an owner; returns the cells it had, as one set."""
         cells = self.cells(owner)
@@ -234,6 +240,33 @@ def _grown(mask):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _cell_of(point, cells_per_m):  # type: ignore[no-untyped-def]
+    """Block and bit of the cell of a point; block -1 where it is too far away."""
+    block = np.int64(0)
+    bit = np.int64(0)
+    inside = True
+    for axis in range(3):
+        step = np.int64(np.floor(np.float64(point[axis]) * cells_per_m)) + _BIAS
+        inside = bool(inside and 0 <= step < 2 * _BIAS)
+        block = (block << 21) | (step >> 2)
+        bit = (bit << 2) | (step & 3)
+    return (block if inside else np.int64(-1)), np.uint64(1) << np.uint64(bit)
+
+
+@njit(cache=True, nogil=True)
+def _holds(keys, masks, owners, owner, points, cell_m):  # type: ignore[no-untyped-def]
+    held = np.zeros(len(points), np.bool_)
+    for index in range(len(points)):
+        block, bit = _cell_of(points[index], 1.0 / cell_m)
+        slot = _place(keys, block)
+        while keys[slot] != -1:
+            if keys[slot] == block and owners[slot] == owner:
+                held[index] = masks[slot] & bit != 0
+            slot = (slot + 1) & (len(keys) - 1)
+    return held
+
+
+@njit(cache=True, nogil=True)
 def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
     blocks = np.empty(len(points), np.int64)
     masks = np.zeros(len(points), np.uint64)
@@ -247,15 +280,8 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
         # Where each block is kept, by hash.
         known = np.full(capacity, -1, np.int64)
         for point in range(starts[index], starts[index + 1]):
-            block = np.int64(0)
-            bit = np.int64(0)
-            inside = True
-            for axis in range(3):
-                step = np.int64(np.floor(np.float64(points[point, axis]) * cells_per_m)) + _BIAS
-                inside = bool(inside and 0 <= step < 2 * _BIAS)
-                block = (block << 21) | (step >> 2)
-                bit = (bit << 2) | (step & 3)
-            if not inside:
+            block, bit = _cell_of(points[point], cells_per_m)
+            if block < 0:
                 continue
             place = _place(known, block)
             while known[place] >= 0 and blocks[known[place]] != block:
@@ -264,7 +290,7 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
                 known[place] = kept
                 blocks[kept] = block
                 kept += 1
-            masks[known[place]] |= np.uint64(1) << np.uint64(bit)
+            masks[known[place]] |= bit
         new_starts[index + 1] = kept
     return blocks[:kept].copy(), masks[:kept].copy(), new_starts
 

@@ -181,9 +181,18 @@ class SceneGraph:
         self._forget(gone_id, keep_id)
         return keep_id
 
-    def discount(self, node_id: int, factor: float) -> None:
-        """Let the Gaussian of a live node count for less than it did beside those to come."""
-        self.nodes.weights[self.nodes.row(node_id)] *= factor
+    def correct(self, node_id: int, factor: float, points_world: Float32) -> None:
+        """Take from a live node what was another's.
+
+        Args:
+            node_id: of the node.
+            factor: how much less its Gaussian counts beside those to come.
+            points_world: (k, 3) those points of its surface that stay.
+        """
+        row = self.nodes.row(node_id)
+        self.nodes.weights[row] *= factor
+        self.nodes.set_surface(row, points_world)
+        self.nodes.revisions[row] = self._changed()
 
     def set_confirmed(self, node_id: int, confirmed: bool) -> None:
         """Note that a node is sure to be an object, or no longer sure."""
