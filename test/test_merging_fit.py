@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from merging_support import local_graph, random_classes, random_covariances, seeds
+from numpy.typing import ArrayLike
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.fit import (
@@ -18,7 +19,7 @@ from deworldsg_ros.merging.fit import (
     fit,
     one_to_one,
 )
-from deworldsg_ros.merging.joint import JointEvidence
+from deworldsg_ros.merging.joint import APART, JointEvidence
 from deworldsg_ros.scene.gaussian import bhattacharyya_distance
 from deworldsg_ros.scene.nodes import NodeTable
 
@@ -42,7 +43,7 @@ def test_values_equal_the_formulas(seed: int) -> None:
         nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
     rows = rng.permutation(5)[:3]
     shares = rng.uniform(0, 1, (4, 3))
-    values = fit(local, nodes, rows, shares, CONFIG)
+    values, touching = fit(local, nodes, rows, shares, CONFIG)
     blur = CONFIG.cell_m**2 / 12 * np.eye(3)
     for (index, column), share in np.ndenumerate(shares):
         row = rows[column]
@@ -58,12 +59,13 @@ def test_values_equal_the_formulas(seed: int) -> None:
         alike = same or sizes.max() <= CONFIG.size_ratio_other_class * sizes.min()
         fits = share >= wanted and alike and apart <= MAX_DEVIATIONS
         assert values[index, column] == pytest.approx(value if fits else 0.0, abs=1e-9)
+        assert touching[index, column] == same
 
 
 def test_nothing_to_compare() -> None:
     empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
-    values = fit(empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), CONFIG)
-    assert values.shape == (0, 0)
+    values, touching = fit(empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), CONFIG)
+    assert values.shape == touching.shape == (0, 0)
     assert one_to_one(values) == []
     assert one_to_one(np.zeros((2, 0))) == [-1, -1]
 
@@ -84,41 +86,56 @@ def test_the_assignment_has_the_greatest_total(seed: int) -> None:
     assert total == pytest.approx(best)
 
 
+def note(evidence: JointEvidence, seen: list[int], known: list[int], values: ArrayLike) -> None:
+    """One frame; the first objects seen are those known, and what fits touches."""
+    fits = np.array(values).reshape(len(seen), len(known))
+    matched = [known.index(owner) if owner in known else -1 for owner in seen]
+    evidence.note(seen, known, fits, fits > 0, matched)
+
+
 def test_a_frame_that_shows_two_outweighs_ten_that_show_one_on_both() -> None:
-    both = np.ones((1, 2))
     evidence = JointEvidence()
     for _ in range(2):
-        evidence.note([4], [4, 7], both, [0])
+        note(evidence, [4], [4, 7], [[1, 1]])
         assert evidence.take() is None
-    evidence.note([4], [4, 7], both, [0])
+    note(evidence, [4], [4, 7], [[1, 1]])
     assert evidence.take() == (4, 7)
     evidence.forget(7)
 
     # Side by side in one frame, wherever in it: they need not touch.
-    evidence.note([4, 7], [4, 7], np.eye(2), [0, 1])
+    note(evidence, [4, 7], [4, 7], [[1, 0], [0, 1]])
     for _ in range(12):
-        evidence.note([4], [4, 7], both, [0])
+        note(evidence, [4], [4, 7], [[1, 1]])
     assert evidence.take() is None
-    assert evidence.counts == {(4, 7): 2}
-    evidence.note([4], [4, 7], both, [0])
+    note(evidence, [4], [4, 7], [[1, 1]])
     assert evidence.take() == (4, 7)
     evidence.forget(7)
     assert evidence.take() is None
     assert evidence.counts == {}
 
 
+def test_what_touches_for_long_and_is_never_seen_apart_is_one() -> None:
+    evidence = JointEvidence()
+    fits, touching = np.array([[1.0, 0.0]]), np.ones((1, 2), bool)
+    for _ in range(8):
+        evidence.note([4], [4, 7], fits, touching, [0])
+    assert evidence.take() is None
+    evidence.note([4], [4, 7], fits, touching, [0])
+    assert evidence.take() == (4, 7)
+
+
 def test_a_new_node_is_another_than_those_of_its_frame() -> None:
     evidence = JointEvidence()
-    evidence.note([2, 5], [2], np.array([[1.0], [0.5]]), [0, -1])
-    assert evidence.counts == {(2, 5): -10}
+    note(evidence, [2, 5], [2], [[1], [0.5]])
+    assert evidence.counts == {(2, 5): -APART}
 
 
 def test_what_two_parts_were_seen_beside_their_whole_was() -> None:
     evidence = JointEvidence()
-    evidence.note([1, 3], [], np.zeros((2, 0)), [-1, -1])
-    evidence.note([2, 3], [3], np.array([[0.0], [1.0]]), [-1, 0])
+    note(evidence, [1, 3], [], [[], []])
+    note(evidence, [2, 3], [3], [[0], [1]])
     evidence.merge(1, 2)
-    assert evidence.counts == {(1, 3): -20}
+    assert evidence.counts == {(1, 3): -2 * APART}
 
 
 @given(seeds)
@@ -128,8 +145,6 @@ def test_evidence_goes_on_from_its_counts(seed: int) -> None:
     evidence, restored = JointEvidence(), JointEvidence()
     for _ in range(30):
         owners = rng.permutation(6)[: rng.integers(1, 5)].tolist()
-        values = rng.integers(0, 2, (len(owners), len(owners) + 1)).astype(float)
-        columns = list(range(len(owners)))
-        evidence.note(owners, [*owners, 6], values, columns)
+        note(evidence, owners, [*owners, 6], rng.integers(0, 2, (len(owners), len(owners) + 1)))
     restored.restore(evidence.counts)
     assert restored.counts == evidence.counts

@@ -31,7 +31,7 @@ def fit(
     rows: NDArray[np.int64],
     shares: Float64,
     config: MergingConfig,
-) -> Float64:
+) -> tuple[Float64, NDArray[np.bool_]]:
     """How well each object fits each node; 0 where they cannot be the same.
 
     Args:
@@ -43,9 +43,10 @@ def fit(
 
     Returns:
         (n, k) float64: share + bonus · Σ p q + bonus · exp(-BD), with the Bhattacharyya distance
-        BD of the two Gaussians, both blurred by the size of a cell.
+        BD of the two Gaussians, both blurred by the size of a cell; (n, k) bool: whether they touch
+        and their classes agree.
     """
-    values: Float64 = _fit(
+    result: tuple[Float64, NDArray[np.bool_]] = _fit(
         local.means_world,
         local.covariances_world,
         local.class_probabilities,
@@ -60,7 +61,7 @@ def fit(
         # Variance of a place that is known to be in a cell, along each axis.
         config.cell_m**2 / 12,
     )
-    return values
+    return result
 
 
 def one_to_one(values: Float64) -> list[int]:
@@ -109,17 +110,19 @@ def _fit(  # type: ignore[no-untyped-def]
     blur_m2,
 ):
     values = np.zeros(shares.shape)
+    touching = np.zeros(shares.shape, np.bool_)
     blur = blur_m2 * np.eye(3)
     for index in range(len(shares)):
         for column in range(len(rows)):
             share = shares[index, column]
-            if share < threshold and share < threshold_other_class:
+            if share == 0.0:
                 continue
             row = rows[column]
             agreement = 0.0
             for label in range(classes.shape[1]):
                 agreement += classes[index, label] * node_classes[row, label]
             agree = agreement > CLASS_AGREEMENT
+            touching[index, column] = agree
             if share < (threshold if agree else threshold_other_class):
                 continue
             a = covariances[index] + blur
@@ -141,4 +144,4 @@ def _fit(  # type: ignore[no-untyped-def]
                 math.sqrt(determinant_a * determinant_b) / determinant
             )
             values[index, column] = share + CLASS_BONUS * agreement + GAUSSIAN_BONUS * likeness
-    return values
+    return values, touching

@@ -72,7 +72,7 @@ class SurfaceMerging:
         warm_up_fit()
         warm_up_graph()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph, outlier_rate: float = 0.0) -> list[int]:
+    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
 
         Two objects of one frame are never one node: they stay two even where both overlap it.
@@ -83,20 +83,21 @@ class SurfaceMerging:
         cells = self._map.cells_of(local.surface_points_world)
         owners, shares = self._map.shares(cells)
         rows = [graph.nodes.row(self._owners.node(owner)) for owner in owners]
-        values = fit(local, graph.nodes, np.array(rows, np.int64), shares, self._config)
+        values, touching = fit(local, graph.nodes, np.array(rows, np.int64), shares, self._config)
         matched = one_to_one(values)
         places = [owners[column] if column >= 0 else -1 for column in matched]
         if self._config.contest_cells:
             self._contest(graph, cells, places)
         node_ids = self._place(graph, local, cells, places)
-        self._joint.note([self._owner(node_id) for node_id in node_ids], owners, values, matched)
+        seen = [self._owner(node_id) for node_id in node_ids]
+        self._joint.note(seen, owners, values, touching, matched)
         self._merge_grown(graph)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         self._look_for_absent(graph, local, node_ids)
         self._expire(graph, local.stamp_ns)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids, outlier_rate)
+        add_relations(graph, local, node_ids)
         return node_ids
 
     def memory(self) -> Memory:
