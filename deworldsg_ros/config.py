@@ -40,6 +40,15 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "least detection score (the paper: 0.7); -1 = the backend's own default", ge=-1, le=1
         ),
     ] = -1.0
+    unsure_share: Annotated[
+        float,
+        option(
+            "share of the score threshold from which a box within a larger object keeps its pixels "
+            "from that one, though it is no object itself; 1 = none",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.5
     max_objects: Annotated[int, option("most objects kept a frame, best first", ge=1, le=300)] = 50
     top_relations: Annotated[int, option("relations kept a frame", ge=0, le=1000)] = 10
     join_nested: Annotated[

@@ -150,6 +150,7 @@ def test_the_papers_perception_as_one_stage(folder, tmp_path):
         # Random weights put their boxes anywhere.
         join_nested=False,
         drop_views=False,
+        unsure_share=1.0,
     )
     perception = build_perception(config, world_up="z")
     depth_m = np.full((48, 64), 1.5, np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.perception.nested import join_nested
+from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
 
 SCREEN, CUP = [0.9, 0.1], [0.1, 0.9]
@@ -75,3 +75,20 @@ def test_nothing():
     none = Detections(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0))
     joined, masks = join_nested(none, [], np.zeros((80, 100), np.float32))
     assert len(joined) == 0 and masks == []
+
+
+@pytest.mark.parametrize(
+    ("box", "of_class", "in_front"),
+    [
+        (INNER, CUP, True),
+        (INNER, SCREEN, False),  # a part of the screen
+        ([60, 20, 99, 60], CUP, False),  # beside it, for the most part
+        ([0, 0, 99, 79], CUP, False),  # what holds the screen
+    ],
+)
+def test_what_is_in_front_of_an_object_lies_in_it_and_is_another(box, of_class, in_front):
+    objects, _ = detections((OUTER, SCREEN, 0.8))
+    unsure, _ = detections((box, of_class, 0.3))
+    assert len(in_front_of(objects, unsure)) == in_front
+    assert len(in_front_of(objects.take(slice(0)), unsure)) == 0
+    assert len(in_front_of(objects, unsure.take(slice(0)))) == 0

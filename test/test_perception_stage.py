@@ -133,12 +133,22 @@ def test_relations_can_be_off():
 
 
 @pytest.mark.parametrize(("configured", "used"), [(-1.0, 0.45), (0.7, 0.7), (0.0, 0.0)])
-def test_threshold_is_the_backends_unless_configured(configured, used):
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_threshold_is_the_backends_unless_configured(configured, used, share):
     frame, *_ = table_and_cup()
     detector = ListedDetector([], [], [])
-    perception = stage(detector, score_threshold=configured)
+    perception = stage(detector, score_threshold=configured, unsure_share=share)
     perception.perceive(frame)
-    assert detector.asked == [used] and perception.score_threshold == used
+    assert detector.asked == [used * share] and perception.score_threshold == used
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.5, 0.0), (1.0, 1.0)])
+def test_a_cup_that_is_not_sure_is_no_object_and_no_part_of_the_table(share, taken):
+    frame, table, cup, owner = table_and_cup()
+    detector = ListedDetector([table, cup], [0, 1], [0.6, 0.3])
+    perceived = stage(detector, unsure_share=share).perceive(frame)
+    assert perceived.frame_graph.scores.tolist() == [0.6] and perceived.drops == {}
+    assert (perceived.instances[owner == 2] > 0).mean() == pytest.approx(taken, abs=0.1)
 
 
 def test_the_same_frame_gives_the_same():

@@ -241,6 +241,7 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
     } == {
         ("perception", "join_nested"),
         ("perception", "drop_views"),
+        ("perception", "unsure_share"),
         ("merging", "association"),
         ("relations", "encode"),
         ("relations", "clips_per_s"),

@@ -1,4 +1,4 @@
-"""One thing that was detected twice in a frame, once within the other."""
+"""Boxes within other boxes of a frame: one thing detected twice, and what lies in front of it."""
 
 from __future__ import annotations
 
@@ -57,16 +57,33 @@ def join_nested(
     return replace(objects, boxes_xyxy=boxes).take(kept), [masks[row] for row in kept]
 
 
+def in_front_of(objects: Detections, unsure: Detections) -> Detections:
+    """Those of `unsure` that lie within a larger object and are no part of any.
+
+    What overlaps an object of its own class may be that object once more.
+    """
+    inside, overlaps, same_class = _placed(unsure, objects)
+    part = (overlaps & same_class).any(axis=1)
+    return unsure.take(np.flatnonzero((inside & ~same_class).any(axis=1) & ~part))
+
+
 def _nested(objects: Detections) -> NDArray[np.bool_]:
     """(n, n): the box of the row lies in the larger one of the column, and is of its class."""
-    boxes = objects.boxes_xyxy
-    area = (boxes[:, 2:] - boxes[:, :2]).prod(axis=1)
-    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
+    inside, _, same_class = _placed(objects, objects)
+    return inside & same_class
+
+
+def _placed(
+    a: Detections, b: Detections
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """(n, m) each: a lies within b, which is larger; they overlap; they are of one class."""
+    area_a, area_b = ((x.boxes_xyxy[:, 2:] - x.boxes_xyxy[:, :2]).prod(axis=1) for x in (a, b))
+    low = np.maximum(a.boxes_xyxy[:, None, :2], b.boxes_xyxy[None, :, :2])
+    high = np.minimum(a.boxes_xyxy[:, None, 2:], b.boxes_xyxy[None, :, 2:])
     shared = np.clip(high - low, 0.0, None).prod(axis=2)
-    same_class = objects.class_probabilities @ objects.class_probabilities.T > SAME_CLASS
-    inside = shared > NESTED_SHARE * area[:, None]
-    return np.asarray(same_class & inside & (area[:, None] < area[None, :]))
+    inside = (shared > NESTED_SHARE * area_a[:, None]) & (area_a[:, None] < area_b[None, :])
+    same_class = a.class_probabilities @ b.class_probabilities.T > SAME_CLASS
+    return inside, shared > 0, same_class
 
 
 def _at_one_depth(inner: MaskPatch, outer: MaskPatch, depth_m: NDArray[np.float32]) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.label_image import label_image
-from deworldsg_ros.perception.nested import join_nested
+from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
@@ -97,8 +97,10 @@ class Perception:
         up_camera = self._up_camera(frame.T_world_camera)
         self._failures = {}
         found = self.detect(frame)
-        objects, drops = self._select(found, intrinsics.width, intrinsics.height)
-        masks = self.segment(frame, objects)
+        sure = found.scores >= self.score_threshold
+        objects, drops = self._select(found.take(sure), intrinsics.width, intrinsics.height)
+        unsure, _ = self._select(found.take(~sure), intrinsics.width, intrinsics.height)
+        masks = self.segment(frame, objects, in_front_of(objects, unsure))
         if masks is None:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
@@ -130,23 +132,28 @@ class Perception:
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
     def detect(self, frame: RgbdFrame) -> Detections:
-        """Objects of the image; raises RefusedInput ``detector_error``."""
+        """What may be an object in the image; raises RefusedInput ``detector_error``."""
         try:
-            return self._detector.detect(frame.rgb, self.score_threshold)
+            return self._detector.detect(
+                frame.rgb, self._config.unsure_share * self.score_threshold
+            )
         except Exception as error:  # a model can fail in more ways than can be listed
             message = self._note_failure("detector", "detector_error", error)
             raise RefusedInput("detector_error", message) from error
 
-    def segment(self, frame: RgbdFrame, objects: Detections) -> list[MaskPatch] | None:
-        """A mask for each object; None where the segmenter failed."""
+    def segment(
+        self, frame: RgbdFrame, objects: Detections, others: Detections
+    ) -> list[MaskPatch] | None:
+        """A mask for each object, beside others; None where the segmenter failed."""
         try:
-            return self._segmenter.segment(
+            masks = self._segmenter.segment(
                 frame.rgb,
                 frame.depth_m,
                 frame.intrinsics,
-                objects.boxes_xyxy,
-                self._likeliest_names(objects),
+                np.concatenate([objects.boxes_xyxy, others.boxes_xyxy]),
+                self._likeliest_names(objects) + self._likeliest_names(others),
             )
+            return masks[: len(objects)]
         except Exception as error:  # see detect
             self._note_failure("segmenter", "segmenter_error", error)
             return None
