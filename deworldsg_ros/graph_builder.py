@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from deworldsg_ros.relations.consistency import Consistency
 from deworldsg_ros.relations.evidence import (
     PROVENANCES,
     FusedEdges,
+    bounded_logits,
     choose_directions,
     fuse_edges,
 )
@@ -121,7 +123,9 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
-        node_ids = self._merging.merge(self.graph, local, self._relations.outlier_rate)
+        logits = bounded_logits(local.relations.logits, self._relations.outlier_rate)
+        relations = replace(local.relations, logits=logits)
+        node_ids = self._merging.merge(self.graph, replace(local, relations=relations))
         self._newest_ns = local.stamp_ns
         self._associations.append(
             wire.Association(wire.stamp_from_ns(local.stamp_ns), list(node_ids))

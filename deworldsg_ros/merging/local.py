@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.scene.edges import bounded_logits
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import Float64
@@ -42,21 +41,11 @@ def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
         )
 
 
-def add_relations(
-    graph: SceneGraph, local: LocalGraph, node_ids: list[int], outlier_rate: float
-) -> None:
-    """Sum a frame's visual relation logits into the edges of the nodes its rows became.
-
-    Args:
-        graph: it takes them.
-        local: of the frame.
-        node_ids: of each row, after all merges of the frame.
-        outlier_rate: see `bounded_logits`.
-    """
+def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
+    """Sum a frame's visual relation logits into the edges of the nodes its rows became."""
     # Summed by pair first, so that a frame counts once also where two of its rows are one node.
     sums: dict[tuple[int, int], Float64] = {}
-    bounded = bounded_logits(local.relations.logits, outlier_rate)
-    for (subject, object_), logits in zip(local.relations.pairs.tolist(), bounded):
+    for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
         pair = (node_ids[subject], node_ids[object_])
         sums[pair] = sums[pair] + logits if pair in sums else logits
     for (subject_id, object_id), logits in sums.items():

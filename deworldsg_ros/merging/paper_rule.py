@@ -24,7 +24,7 @@ class PaperMerging:
         warm_up()
         warm_up_graph()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph, outlier_rate: float = 0.0) -> list[int]:
+    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
 
         Objects are taken in row order, and meet the nodes that earlier rows founded. Relations
@@ -44,7 +44,7 @@ class PaperMerging:
         ]
         node_ids = [graph.resolve(node_id) for node_id in placed]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids, outlier_rate)
+        add_relations(graph, local, node_ids)
         return node_ids
 
     def memory(self) -> Memory:

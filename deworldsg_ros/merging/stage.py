@@ -19,13 +19,8 @@ class Merging(Protocol):
         """Compile now what would else be compiled during the first frame."""
         ...
 
-    def merge(self, graph: SceneGraph, local: LocalGraph, outlier_rate: float = 0.0) -> list[int]:
+    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph, always the same one.
-
-        Args:
-            graph: it takes the frame.
-            local: of the frame.
-            outlier_rate: of its relations, see `bounded_logits`; 0 = the paper.
 
         Returns:
             The id of the node that each row became, after all merges of this frame.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.relations.prior import ClassPairPrior
 
 __all__ = [
+    "bounded_logits",
     "PROVENANCES",
     "ClassPairPrior",
     "FusedEdge",
@@ -40,6 +41,27 @@ _VISUAL, _PRIOR, _FUSED = range(3)
 # distribution at the paper's weight. With less than what some clips can tell apart, an edge would
 # turn round again and again as predictions come in.
 DIRECTION_MARGIN = 0.05
+
+
+def bounded_logits(logits: Float64, outlier_rate: float) -> Float64:
+    """A frame's relation logits, if a share of all frames says nothing (beyond the paper).
+
+    log((1 - ε) softmax(ℓ)_r + ε / R): summed like the logits in Eq. 9, but no frame weighs more
+    against a predicate than log(1 + R (1 - ε) / ε) nats.
+
+    Args:
+        logits: (m, R) float64, pre-sigmoid logits of one frame.
+        outlier_rate: ε, from 0 (the paper: the logits as they are) to less than 1.
+
+    Returns:
+        (m, R) float64.
+    """
+    if not outlier_rate or not logits.size:
+        return logits
+    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+    told = (1.0 - outlier_rate) * weights / weights.sum(axis=1, keepdims=True)
+    bounded: Float64 = np.log(told + outlier_rate / logits.shape[1])
+    return bounded
 
 
 def visual_distribution(summed_logits: Float64) -> Float64:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.scene.edges import bounded_logits
+from deworldsg_ros.relations.evidence import bounded_logits
 
 rates = st.sampled_from([0.01, 0.1, 0.5, 0.9])
 
