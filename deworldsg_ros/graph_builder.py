@@ -39,6 +39,14 @@ from deworldsg_ros.scene.graph import SceneGraph
 MEMORY = "merging."
 
 
+def check_map_writable(path: Path) -> None:
+    """Make a map's folder; raises ConfigurationError where the map could not be written there."""
+    try:
+        storage.check_writable(path)
+    except OSError as error:
+        raise ConfigurationError(f"map {path} cannot be written: {error.strerror}") from error
+
+
 class GraphBuilder:
     """Keeps the global graph, and tells what of it is published.
 
@@ -96,10 +104,16 @@ class GraphBuilder:
                 },
             )
         except (RefusedInput, KeyError, TypeError, ValueError, IndexError) as error:
-            raise ConfigurationError(f"map {path} cannot be used: {error}") from error
+            seen = str(error).removeprefix(f"graph file {path}: ")
+            raise ConfigurationError(f"map {path} cannot be used: {seen}") from error
         builder.prior = prior
         builder._map_ns = int(graph.nodes.last_seen_ns.max(initial=0))
         return builder
+
+    @property
+    def confirmed(self) -> int:
+        """Number of nodes that are not tentative."""
+        return int(self.graph.nodes.confirmed.sum())
 
     def save_map(self, path: Path) -> None:
         """Write all that a later run needs to go on: graph, memory of the merging, and priors.

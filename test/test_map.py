@@ -11,7 +11,7 @@ from merging_support import VOCABULARY, random_local_graphs
 from test_merging_surface import CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 from deworldsg_ros.scene.storage import state_of
@@ -107,9 +107,18 @@ def test_files_that_are_no_map_are_refused(tmp_path):
     builder = builder_of()
     builder.graph.save(tmp_path / "graph.map")  # without priors
     (tmp_path / "text.map").write_text("hello")
-    for name in ("graph.map", "text.map"):
-        with pytest.raises(ConfigurationError, match=name):
+    (tmp_path / "folder.map").mkdir()
+    for name in ("graph.map", "text.map", "folder.map"):
+        with pytest.raises(ConfigurationError, match=f"{name} cannot be used: (?!graph file)"):
             GraphBuilder.from_map(Config(), tmp_path / name)
+
+
+def test_a_map_that_could_not_be_written_is_refused_beforehand(tmp_path):
+    check_map_writable(tmp_path / "maps" / "room.map")
+    assert list((tmp_path / "maps").iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigurationError, match=r"map .*room\.map cannot be written: \w+"):
+        check_map_writable(tmp_path / "file" / "room.map")
 
 
 def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):

@@ -43,10 +43,9 @@ def write_graph(out: Path, graph: wire.SceneGraphMessage) -> None:
 def write_map(path: Path, builder: GraphBuilder) -> None:
     """Write a map for a later run to go on with; raises ConfigurationError."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         builder.save_map(path)
     except OSError as error:
-        raise ConfigurationError(f"--map {path}: cannot be written ({error.strerror})") from error
+        raise ConfigurationError(f"map {path} cannot be written: {error.strerror}") from error
 
 
 def read_graph(out: Path) -> wire.SceneGraphMessage:

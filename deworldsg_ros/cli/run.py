@@ -24,7 +24,7 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.temporal import UpdateLog
-from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
@@ -67,6 +67,8 @@ def run_recording(
     try:
         recording = Recording(choose_poses(source, poses, config), config.inputs)
         outputs.prepare_folder(out, config)
+        if map_path is not None:
+            check_map_writable(map_path)
         with working(console, LOADING):
             pipeline = Pipeline(config)
             pipeline.lifting.warm_up()
@@ -159,9 +161,9 @@ def _process(
                     updates.note(pipeline.builder, truth, result)
             progress.advance(task)
             if pipeline.builder is not None and len(poses) % COUNT_EVERY == 0:
-                progress.update(task, note=f"{len(pipeline.builder.graph)} nodes")
+                progress.update(task, note=f"{pipeline.builder.confirmed} nodes")
         if pipeline.builder is not None:
-            note = f"{len(pipeline.builder.graph)} nodes"
+            note = f"{pipeline.builder.confirmed} nodes"
             progress.update(task, note=note, total=len(poses) + refused.total())
     return poses, refused
 

@@ -17,7 +17,7 @@ from deworldsg_ros.bridge.node import StageNode, run
 from deworldsg_ros.bridge.pending import PendingEvidence
 from deworldsg_ros.bridge.poses import pose_from_message, stamp_ns_of
 from deworldsg_ros.bridge.qos import reliable
-from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
@@ -57,8 +57,10 @@ class GraphNode(StageNode):
             PoseStamped, CORRECTION_TOPIC, self.guarded(self._correct), reliable(10)
         )
         self.every(1.0 / self.parameters.output.rate_hz, self._publish)
-        if self._map_path is not None and self._map_path.exists():
-            self._go_on_with(self._map_path)
+        if self._map_path is not None:
+            check_map_writable(self._map_path)
+            if self._map_path.exists():
+                self._go_on_with(self._map_path)
 
     def _go_on_with(self, path: Path) -> None:
         """Begin with the graph of a map; raises ConfigurationError where there is none in it."""
@@ -72,8 +74,11 @@ class GraphNode(StageNode):
     def close(self) -> None:
         """Write the map."""
         if self._map_path is not None:
-            _, message = self._save_map(self._map_path)
-            self.get_logger().info(message)
+            written, message = self._save_map(self._map_path)
+            if written:
+                self.get_logger().info(message)
+            else:
+                self.get_logger().warning(message)
         super().close()
 
     def _integrate(self, message: wire.LocalGraphMessage) -> None:
@@ -147,11 +152,10 @@ class GraphNode(StageNode):
         if self._builder is None:
             return False, "no map was written: no local graph has come"
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             self._builder.save_map(path)
         except OSError as error:
-            return False, f"map {path}: {error}"
-        return True, f"map {path}: {len(self._builder.graph)} nodes"
+            return False, f"map {path} cannot be written: {error.strerror}"
+        return True, f"map {path}: {self._builder.confirmed} nodes"
 
     def _save_to(self, path: Path) -> tuple[bool, str]:
         if self._builder is None:

@@ -147,10 +147,22 @@ def _split(flat: NDArray[Any], counts: NDArray[np.int64]) -> list[NDArray[Any]]:
     return np.split(flat, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
+def check_writable(path: Path) -> None:
+    """Make the folder of a file that `write` is to write; raises OSError where it cannot be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = _partial(path)
+    partial.touch()
+    partial.unlink()
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(path.name + ".partial")
+
+
 def write(path: str | Path, state: State) -> None:
     """Write a state as .npz; the file appears complete or not at all."""
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = _partial(path)
     with partial.open("wb") as file:
         np.savez(file, **state)  # type: ignore[arg-type]  # its own options are named in the stub
         file.flush()
@@ -163,8 +175,9 @@ def read(path: str | Path) -> State:
     try:
         with Path(path).open("rb") as file:
             if not zipfile.is_zipfile(file):
-                raise ValueError("no archive of arrays (.npz)")
+                raise ValueError("no .npz archive, as a saved graph or map is")
         with np.load(Path(path), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
-        raise RefusedInput("invalid_graph_file", f"graph file {path}: {error}") from error
+        seen = getattr(error, "strerror", None) or error
+        raise RefusedInput("invalid_graph_file", f"graph file {path}: {seen}") from error
