@@ -146,3 +146,14 @@ def test_points_beyond_the_map_are_left_out() -> None:
     points = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 0]], np.float32)
     surfaces.add([0], surfaces.cells_of([points]))
     assert surfaces.centres(0) == pytest.approx(np.full((1, 3), 0.005))
+
+
+def test_what_is_gone_takes_no_room() -> None:
+    rng = np.random.default_rng(0)
+    surfaces = VoxelMap(CELL_M)
+    room = len(surfaces._keys)
+    for _ in range(1000):
+        cells = surfaces.cells_of([random_points(rng, 20) + rng.uniform(-9, 9, 3).astype("f4")])
+        surfaces.add([0], cells)
+        surfaces.remove(0)
+    assert len(surfaces._keys) == room

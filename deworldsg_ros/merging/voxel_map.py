@@ -107,7 +107,7 @@ class VoxelMap:
             return
         self._make_room(max(owners) + 1)
         if 2 * (self._used + len(sets.blocks)) > len(self._keys):
-            self._grow(self._used + len(sets.blocks))
+            self._grow(len(sets.blocks))
         new, starts, self._used = _add(
             self._keys,
             self._masks,
@@ -199,8 +199,10 @@ class VoxelMap:
         # Cells of each slot that a query has met; zero between queries.
         self._marks = np.zeros(capacity, np.uint64)
 
-    def _grow(self, slots: int) -> None:
+    def _grow(self, more_slots: int) -> None:
         keys, masks, owners = self._keys, self._masks, self._owners
+        # The slots of owners that are gone are left behind.
+        slots = np.count_nonzero(owners >= 0) + more_slots
         capacity = len(keys)
         while capacity < 3 * slots:
             capacity *= 2
