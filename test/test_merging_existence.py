@@ -247,3 +247,23 @@ def test_a_loaded_node_was_missed_in_no_look_before(tmp_path):
     assert walk.told == [1]  # 2 of 5 looks
     walk.see(found=False)
     assert walk.told == []
+
+
+@pytest.mark.parametrize("behind_s", [0, 10**6])
+def test_what_was_known_long_stays_known_under_a_clock_that_is_behind(behind_s: int) -> None:
+    def camera(look: int) -> np.ndarray:
+        return 2.0 * np.array([np.cos(0.3 * look), np.sin(0.3 * look), 0.0])
+
+    def stamp_ns(look: int) -> int:
+        return (10**7 + look) * 10**9
+
+    cup = np.zeros((1, 3))
+    earlier, later = Existence(MergingConfig()), Existence(MergingConfig())
+    for look in range(20):
+        earlier.detected([0], cup, np.ones(1), camera(look), stamp_ns(look))
+        earlier.viewed([0], np.array([ALL]))
+    later.restore([0], earlier.records([0]), earlier.by_view)
+    later.detected([0], cup, np.ones(1), camera(20), stamp_ns(20 - behind_s))
+    for look in range(21, 26):
+        missed = later.missed([0], np.array([ALL]), cup, camera(look), stamp_ns(look - behind_s))
+        assert not missed

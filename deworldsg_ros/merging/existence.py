@@ -206,6 +206,11 @@ def _miss_chance(by_view, view):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _look(node, by_view, mean, camera, stamp_ns, baseline_rad):  # type: ignore[no-untyped-def]
     """Begin another look where the camera has moved on; returns its distance from the node."""
+    # A clock that is behind that of an earlier run: what was known then was known before.
+    behind_ns = max(0, max(node.last_ns, node.look_ns) - stamp_ns)
+    node.first_ns -= behind_ns
+    node.last_ns -= behind_ns
+    node.look_ns -= behind_ns
     distance = 0.0
     step = 0.0
     for axis in range(3):
