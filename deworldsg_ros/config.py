@@ -388,7 +388,9 @@ def load_config(path: Union[str, Path]) -> Config:
     """
     try:
         content = msgspec.yaml.decode(Path(path).read_bytes())
-    except (OSError, msgspec.MsgspecError) as error:
+    except OSError as error:
+        raise ConfigurationError(f"configuration {path}: {error.strerror}") from error
+    except msgspec.MsgspecError as error:
         raise ConfigurationError(f"configuration {path}: {error}") from error
     for key in ("/**", "ros__parameters"):
         if isinstance(content, dict) and key in content:

@@ -104,7 +104,7 @@ class GraphBuilder:
                 },
             )
         except (RefusedInput, KeyError, TypeError, ValueError, IndexError) as error:
-            seen = str(error).removeprefix(f"graph file {path}: ")
+            seen = storage.told(error).removeprefix(f"graph file {path}: ")
             raise ConfigurationError(f"map {path} cannot be used: {seen}") from error
         builder.prior = prior
         builder._map_ns = int(graph.nodes.last_seen_ns.max(initial=0))

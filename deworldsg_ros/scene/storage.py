@@ -90,7 +90,14 @@ def graph_of(state: State, source: str, **settings: Any) -> SceneGraph:
     try:
         return _graph_of(state, settings)
     except (KeyError, ValueError, TypeError, IndexError, MemoryError) as error:
-        raise RefusedInput("invalid_graph_file", f"graph file {source}: {error}") from error
+        raise RefusedInput("invalid_graph_file", f"graph file {source}: {told(error)}") from error
+
+
+def told(error: Exception) -> str:
+    """What is wrong with a file, in words, where the exception tells no more than a name."""
+    if isinstance(error, KeyError):
+        return f"there is no {error} in it"
+    return getattr(error, "strerror", None) or str(error)
 
 
 def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
@@ -179,5 +186,4 @@ def read(path: str | Path) -> State:
         with np.load(Path(path), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
-        seen = getattr(error, "strerror", None) or error
-        raise RefusedInput("invalid_graph_file", f"graph file {path}: {seen}") from error
+        raise RefusedInput("invalid_graph_file", f"graph file {path}: {told(error)}") from error
