@@ -138,6 +138,17 @@ def test_what_two_parts_were_seen_beside_their_whole_was() -> None:
     assert evidence.counts == {(1, 3): -2 * APART}
 
 
+def test_what_lies_on_two_that_are_known_apart_becomes_one_of_them_only() -> None:
+    evidence = JointEvidence()
+    note(evidence, [2, 3], [], [[], []])
+    for _ in range(3):
+        note(evidence, [1], [1, 2, 3], [[1, 1, 1]])
+    pair = evidence.take()
+    assert pair in {(1, 2), (1, 3)}
+    evidence.merge(*pair)
+    assert evidence.take() is None
+
+
 @given(seeds)
 @settings(max_examples=20)
 def test_evidence_goes_on_from_its_counts(seed: int) -> None:

@@ -84,7 +84,8 @@ class JointEvidence:
         """The next pair that is one object, after which the two have to be merged."""
         while self._due:
             pair = self._due.pop()
-            if pair in self._together:
+            # Since it was due, one of the two may have become a part of what the other is not.
+            if self._balance(pair) >= ENOUGH:
                 return pair
         return None
 
