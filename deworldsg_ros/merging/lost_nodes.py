@@ -22,9 +22,6 @@ class LostNodes:
         self._memory_ns = int(memory_s * 1e9)
         self._lost_ns: dict[int, int] = {}
 
-    def __len__(self) -> int:
-        return len(self._lost_ns)
-
     def __contains__(self, node_id: object) -> bool:
         return node_id in self._lost_ns
 
