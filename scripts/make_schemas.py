@@ -152,6 +152,7 @@ def _node(
         observations=observations,
         first_seen=EARLIER,
         last_seen=STAMP,
+        entropy_nats=0.32,
     )
 
 

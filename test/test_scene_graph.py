@@ -321,3 +321,15 @@ def test_a_file_of_a_later_version_is_refused(tmp_path: Path, monkeypatch) -> No
     monkeypatch.undo()
     with pytest.raises(RefusedInput, match="version 2: wanted 1 or older"):
         SceneGraph.load(tmp_path / "later.npz")
+
+
+@pytest.mark.parametrize(
+    ("classes", "entropy_nats"),
+    [([1.0, 0.0, 0.0, 0.0], 0.0), ([0.5, 0.5, 0.0, 0.0], np.log(2)), ([0.25] * 4, np.log(4))],
+)
+def test_a_node_tells_how_much_its_labels_disagree(classes, entropy_nats) -> None:
+    graph = SceneGraph(VOCABULARY, "world")
+    graph.add_node(np.zeros(3), np.eye(3), np.array(classes), 1)
+    (state,) = graph.node_states(1).values()
+    assert len(state.classes) == 1  # the entropy is of all classes
+    assert state.entropy_nats == pytest.approx(entropy_nats)

@@ -59,6 +59,7 @@ def _state(
     # Stable: of equal probabilities the first class of the vocabulary comes first.
     order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
     beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
+    possible = probabilities[probabilities > 0]
     points = nodes.surface(row)
     mean, covariance = nodes.means[row], nodes.covariances[row]
     if even and len(points):
@@ -74,4 +75,5 @@ def _state(
         first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
         last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
         surface_points_m=points.tolist() if with_points else [],
+        entropy_nats=max(0.0, -float(possible @ np.log(possible))),
     )

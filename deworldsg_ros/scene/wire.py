@@ -172,6 +172,13 @@ class NodeState(msgspec.Struct, frozen=True):
         bool, msgspec.Meta(description="false = tentative: seen too rarely to be sure")
     ] = True
     surface_points_m: list[Vector3] = []
+    entropy_nats: Annotated[
+        Union[float, None],
+        msgspec.Meta(
+            description="of the whole class distribution: how much its observations disagree; "
+            "null = not told"
+        ),
+    ] = None
 
 
 Provenance = Literal["visual", "prior", "fused"]
