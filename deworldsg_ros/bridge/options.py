@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, option
 
 
 class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -12,27 +12,27 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     queue_size: Annotated[
         int,
-        msgspec.Meta(
-            description="frames that may wait for this node's work; the oldest goes: overrun",
+        option(
+            "frames that may wait for this node's work; the oldest goes: overrun",
             ge=1,
             le=100000,
         ),
     ] = 10
     patience_s: Annotated[
         float,
-        msgspec.Meta(
-            description="longest time a frame waits for depth, camera_info or pose, seconds",
+        option(
+            "longest time a frame waits for depth, camera_info or pose, seconds",
             gt=0,
             le=3600,
         ),
     ] = 5.0
-    save_path: Annotated[
-        str, msgspec.Meta(description="file that graph_node's service ~/save writes")
-    ] = "scene_graph.json"
+    save_path: Annotated[str, option("file that graph_node's service ~/save writes")] = (
+        "scene_graph.json"
+    )
     map_path: Annotated[
         str,
-        msgspec.Meta(
-            description="map that graph_node goes on with, where the file is there, and that "
+        option(
+            "map that graph_node goes on with, where the file is there, and that "
             "~/save and a clean end write; empty = none. Poses have to be in the same world frame"
         ),
     ] = ""
