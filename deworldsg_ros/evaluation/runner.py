@@ -7,7 +7,7 @@ or a cluster. Its only effect is the folder of its results.
 from __future__ import annotations
 
 from collections import Counter
-from contextlib import closing
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from deworldsg_ros.bags.recording import Recording, open_source
-from deworldsg_ros.bags.source import Source
 from deworldsg_ros.config import Config, to_yaml
-from deworldsg_ros.datasets.annotations import Annotations, ScanPoints
+from deworldsg_ros.datasets.annotations import Annotations
 from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -123,22 +122,17 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     Raises:
         DeWorldSGError: where the scan cannot be read or evaluated.
     """
+    with ExitStack() as opened:
+        return _evaluate(task, opened)
+
+
+def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     annotations = open_annotations(task.root, task.layout)
+    annotation = annotations.scan(task.scan)
     points = annotations.points(task.scan, aligned=task.options.aligned_ply)
     reference = read_reference(annotations, task.scan, points)
     source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
-    with closing(source):
-        return _evaluate(task, annotations, points, reference, source)
-
-
-def _evaluate(
-    task: ScanTask,
-    annotations: Annotations,
-    points: ScanPoints,
-    reference: ReferenceScene,
-    source: Source,
-) -> ScanOutcome:
-    annotation = annotations.scan(task.scan)
+    opened.callback(source.close)
     front_end = build_front_end(task.front_end, annotations, task.scan, source, task.config)
     pipeline = build_method(task.method, task.config, front_end)
     recording = Recording(source, task.config.inputs)
