@@ -16,7 +16,6 @@ import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.stage import build_merging
-from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.relations.consistency import Consistency
 from deworldsg_ros.relations.evidence import (
     PROVENANCES,
@@ -186,8 +185,7 @@ class GraphBuilder:
         node_ids = nodes_since(self.graph, since_ns)
         for node_id in node_ids:
             self.graph.move_node(node_id, T_correction)
-        if isinstance(self._merging, SurfaceMerging):
-            self._merging.moved(self.graph, node_ids, T_correction)
+        self._merging.moved(self.graph, node_ids, T_correction)
         return node_ids
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:

@@ -54,6 +54,9 @@ class PaperMerging:
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """Nothing is needed."""
 
+    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+        """Nothing is needed."""
+
     def _place(
         self,
         graph: SceneGraph,

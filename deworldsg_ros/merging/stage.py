@@ -9,6 +9,7 @@ from deworldsg_ros.merging.local import Memory
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
 
 
@@ -45,6 +46,10 @@ class Merging(Protocol):
         Raises:
             KeyError, ValueError, TypeError, IndexError: where this is no memory.
         """
+        ...
+
+    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+        """Follow nodes that a correction (4, 4) has moved in the graph."""
         ...
 
 

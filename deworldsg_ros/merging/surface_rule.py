@@ -150,7 +150,7 @@ class SurfaceMerging:
         )
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
-        """Follow nodes that a correction (4, 4) has moved in the graph."""
+        """See `Merging.moved`."""
         # Whoever corrects the past corrects the poses to come.
         self._alignment = PoseAlignment()
         for node_id in node_ids:
