@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,14 @@ MEMORY = "merging."
 
 def check_map_writable(path: Path) -> None:
     """Make a map's folder; raises ConfigurationError where the map could not be written there."""
-    try:
+    with _writing(path):
         storage.check_writable(path)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
         raise ConfigurationError(f"map {path} cannot be written: {error.strerror}") from error
 
@@ -118,11 +125,12 @@ class GraphBuilder:
         """Write all that a later run needs to go on: graph, memory of the merging, and priors.
 
         Raises:
-            OSError: where it cannot be written; what was there is then still there.
+            ConfigurationError: where it cannot be written; what was there is then still there.
         """
         prior = np.frombuffer(json.dumps(self.prior.to_state()).encode(), np.uint8)
         memory = {MEMORY + name: values for name, values in self._merging.memory().items()}
-        storage.write(path, {**storage.state_of(self.graph), **memory, "prior": prior})
+        with _writing(path):
+            storage.write(path, {**storage.state_of(self.graph), **memory, "prior": prior})
 
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.

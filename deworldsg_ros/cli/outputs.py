@@ -11,7 +11,6 @@ import numpy as np
 from rich.console import Console
 
 from deworldsg_ros.config import Config, to_yaml
-from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -38,14 +37,6 @@ def prepare_folder(out: Path, config: Config) -> None:
 def write_graph(out: Path, graph: wire.SceneGraphMessage) -> None:
     """Write scene_graph.json."""
     (out / GRAPH_FILE).write_text(wire.encode(graph), encoding="utf-8")
-
-
-def write_map(path: Path, builder: GraphBuilder) -> None:
-    """Write a map for a later run to go on with; raises ConfigurationError."""
-    try:
-        builder.save_map(path)
-    except OSError as error:
-        raise ConfigurationError(f"map {path} cannot be written: {error.strerror}") from error
 
 
 def read_graph(out: Path) -> wire.SceneGraphMessage:

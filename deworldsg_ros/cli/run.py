@@ -93,7 +93,7 @@ def run_recording(
     if trajectory_out is not None:
         write_tum(trajectory_out, list(path_taken), T_world_cameras)
     if map_path is not None and pipeline.builder is not None:
-        outputs.write_map(map_path, pipeline.builder)
+        pipeline.builder.save_map(map_path)
     clips = pipeline.relations.counters()
     if failed := clips.dropped.get("world_model_error"):
         drops["world model"] = {"world_model_error": failed}

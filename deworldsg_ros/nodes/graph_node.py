@@ -21,7 +21,7 @@ from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.view.markers import markers
 
 SILENCE_S = 2.0
@@ -153,8 +153,8 @@ class GraphNode(StageNode):
             return False, "no map was written: no local graph has come"
         try:
             self._builder.save_map(path)
-        except OSError as error:
-            return False, f"map {path} cannot be written: {error.strerror}"
+        except ConfigurationError as error:
+            return False, str(error)
         return True, f"map {path}: {self._builder.confirmed} nodes"
 
     def _save_to(self, path: Path) -> tuple[bool, str]:
