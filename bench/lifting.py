@@ -16,7 +16,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
-from reference_lifting import reference_lift  # noqa: E402
+from support.reference_lifting import reference_lift  # noqa: E402
 
 from deworldsg_ros.config import LiftingConfig  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402

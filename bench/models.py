@@ -24,10 +24,10 @@ import transformers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from deworldsg_ros.checkpoints import choose_device, choose_dtype
+from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype
+from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.backbone import FrozenBackbone, quantise
-from deworldsg_ros.relations.probe import BackboneIdentity
+from deworldsg_ros.relations.probing.backbone import FrozenBackbone, quantise
 from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.errors import ConfigurationError
 

@@ -23,12 +23,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from segmenter_iou import Frame, grab_cut
 
-from deworldsg_ros.perception.geometric_head import GeometricRelationHead
+from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
+from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
+from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.label_image import label_image
-from deworldsg_ros.perception.nanodet import NanoDetDetector
-from deworldsg_ros.perception.rgbd_segmenter import RgbdSegmenter
-from deworldsg_ros.perception.vocabularies import REPLICA_SSG_PREDICATES
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
 
 WIDTH, HEIGHT, OBJECTS = 640, 480, 12
 INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)

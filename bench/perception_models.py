@@ -18,15 +18,16 @@ import torch
 import transformers
 from safetensors.torch import save_file
 
+from deworldsg_ros.checkpoints.architectures import HEAD_FILE
+from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, write_card
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.checkpoint_card import CARD_FILE, CheckpointCard, write_card
-from deworldsg_ros.perception.egtr import HEAD_FILE, EgtrRelationHead
-from deworldsg_ros.perception.egtr_network import EgtrNetwork
-from deworldsg_ros.perception.rtdetr import RtDetrDetector
-from deworldsg_ros.perception.sam import SamSegmenter
-from deworldsg_ros.perception.sam2 import Sam2Segmenter
-from deworldsg_ros.perception.vocabularies import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
+from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
+from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.perception.backends.sam import SamSegmenter
+from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
 
 WIDTH, HEIGHT, OBJECTS = 640, 480, 12
 INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)

@@ -3,7 +3,7 @@
     python bench/probe.py [--rooms 16] [--pairs 30] [--out FOLDER]
 
 The backbones are tiny and randomly initialised, so that anyone can run this: random features. The
-rooms are those of `test/pair_rooms.py`. Nothing here says how good the published models are.
+rooms are those of `test/support/pair_rooms.py`. Nothing here says how good published models are.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 
-from models_support import save_dinov2, save_vjepa2
-from pair_rooms import CLASSES, PREDICATES, PairClip, render_room
+from support.checkpoints import save_dinov2, save_vjepa2
+from support.pair_rooms import CLASSES, PREDICATES, PairClip, render_room
 
+from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, relative_box_pair
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations import ClassPairPrior, fuse_edges, union_box
-from deworldsg_ros.relations.backbone import FrozenBackbone
-from deworldsg_ros.relations.probe import BackboneIdentity, relative_box_pair
-from deworldsg_ros.relations.probe_network import load_probe
-from deworldsg_ros.relations.probed_world_model import ProbedWorldModel
-from deworldsg_ros.relations.training.labelled_clips import LabelledClip
-from deworldsg_ros.relations.training.train import TrainingOptions, train_probe
+from deworldsg_ros.relations.probing.backbone import FrozenBackbone
+from deworldsg_ros.relations.probing.probe_network import load_probe
+from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.training.labelled_clips import LabelledClip
+from deworldsg_ros.training.train import TrainingOptions, train_probe
 
 VOCABULARY = Vocabulary(CLASSES, PREDICATES)
 DEFAULTS = RelationsConfig()

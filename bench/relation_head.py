@@ -22,12 +22,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from segmenter_iou import INTRINSICS, load
 
-from deworldsg_ros.perception.geometric_head import GeometricRelationHead
+from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
+from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.label_image import label_image
 from deworldsg_ros.perception.protocols import MaskPatch
-from deworldsg_ros.perception.rgbd_segmenter import RgbdSegmenter
-from deworldsg_ros.perception.vocabularies import REPLICA_SSG_PREDICATES
 from deworldsg_ros.scene.frame_graph import Relations
+from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
 
 TOP_RELATIONS = 10
 

@@ -26,7 +26,8 @@ from deworldsg_ros.relations.evidence import (
     fuse_edges,
 )
 from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.scene import storage, wire
+from deworldsg_ros.scene import graph_io as storage
+from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Float64, check_pose
 from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.delta import diff

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[1]
 
 # Nodes of a test run see one another and nobody else; 0-101 are the domains free of clashes with
 # ephemeral ports on Linux, and 0 is everybody's default.

@@ -7,14 +7,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from merging_support import VOCABULARY, random_local_graphs
-from test_merging_surface import CUP, TABLE, WHOLE, frame, slab
+from support.merging import VOCABULARY, random_local_graphs
+from support.surfaces import CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import RelationEvidence
-from deworldsg_ros.scene.storage import state_of
+from deworldsg_ros.scene.graph_io import state_of
 
 MUG = slab((0.5, 0, 1.05), (0.08, 0.08, 0.1))
 
@@ -123,9 +123,9 @@ def test_a_map_that_could_not_be_written_is_refused_beforehand(tmp_path):
 
 def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
     rclpy = pytest.importorskip("rclpy")
-    from nodes_bench import Bench, works
-    from nodes_bench import local_graph as message_of
     from std_msgs.msg import String
+    from support.nodes_bench import Bench, works
+    from support.nodes_bench import local_graph as message_of
 
     from deworldsg_ros.nodes.graph_node import GraphNode
 

@@ -12,10 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from deworldsg_ros import __version__
-from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import EXIT_INTERRUPTED, models, probe
 from deworldsg_ros.cli.evaluate import evaluate
-from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
+from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 # Bad usage, a bad configuration, a recording that cannot be used.
@@ -170,9 +170,9 @@ def run(
 ) -> None:
     """Make a recording's scene graph in one process."""
     with _telling_errors():
-        from deworldsg_ros.bags.posing import PoseChoice
         from deworldsg_ros.cli.run import run_recording
         from deworldsg_ros.poses.perturbation import parse_noise
+        from deworldsg_ros.recordings.posing import PoseChoice
 
         run_recording(
             recording,

@@ -8,14 +8,14 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
-from deworldsg_ros.bags.messages import Role
-from deworldsg_ros.bags.recording import open_source
-from deworldsg_ros.bags.source import RawRoleMessage, Source
-from deworldsg_ros.bags.topics import TopicChoice
-from deworldsg_ros.bags.writer import check_output, write_mcap
 from deworldsg_ros.cli.outputs import print_drops
 from deworldsg_ros.cli.progress import frame_progress
-from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.recording import open_source
+from deworldsg_ros.recordings.source import RawRoleMessage, Source
+from deworldsg_ros.recordings.writer import check_output, write_mcap
 
 
 def convert_recording(

@@ -18,17 +18,17 @@ import numpy as np
 from rich.console import Console
 
 from deworldsg_ros import __version__
-from deworldsg_ros.bags import events
-from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.messages import ODOMETRY, Role
-from deworldsg_ros.bags.recording import open_source
-from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.installation import find_shared, node_command
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
 from deworldsg_ros.cli.progress import frame_progress, working
-from deworldsg_ros.datasets.dataset import DatasetOptions
+from deworldsg_ros.recordings import events
+from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.messages import ODOMETRY, Role
+from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import DeWorldSGError
 

@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 
 if TYPE_CHECKING:
-    from deworldsg_ros.datasets.annotations import Annotations
-    from deworldsg_ros.evaluation.protocol import ProtocolOptions
+    from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
     from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask
+    from deworldsg_ros.recordings.folders.annotations import Annotations
 
 EXIT_NOTHING_DONE = 1
 DEFAULT_OUT = Path("evaluation_out")
@@ -146,13 +146,13 @@ def evaluate(
     from deworldsg_ros.cli.configuration import effective_config
     from deworldsg_ros.cli.tables import evaluate_table, pose_choices
     from deworldsg_ros.config import Config
-    from deworldsg_ros.datasets.dataset import DatasetOptions
-    from deworldsg_ros.evaluation import report
     from deworldsg_ros.evaluation.errors import EvaluationError
     from deworldsg_ros.evaluation.front_ends import FrontEndChoice, parse_faults
-    from deworldsg_ros.evaluation.protocol import ProtocolOptions
+    from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
     from deworldsg_ros.evaluation.recorded_room import open_annotations
+    from deworldsg_ros.evaluation.reports import report
     from deworldsg_ros.evaluation.runner import ScanTask
+    from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 
     given = [bool(predictions), graphs is not None, front_end is not None]
     if table is None and sum(given) != 1:
@@ -235,9 +235,11 @@ def _evaluate_predictions(
     out: Path | None,
     console: Console,
 ) -> dict[str, Any]:
-    from deworldsg_ros.evaluation import measures, report, results, tables
-    from deworldsg_ros.evaluation.predictions import read_predictions
-    from deworldsg_ros.evaluation.protocol import evaluate_predictions
+    from deworldsg_ros.evaluation.measures import graph_measures as measures
+    from deworldsg_ros.evaluation.protocol.predictions import read_predictions
+    from deworldsg_ros.evaluation.protocol.scoring import evaluate_predictions
+    from deworldsg_ros.evaluation.reports import report, results
+    from deworldsg_ros.evaluation.reports import terminal as tables
 
     predictions = read_predictions(path)
     result = evaluate_predictions(annotations, predictions, options)
@@ -268,7 +270,10 @@ def _evaluate_graphs(
     out: Path | None,
     console: Console,
 ) -> dict[str, Any]:
-    from deworldsg_ros.evaluation import measures, protocol, report, results, tables
+    from deworldsg_ros.evaluation.measures import graph_measures as measures
+    from deworldsg_ros.evaluation.protocol import scoring as protocol
+    from deworldsg_ros.evaluation.reports import report, results
+    from deworldsg_ros.evaluation.reports import terminal as tables
     from deworldsg_ros.evaluation.runner import GRAPH_FILE, evaluate_graph, read_graph
 
     chosen = scans or annotations.scans(options.split)
@@ -291,7 +296,10 @@ def _evaluate_graphs(
 def _evaluate_runs(
     annotations: Annotations, tasks: list[ScanTask], console: Console
 ) -> dict[str, Any]:
-    from deworldsg_ros.evaluation import measures, protocol, report, results, tables
+    from deworldsg_ros.evaluation.measures import graph_measures as measures
+    from deworldsg_ros.evaluation.protocol import scoring as protocol
+    from deworldsg_ros.evaluation.reports import report, results
+    from deworldsg_ros.evaluation.reports import terminal as tables
     from deworldsg_ros.evaluation.runner import evaluate_scan
     from deworldsg_ros.scene.errors import DeWorldSGError
 

@@ -8,10 +8,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.messages import Role
-from deworldsg_ros.bags.recording import detect_kind, open_source
-from deworldsg_ros.bags.storage import RawBag
+from deworldsg_ros.recordings.bags.storage import RawBag
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.recording import detect_kind, open_source
 
 
 def show_recording(path: Path, console: Console) -> None:

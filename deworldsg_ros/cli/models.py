@@ -66,7 +66,7 @@ def _import(
     checkpoint: Path, out: Path, names_file: Path | None, frequency_bias: bool | None
 ) -> str:
     try:
-        from deworldsg_ros.perception.fross_checkpoint import Names, import_checkpoint
+        from deworldsg_ros.checkpoints.fross import Names, import_checkpoint
     except ImportError as error:
         raise ConfigurationError(
             f"importing a checkpoint needs torch, transformers and safetensors ({error}): pip "

@@ -10,10 +10,10 @@ from typing import Annotated, Any, Optional
 import typer
 from rich.console import Console
 
+from deworldsg_ros.checkpoints.card import CARD_FILE, read_card
 from deworldsg_ros.config import RelationsConfig, from_mapping
-from deworldsg_ros.perception.checkpoint_card import CARD_FILE, read_card
-from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 OPTION_OF = {
     "model_path": "--model",
@@ -104,10 +104,10 @@ def train_probe(
     names = read_predicates(predicates)
     console = Console(highlight=False, soft_wrap=True)
     with _needing_torch():
-        from deworldsg_ros.cli.probe_clips import read_clips
-        from deworldsg_ros.relations.training.fit import FitOptions
-        from deworldsg_ros.relations.training.train import Progress, TrainingOptions
-        from deworldsg_ros.relations.training.train import train_probe as train
+        from deworldsg_ros.training.dataset_clips import read_clips
+        from deworldsg_ros.training.fit import FitOptions
+        from deworldsg_ros.training.train import Progress, TrainingOptions
+        from deworldsg_ros.training.train import train_probe as train
 
         clips = read_clips(source, clip_length, clips_per_pair)
         options = TrainingOptions(
@@ -161,7 +161,7 @@ def import_probe(
     """Turn the published probe of V-JEPA 2 ViT-g 384 into a folder that loads by name."""
     names = read_predicates(predicates)
     with _needing_torch():
-        from deworldsg_ros.relations.probe_network import import_published, save_probe
+        from deworldsg_ros.relations.probing.probe_network import import_published, save_probe
 
         probe = import_published(checkpoint, names)
         save_probe(out, probe)

@@ -14,20 +14,20 @@ from rich.console import Console
 from rich.table import Table
 
 from deworldsg_ros import __version__
-from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.messages import Role
-from deworldsg_ros.bags.posing import PoseChoice, PosedSource, choose_poses, posed_frames
-from deworldsg_ros.bags.recording import Recording, open_source
-from deworldsg_ros.bags.topics import TopicChoice
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress, working
-from deworldsg_ros.datasets.dataset import DatasetOptions
-from deworldsg_ros.evaluation.temporal import UpdateLog
+from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
+from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
+from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.camera import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.timing import STAGES, device_name, total_ms

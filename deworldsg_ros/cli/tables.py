@@ -14,18 +14,18 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.installation import find_shared
 from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.config import Config
-from deworldsg_ros.datasets.annotations import Annotations
-from deworldsg_ros.evaluation import measures
-from deworldsg_ros.evaluation.comparison import results, text
-from deworldsg_ros.evaluation.comparison.jobs import Job, JobResult
-from deworldsg_ros.evaluation.comparison.mapping import run_jobs
-from deworldsg_ros.evaluation.comparison.rows import Row, table_rows
 from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.measures import graph_measures as measures
 from deworldsg_ros.evaluation.pose_sources import KINDS, WORSE, PoseChoice
-from deworldsg_ros.evaluation.predictions import read_predictions
-from deworldsg_ros.evaluation.protocol import ProtocolOptions, evaluate_predictions
+from deworldsg_ros.evaluation.protocol.predictions import read_predictions
+from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
 from deworldsg_ros.evaluation.runner import ScanTask
+from deworldsg_ros.evaluation.tables import results, text
+from deworldsg_ros.evaluation.tables.jobs import Job, JobResult
+from deworldsg_ros.evaluation.tables.mapping import run_jobs
+from deworldsg_ros.evaluation.tables.rows import Row, table_rows
 from deworldsg_ros.poses.perturbation import parse_noise
+from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.scene.errors import ConfigurationError
 
 EXIT_NOTHING_DONE = 1

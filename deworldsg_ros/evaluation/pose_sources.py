@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Literal
 
-from deworldsg_ros.bags.source import Source
 from deworldsg_ros.config import OdometryConfig
-from deworldsg_ros.datasets.sequence import SequenceDataset, turned_pose
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
 from deworldsg_ros.poses.trajectory import read_trajectory
+from deworldsg_ros.recordings.folders.sequence import SequenceDataset, turned_pose
+from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 

@@ -18,12 +18,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.bags.errors import RecordingError
-from deworldsg_ros.bags.recording import Recording, open_source
-from deworldsg_ros.datasets.annotations import Annotations, Layout, ScanAnnotation, ScanPoints
-from deworldsg_ros.datasets.dataset import read_file
-from deworldsg_ros.perception.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.annotations import (
+    Annotations,
+    Layout,
+    ScanAnnotation,
+    ScanPoints,
+)
+from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 LAYOUT = Layout("recording", "", "", "", "", "", "", "", "bags/README.md says what belongs to it")
 # Older spellings of COCO's words, which ground truth may have.

@@ -14,20 +14,25 @@ from pathlib import Path
 
 import numpy as np
 
-from deworldsg_ros.bags.recording import Recording, open_source
 from deworldsg_ros.config import Config, to_yaml
-from deworldsg_ros.datasets.annotations import Annotations
-from deworldsg_ros.datasets.dataset import DatasetOptions
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
-from deworldsg_ros.evaluation.labels import translate
-from deworldsg_ros.evaluation.measures import Measures, ReferenceScene, measure, read_reference
+from deworldsg_ros.evaluation.measures.graph_measures import (
+    Measures,
+    ReferenceScene,
+    measure,
+    read_reference,
+)
 from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
-from deworldsg_ros.evaluation.protocol import ProtocolOptions, ScanResult, score_scan
+from deworldsg_ros.evaluation.protocol.labels import translate
+from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
+from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.recorded_room import open_annotations
-from deworldsg_ros.evaluation.scene_graphs import to_prediction
 from deworldsg_ros.pipeline import Perceiver, Pipeline
+from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.timing import device_name, total_ms

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.lifting.compiling import kernel
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.lifting.pixels import Float32, Int64
 
 Float64 = NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.lifting.compiling import kernel
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.lifting.pixels import Float32, Int32, Pixels
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.gaussian import transform

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.lifting.compiling import borrowed, kernel
+from deworldsg_ros.kernels import borrowed, kernel
 
 Float32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.lifting.compiling import borrowed, kernel
+from deworldsg_ros.kernels import borrowed, kernel
 from deworldsg_ros.lifting.pixels import Float32, Int32, Int64, Pixels
 
 

@@ -12,16 +12,16 @@ from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from deworldsg_ros.bridge.markers import marker_array
-from deworldsg_ros.bridge.node import StageNode, run
-from deworldsg_ros.bridge.pending import PendingEvidence
-from deworldsg_ros.bridge.poses import pose_from_message, stamp_ns_of
-from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
 from deworldsg_ros.merging.stage import build_merging
+from deworldsg_ros.ros.markers import marker_array
+from deworldsg_ros.ros.node import StageNode, run
+from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.streams.pending import PendingEvidence
+from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
 from deworldsg_ros.view.markers import markers
 
 SILENCE_S = 2.0

@@ -7,15 +7,15 @@ from typing import Any
 
 from sensor_msgs.msg import Image
 
-from deworldsg_ros.bridge.inputs import listen_camera_info, listen_depth, listen_pose
-from deworldsg_ros.bridge.joining import JoiningNode
-from deworldsg_ros.bridge.node import run
-from deworldsg_ros.bridge.poses import stamp_ns_of
-from deworldsg_ros.bridge.qos import source
-from deworldsg_ros.bridge.sync import LiftingAssembler, LiftingFrame
 from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose
+from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.qos import source
 from deworldsg_ros.scene.codec import frame_graph_from_message, local_graph_to_message
 from deworldsg_ros.scene.wire import FrameGraphMessage
+from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.streams.sync import LiftingAssembler, LiftingFrame
 
 
 class LiftingNode(JoiningNode[LiftingFrame]):

@@ -8,20 +8,20 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 
-from deworldsg_ros.bridge.inputs import (
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY, RgbdOdometry
+from deworldsg_ros.ros.inputs import (
     POSE_DEPTH,
     listen_camera_info,
     listen_depth,
     listen_rgb,
 )
-from deworldsg_ros.bridge.joining import JoiningNode
-from deworldsg_ros.bridge.node import run
-from deworldsg_ros.bridge.poses import set_stamp
-from deworldsg_ros.bridge.qos import reliable
-from deworldsg_ros.bridge.transform_output import TransformOutput, put_pose
-from deworldsg_ros.bridge.unposed import UnposedAssembler, UnposedFrame
-from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY, RgbdOdometry
+from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.ros.transform_output import TransformOutput, put_pose
 from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.streams.poses import set_stamp
+from deworldsg_ros.streams.unposed import UnposedAssembler, UnposedFrame
 
 
 class OdometryNode(JoiningNode[UnposedFrame]):

@@ -10,19 +10,19 @@ from typing import Any
 
 from std_msgs.msg import String
 
-from deworldsg_ros.bridge.inputs import listen_rgb
-from deworldsg_ros.bridge.joining import JoiningNode
-from deworldsg_ros.bridge.node import run
-from deworldsg_ros.bridge.qos import reliable
-from deworldsg_ros.bridge.sync import PairingFrame, RelationAssembler
-from deworldsg_ros.perception.checkpoint_card import graph_predicates
+from deworldsg_ros.checkpoints.card import graph_predicates
 from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
 from deworldsg_ros.relations.world_model import build_world_model, require_predicates
+from deworldsg_ros.ros.inputs import listen_rgb
+from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
 from deworldsg_ros.scene.frame_graph import RelationEvidence
+from deworldsg_ros.streams.sync import PairingFrame, RelationAssembler
 
 
 class RelationNode(JoiningNode[PairingFrame]):

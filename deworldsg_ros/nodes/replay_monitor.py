@@ -16,9 +16,9 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from deworldsg_ros.bags.messages import Role
-from deworldsg_ros.bags.pacing import Window
-from deworldsg_ros.bridge.qos import reliable
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.pacing import Window
+from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 
 SEGMENTATION, LIFTING, RELATION, GRAPH, ODOMETRY = (

@@ -21,20 +21,20 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from deworldsg_ros.bags import events, messages
-from deworldsg_ros.bags.messages import Role
-from deworldsg_ros.bags.pacing import Pace
-from deworldsg_ros.bags.recording import open_source
-from deworldsg_ros.bags.source import RawRoleMessage
-from deworldsg_ros.bags.topics import TopicChoice
-from deworldsg_ros.bags.writer import topic_of
-from deworldsg_ros.bridge.parameters import declare
-from deworldsg_ros.bridge.process import refuse, run_process
-from deworldsg_ros.bridge.qos import reliable
 from deworldsg_ros.config import Config, load_config
-from deworldsg_ros.datasets.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.nodes.replay_monitor import SETTLE_S, Endpoint, PipelineMonitor
 from deworldsg_ros.nodes.replay_options import ReplayParameters
+from deworldsg_ros.recordings import events, messages
+from deworldsg_ros.recordings.bags.topics import TopicChoice
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.pacing import Pace
+from deworldsg_ros.recordings.recording import open_source
+from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.recordings.writer import topic_of
+from deworldsg_ros.ros.parameters import declare
+from deworldsg_ros.ros.process import refuse, run_process
+from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 CLASSES = {

@@ -8,16 +8,16 @@ from typing import Any
 
 from sensor_msgs.msg import Image
 
-from deworldsg_ros.bridge.images import fill_image
-from deworldsg_ros.bridge.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
-from deworldsg_ros.bridge.joining import JoiningNode
-from deworldsg_ros.bridge.node import run
-from deworldsg_ros.bridge.poses import set_stamp
-from deworldsg_ros.bridge.qos import reliable
-from deworldsg_ros.bridge.sync import FrameAssembler
 from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
+from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.codec import frame_graph_to_message
+from deworldsg_ros.streams.images import fill_image
+from deworldsg_ros.streams.poses import set_stamp
+from deworldsg_ros.streams.sync import FrameAssembler
 
 
 class SegmentationNode(JoiningNode[RgbdFrame]):

@@ -12,47 +12,47 @@ from typing import TypeVar
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
 from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 Made = TypeVar("Made")
 
 
 def _nanodet(config: PerceptionConfig) -> Detector:
-    from deworldsg_ros.perception.nanodet import NanoDetDetector
+    from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
 
     return NanoDetDetector(threads=config.threads)
 
 
 def _rtdetr(config: PerceptionConfig) -> Detector:
     with _torch("perception.detector", config.detector, config):
-        from deworldsg_ros.perception.rtdetr import RtDetrDetector
+        from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 
     return RtDetrDetector(config)
 
 
 def _rgbd(config: PerceptionConfig) -> Segmenter:
-    from deworldsg_ros.perception.rgbd_segmenter import RgbdSegmenter
+    from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 
     return RgbdSegmenter()
 
 
 def _sam2(config: PerceptionConfig) -> Segmenter:
     with _torch("perception.segmenter", config.segmenter, config):
-        from deworldsg_ros.perception.sam2 import Sam2Segmenter
+        from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
 
     return Sam2Segmenter(config)
 
 
 def _sam(config: PerceptionConfig) -> Segmenter:
     with _torch("perception.segmenter", config.segmenter, config):
-        from deworldsg_ros.perception.sam import SamSegmenter
+        from deworldsg_ros.perception.backends.sam import SamSegmenter
 
     return SamSegmenter(config)
 
 
 def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
-    from deworldsg_ros.perception.geometric_head import GeometricRelationHead
+    from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 
     if config.predicate_set == "checkpoint":
         raise ConfigurationError(
@@ -64,7 +64,7 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
 def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     with _torch("perception.relation_head", config.relation_head, config):
-        from deworldsg_ros.perception.egtr import EgtrRelationHead
+        from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
 
     return EgtrRelationHead(config, detector)
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deworldsg_ros.scene import storage, wire
+from deworldsg_ros.scene import graph_io as storage
+from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import Float64, transform

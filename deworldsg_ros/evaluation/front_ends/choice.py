@@ -9,11 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.bags.source import Source
 from deworldsg_ros.config import Config
-from deworldsg_ros.datasets.annotations import Annotations
-from deworldsg_ros.datasets.instances import read_instances
-from deworldsg_ros.datasets.sequence import SequenceDataset
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.faults import Faults
 from deworldsg_ros.evaluation.front_ends.ground_truth import GroundTruthFrontEnd
@@ -21,9 +17,13 @@ from deworldsg_ros.evaluation.front_ends.injection import FrameFaults, Injection
 from deworldsg_ros.evaluation.front_ends.recorded import RecordedFrontEnd
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom
 from deworldsg_ros.perception.registry import build_perception
-from deworldsg_ros.perception.vocabularies import PREDICATE_SETS
 from deworldsg_ros.pipeline import Perceiver
+from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.recordings.folders.instances import read_instances
+from deworldsg_ros.recordings.folders.sequence import SequenceDataset
+from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 Kind = Literal["backend", "recorded", "ground-truth"]
 KINDS: tuple[Kind, ...] = ("backend", "recorded", "ground-truth")

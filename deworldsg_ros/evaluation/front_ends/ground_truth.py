@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from deworldsg_ros.datasets.annotations import ScanAnnotation, ScanPoints
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.assembly import (
     Detection,
@@ -24,6 +23,7 @@ from deworldsg_ros.evaluation.front_ends.assembly import (
 )
 from deworldsg_ros.evaluation.front_ends.injection import Injection
 from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.recordings.folders.annotations import ScanAnnotation, ScanPoints
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 

@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.datasets.dataset import decode_image, read_file
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.assembly import Detection, Relation, Seen, assemble, spread
 from deworldsg_ros.evaluation.front_ends.injection import Injection
 from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 

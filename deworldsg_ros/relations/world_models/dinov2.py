@@ -10,11 +10,16 @@ from typing import Any
 import torch
 from transformers import Dinov2Model
 
+from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.backbone import FrozenBackbone, fingerprint, load_checkpoint, place
-from deworldsg_ros.relations.preprocessing import ClipGeometry
-from deworldsg_ros.relations.probe import BackboneIdentity
-from deworldsg_ros.relations.probed_world_model import ProbedWorldModel, build_probed
+from deworldsg_ros.relations.probing.backbone import (
+    FrozenBackbone,
+    fingerprint,
+    load_checkpoint,
+    place,
+)
+from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
+from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
 from deworldsg_ros.scene.errors import ConfigurationError
 
 FAMILY = "dinov2"

@@ -1,0 +1,1 @@
+"""Checkpoints: loading, cards, and the import of published files."""

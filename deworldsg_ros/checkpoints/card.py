@@ -1,0 +1,80 @@
+"""What a detector's checkpoint has to tell besides its weights: `deworldsg.json` in its folder."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Union
+
+import msgspec
+
+from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
+
+CARD_FILE = "deworldsg.json"
+# Mean and standard deviation of ImageNet, RGB, of values in [0, 1].
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+# The paper's threshold is one for softmax scores; sigmoid scores of RT-DETR are lower.
+DEFAULT_SCORE_THRESHOLD = {"softmax": 0.7, "sigmoid": 0.5}
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class CheckpointCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a checkpoint is meant to be read; a checkpoint without a card is a public RT-DETR.
+
+    Attributes:
+        class_scores: ``softmax`` over the classes (the paper), or independent ``sigmoid``s.
+        temperature: of the softmax that makes the class distribution; below 1 sharpens.
+        score_threshold: the least score of an object; None = 0.7 for softmax, 0.5 for sigmoid.
+        decoder_layers: layers of the decoder that are run; 0 = all.
+        classes: names of the classes; empty = the `id2label` of config.json.
+        predicates: names of the predicates of the relation head beside the detector, if any.
+        frequency_bias: whether the relation head adds its class-pair statistics.
+    """
+
+    class_scores: Literal["softmax", "sigmoid"] = "sigmoid"
+    temperature: Positive = 1.0
+    score_threshold: Union[Annotated[float, msgspec.Meta(ge=0, le=1)], None] = None
+    decoder_layers: Annotated[int, msgspec.Meta(ge=0)] = 0
+    classes: tuple[str, ...] = ()
+    predicates: tuple[str, ...] = ()
+    frequency_bias: bool = False
+
+
+def read_card(path: Union[Path, None]) -> CheckpointCard:
+    """The card in a file, or the default where there is none; raises ConfigurationError."""
+    if path is None:
+        return CheckpointCard()
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=CheckpointCard)
+    except (OSError, msgspec.MsgspecError) as error:
+        raise ConfigurationError(f"checkpoint card {path}: {error}") from error
+
+
+def write_card(path: Path, card: CheckpointCard) -> None:
+    """Write a card, for people to read, too."""
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+
+
+def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
+    """The predicates that the graph will have, for who runs no perception.
+
+    Returns:
+        None where only loading the relation head would tell: its checkpoint is no folder here.
+
+    Raises:
+        ConfigurationError: the checkpoint's card cannot be read, or names none.
+    """
+    if config.predicate_set != "checkpoint":
+        return PREDICATE_SETS[config.predicate_set]
+    folder = Path(config.relation_head_path or config.detector_path).expanduser()
+    path = folder / CARD_FILE
+    if not path.is_file():
+        return None
+    predicates = read_card(path).predicates
+    if not predicates:
+        raise ConfigurationError(
+            f"perception.predicate_set is 'checkpoint' and {path} names no predicates: it is the "
+            "card of a detector without a relation head"
+        )
+    return predicates

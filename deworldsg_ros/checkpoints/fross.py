@@ -1,0 +1,357 @@
+"""A published FROSS checkpoint (RT-DETR with EGTR, by Lightning) → a folder that loads by name."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import torch
+from safetensors.torch import save_file
+from transformers import RTDetrConfig, RTDetrResNetConfig, RTDetrV2Config
+
+from deworldsg_ros.checkpoints.architectures import DETECTORS, HEAD_FILE
+from deworldsg_ros.checkpoints.card import (
+    CARD_FILE,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    CheckpointCard,
+    write_card,
+)
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork, check_names
+from deworldsg_ros.checkpoints.fross_names import (
+    DERIVED,
+    canonical_name,
+    earlier_name,
+    public_name,
+    published_name,
+)
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.vocabularies import (
+    REPLICA_SSG_PREDICATES,
+    SCANNET_CLASSES,
+    SCANNET_PREDICATES,
+    VISUAL_GENOME_CLASSES,
+)
+
+DETECTOR_PREFIX = "model.obj_det_model."
+HEAD_PREFIX = "model.egtr_head."
+INPUT_SIZE = 640
+# What FROSS's own config.json does not say, it takes from its defaults.
+HEADS = 8
+QUERIES = 300
+# Index of the last layer that is run, of six.
+EVALUATED_LAYER = 2
+VOCABULARIES = (
+    (VISUAL_GENOME_CLASSES, REPLICA_SSG_PREDICATES),
+    (SCANNET_CLASSES, SCANNET_PREDICATES),
+)
+
+Tensors = Mapping[str, torch.Tensor]
+
+
+class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Names of the outputs, in their order."""
+
+    classes: tuple[str, ...]
+    predicates: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Imported:
+    """What an import made.
+
+    Attributes:
+        architecture: ``rt_detr`` or ``rt_detr_v2``.
+        parameters: number of values in detector and head.
+        card: how the folder is read.
+        layers: of the decoder.
+    """
+
+    architecture: str
+    parameters: int
+    card: CheckpointCard
+    layers: int
+
+
+def import_checkpoint(
+    checkpoint: Path,
+    out: Path,
+    *,
+    names: Names | None = None,
+    frequency_bias: bool | None = None,
+) -> Imported:
+    """Write detector, relation head, names and preprocessing into `out`.
+
+    Args:
+        checkpoint: the .ckpt file, or the folder that holds ``checkpoints/epoch=….ckpt``. A
+            config.json beside it or above it is read for what the weights do not tell.
+        out: folder to make; must not hold a checkpoint yet.
+        names: of classes and predicates; None = by their numbers, Visual Genome's or 3DSSG's.
+        frequency_bias: whether the class-pair statistics are added; None = as config.json says,
+            and without one not.
+
+    Raises:
+        ConfigurationError: a file that is no such checkpoint, with the parameters that are
+            missing or unknown, by name.
+    """
+    path = _checkpoint_file(checkpoint)
+    detector, head = split(read_state(path), str(path))
+    settings = _settings_beside(path)
+    config = infer_config(detector, settings, str(path))
+    model = DETECTORS[config.model_type](config)
+    _fill(model, detector, str(path))
+    network = EgtrNetwork.for_parameters(head, f"{path} ({HEAD_PREFIX}…)")
+    if network.final_sub_proj.in_features != config.d_model:
+        raise ConfigurationError(
+            f"{path}: the relation head reads {network.final_sub_proj.in_features} features and "
+            f"the detector has {config.d_model}: wanted one checkpoint of both"
+        )
+    names = names or _known_names(config.num_labels, network.predicates, str(path))
+    _check_counts(names, config.num_labels, network.predicates, str(path))
+    evaluated = int(settings.get("rt_detr_transformer_eval_idx", EVALUATED_LAYER))
+    layers = evaluated % config.decoder_layers + 1 if evaluated < config.decoder_layers else 0
+    if frequency_bias is None:
+        frequency_bias = bool(settings.get("use_freq_bias", False))
+    card = CheckpointCard(
+        class_scores="softmax",
+        score_threshold=0.7,
+        decoder_layers=layers,
+        classes=names.classes,
+        predicates=names.predicates,
+        frequency_bias=frequency_bias,
+    )
+    model.config.id2label = dict(enumerate(names.classes))
+    model.config.label2id = {name: index for index, name in enumerate(names.classes)}
+    _write(out, model, network, card)
+    values = [*model.state_dict().values(), *network.state_dict().values()]
+    return Imported(config.model_type, sum(v.numel() for v in values), card, config.decoder_layers)
+
+
+def read_state(path: Path) -> Tensors:
+    """The parameters of a Lightning checkpoint; nothing in the file is executed.
+
+    Raises:
+        ConfigurationError: no such file, or none that holds tensors alone.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and torch each have errors of their own
+        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise ConfigurationError(
+            f"checkpoint {path} cannot be read ({first_line}): wanted the .ckpt file that Lightning"
+            " wrote; where it holds more than tensors, keep its `state_dict` alone"
+        ) from error
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict) or not all(map(torch.is_tensor, state.values())):
+        raise ConfigurationError(f"checkpoint {path} has no `state_dict` of tensors: wanted one")
+    return state
+
+
+def split(state: Tensors, where: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Parameters of the detector and of the relation head, without their prefixes."""
+    detector: dict[str, torch.Tensor] = {}
+    head: dict[str, torch.Tensor] = {}
+    unknown = []
+    for name, value in state.items():
+        if name.startswith(DETECTOR_PREFIX):
+            detector[canonical_name(name[len(DETECTOR_PREFIX) :])] = value
+        elif name.startswith(HEAD_PREFIX):
+            head[name[len(HEAD_PREFIX) :]] = value
+        else:
+            unknown.append(name)
+    if unknown or not detector or not head:
+        example = f", and not {sorted(unknown)[0]}" if unknown else ""
+        raise ConfigurationError(
+            f"{where} is no checkpoint of RT-DETR with EGTR: wanted parameters named "
+            f"{DETECTOR_PREFIX}… and {HEAD_PREFIX}… alone{example} (EGTR's own checkpoints are of "
+            "another detector, Deformable DETR)"
+        )
+    return detector, head
+
+
+def infer_config(detector: Tensors, settings: Mapping[str, Any], where: str) -> Any:
+    """The architecture that published parameters belong to.
+
+    Args:
+        detector: canonical names.
+        settings: FROSS's config.json, or nothing.
+        where: the parameters come from, for messages.
+
+    Raises:
+        ConfigurationError: a parameter that tells a size is missing.
+    """
+
+    def shape(name: str) -> torch.Size:
+        if name not in detector:
+            raise ConfigurationError(f"{where} lacks {DETECTOR_PREFIX}{name}: wanted it")
+        return detector[name].shape
+
+    def count(pattern: str) -> int:
+        found = [re.match(pattern, name) for name in detector]
+        return 1 + max((int(match[1]) for match in found if match), default=-1)
+
+    bottleneck = "backbone.res_layers.0.blocks.0.branch2c.conv.weight" in detector
+    last_branch = "c" if bottleneck else "b"
+    stages = range(count(r"backbone\.res_layers\.(\d+)\."))
+    make_backbone: Any = RTDetrResNetConfig
+    backbone = make_backbone(
+        embedding_size=shape("backbone.conv1.conv1_3.conv.weight")[0],
+        hidden_sizes=[
+            shape(f"backbone.res_layers.{stage}.blocks.0.branch2{last_branch}.conv.weight")[0]
+            for stage in stages
+        ],
+        depths=[count(rf"backbone\.res_layers\.{stage}\.blocks\.(\d+)\.") for stage in stages],
+        layer_type="bottleneck" if bottleneck else "basic",
+        out_features=[f"stage{stage + 1}" for stage in stages][-3:],
+    )
+    levels = count(r"decoder\.input_proj\.(\d+)\.")
+    projections = range(count(r"encoder\.input_proj\.(\d+)\."))
+    hidden = shape("encoder.input_proj.0.conv.weight")[0]
+    attention = "decoder.decoder.layers.0.cross_attn."
+    second = f"{attention}num_points_scale" in detector
+    heads = int(settings.get("hybrid_encoder_nhead", HEADS))
+    points = shape(f"{attention}attention_weights.weight")[0] // (HEADS * max(levels, 1))
+    sizes: dict[str, Any] = {
+        "encoder_hidden_dim": hidden,
+        "encoder_in_channels": [
+            shape(f"encoder.input_proj.{level}.conv.weight")[1] for level in projections
+        ],
+        "encoder_layers": count(r"encoder\.encoder\.0\.layers\.(\d+)\."),
+        "encoder_ffn_dim": shape("encoder.encoder.0.layers.0.linear1.weight")[0],
+        "encoder_attention_heads": heads,
+        "hidden_expansion": shape("encoder.fpn_blocks.0.conv1.conv.weight")[0] / hidden,
+        "d_model": shape("decoder.input_proj.0.conv.weight")[0],
+        "decoder_in_channels": [
+            shape(f"decoder.input_proj.{level}.conv.weight")[1] for level in range(levels)
+        ],
+        "num_feature_levels": levels,
+        "decoder_layers": count(r"decoder\.decoder\.layers\.(\d+)\."),
+        "decoder_ffn_dim": shape("decoder.decoder.layers.0.linear1.weight")[0],
+        "decoder_attention_heads": HEADS,
+        "decoder_n_points": points,
+        "num_queries": int(settings.get("num_queries", QUERIES)),
+        "num_denoising": 100 if "decoder.denoising_class_embed.weight" in detector else 0,
+        "learn_initial_query": "decoder.tgt_embed.weight" in detector,
+        "num_labels": shape("decoder.dec_score_head.0.weight")[0],
+    }
+    if second:
+        return RTDetrV2Config(backbone_config=backbone, decoder_n_levels=levels, **sizes)
+    return RTDetrConfig(backbone_config=backbone, **sizes)
+
+
+def _fill(model: Any, detector: Tensors, where: str) -> None:
+    """Put published parameters into the model: each has to find its place, and the reverse."""
+    wanted = {name: published_name(name) for name in model.state_dict()}
+    expected: dict[str, None] = {}
+    found: dict[str, torch.Tensor] = {}
+    for published in wanted.values():
+        if published is not None and not _is_counter(published):
+            expected[_packed(published)] = None
+    for name, value in detector.items():
+        if not _is_counter(name) and name not in DERIVED:
+            found[name] = value
+    check_names(found, expected, f"{where} ({DETECTOR_PREFIX}…)")
+    public = {}
+    for name, value in found.items():
+        for unpacked, part in _unpacked(name, value).items():
+            public[public_name(unpacked)] = part
+    state = model.state_dict()
+    filled = {name: public.get(earlier_name(name), state[name]) for name in state}
+    try:
+        model.load_state_dict(filled)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise ConfigurationError(f"{where} is no RT-DETR of one kind: {reason}") from error
+
+
+def _is_counter(name: str) -> bool:
+    """Batches that a normalisation saw in training: there or not, nothing depends on them."""
+    return name.endswith("num_batches_tracked")
+
+
+def _packed(name: str) -> str:
+    """torch's own attention keeps the rows of q, k and v in one parameter."""
+    return re.sub(r"\.self_attn\.[qkv]_proj\.(weight|bias)$", r".self_attn.in_proj_\1", name)
+
+
+def _unpacked(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:
+    packed = re.fullmatch(r"(.*\.self_attn)\.in_proj_(weight|bias)", name)
+    if packed is None:
+        return {name: value}
+    return {
+        f"{packed[1]}.{part}_proj.{packed[2]}": rows for part, rows in zip("qkv", value.chunk(3))
+    }
+
+
+def _known_names(classes: int, predicates: int, where: str) -> Names:
+    for known_classes, known_predicates in VOCABULARIES:
+        if (classes, predicates) == (len(known_classes), len(known_predicates)):
+            return Names(known_classes, known_predicates)
+    raise ConfigurationError(
+        f"{where} has {classes} classes and {predicates} predicates, neither Visual Genome's 150 "
+        "and 50 nor 3DSSG's 20 and 7: name them in a JSON file and pass it with --names"
+    )
+
+
+def _check_counts(names: Names, classes: int, predicates: int, where: str) -> None:
+    found = len(names.classes), len(names.predicates)
+    if found != (classes, predicates):
+        raise ConfigurationError(
+            f"{where} has {classes} classes and {predicates} predicates, and {found[0]} and "
+            f"{found[1]} are named: wanted a name for each"
+        )
+
+
+def _checkpoint_file(path: Path) -> Path:
+    if path.is_file():
+        return path
+    # The last epoch, as FROSS itself chooses.
+    found = sorted(
+        path.glob("checkpoints/epoch=*.ckpt"),
+        key=lambda file: int(re.findall(r"epoch=(\d+)", file.name)[0]),
+    )
+    if not found:
+        raise ConfigurationError(
+            f"checkpoint {path}: wanted a .ckpt file, or a folder with checkpoints/epoch=….ckpt"
+        )
+    return found[-1]
+
+
+def _settings_beside(path: Path) -> Mapping[str, Any]:
+    for folder in (path.parent, path.parent.parent):
+        file = folder / "config.json"
+        if file.is_file():
+            try:
+                settings: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                raise ConfigurationError(f"{file}: {error}; wanted FROSS's settings") from error
+            return settings
+    return {}
+
+
+def _write(out: Path, model: Any, network: EgtrNetwork, card: CheckpointCard) -> None:
+    if (out / "config.json").exists():
+        raise ConfigurationError(f"{out} holds a checkpoint already: wanted an empty or new folder")
+    preprocessing = {
+        "image_processor_type": "RTDetrImageProcessor",
+        "size": {"height": INPUT_SIZE, "width": INPUT_SIZE},
+        "do_resize": True,
+        "do_rescale": True,
+        "do_normalize": True,
+        "image_mean": list(IMAGENET_MEAN),
+        "image_std": list(IMAGENET_STD),
+    }
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        model.save_pretrained(out)
+        save_file({k: v.contiguous() for k, v in network.state_dict().items()}, out / HEAD_FILE)
+        text = json.dumps(preprocessing, indent=2) + "\n"
+        (out / "preprocessor_config.json").write_text(text, encoding="utf-8")
+        write_card(out / CARD_FILE, card)
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {out}: {error}") from error

@@ -1,0 +1,1 @@
+"""Measures beside the protocol: precision, duplicates, positions, steadiness."""

@@ -1,0 +1,309 @@
+"""What recall leaves out: precision, duplicates, position, extent, edges, calibration.
+
+docs/evaluation.md defines every measure. Counts are kept, so that scans can be pooled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from deworldsg_ros.evaluation.measures.reference import ReferenceScene, read_reference
+from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+
+__all__ = ["Measures", "ReferenceScene", "measure", "measure_prediction", "pool", "read_reference"]
+
+# A node belongs to an object when its mean is in the object's box, grown by this on every side.
+BOX_MARGIN_M = 0.05
+# A node's extent is between these quantiles of its surface points: single stray points are not it.
+EXTENT_QUANTILES = (0.02, 0.98)
+CALIBRATION_BINS = 10
+
+
+class NodeView(NamedTuple):
+    """What the measures look at in a node; `weight` decides which of several is the main one."""
+
+    id: int
+    label: str
+    probability: float
+    mean_m: Float64
+    points_m: Float64
+    weight: float
+
+
+class EdgeView(NamedTuple):
+    """What the measures look at in an edge: ends by node id, best predicate and its probability."""
+
+    subject: int
+    object: int
+    predicate: str
+    probability: float
+
+
+class Calibrated(NamedTuple):
+    """A stated probability and whether it came true."""
+
+    probability: float
+    right: bool
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Counts and samples of one scan or of several.
+
+    Attributes:
+        objects: annotated objects that a perfect run finds.
+        nodes: of the graph.
+        found: objects with at least one node.
+        matched: nodes of the class of an object whose box their mean is in.
+        wrong_class: nodes in the box of an object, but of none of their class.
+        stray: nodes in no box.
+        edges: of the graph.
+        edges_between: edges whose ends are matched to two objects.
+        edges_right: of those, the ones whose best predicate is annotated.
+        relations: annotated relations between objects that a perfect run finds.
+        relations_found: of those, the ones that a right edge states.
+        best_errors_m, main_errors_m: distance of mean and visible centroid, of each object found.
+        extent_errors_m: mean over the axes of the difference of extents, main nodes.
+        box_ious: overlap of the boxes, main nodes.
+        edge_beliefs, node_beliefs: probabilities of best predicates of edges between objects and
+            of best classes of nodes in a box.
+        confusion: (annotated class, predicted class) of nodes that are in one object's box.
+    """
+
+    objects: int = 0
+    nodes: int = 0
+    found: int = 0
+    matched: int = 0
+    wrong_class: int = 0
+    stray: int = 0
+    edges: int = 0
+    edges_between: int = 0
+    edges_right: int = 0
+    relations: int = 0
+    relations_found: int = 0
+    best_errors_m: list[float] = field(default_factory=list)
+    main_errors_m: list[float] = field(default_factory=list)
+    extent_errors_m: list[float] = field(default_factory=list)
+    box_ious: list[float] = field(default_factory=list)
+    edge_beliefs: list[Calibrated] = field(default_factory=list)
+    node_beliefs: list[Calibrated] = field(default_factory=list)
+    confusion: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def duplicates(self) -> int:
+        """Matched nodes beyond the first of each object."""
+        return self.matched - self.found
+
+    def numbers(self) -> dict[str, float]:
+        """Every measure by name; fractions, metres; NaN where undefined."""
+        node_precision = _ratio(self.matched, self.nodes)
+        return {
+            "objects": self.objects,
+            "nodes": self.nodes,
+            "found": self.found,
+            "duplicates": self.duplicates,
+            "wrong_class": self.wrong_class,
+            "stray": self.stray,
+            "node_recall": _ratio(self.found, self.objects),
+            "node_precision": node_precision,
+            "duplicates_per_object": _ratio(self.duplicates, self.found),
+            "f1": _ratio(2 * self.found, self.nodes + self.objects),
+            "centroid_error_best_median_m": _quantile(self.best_errors_m, 0.5),
+            "centroid_error_best_mean_m": _mean(self.best_errors_m),
+            "centroid_error_best_p90_m": _quantile(self.best_errors_m, 0.9),
+            "centroid_error_main_median_m": _quantile(self.main_errors_m, 0.5),
+            "centroid_error_main_mean_m": _mean(self.main_errors_m),
+            "extent_error_median_m": _quantile(self.extent_errors_m, 0.5),
+            "extent_error_mean_m": _mean(self.extent_errors_m),
+            "box_iou_mean": _mean(self.box_ious),
+            "edges": self.edges,
+            "edges_between_objects": self.edges_between,
+            "edges_right": self.edges_right,
+            "edge_precision": _ratio(self.edges_right, self.edges),
+            "edge_precision_between_objects": _ratio(self.edges_right, self.edges_between),
+            "edge_recall": _ratio(self.relations_found, self.relations),
+            "edge_calibration_error": calibration_error(self.edge_beliefs),
+            "node_calibration_error": calibration_error(self.node_beliefs),
+        }
+
+
+def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measures:
+    """Hold a scene graph against the objects of its scan."""
+    nodes = [
+        NodeView(
+            node.id,
+            node.label,
+            node.classes[0].probability,
+            np.array(node.mean_m),
+            np.array(node.surface_points_m, np.float64).reshape(-1, 3),
+            # Of equally often seen nodes the one with more points.
+            node.observations + 1e-6 * len(node.surface_points_m),
+        )
+        for node in graph.nodes
+    ]
+    edges = [
+        EdgeView(edge.subject, edge.object, edge.predicate, edge.probability)
+        for edge in graph.edges
+    ]
+    return measure_views(nodes, edges, reference)
+
+
+def measure_prediction(
+    prediction: ScanPrediction, vocabulary: Vocabulary, reference: ReferenceScene
+) -> Measures:
+    """The same for a prediction: a node is at the median of its points, its weight their number.
+
+    The median, because a few wild points among them are common and must not move it.
+    Nodes without a finite point are nowhere: they count, as stray ones.
+    """
+    nodes = []
+    for place, points in enumerate(prediction.points_world):
+        surface = np.asarray(points, np.float64)
+        surface = surface[np.isfinite(surface).all(axis=1)]
+        mean = np.median(surface, axis=0) if len(surface) else np.full(3, np.nan)
+        label, probability = _top(prediction.class_scores[place], vocabulary.classes)
+        nodes.append(NodeView(place, label, probability, mean, surface, len(surface)))
+    edges = []
+    for (subject, object_), scores in zip(prediction.edges.tolist(), prediction.edge_scores):
+        edges.append(EdgeView(subject, object_, *_top(scores, vocabulary.predicates)))
+    return measure_views(nodes, edges, reference)
+
+
+def measure_views(
+    nodes: Sequence[NodeView], edges: Sequence[EdgeView], reference: ReferenceScene
+) -> Measures:
+    """The measures of nodes and edges, see the module."""
+    nodes_of: dict[int, list[NodeView]] = {}
+    object_of: dict[int, int] = {}
+    confusion: list[tuple[str, str]] = []
+    node_beliefs: list[Calibrated] = []
+    counts = {"matched": 0, "wrong_class": 0, "stray": 0}
+    for node in nodes:
+        inside = _objects_around(node.mean_m, reference)
+        own = [row for row in inside if reference.labels[row] == node.label]
+        counts["matched" if own else "wrong_class" if inside else "stray"] += 1
+        if not inside:
+            continue
+        node_beliefs.append(Calibrated(node.probability, bool(own)))
+        row = _nearest(node.mean_m, own or inside, reference)
+        confusion.append((reference.labels[row], node.label))
+        if own:
+            nodes_of.setdefault(row, []).append(node)
+            object_of[node.id] = reference.ids[row]
+
+    best_errors, main_errors, extent_errors, ious = [], [], [], []
+    for row, matched in sorted(nodes_of.items()):
+        errors = [float(np.linalg.norm(n.mean_m - reference.centroids[row])) for n in matched]
+        main = max(range(len(matched)), key=lambda place: matched[place].weight)
+        best_errors.append(min(errors))
+        main_errors.append(errors[main])
+        if len(matched[main].points_m):
+            low, high = np.quantile(matched[main].points_m, EXTENT_QUANTILES, axis=0)
+            box = reference.boxes_min[row], reference.boxes_max[row]
+            extent_errors.append(float(np.abs((high - low) - (box[1] - box[0])).mean()))
+            ious.append(_box_iou((low, high), box))
+
+    between = [
+        (object_of[edge.subject], object_of[edge.object], edge)
+        for edge in edges
+        if edge.subject in object_of
+        and edge.object in object_of
+        and object_of[edge.subject] != object_of[edge.object]
+    ]
+    judged = [((s, o, edge.predicate), edge.probability) for s, o, edge in between]
+    known = set(reference.ids)
+    wanted = {item for item in reference.relations if {item[0], item[1]} <= known}
+    right = [triple for triple, _ in judged if triple in reference.relations]
+    return Measures(
+        objects=len(reference),
+        nodes=len(nodes),
+        found=len(nodes_of),
+        **counts,
+        edges=len(edges),
+        edges_between=len(between),
+        edges_right=len(right),
+        relations=len(wanted),
+        relations_found=len(wanted & set(right)),
+        best_errors_m=best_errors,
+        main_errors_m=main_errors,
+        extent_errors_m=extent_errors,
+        box_ious=ious,
+        edge_beliefs=[
+            Calibrated(probability, triple in reference.relations) for triple, probability in judged
+        ],
+        node_beliefs=node_beliefs,
+        confusion=confusion,
+    )
+
+
+def pool(measures: Iterable[Measures]) -> Measures:
+    """The measures of all scans together: counts are added, samples joined."""
+    totals = Measures()
+    for item in measures:
+        totals = Measures(
+            **{name: getattr(totals, name) + getattr(item, name) for name in vars(totals)}
+        )
+    return totals
+
+
+def calibration_error(beliefs: Sequence[Calibrated]) -> float:
+    """Expected calibration error over ten equal bins of probability; NaN without beliefs."""
+    if not beliefs:
+        return math.nan
+    probabilities = np.array([item.probability for item in beliefs])
+    right = np.array([item.right for item in beliefs], np.float64)
+    bins = np.clip((probabilities * CALIBRATION_BINS).astype(int), 0, CALIBRATION_BINS - 1)
+    gaps = [
+        abs(float((right[bins == place] - probabilities[bins == place]).sum()))
+        for place in range(CALIBRATION_BINS)
+    ]
+    return sum(gaps) / len(beliefs)
+
+
+def _objects_around(mean_m: Float64, reference: ReferenceScene) -> list[int]:
+    inside = (
+        (mean_m >= reference.boxes_min - BOX_MARGIN_M)
+        & (mean_m <= reference.boxes_max + BOX_MARGIN_M)
+    ).all(axis=1)
+    rows: list[int] = np.flatnonzero(inside).tolist()
+    return rows
+
+
+def _nearest(mean_m: Float64, rows: Sequence[int], reference: ReferenceScene) -> int:
+    return min(rows, key=lambda row: float(np.linalg.norm(mean_m - reference.centroids[row])))
+
+
+def _box_iou(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:
+    sides = np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0, None)
+    common = float(np.prod(sides))
+    union = float(np.prod(a[1] - a[0])) + float(np.prod(b[1] - b[0])) - common
+    return common / union if union > 0 else 0.0
+
+
+def _top(scores: Float64, names: Sequence[str]) -> tuple[str, float]:
+    """The best label, the last of equals, and its share of all scores."""
+    if not len(scores):
+        return "", 0.0
+    place = len(scores) - 1 - int(np.argmax(scores[::-1]))
+    value, total = float(scores[place]), float(np.nansum(scores))
+    share = value / total if total > 0 and 0 <= value <= total else 0.0
+    return (names[place] if place < len(names) else ""), share
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else math.nan
+
+
+def _quantile(values: Sequence[float], fraction: float) -> float:
+    return float(np.quantile(values, fraction)) if values else math.nan

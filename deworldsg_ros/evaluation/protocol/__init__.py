@@ -1,0 +1,1 @@
+"""The official protocol and its input formats."""

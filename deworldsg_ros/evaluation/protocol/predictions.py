@@ -1,0 +1,249 @@
+"""Predicted scene graphs as the protocol takes them: two formats in, one format out.
+
+The open format (JSON) and the official pickle are described in docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.protocol.pickles import load_pickle
+
+FORMAT = "scene graph predictions 1"
+
+
+@dataclass(frozen=True)
+class ScanPrediction:
+    """The predicted graph of one scan (N nodes, E edges); the order of both decides ties.
+
+    Attributes:
+        points_world: N arrays (n_i, 3), metres.
+        class_scores: (N, C), any number type.
+        edges: (E, 2) int64, subject and object, places among the nodes.
+        edge_scores: (E, P), any number type.
+        notes: what the official program would have stopped at, and what was done instead.
+    """
+
+    points_world: tuple[NDArray[np.floating[Any]], ...]
+    class_scores: NDArray[Any]
+    edges: NDArray[np.int64]
+    edge_scores: NDArray[Any]
+    notes: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.points_world)
+
+    @staticmethod
+    def empty(class_count: int, predicate_count: int) -> ScanPrediction:
+        """Nothing found."""
+        return ScanPrediction(
+            (),
+            np.zeros((0, class_count)),
+            np.zeros((0, 2), np.int64),
+            np.zeros((0, predicate_count)),
+        )
+
+
+def read_predictions(path: Path) -> dict[str, ScanPrediction]:
+    """Predictions of a ``.json`` or ``.pkl`` file, by scan.
+
+    Raises:
+        EvaluationError: with what was seen and what was wanted.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise EvaluationError(f"predictions {path} cannot be read ({error.strerror})") from error
+    if path.suffix.lower() in (".pkl", ".pickle"):
+        return _from_official(load_pickle(content, str(path)), path)
+    return _from_open(_parse_json(content, path), path)
+
+
+def write_predictions(
+    path: Path,
+    predictions: Mapping[str, ScanPrediction],
+    class_count: int,
+    predicate_count: int,
+) -> None:
+    """Write the open format."""
+    scans = {
+        scan: {
+            "nodes": [
+                {"id": row, "class_probabilities": scores, "points": points.tolist()}
+                for row, (scores, points) in enumerate(
+                    zip(prediction.class_scores.tolist(), prediction.points_world)
+                )
+            ],
+            "edges": [
+                {"subject": subject, "object": object_, "predicate_probabilities": scores}
+                for (subject, object_), scores in zip(
+                    prediction.edges.tolist(), prediction.edge_scores.tolist()
+                )
+            ],
+        }
+        for scan, prediction in predictions.items()
+    }
+    content = {
+        "format": FORMAT,
+        "num_classes": class_count,
+        "num_predicates": predicate_count,
+        "scans": scans,
+    }
+    path.write_bytes(msgspec.json.encode(content))
+
+
+def _parse_json(content: bytes, path: Path) -> Any:
+    try:
+        return msgspec.json.decode(content)
+    except msgspec.DecodeError:
+        pass
+    try:
+        # Slower, but knows NaN and Infinity, which Python's own writer writes.
+        return json.loads(content)
+    except ValueError as error:
+        raise EvaluationError(f"predictions {path} are no JSON: {error}") from error
+
+
+def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
+    try:
+        class_count, predicate_count = int(content["num_classes"]), int(content["num_predicates"])
+        scans = dict(content["scans"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise EvaluationError(
+            f"predictions {path}: wanted num_classes, num_predicates and scans at the top"
+        ) from error
+    predictions = {}
+    for scan, graph in scans.items():
+        try:
+            predictions[scan] = _open_scan(graph, class_count, predicate_count)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise EvaluationError(
+                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; wanted nodes "
+                "with class_index or class_probabilities and points, and edges with subject, "
+                "object and predicate_probabilities"
+            ) from error
+        except EvaluationError as error:
+            raise EvaluationError(f"predictions {path}, scan {scan}: {error}") from error
+    return predictions
+
+
+def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPrediction:
+    nodes, edges = list(graph["nodes"]), list(graph.get("edges", []))
+    notes: list[str] = []
+    class_scores = np.zeros((len(nodes), class_count))
+    places: dict[int, int] = {}
+    for row, node in enumerate(nodes):
+        node_id = int(node.get("id", row))
+        if node_id in places:
+            raise EvaluationError(f"two nodes have the id {node_id}")
+        places[node_id] = row
+        if node.get("class_probabilities") is not None:
+            class_scores[row] = _vector(node["class_probabilities"], class_count)
+        else:
+            class_scores[row] = _one_hot(node["class_index"], class_count)
+    edge_scores = np.zeros((len(edges), predicate_count))
+    ends = np.zeros((len(edges), 2), np.int64)
+    for row, edge in enumerate(edges):
+        ids = (int(edge["subject"]), int(edge["object"]))
+        _refuse_negative(min(ids))
+        if not places.keys() >= set(ids):
+            notes.append(f"edge {ids} names a node that there is not: it relates nothing")
+        ends[row] = [places.get(end, len(nodes)) for end in ids]
+        if edge.get("predicate_probabilities") is not None:
+            edge_scores[row] = _vector(edge["predicate_probabilities"], predicate_count)
+        else:
+            edge_scores[row] = _one_hot(edge["predicate_index"], predicate_count)
+    points = tuple(_segment(node.get("points", [])) for node in nodes)
+    return ScanPrediction(points, class_scores, ends, edge_scores, notes)
+
+
+def _one_hot(index: Any, count: int) -> NDArray[np.float64]:
+    if not isinstance(index, int) or not 0 <= index < count:
+        raise EvaluationError(f"index {index!r}: wanted a whole number from 0 to {count - 1}")
+    return np.eye(count)[index]
+
+
+def _vector(values: Any, count: int) -> NDArray[np.float64]:
+    # null is how strict writers spell NaN; numpy reads it so.
+    vector = np.array(values, np.float64)
+    if vector.shape != (count,):
+        raise EvaluationError(f"vector of {vector.size} scores: wanted {count}")
+    return vector
+
+
+def _segment(values: Any) -> NDArray[np.floating[Any]]:
+    """Points (n, 3); float32 arrays stay what they are."""
+    points = np.array(values, np.float64) if isinstance(values, list) else np.asarray(values)
+    if points.size == 0:
+        return np.zeros((0, 3))
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+        raise EvaluationError(f"segment of shape {points.shape}: wanted (n, 3) numbers")
+    return points if points.dtype.kind == "f" else points.astype(np.float64)
+
+
+def _from_official(content: Any, path: Path) -> dict[str, ScanPrediction]:
+    if not isinstance(content, dict):
+        raise EvaluationError(f"predictions {path}: wanted a dictionary by scan")
+    predictions = {}
+    for scan, graph in content.items():
+        try:
+            predictions[str(scan)] = _official_scan(graph)
+        except (KeyError, TypeError, ValueError) as error:
+            raise EvaluationError(
+                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; wanted pcd, "
+                "cls, edge_index and edge_cls"
+            ) from error
+        except EvaluationError as error:
+            raise EvaluationError(f"predictions {path}, scan {scan}: {error}") from error
+    return predictions
+
+
+def _official_scan(graph: Mapping[str, Any]) -> ScanPrediction:
+    points = tuple(_segment(segment) for segment in graph["pcd"])
+    class_scores = _table(graph["cls"], len(points), "cls")
+    edges = np.asarray(graph["edge_index"])
+    if edges.size == 0:
+        edges = np.zeros((2, 0), np.int64)
+    if edges.ndim != 2 or edges.shape[0] != 2:
+        raise EvaluationError(f"edge_index of shape {edges.shape}: wanted (2, E)")
+    if edges.dtype.kind == "f" and not (edges == np.floor(edges)).all():
+        raise EvaluationError("edge_index holds fractions: wanted whole numbers")
+    edges = edges.T.astype(np.int64)
+    if len(edges):
+        _refuse_negative(int(edges.min()))
+    notes = []
+    if (edges >= len(points)).any():
+        notes.append(
+            f"edge_index names node {int(edges.max())} of {len(points)}: such edges relate nothing"
+        )
+    return ScanPrediction(
+        points, class_scores, edges, _table(graph["edge_cls"], len(edges), "edge_cls"), notes
+    )
+
+
+def _table(values: Any, rows: int, name: str) -> NDArray[Any]:
+    """Scores (rows, columns) in their own number type."""
+    table = np.asarray(values) if not isinstance(values, Sequence) else _stack(values)
+    if table.size == 0 and rows == 0:
+        return np.zeros((0, table.shape[1] if table.ndim == 2 else 0))
+    if table.ndim != 2 or len(table) != rows or table.dtype.kind not in "?biuf":
+        raise EvaluationError(f"{name} has the shape {table.shape}: wanted {rows} rows of scores")
+    return table
+
+
+def _stack(values: Sequence[Any]) -> NDArray[Any]:
+    return np.array([np.asarray(row) for row in values]) if values else np.zeros((0, 0))
+
+
+def _refuse_negative(smallest: int) -> None:
+    if smallest < 0:
+        raise EvaluationError(f"an edge names node {smallest}: wanted 0 or more")

@@ -1,0 +1,79 @@
+"""Scene graphs of this package as predictions of the protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+
+# About what one frame adds to the surface of a node.
+POINTS_PER_OBSERVATION = 64
+
+
+def to_prediction(
+    graph: wire.SceneGraphMessage, vocabulary: Vocabulary, *, sampled: bool = True
+) -> ScanPrediction:
+    """Nodes with their surface points, edges with their predicate distributions, in graph order.
+
+    The protocol prefers the prediction with more points, so that of several nodes on one object
+    the one that was seen most stands for it. A graph keeps a bounded sample of the surface: the
+    first `POINTS_PER_OBSERVATION` of it count once for each frame in which the node was seen.
+    Where the points are not `sampled` but all that there are, each counts once.
+
+    A graph tells the k most probable labels: the rest of the probability is spread evenly over
+    the other labels. Classes outside the vocabulary (see `labels`) are left out.
+
+    Raises:
+        EvaluationError: where no class, or some predicate, is in the vocabulary.
+    """
+    classes = {name: place for place, name in enumerate(vocabulary.classes)}
+    predicates = {name: place for place, name in enumerate(vocabulary.predicates)}
+    place_of = {node.id: place for place, node in enumerate(graph.nodes)}
+    points = tuple(_segment(node) if sampled else _points(node) for node in graph.nodes)
+    labels = {belief.label for node in graph.nodes for belief in node.classes}
+    if labels and not labels & set(classes):
+        raise _foreign("class", labels)
+    unknown = {belief.label for edge in graph.edges for belief in edge.predicates} - set(predicates)
+    if unknown:
+        raise _foreign("predicate", unknown)
+    class_scores = [_expand(node.classes, classes) for node in graph.nodes]
+    edge_scores = [_expand(edge.predicates, predicates) for edge in graph.edges]
+    edges = [(place_of[edge.subject], place_of[edge.object]) for edge in graph.edges]
+    return ScanPrediction(
+        points,
+        np.array(class_scores).reshape(-1, len(classes)),
+        np.array(edges, np.int64).reshape(-1, 2),
+        np.array(edge_scores).reshape(-1, len(predicates)),
+        [] if all(map(len, points)) else ["a node has no surface points: it supports nothing"],
+    )
+
+
+def _points(node: wire.NodeState) -> Float64:
+    return np.array(node.surface_points_m, np.float64).reshape(-1, 3)
+
+
+def _segment(node: wire.NodeState) -> Float64:
+    """Points (n, 3) of a node; the sample is in random order, so its beginning is a sample too."""
+    return np.tile(_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
+
+
+def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int]) -> Float64:
+    others = len(places) - sum(belief.label in places for belief in beliefs)
+    left = max(0.0, 1.0 - sum(belief.probability for belief in beliefs))
+    scores = np.full(len(places), left / others if others else 0.0)
+    for belief in beliefs:
+        if belief.label in places:
+            scores[places[belief.label]] = belief.probability
+    return scores
+
+
+def _foreign(kind: str, labels: set[str]) -> EvaluationError:
+    return EvaluationError(
+        f"scene graph has the {kind} '{min(labels)}', which the data set does not: was it made "
+        "with another vocabulary?"
+    )

@@ -1,0 +1,70 @@
+"""Results as files: CSV for programs, LaTeX rows for papers."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
+
+# The columns of the paper's tables.
+LATEX_COLUMNS = (
+    "relationship_recall",
+    "object_recall",
+    "predicate_recall",
+    "object_mean_recall",
+    "predicate_mean_recall",
+)
+_LATEX_SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"}
+
+
+def write_rows(path: Path, rows: Mapping[str, Mapping[str, float]], heading: str) -> None:
+    """One CSV line a row, a column a number by name; what is undefined is left empty."""
+    columns = list(dict.fromkeys(name for row in rows.values() for name in row))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([heading, *columns])
+        for name, row in rows.items():
+            writer.writerow([name, *(_cell(row.get(column, math.nan)) for column in columns)])
+
+
+def write_classes(path: Path, result: ProtocolResult) -> None:
+    """CSV of the recall by class and by predicate."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["kind", "class", "items", "right", "recall"])
+        for kind, counts in (
+            ("object", result.object_classes),
+            ("predicate", result.predicate_classes),
+        ):
+            for name, count in counts.items():
+                writer.writerow([kind, name, count.total, count.hits, _cell(count.recall)])
+
+
+def latex_rows(methods: Mapping[str, Mapping[str, float]]) -> str:
+    """Rows of the paper's tables: method & Rel. & Obj. & Pred. & mObj. & mPred., in percent."""
+    lines = []
+    for method, numbers in methods.items():
+        cells = [_percent(numbers.get(name, math.nan)) for name in LATEX_COLUMNS]
+        lines.append(" & ".join([latex_text(method), *cells]) + r" \\")
+    return "\n".join(lines) + "\n"
+
+
+def latex_text(text: str) -> str:
+    """Text with LaTeX's special characters escaped."""
+    return "".join(_LATEX_SPECIAL.get(character, character) for character in text)
+
+
+def class_items(counts: Mapping[str, Count]) -> Sequence[tuple[str, Count]]:
+    """Classes, most items first."""
+    return sorted(counts.items(), key=lambda item: (-item[1].total, item[0]))
+
+
+def _cell(value: float) -> str:
+    return "" if isinstance(value, float) and math.isnan(value) else repr(value)
+
+
+def _percent(fraction: float) -> str:
+    return "--" if math.isnan(fraction) else f"{100 * fraction:.1f}"

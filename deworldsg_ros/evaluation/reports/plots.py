@@ -1,0 +1,101 @@
+"""Results as PNG plots: recall by class, confusion, recall over time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from deworldsg_ros.evaluation.protocol.scoring import Count
+from deworldsg_ros.evaluation.reports.files import class_items
+from deworldsg_ros.evaluation.runner import Checkpoint
+
+DPI = 130
+RIGHT, ALL = "#2f6f8f", "#d5dde3"
+COLOURS = ("#2f6f8f", "#b8562f", "#5c8a3a")
+MOST_CLASSES = 40
+
+
+def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
+    """Bars of items and right items by class, most items first."""
+    items = class_items(counts)[:MOST_CLASSES]
+    figure, axes = _figure(10.0, 1.2 + 0.24 * max(len(items), 3))
+    places = np.arange(len(items))
+    axes.barh(places, [count.total for _, count in items], color=ALL, label="annotated")
+    axes.barh(places, [count.hits for _, count in items], color=RIGHT, label="right")
+    for place, (_, count) in enumerate(items):
+        axes.text(count.total, place, f" {100 * count.recall:.0f} %", va="center", fontsize=8)
+    axes.set_yticks(places, [name for name, _ in items], fontsize=9)
+    axes.invert_yaxis()
+    axes.margins(x=0.08)
+    axes.set_xlabel("items")
+    axes.set_title(title)
+    if items:
+        axes.legend(loc="lower right", frameon=False)
+    _save(figure, path)
+
+
+def plot_confusion(path: Path, pairs: Sequence[tuple[str, str]], title: str) -> None:
+    """Annotated class against predicted class of nodes, each row a share of its nodes."""
+    counts = Counter(pairs)
+    rows = [name for name, _ in Counter(pair[0] for pair in pairs).most_common(MOST_CLASSES)]
+    others = Counter(pair[1] for pair in pairs if pair[1] not in rows)
+    columns = rows + [name for name, _ in others.most_common(max(0, MOST_CLASSES - len(rows)))]
+    table = np.array([[counts[row, column] for column in columns] for row in rows], float)
+    table = table.reshape(len(rows), len(columns))
+    shares = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
+    side = 2.5 + 0.24 * max(len(columns), 4)
+    figure, axes = _figure(side, 2.0 + 0.24 * max(len(rows), 4))
+    if len(rows):
+        image = axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+        figure.colorbar(image, ax=axes, fraction=0.035, label="share of the nodes of a row")
+    axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(rows)), rows, fontsize=8)
+    axes.set_xlabel("predicted class of the node")
+    axes.set_ylabel("annotated class of the object it is in")
+    axes.set_title(title)
+    _save(figure, path)
+
+
+def plot_over_time(path: Path, runs: Mapping[str, Sequence[Checkpoint]], title: str) -> None:
+    """How fast each scan's graph becomes right: recall over the time of the recording."""
+    figure, axes = _figure(9.0, 5.0)
+    kinds = ("object_recall", "predicate_recall", "relationship_recall")
+    for run, checkpoints in enumerate(runs.values()):
+        times_s = [item.stamp_s for item in checkpoints]
+        for kind, colour in zip(kinds, COLOURS):
+            axes.plot(
+                times_s,
+                [100 * getattr(item, kind) for item in checkpoints],
+                color=colour,
+                alpha=0.9 if len(runs) < 4 else 0.5,
+                marker="o",
+                markersize=3,
+                linestyle=("-", "--", ":", "-.")[run % 4],
+                label=kind.split("_")[0] + "s" if run == 0 else None,
+            )
+    axes.set_ylim(0, 103)
+    axes.set_xlabel("time of the recording, s")
+    axes.set_ylabel("recall at 1, %")
+    axes.set_title(title)
+    if runs:
+        axes.legend(loc="lower right", frameon=False)
+    _save(figure, path)
+
+
+def _figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _save(figure: Figure, path: Path) -> None:
+    # No date or version in the file: the same results, the same bytes.
+    figure.savefig(path, metadata={"Software": None})

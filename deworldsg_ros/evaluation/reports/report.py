@@ -1,0 +1,91 @@
+"""Results as plain values for JSON, with every number by name."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult, ScanResult
+from deworldsg_ros.evaluation.runner import ScanOutcome
+
+
+def protocol_values(result: ProtocolResult) -> dict[str, Any]:
+    """Plain values of the protocol's numbers: recalls as fractions, NaN where undefined."""
+    return {
+        **result.numbers(),
+        "counts": {
+            "object": _count_values(result.objects),
+            "predicate": _count_values(result.predicates),
+            "relationship": _count_values(result.relationships),
+        },
+        "object_per_class": _class_values(result.object_classes),
+        "predicate_per_class": _class_values(result.predicate_classes),
+        "scans": [scan_values(scan) for scan in result.scans],
+        "notes": result.notes,
+    }
+
+
+def scan_values(scan: ScanResult) -> dict[str, Any]:
+    """Plain values of one scan's share."""
+    return {
+        "scan": scan.scan,
+        "objects": {
+            "hits": sum(ranked == 0 for ranked in scan.object_ranks),
+            "total": len(scan.object_ranks),
+            "found": len(scan.matching.prediction_of),
+        },
+        "predicates": _ranks_values(scan.predicate_ranks),
+        "relationships": _ranks_values(scan.relationship_ranks),
+        "predictions": len(scan.matching.supports),
+        "void_predictions": sum(support is None for support in scan.matching.supports),
+    }
+
+
+def outcome_values(outcome: ScanOutcome) -> dict[str, Any]:
+    """Plain values of one scan's run: what it cost, what was dropped, how it became right."""
+    return {
+        **scan_values(outcome.result),
+        "frames": outcome.frames,
+        "nodes": outcome.nodes,
+        "edges": outcome.edges,
+        "times_ms": outcome.times_ms,
+        "drops": outcome.drops,
+        "measures": outcome.measures.numbers(),
+        "over_time": [asdict(item) for item in outcome.over_time],
+    }
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write values as JSON; NaN and infinity become null."""
+    text = json.dumps(finite_or_none(values), indent=2, ensure_ascii=False, allow_nan=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+def finite_or_none(value: Any) -> Any:
+    """`value` with None in place of every float that JSON cannot hold."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): finite_or_none(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite_or_none(item) for item in value]
+    return value
+
+
+def _class_values(counts: Mapping[str, Count]) -> dict[str, dict[str, float]]:
+    return {
+        name: {**_count_values(count), "recall": count.recall} for name, count in counts.items()
+    }
+
+
+def _count_values(count: Count) -> dict[str, int]:
+    return {"hits": count.hits, "total": count.total}
+
+
+def _ranks_values(ranks: list[int]) -> dict[str, int]:
+    return {"hits": sum(ranked == 0 for ranked in ranks), "total": len(ranks)}

@@ -1,0 +1,83 @@
+"""Results as tables on the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.table import Table
+
+from deworldsg_ros.evaluation.measures.graph_measures import Measures
+from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
+
+
+def percent(fraction: float) -> str:
+    """A fraction in percent with one decimal; a dash where it is undefined."""
+    return "–" if math.isnan(fraction) else f"{100 * fraction:.1f}"
+
+
+def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
+    """The five numbers, the tables by class, and the notes."""
+    table = Table(title=title)
+    for heading in ("recall at 1, %", "items", "right", "recall", "mean over classes"):
+        table.add_column(heading, justify="left" if heading.startswith("recall at") else "right")
+    rows = (
+        ("objects", result.objects, percent(result.object_mean_recall)),
+        ("predicates", result.predicates, percent(result.predicate_mean_recall)),
+        ("relationships", result.relationships, ""),
+    )
+    for name, count, mean in rows:
+        table.add_row(name, str(count.total), str(count.hits), percent(count.recall), mean)
+    console.print(table)
+    _print_classes(console, "objects by class", result.object_classes)
+    _print_classes(console, "predicates", result.predicate_classes)
+    for note in dict.fromkeys(result.notes):
+        console.print(f"[yellow]note:[/] {note}", highlight=False, soft_wrap=True)
+
+
+# What is printed of the measures: heading, name, factor (0 = a count).
+MEASURE_ROWS = (
+    ("objects", "objects", 0),
+    ("nodes", "nodes", 0),
+    ("objects found", "found", 0),
+    ("duplicates", "duplicates", 0),
+    ("nodes of a wrong class", "wrong_class", 0),
+    ("stray nodes", "stray", 0),
+    ("node precision, %", "node_precision", 100),
+    ("F1, %", "f1", 100),
+    ("centroid error, cm (median)", "centroid_error_main_median_m", 100),
+    ("extent error, cm (median)", "extent_error_median_m", 100),
+    ("edges", "edges", 0),
+    ("edge precision, %", "edge_precision", 100),
+    ("edge calibration error, %", "edge_calibration_error", 100),
+)
+# More columns than this do not fit a terminal; the files have all.
+MOST_COLUMNS = 4
+
+
+def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
+    """What recall leaves out, a column a scan; of many scans only the last column, their pool."""
+    shown = dict(list(measures.items())[-1:]) if len(measures) > MOST_COLUMNS else measures
+    table = Table(title="beside recall")
+    table.add_column("")
+    for name in shown:
+        table.add_column(name, justify="right", overflow="fold")
+    numbers = [item.numbers() for item in shown.values()]
+    for heading, key, factor in MEASURE_ROWS:
+        table.add_row(heading, *(_cell(item[key], factor) for item in numbers))
+    console.print(table)
+
+
+def _cell(value: float, factor: float) -> str:
+    return percent(value * factor / 100) if factor else f"{value:.0f}"
+
+
+def _print_classes(console: Console, title: str, counts: Mapping[str, Count]) -> None:
+    table = Table(title=title)
+    table.add_column("class")
+    for heading in ("items", "right", "recall, %"):
+        table.add_column(heading, justify="right")
+    for name, count in counts.items():
+        table.add_row(name, str(count.total), str(count.hits), percent(count.recall))
+    console.print(table)

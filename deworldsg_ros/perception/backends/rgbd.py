@@ -1,0 +1,62 @@
+"""Box-conditioned segmenter for RGB-D images without weights."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.perception.arrays import read_only
+from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
+from deworldsg_ros.perception.superpixels.region_cut import cut_boxes
+from deworldsg_ros.perception.superpixels.superpixels import cut_regions, reduce_frame
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import Float64
+
+# Cells across the image; fewer lose chair legs, more cost time.
+TARGET_WIDTH = 213
+
+
+class RgbdSegmenter:
+    """The visible surface of the object in each box, from colour and depth; all boxes jointly."""
+
+    def __init__(self) -> None:
+        # The kernels are compiled now, and not when the first image waits.
+        side = 24
+        self.segment(
+            np.zeros((side, side, 3), dtype=np.uint8),
+            np.ones((side, side), dtype=np.float32),
+            Intrinsics(side, side, side / 2, side / 2, side, side),
+            np.array([[4.0, 4.0, 16.0, 16.0]]),
+        )
+
+    def segment(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        intrinsics: Intrinsics,
+        boxes_xyxy: Float64,
+        class_names: list[str] | None = None,
+    ) -> list[MaskPatch]:
+        """One mask a box; see `Segmenter`. The masks are disjoint."""
+        del class_names  # The geometry decides.
+        if len(boxes_xyxy) == 0:
+            return []
+        rgb, depth_m = read_only(rgb), read_only(depth_m)
+        height, width = depth_m.shape
+        stride = max(1, round(width / TARGET_WIDTH))
+        cells = reduce_frame(rgb, depth_m, intrinsics, stride)
+        regions = cut_regions(cells)
+        rows, columns = regions.labels.shape
+        limits = np.array([columns - 1, rows - 1] * 2)
+        boxes_cells = np.clip(np.round(boxes_xyxy) // stride, 0, limits).astype(np.int64)
+        owner = cut_boxes(regions, boxes_cells)
+        labels = upsample_labels(
+            owner[regions.labels], cells.rgb, cells.points[..., 2], rgb, depth_m, stride
+        )
+        patches = []
+        for row, box in enumerate(boxes_xyxy):
+            left, top = np.clip(np.round(box[:2]), 0, [width, height]).astype(int)
+            right, bottom = np.clip(np.round(box[2:]) + 1, 0, [width, height]).astype(int)
+            patches.append(MaskPatch(int(top), int(left), labels[top:bottom, left:right] == row))
+        return patches

@@ -1,0 +1,1 @@
+"""Metric layout of the objects of one frame."""

@@ -1,0 +1,1 @@
+"""rosbag2 bags as messages, damaged ones too."""

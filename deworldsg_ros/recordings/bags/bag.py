@@ -1,0 +1,206 @@
+"""A rosbag2 bag as the messages of one posed RGB-D camera."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, Topic
+from deworldsg_ros.recordings.bags.topics import TopicChoice, find_topics
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import (
+    ODOMETRY,
+    POSE_STAMPED,
+    TF_MESSAGE,
+    Role,
+    RoleMessage,
+    decode,
+    encode,
+    pose_stamped,
+    stamp_ns_of_cdr,
+)
+from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.poses import pose_from_message
+from deworldsg_ros.streams.transforms import TransformTree
+
+# Ending of the topic of transforms that do not change.
+STATIC = "tf_static"
+
+
+class BagSource:
+    """Messages of the four roles of a bag; see `Source`.
+
+    Where the pose is in TF, a PoseStamped of the RGB frame is computed for every RGB image. Where
+    it is an Odometry of another frame, /tf_static carries it over to the RGB frame.
+
+    Args:
+        path: folder, .mcap or .db3 file.
+        choice: topics named by the user.
+        inputs: ``world_frame`` and ``pose_slop_s`` are used, for poses from TF.
+        need_pose: whether a bag without poses is refused.
+
+    Raises:
+        RecordingError: where it cannot be read, or a topic is missing.
+    """
+
+    kind: ClassVar[str] = "rosbag2"
+
+    def __init__(
+        self,
+        path: Path,
+        choice: TopicChoice | None = None,
+        inputs: InputsConfig | None = None,
+        *,
+        need_pose: bool = True,
+    ) -> None:
+        choice = choice or TopicChoice()
+        self.name = path.name
+        self._inputs = inputs or InputsConfig()
+        self._bag = RawBag(path)
+        self.losses = self._bag.losses
+        self.drops: Counter[str] = Counter()
+        try:
+            found = find_topics(
+                self._bag.topics, choice, str(path), self._inputs, need_pose=need_pose
+            )
+            self._T_child_camera = self._mounting(found, choice)
+        except RecordingError:
+            self._bag.close()
+            raise
+        self.topics = {
+            role: UsedTopic(topic.name, topic.msgtype, topic.count) for role, topic in found.items()
+        }
+        if self._T_child_camera is not None:
+            odometry = found[Role.POSE]
+            self.topics[Role.POSE] = UsedTopic(odometry.name, POSE_STAMPED, odometry.count)
+        self.frame_count = found[Role.RGB].count
+
+    def raw_messages(self) -> Iterator[RawRoleMessage]:
+        """Serialized messages in the order in which they were recorded."""
+        roles = {topic.name: role for role, topic in self.topics.items()}
+        poses = None
+        if Role.POSE in self.topics and self.topics[Role.POSE].msgtype == TF_MESSAGE:
+            del roles[self.topics[Role.POSE].name]
+            poses = _TfPoses(self._bag, self._inputs)
+        for raw in self._bag.messages(roles):
+            role = roles[raw.topic]
+            stamp_ns = stamp_ns_of_cdr(raw.data)
+            if role is Role.RGB and poses is not None:
+                pose = poses.at(stamp_ns, decode(raw.data, raw.msgtype).header.frame_id)
+                if pose is not None:
+                    yield _serialized(pose, raw.log_time_ns)
+            if role is Role.POSE and self._T_child_camera is not None:
+                yield from self._carried(raw, self._T_child_camera)
+                continue
+            yield RawRoleMessage(role, raw.msgtype, stamp_ns, raw.log_time_ns, raw.data)
+        if poses is not None and poses.refusal:
+            self.losses.append(poses.refusal)
+
+    def messages(self) -> Iterator[RoleMessage]:
+        """Decoded messages; what cannot be decoded is counted as ``invalid_message``."""
+        for raw in self.raw_messages():
+            try:
+                message = decode(raw.data, raw.msgtype)
+            except Exception:  # whatever rosbags raises on a broken message
+                self.drops["invalid_message"] += 1
+                continue
+            yield RoleMessage(raw.role, raw.msgtype, raw.stamp_ns, message)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._bag.close()
+
+    def _mounting(self, found: dict[Role, Topic], choice: TopicChoice) -> Float64 | None:
+        """T_child_camera (4, 4) of an odometry of another frame than the camera's, else None.
+
+        Where /tf_static does not connect the two, TF alone takes the odometry's place.
+        """
+        pose = found.get(Role.POSE)
+        if pose is None or pose.msgtype != ODOMETRY or self._inputs.pose_source != "auto":
+            return None
+        image, odometry = self._first(found[Role.RGB]), self._first(pose)
+        if image is None or odometry is None:
+            return None
+        camera = image.header.frame_id.lstrip("/")
+        child = odometry.child_frame_id.lstrip("/")
+        if child in ("", camera):
+            return None
+        try:
+            return _TfPoses(self._bag, self._inputs).mounting(child, camera)
+        except RefusedInput:
+            moving = [t for t in self._bag.topics if t.msgtype == TF_MESSAGE and t.count]
+            moving = [t for t in moving if not t.name.endswith(STATIC)]
+            if moving and not choice.pose:
+                found[Role.POSE] = next((t for t in moving if t.name == "/tf"), moving[0])
+            return None
+
+    def _carried(self, raw: RawMessage, T_child_camera: Float64) -> Iterator[RawRoleMessage]:
+        """PoseStamped of the camera out of an Odometry."""
+        try:
+            T_world_child, frame_id = pose_from_message(decode(raw.data, raw.msgtype))
+        except RefusedInput as refusal:
+            self.drops[refusal.reason] += 1
+            return
+        except Exception:  # whatever rosbags raises on a broken message
+            self.drops["invalid_message"] += 1
+            return
+        T = T_world_child @ T_child_camera
+        quat_xyzw = quaternion_from_rotation(T[:3, :3])
+        pose = pose_stamped(stamp_ns_of_cdr(raw.data), frame_id, T[:3, 3], quat_xyzw)
+        yield _serialized(pose, raw.log_time_ns)
+
+    def _first(self, topic: Topic) -> Any:
+        """The first message that can be decoded; None where none can."""
+        for raw in self._bag.messages([topic.name]):
+            with contextlib.suppress(Exception):  # whatever rosbags raises on a broken message
+                return decode(raw.data, raw.msgtype)
+        return None
+
+
+def _serialized(item: RoleMessage, log_time_ns: int) -> RawRoleMessage:
+    data = encode(item.message, item.msgtype)
+    return RawRoleMessage(item.role, item.msgtype, item.stamp_ns, log_time_ns, data)
+
+
+class _TfPoses:
+    """Poses of the camera out of /tf and /tf_static, read just as far ahead as is needed."""
+
+    def __init__(self, bag: RawBag, inputs: InputsConfig) -> None:
+        self._tree = TransformTree(round(inputs.pose_slop_s * 1e9), inputs.world_frame)
+        names = [t.name for t in bag.topics if t.msgtype == TF_MESSAGE]
+        static = [name for name in names if name.endswith(STATIC)]
+        self.refusal = ""
+        for raw in bag.messages(static):
+            self._add(raw, is_static=True)
+        self._moving = bag.messages([name for name in names if name not in static])
+
+    def mounting(self, parent_frame: str, camera_frame: str) -> Float64:
+        """T_parent_camera (4, 4) of frames that do not move; RefusedInput where none is told."""
+        return self._tree.between(0, parent_frame, camera_frame)
+
+    def at(self, stamp_ns: int, camera_frame: str) -> RoleMessage | None:
+        """PoseStamped of the camera; None, with the reason in `refusal`, where TF has none."""
+        while not self._tree.settled(stamp_ns, camera_frame):
+            raw = next(self._moving, None)
+            if raw is None:
+                break
+            self._add(raw, is_static=False)
+        try:
+            T, world_frame = self._tree.at(stamp_ns, camera_frame)
+        except RefusedInput as refusal:
+            self.refusal = f"poses from TF: {refusal}"
+            return None
+        self._tree.forget_before(stamp_ns)
+        return pose_stamped(stamp_ns, world_frame, T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+
+    def _add(self, raw: RawMessage, *, is_static: bool) -> None:
+        try:
+            self._tree.add(decode(raw.data, raw.msgtype), static=is_static)
+        except Exception as error:  # a broken message, or a transform that is not rigid
+            self.refusal = f"poses from TF: {error}"

@@ -1,0 +1,169 @@
+"""Raw messages of a rosbag2 bag: a folder with metadata.yaml, a bare .mcap or .db3 file.
+
+Whole bags are read by rosbags. Where that fails (recording was killed, disk was full, a file was
+cut), a salvage reader takes what is left, and `losses` says in words that data was lost.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from rosbags.rosbag2 import Reader, ReaderError
+
+from deworldsg_ros.recordings.bags.salvage_mcap import salvage_mcap
+from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
+from deworldsg_ros.recordings.errors import RecordingError
+
+SALVAGERS: dict[str, Callable[..., Iterator[tuple[str, str, int, bytes]]]] = {
+    ".mcap": salvage_mcap,
+    ".db3": salvage_sqlite,
+}
+
+
+@dataclass(frozen=True, order=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+class RawMessage(NamedTuple):
+    """A serialized message of a bag; `log_time_ns` is when it was recorded."""
+
+    topic: str
+    msgtype: str
+    log_time_ns: int
+    data: bytes
+
+
+class RawBag:
+    """One rosbag2 bag, open for reading.
+
+    Attributes:
+        path: of the bag.
+        topics: what it holds, by name.
+        losses: sentences that say which data was lost; more may come while messages are read.
+
+    Raises:
+        RecordingError: where it is no bag, or nothing in it can be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.losses: list[str] = []
+        self._reader: Reader | None = None
+        try:
+            reader = Reader(path)
+            reader.open()
+        except FileNotFoundError:
+            self._open_damaged(None if path.is_dir() else f"{path} does not exist")
+        except Exception as error:  # rosbags lets struct, yaml and index errors through
+            self._open_damaged(_one_line(error))
+        else:
+            self._reader = reader
+            self.topics = sorted(
+                Topic(connection.topic, connection.msgtype, connection.msgcount)
+                for connection in reader.connections
+            )
+
+    def _open_damaged(self, cause: str | None) -> None:
+        """Count what can be salvaged; `cause` is what the whole-bag reader said."""
+        if not self.path.exists():
+            raise RecordingError(f"recording {self.path}: there is no such file or folder")
+        if not self.files:
+            raise RecordingError(
+                f"recording {self.path}: no .mcap or .db3 file there: "
+                "wanted a rosbag2 folder with its metadata.yaml, or one of these files"
+            )
+        if cause is None:
+            self.losses.append("metadata.yaml is missing; the files were read without it")
+        else:
+            self.losses.append(f"the bag is damaged ({cause}); what is left of it was read")
+        counts: dict[tuple[str, str], int] = {}
+        for topic, msgtype, _, _ in self._salvage(self.losses):
+            counts[topic, msgtype] = counts.get((topic, msgtype), 0) + 1
+        if not counts:
+            raise RecordingError(
+                f"recording {self.path}: nothing could be read ({'; '.join(self.losses)})"
+            )
+        self.topics = sorted(Topic(*key, count) for key, count in counts.items())
+
+    @property
+    def files(self) -> list[Path]:
+        """Storage files of the bag."""
+        if self.path.is_file():
+            return [self.path] if self.path.suffix in SALVAGERS else []
+        return storage_files(self.path)
+
+    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
+        """Messages of the topics in the order in which they were recorded."""
+        wanted = frozenset(topics)
+        if self._reader is None:
+            yield from (RawMessage(*item) for item in self._salvage([]) if item[0] in wanted)
+            return
+        connections = [c for c in self._reader.connections if c.topic in wanted]
+        if not connections:
+            return
+        last_time_ns, topics_at_last_time = -1, set[str]()
+        try:
+            for connection, time_ns, data in self._reader.messages(connections):
+                yield RawMessage(connection.topic, connection.msgtype, time_ns, data)
+                if time_ns != last_time_ns:
+                    last_time_ns, topics_at_last_time = time_ns, set()
+                topics_at_last_time.add(connection.topic)
+        except GeneratorExit:
+            raise
+        except Exception as error:  # a damaged chunk: whatever its decompressor raises
+            self._note(f"the bag is damaged ({_one_line(error)}); what is left of it was read")
+            for item in self._salvage(self.losses):
+                topic, time_ns = item[0], item[2]
+                known = time_ns < last_time_ns or (
+                    time_ns == last_time_ns and topic in topics_at_last_time
+                )
+                if topic in wanted and not known:
+                    yield RawMessage(*item)
+
+    def _salvage(self, losses: list[str]) -> Iterator[tuple[str, str, int, bytes]]:
+        def note(text: str) -> None:
+            if text not in losses:
+                losses.append(text)
+
+        return itertools.chain.from_iterable(
+            SALVAGERS[file.suffix](file, note) for file in self.files
+        )
+
+    def _note(self, text: str) -> None:
+        if text not in self.losses:
+            self.losses.append(text)
+
+    def close(self) -> None:
+        """Close the files."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The .mcap or .db3 files of a bag folder; none where they are not parts of one bag.
+
+    rosbag2 names the parts of a split bag NAME_0, NAME_1, …
+    """
+    found = sorted(
+        (file for file in folder.iterdir() if file.suffix in SALVAGERS),
+        # NAME_2 comes before NAME_10.
+        key=lambda file: (len(file.name), file.name),
+    )
+    bags = {(re.sub(r"_\d+$", "", file.stem), file.suffix) for file in found}
+    return found if len(bags) == 1 else []
+
+
+def _one_line(error: BaseException) -> str:
+    text = " ".join(str(error).split()).rstrip(".")
+    return text if isinstance(error, ReaderError) and text else f"{type(error).__name__}: {text}"

@@ -1,0 +1,176 @@
+"""Which topic of a bag is RGB, which depth, …: by type and name, unless told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.recordings.bags.storage import Topic
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    ODOMETRY,
+    POSE_STAMPED,
+    TF_MESSAGE,
+    Role,
+)
+
+Types = tuple[str, ...]
+# Higher is better; None = not this role.
+Score = Callable[[Topic], "tuple[float, ...] | None"]
+
+IMAGES = (IMAGE, COMPRESSED_IMAGE)
+# Most wanted first.
+POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
+# Images that are neither colour nor depth.
+OTHER_IMAGES = ("infra", "/ir/", "instance", "label", "mask", "segment", "semantic", "mono")
+
+TYPES = {
+    Role.RGB: IMAGES,
+    Role.DEPTH: IMAGES,
+    Role.CAMERA_INFO: (CAMERA_INFO,),
+    Role.POSE: POSES,
+}
+TRANSPORTS: dict[str, Types] = {
+    "auto": IMAGES,
+    "raw": (IMAGE,),
+    "compressed": (COMPRESSED_IMAGE,),
+}
+POSE_SOURCES: dict[str, Types] = {
+    "auto": POSES,
+    "pose": (POSE_STAMPED,),
+    "odometry": (ODOMETRY,),
+    "tf": (TF_MESSAGE,),
+}
+WANTED = {
+    Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
+    Role.DEPTH: "an Image or CompressedImage with depth in its name",
+    Role.CAMERA_INFO: "a CameraInfo beside the RGB image",
+    Role.POSE: "a PoseStamped, an Odometry or /tf, or --odometry, or run with --poses FILE",
+}
+
+
+@dataclass(frozen=True)
+class TopicChoice:
+    """Topics named by the user; empty = found by type and name."""
+
+    rgb: str = ""
+    depth: str = ""
+    camera_info: str = ""
+    pose: str = ""
+
+
+def find_topics(
+    topics: Sequence[Topic],
+    choice: TopicChoice,
+    recording: str,
+    inputs: InputsConfig | None = None,
+    *,
+    need_pose: bool = True,
+) -> dict[Role, Topic]:
+    """The topic of each role.
+
+    Args:
+        topics: of the bag.
+        choice: what the user named; that need not be of a type that `inputs` asks for.
+        recording: what to call the bag in an error.
+        inputs: ``transport`` and ``pose_source`` narrow the types down.
+        need_pose: whether a bag without poses is refused; otherwise it has no such role.
+
+    Raises:
+        RecordingError: names the role, the topics seen and what was wanted.
+    """
+    inputs = inputs or InputsConfig()
+    images = TRANSPORTS[inputs.transport]
+    filled = [topic for topic in topics if topic.count]
+
+    def find(role: Role, chosen: str, types: Types, score: Score) -> Topic:
+        return _find(role, filled, chosen, types, score, recording)
+
+    rgb = find(Role.RGB, choice.rgb, images, _rgb_score)
+    found = {
+        Role.RGB: rgb,
+        Role.DEPTH: find(Role.DEPTH, choice.depth, images, _depth_score),
+        Role.CAMERA_INFO: find(
+            Role.CAMERA_INFO,
+            choice.camera_info,
+            (CAMERA_INFO,),
+            lambda topic: _camera_info_score(topic, rgb.name),
+        ),
+    }
+    types = POSE_SOURCES[inputs.pose_source]
+    posed = any(topic.msgtype in types and _pose_score(topic) is not None for topic in filled)
+    if need_pose or posed or choice.pose:
+        found[Role.POSE] = find(Role.POSE, choice.pose, types, _pose_score)
+    return found
+
+
+def _find(
+    role: Role,
+    topics: Sequence[Topic],
+    chosen: str,
+    types: Types,
+    score: Score,
+    recording: str,
+) -> Topic:
+    option = "--" + role.value.replace("_", "-")
+    if chosen:
+        for topic in topics:
+            if topic.name == chosen and topic.msgtype in TYPES[role]:
+                return topic
+        problem = f"{option} {chosen} is not a topic that can be {role.value}"
+    else:
+        scored = [
+            (value, topic)
+            for topic in topics
+            if topic.msgtype in types and (value := score(topic)) is not None
+        ]
+        if scored:
+            # The best; among equals the one that sorts first.
+            return min(scored, key=lambda item: ([-value for value in item[0]], item[1].name))[1]
+        problem = f"no {role.value} topic"
+    seen = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in topics)
+    raise RecordingError(
+        f"recording {recording}: {problem}. It has: {seen or 'no messages at all'}. "
+        f"Wanted {WANTED[role]}; name one with {option} TOPIC"
+    )
+
+
+def _rgb_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if "depth" in name or any(word in name for word in OTHER_IMAGES):
+        return None
+    return ("rgb" in name or "color" in name, "image" in name, "rect" in name, *_plain(topic))
+
+
+def _depth_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if "depth" not in name or any(word in name for word in ("theora", "points")):
+        return None
+    return ("aligned" in name or "registered" in name, "compresseddepth" in name, *_plain(topic))
+
+
+def _plain(topic: Topic) -> tuple[float, ...]:
+    """More messages, and of equally many the uncompressed ones."""
+    return (topic.count, topic.msgtype == IMAGE)
+
+
+def _camera_info_score(topic: Topic, rgb_name: str) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    shared = 0
+    for ours, theirs in zip(topic.name.split("/"), rgb_name.split("/")):
+        if ours != theirs:
+            break
+        shared += 1
+    return (shared, "rgb" in name or "color" in name, "depth" not in name, topic.count)
+
+
+def _pose_score(topic: Topic) -> tuple[float, ...] | None:
+    name = topic.name.lower()
+    if name.endswith("tf_static"):
+        return None
+    rank = -POSES.index(topic.msgtype)
+    return (rank, "camera" in name, "pose" in name, topic.count)

@@ -1,0 +1,259 @@
+"""Ground truth of a data set in one of the two official layouts: objects, relations, points.
+
+Rules of reading, as the official evaluation program has them, are in docs/evaluation.md.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.folders.ply import read_vertices
+from deworldsg_ros.recordings.folders.rooms import read_ground_truth
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
+SPLIT_FILES = {
+    "train": "train_scans.txt",
+    "validation": "validation_scans.txt",
+    "val": "validation_scans.txt",
+    "test": "test_scans.txt",
+}
+PLY_NAME = "labels.instances.annotated.v2.ply"
+ALIGNED_PLY_NAME = "labels.instances.align.annotated.v2.ply"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a data set keeps its annotations, relative to its root, and what its keys are called.
+
+    Attributes:
+        name: as the command line takes it.
+        lists: folder of the split files.
+        objects, relations, mapping: files.
+        label_map, classes, predicates: keys in the mapping file.
+        how_to_get: one sentence for whoever lacks a file.
+    """
+
+    name: str
+    lists: str
+    objects: str
+    relations: str
+    mapping: str
+    label_map: str
+    classes: str
+    predicates: str
+    how_to_get: str
+
+
+LAYOUTS = {
+    "replica": Layout(
+        "replica",
+        "ReplicaSSG",
+        "ReplicaSSG/objects.json",
+        "ReplicaSSG/relationships.json",
+        "ReplicaSSG/replica_to_visual_genome.json",
+        "Replica2VisualGenome",
+        "VisualGenome_list",
+        "VisualGenome_rel",
+        "ReplicaSSG/ comes from https://github.com/Howardkhh/ReplicaSSG; its scripts make data/ "
+        "from the Replica download",
+    ),
+    "3rscan": Layout(
+        "3rscan",
+        "3DSSG_subset",
+        "3DSSG/objects.json",
+        "3DSSG_subset/relationships20.json",
+        "3DSSG_subset/3dssg_to_scannet.json",
+        "3DSSG2NYUv2",
+        "ScanNet_list",
+        "ScanNet_rel",
+        "3DSSG/ comes from https://3dssg.github.io, data/ from 3RScan "
+        "(https://github.com/WaldJohannaU/3RScan, after its terms are agreed to), 3DSSG_subset/ "
+        "from https://github.com/Howardkhh/FROSS",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class ScanAnnotation:
+    """What is annotated of one scan, in file order.
+
+    Attributes:
+        scan: id of the scan.
+        objects: place in the class list of each object id; objects of other classes are left out.
+        relations: (subject id, object id, place in the predicate list, or -1 where it is none).
+        related_ids: ids in the *last* relation entry of the scan; None where it has no entry.
+        notes: what the official program would have stopped at, and what was done instead.
+    """
+
+    scan: str
+    objects: dict[int, int]
+    relations: list[tuple[int, int, int]]
+    related_ids: frozenset[int] | None
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class ScanPoints:
+    """Annotated surface points: (n, 3) float64 metres, world; (n,) int64 object ids."""
+
+    points_world: NDArray[np.float64]
+    object_ids: NDArray[np.int64]
+
+
+class Annotations:
+    """The annotations of a data set.
+
+    Args:
+        root: folder of the data set.
+        layout: ``replica`` or ``3rscan``.
+
+    Raises:
+        RecordingError: names the file that was expected, and how to get it.
+    """
+
+    def __init__(self, root: Path, layout: str) -> None:
+        if layout not in LAYOUTS:
+            raise RecordingError(
+                f"layout '{layout}' is unknown: wanted {', '.join(LAYOUTS)} or recording"
+            )
+        self.root = root
+        self.layout = LAYOUTS[layout]
+        mapping = self._read_json(self.layout.mapping)
+        try:
+            self.class_of_label: dict[str, str] = dict(mapping[self.layout.label_map])
+            self.vocabulary = Vocabulary(
+                tuple(mapping[self.layout.classes]), tuple(mapping[self.layout.predicates])
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{root / self.layout.mapping}: wanted the keys {self.layout.label_map}, "
+                f"{self.layout.classes} and {self.layout.predicates}"
+            ) from error
+        self._objects = self._entries(self.layout.objects)
+        self._relations = self._entries(self.layout.relations)
+
+    def scans(self, split: str = "test") -> list[str]:
+        """Ids of the scans of a split, in file order; a scan written twice is given twice."""
+        if split not in SPLIT_FILES:
+            raise RecordingError(f"split '{split}' is unknown: wanted {', '.join(SPLIT_FILES)}")
+        text = self._read(f"{self.layout.lists}/{SPLIT_FILES[split]}").decode()
+        return [line.strip() for line in text.splitlines() if line.strip()]
+
+    def scan(self, scan: str) -> ScanAnnotation:
+        """What is annotated of one scan."""
+        notes: list[str] = []
+        objects = self._scan_objects(scan, notes)
+        relations, related_ids = self._scan_relations(scan, objects, notes)
+        return ScanAnnotation(scan, objects, relations, related_ids, notes)
+
+    def points(self, scan: str, *, aligned: bool = False) -> ScanPoints:
+        """All annotated surface points of a scan, of walls and unlisted ids too."""
+        path = self.ply_path(scan, aligned=aligned)
+        if not path.exists():
+            raise RecordingError(f"{path} is missing; {self.layout.how_to_get}")
+        columns = read_vertices(path, ("x", "y", "z", "objectId"))
+        points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        return ScanPoints(points, columns["objectId"].astype(np.int64))
+
+    def ply_path(self, scan: str, *, aligned: bool = False) -> Path:
+        """Where a scan's points are."""
+        return self.scan_folder(scan) / (ALIGNED_PLY_NAME if aligned else PLY_NAME)
+
+    def scan_folder(self, scan: str) -> Path:
+        """Where a scan is."""
+        return self.root / "data" / scan
+
+    def ground_truth(self, scan: str) -> dict[str, Any] | None:
+        """Content of the scan's gt.json; None where it has none."""
+        return read_ground_truth(self.scan_folder(scan))
+
+    def _scan_objects(self, scan: str, notes: list[str]) -> dict[int, int]:
+        if scan not in self._objects:
+            notes.append(f"{scan} is not in {self.layout.objects}: it has no objects")
+            return {}
+        place = _places(self.vocabulary.classes)
+        objects: dict[int, int] = {}
+        try:
+            # The last entry of a scan replaces the others.
+            for item in self._objects[scan][-1]["objects"]:
+                label = item["label"]
+                if label not in self.class_of_label and self.layout.name == "3rscan":
+                    notes.append(f"{scan}: label '{label}' is not in the mapping: left out")
+                class_name = self.class_of_label.get(label, "")
+                if class_name in place:
+                    objects[int(item["id"])] = place[class_name]
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{self.root / self.layout.objects}, scan {scan}: wanted objects with a label and "
+                f"a whole number as id"
+            ) from error
+        return objects
+
+    def _scan_relations(
+        self, scan: str, objects: dict[int, int], notes: list[str]
+    ) -> tuple[list[tuple[int, int, int]], frozenset[int] | None]:
+        entries = self._relations.get(scan, [])
+        place = _places(self.vocabulary.predicates)
+        relations: list[tuple[int, int, int]] = []
+        related_ids: frozenset[int] | None = None
+        try:
+            for entry in entries:
+                lines = entry["relationships"]
+                related_ids = frozenset(int(end) for line in lines for end in line[:2])
+                for subject, object_, _, name in lines:
+                    relations.append((int(subject), int(object_), place.get(name, -1)))
+                    if name not in place:
+                        notes.append(f"{scan}: predicate '{name}' is in no list: never right")
+        except (KeyError, TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{self.root / self.layout.relations}, scan {scan}: wanted relationships "
+                "[subject, object, number, name]"
+            ) from error
+        strangers = {end for line in relations for end in line[:2]} - set(objects)
+        if strangers:
+            notes.append(
+                f"{scan}: relations name {sorted(strangers)}, no objects of a known class: "
+                "never right"
+            )
+        return relations, related_ids
+
+    def _entries(self, name: str) -> dict[str, list[Any]]:
+        content = self._read_json(name)
+        entries: dict[str, list[Any]] = {}
+        try:
+            for entry in content["scans"]:
+                entries.setdefault(str(entry["scan"]), []).append(entry)
+        except (KeyError, TypeError) as error:
+            raise RecordingError(f"{self.root / name}: wanted scans, each with a scan") from error
+        return entries
+
+    def _read_json(self, name: str) -> Any:
+        try:
+            return json.loads(self._read(name))
+        except ValueError as error:
+            raise RecordingError(f"{self.root / name} is no JSON: {error}") from error
+
+    def _read(self, name: str) -> bytes:
+        path = self.root / name
+        if not path.exists():
+            raise RecordingError(
+                f"data set {self.root} in the layout {self.layout.name}: {path} is missing; "
+                f"{self.layout.how_to_get}"
+            )
+        return read_file(path)
+
+
+def _places(names: tuple[str, ...]) -> dict[str, int]:
+    """Place of each name; the first one of a name that is listed twice."""
+    places: dict[str, int] = {}
+    for place, name in enumerate(names):
+        places.setdefault(name, place)
+    return places

@@ -1,0 +1,143 @@
+"""Folders with a few files a frame, frame-NNNNNN.color.jpg, .pose.txt and so on: one loop for all.
+
+A frame that lacks a file, whose pose is none or whose images cannot be read is left out and
+counted.
+"""
+
+from __future__ import annotations
+
+import re
+from abc import abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from deworldsg_ros.recordings import messages as ros
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, serialized
+from deworldsg_ros.recordings.messages import Role, RoleMessage
+from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.scene.camera import (
+    Float64,
+    Intrinsics,
+    check_pose,
+    pose_from_quaternion,
+    quaternion_from_rotation,
+)
+from deworldsg_ros.scene.errors import RefusedInput
+
+# Stamps count from here: a ROS time of zero means "unset" to many programs.
+FIRST_STAMP_NS = 10**9
+COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)$")
+
+
+class FrameFiles(Dataset):
+    """A data set of numbered frames, each in files of its own.
+
+    Attributes:
+        intrinsics: of the images in the messages.
+        depth_suffix: ending of the depth files.
+        frame_numbers: number of the frame in its file names, by its stamp in nanoseconds.
+    """
+
+    intrinsics: Intrinsics
+    depth_suffix: str
+    pose_suffix: ClassVar[str] = ".pose.txt"
+
+    def _set_frames(
+        self, colors: dict[int, Path], stamps_ns: list[int], camera_info_name: str
+    ) -> None:
+        """Colour image of each frame by its number, their stamps, and whence the intrinsics are."""
+        self._colors = colors
+        self.frame_numbers = dict(zip(stamps_ns, colors))
+        self.frame_count = len(colors)
+        first = next(iter(colors.values()))
+        self.topics = {
+            role: UsedTopic(name, msgtype, self.frame_count)
+            for role, name, msgtype in (
+                (Role.RGB, f"frame-*.color{first.suffix}", ros.COMPRESSED_IMAGE),
+                (Role.DEPTH, f"frame-*{self.depth_suffix}", ros.COMPRESSED_IMAGE),
+                (Role.CAMERA_INFO, camera_info_name, ros.CAMERA_INFO),
+                (Role.POSE, f"frame-*{self.pose_suffix}", ros.POSE_STAMPED),
+            )
+        }
+
+    @abstractmethod
+    def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
+        """Colour image file, its format (jpeg or png), and depth as 16-bit PNG in millimetres.
+
+        Args:
+            color_path: of the frame.
+            depth_path: of the frame.
+            stored: whether PNG files that are made here need not be compressed.
+
+        Raises:
+            RecordingError: for a file that cannot be read.
+        """
+
+    def _camera_pose(self, T_world_file: Float64) -> Float64:
+        """Pose (4, 4) of the messages' colour camera, from that of the pose file."""
+        return T_world_file
+
+    def messages(self) -> Iterator[RoleMessage]:
+        """camera_info, pose, depth and RGB of each frame; frames without a valid pose are left."""
+        # What is decoded at once is not worth compressing: half of the time of reading a frame.
+        return self._messages(stored=True)
+
+    def raw_messages(self) -> Iterator[RawRoleMessage]:
+        """The same, serialized and compressed."""
+        return serialized(self._messages(stored=False))
+
+    def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
+        for stamp_ns, number in self.frame_numbers.items():
+            color_path = self._colors[number]
+            stem = color_path.name.split(".")[0]
+            depth_path = color_path.with_name(stem + self.depth_suffix)
+            pose_path = color_path.with_name(stem + self.pose_suffix)
+            wanted = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
+            missing = next((file for file in wanted if not file.exists()), None)
+            if missing is not None:
+                self.drops["missing_file"] += 1
+                self.losses.append(f"{missing.name} is missing: its frame is left out")
+                continue
+            pose = []
+            try:
+                T = self._camera_pose(read_pose(pose_path))
+                quat_xyzw = quaternion_from_rotation(T[:3, :3])
+                pose = [ros.pose_stamped(stamp_ns, WORLD_FRAME, T[:3, 3], quat_xyzw)]
+            except RefusedInput as refusal:
+                if self.options.poses_needed:
+                    self.drops[refusal.reason] += 1
+                    continue
+            try:
+                color, color_format, depth = self._images(color_path, depth_path, stored)
+            except RecordingError as error:
+                self.drops["decode_failed"] += 1
+                self.losses.append(f"{error}: its frame is left out")
+                continue
+            yield ros.camera_info(stamp_ns, CAMERA_FRAME, self.intrinsics)
+            yield from pose
+            yield ros.compressed_depth(stamp_ns, CAMERA_FRAME, depth)
+            yield ros.compressed_image(stamp_ns, CAMERA_FRAME, color, color_format)
+
+
+def color_files(folder: Path) -> dict[int, Path]:
+    """Colour images of a folder by the number in their names, in order."""
+    return {
+        int(match[1]): file
+        for file in sorted(folder.iterdir())
+        if (match := COLOR_NAME.match(file.name))
+    }
+
+
+def read_pose(path: Path) -> Float64:
+    """The (4, 4) matrix of a pose file; raises RefusedInput ``invalid_pose``."""
+    try:
+        T = np.array(path.read_text().split(), np.float64).reshape(4, 4)
+    except (OSError, ValueError) as error:
+        raise RefusedInput("invalid_pose", f"{path}: {error}; wanted a 4x4 matrix") from error
+    check_pose(T)
+    # Printed decimals are not quite a rotation; the message's quaternion is exactly one.
+    return pose_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))

@@ -1,0 +1,27 @@
+"""Instance images of the data sets that have them: which object each pixel shows."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
+from deworldsg_ros.recordings.folders.sequence import SequenceDataset
+
+
+def read_instances(source: object, stamp_ns: int) -> NDArray[np.uint16] | None:
+    """Object ids of a frame's pixels, (H, W) uint16, 0 = none; None where there is no such image.
+
+    Raises:
+        RecordingError: where the image is there and cannot be decoded.
+    """
+    # Instance images are as the images lie on disk.
+    if not isinstance(source, SequenceDataset) or source.turned:
+        return None
+    if stamp_ns not in source.frame_numbers:
+        return None
+    path = source.file(source.frame_numbers[stamp_ns], ".instance.png")
+    if not path.exists():
+        return None
+    return np.asarray(decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path), np.uint16)

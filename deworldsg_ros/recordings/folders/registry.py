@@ -1,0 +1,76 @@
+"""The data sets of this folder, found by looking: a new one touches no other file.
+
+A data set is a module with a class that derives from `Dataset`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from inspect import isabstract
+from pathlib import Path
+from types import GenericAlias
+from typing import Any, TypeGuard
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import Dataset, DatasetOptions
+
+
+def _is_dataset(item: Any) -> TypeGuard[type[Dataset]]:
+    # Python 3.10 takes an alias such as list[int] for a type, and issubclass() then refuses it.
+    is_class = isinstance(item, type) and not isinstance(item, GenericAlias)
+    return is_class and issubclass(item, Dataset) and not isabstract(item)
+
+
+@functools.lru_cache(maxsize=1)
+def _datasets() -> dict[str, type[Dataset]]:
+    package = importlib.import_module(__package__ or "deworldsg_ros.recordings.folders")
+    found: dict[str, type[Dataset]] = {}
+    for module in pkgutil.iter_modules(package.__path__):
+        content = vars(importlib.import_module(f"{package.__name__}.{module.name}"))
+        for item in content.values():
+            if _is_dataset(item):
+                found[item.kind] = item
+    return dict(sorted(found.items()))
+
+
+def dataset_names() -> list[str]:
+    """Names of the known data sets."""
+    return list(_datasets())
+
+
+def detect_dataset(path: Path) -> str | None:
+    """Name of the data set that a folder looks like; None for none of them.
+
+    Raises:
+        RecordingError: for a whole data set of many scans, which is no recording.
+    """
+    scans = sorted(folder.parent.name for folder in path.glob("data/*/sequence"))
+    if scans:
+        shown = ", ".join(scans[:3]) + (", …" if len(scans) > 3 else "")
+        raise RecordingError(
+            f"recording {path}: it is a data set with the scans {shown}; name one of them, e.g. "
+            f"{path / 'data' / scans[0]}"
+        )
+    return next((name for name, kind in _datasets().items() if kind.looks_like(path)), None)
+
+
+def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -> Dataset:
+    """Open a folder as a data set.
+
+    Raises:
+        RecordingError: for an unknown name, or with the file that was expected and where.
+    """
+    if name not in _datasets():
+        raise RecordingError(
+            f"format '{name}' is unknown: wanted {', '.join(_datasets())}, rosbag2 or auto"
+        )
+    if not path.is_dir():
+        raise RecordingError(f"recording {path}: there is no such folder")
+    return _datasets()[name](path, options or DatasetOptions())
+
+
+def expectations() -> str:
+    """What a folder of each data set holds, in words."""
+    return "; ".join(f"{name}: {kind.expects}" for name, kind in _datasets().items())

@@ -1,0 +1,42 @@
+"""3RScan with 3DSSG's annotations: data/SCAN/sequence, images turned upright by 90 degrees.
+
+The phone was held upright while its images are stored lying: they are turned clockwise, with the
+intrinsics and the poses (`turned_intrinsics`, `turned_pose`). Depth is rendered from the mesh
+where such files are (``frame-*.rendered.depth.png``, as the compared numbers use it), else the
+sensor's; `DatasetOptions.depth_source` chooses.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from deworldsg_ros.recordings.folders.replica import belongs_to_replica
+from deworldsg_ros.recordings.folders.rooms import belongs_to_rooms
+from deworldsg_ros.recordings.folders.sequence import (
+    RENDERED_DEPTH,
+    SequenceDataset,
+    looks_like_scan,
+)
+
+
+class RioScan(SequenceDataset):
+    """One scan of 3RScan, see the module."""
+
+    kind = "3rscan"
+    expects = "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt}"
+    default_rate_hz = 10.0
+    turned = True
+    how_to_get = (
+        "agree to the terms at https://github.com/WaldJohannaU/3RScan, download the scan and "
+        "unpack its sequence.zip into sequence/"
+    )
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether it is a scan that is neither ReplicaSSG's nor a rendered room."""
+        return looks_like_scan(path) and not belongs_to_replica(path) and not belongs_to_rooms(path)
+
+    def _choose_depth(self, first: int) -> str:
+        if self.options.depth_source == "auto" and self.file(first, RENDERED_DEPTH).exists():
+            return RENDERED_DEPTH
+        return super()._choose_depth(first)

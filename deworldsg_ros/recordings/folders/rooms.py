@@ -1,0 +1,54 @@
+"""Rendered rooms: ReplicaSSG's layout with instance images, recorded detections and gt.json."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.folders.sequence import (
+    SequenceDataset,
+    has_frames,
+    looks_like_scan,
+    sequence_folder,
+)
+
+GROUND_TRUTH_NAME = "gt.json"
+
+
+def belongs_to_rooms(path: Path) -> bool:
+    """Whether a scan has instance images and recorded detections."""
+    return has_frames(path, ".instance.png") and has_frames(path, ".frontend.json")
+
+
+class RoomsScan(SequenceDataset):
+    """One rendered room, see the module."""
+
+    kind = "rooms"
+    expects = (
+        "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt,instance.png,"
+        "frontend.json}"
+    )
+    default_rate_hz = 10.0
+    how_to_get = "unpack.py of the rendered rooms makes all of it"
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether it is a scan with instance images and recorded detections."""
+        return looks_like_scan(path) and belongs_to_rooms(path)
+
+
+def read_ground_truth(scan_folder: Path) -> dict[str, Any] | None:
+    """Content of a room's gt.json; None where there is none. Raises RecordingError."""
+    path = sequence_folder(scan_folder).parent / GROUND_TRUTH_NAME
+    if not path.exists():
+        return None
+    try:
+        content = json.loads(read_file(path))
+    except ValueError as error:
+        raise RecordingError(f"{path} is no JSON: {error}") from error
+    if not isinstance(content, dict) or "objects" not in content:
+        raise RecordingError(f"{path}: wanted the key objects")
+    return content

@@ -1,0 +1,238 @@
+"""What 3RScan, ReplicaSSG and the rendered rooms share: a scan folder with sequence/_info.txt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import (
+    DatasetOptions,
+    decode_image,
+    encode_png,
+    image_format,
+    image_size,
+    read_file,
+)
+from deworldsg_ros.recordings.folders.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
+from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.errors import RefusedInput
+
+INFO_NAME = "_info.txt"
+RENDERED_DEPTH = ".rendered.depth.png"
+
+# Axes of the turned camera in those of the camera: x is what was -y, y is what was x.
+TURNED_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class SensorInfo:
+    """What _info.txt says of the two cameras.
+
+    Attributes:
+        color, depth: intrinsics of the images as they lie on disk.
+        depth_units_per_m: value of a depth pixel at one metre.
+    """
+
+    color: Intrinsics
+    depth: Intrinsics
+    depth_units_per_m: float
+
+
+class SequenceDataset(FrameFiles):
+    """One scan of a data set in 3RScan's layout.
+
+    Attributes:
+        default_rate_hz: frames a second, where the data set has no stamps of its own.
+        turned: whether the images are turned by 90 degrees clockwise.
+        how_to_get: one sentence for whoever lacks a file.
+
+    Raises:
+        RecordingError: names the file that was expected, and how to get it.
+    """
+
+    default_rate_hz: ClassVar[float]
+    turned: ClassVar[bool] = False
+    how_to_get: ClassVar[str]
+
+    def __init__(self, path: Path, options: DatasetOptions) -> None:
+        super().__init__(path, options)
+        self.sequence = sequence_folder(path)
+        if self.sequence.parent.name:
+            self.name = self.sequence.resolve().parent.name
+        info_path = self.sequence / INFO_NAME
+        if not info_path.exists():
+            raise RecordingError(
+                f"{self.kind} scan {path}: {info_path} is missing; {self.how_to_get}"
+            )
+        colors = color_files(self.sequence)
+        if not colors:
+            raise RecordingError(
+                f"{self.kind} scan {path}: {self.sequence} holds no frame-NNNNNN.color.jpg; "
+                f"{self.how_to_get}"
+            )
+        first = next(iter(colors.values()))
+        info = read_info(info_path)
+        if image_size(first) != (info.color.width, info.color.height):
+            raise RecordingError(
+                f"{first} is {'x'.join(map(str, image_size(first)))}: {info_path} says "
+                f"{info.color.width}x{info.color.height}"
+            )
+        if options.intrinsics:
+            size = info.color.width, info.color.height
+            info = SensorInfo(
+                Intrinsics(*options.intrinsics, *size), info.depth, info.depth_units_per_m
+            )
+        self.info = info
+        self.intrinsics = turned_intrinsics(info.color) if self.turned else info.color
+        self.depth_suffix = self._choose_depth(min(colors))
+        rate_hz = options.rate_hz or self.default_rate_hz
+        stamps_ns = [FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in colors]
+        self._set_frames(colors, stamps_ns, INFO_NAME)
+
+    def file(self, number: int, suffix: str) -> Path:
+        """File of a frame."""
+        return self.sequence / f"frame-{number:06d}{suffix}"
+
+    def _choose_depth(self, first: int) -> str:
+        """Ending of the depth files, by the first frame; RecordingError where they are absent."""
+        if self.options.depth_source == "rendered":
+            path = self.file(first, RENDERED_DEPTH)
+            if not path.exists():
+                raise RecordingError(
+                    f"{path} is missing: rendered depth was asked for, this scan has the "
+                    "sensor's only"
+                )
+            return RENDERED_DEPTH
+        return ".depth.pgm"
+
+    def _camera_pose(self, T_world_file: Float64) -> Float64:
+        return turned_pose(T_world_file) if self.turned else T_world_file
+
+    def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
+        color, color_format = read_file(color_path), image_format(color_path)
+        depth_mm = self._depth_mm(depth_path)
+        if self.turned:
+            bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
+            bgr = np.asarray(cv2.rotate(bgr, cv2.ROTATE_90_CLOCKWISE), np.uint8)
+            color, color_format = encode_png(bgr, stored=stored), "png"
+            depth_mm = np.asarray(cv2.rotate(depth_mm, cv2.ROTATE_90_CLOCKWISE), np.uint16)
+        return color, color_format, encode_png(depth_mm, stored=stored)
+
+    def _depth_mm(self, path: Path) -> NDArray[np.uint16]:
+        """Depth of the colour image's pixels, (H, W) uint16 millimetres; raises RecordingError."""
+        units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
+        if units.dtype != np.uint16 or units.ndim != 2:
+            raise RecordingError(f"{path} is {units.dtype}: wanted 16-bit grey")
+        size = (units.shape[1], units.shape[0])
+        if size != (self.info.color.width, self.info.color.height):
+            if size != (self.info.depth.width, self.info.depth.height):
+                raise RecordingError(
+                    f"{path} is {size[0]}x{size[1]}: {INFO_NAME} says "
+                    f"{self.info.depth.width}x{self.info.depth.height}"
+                )
+            units = resample(units, self.info.depth, self.info.color)
+        if self.info.depth_units_per_m != 1000.0:
+            units = np.rint(units * (1000.0 / self.info.depth_units_per_m)).astype(np.uint16)
+        return np.asarray(units, np.uint16)
+
+
+def sequence_folder(path: Path) -> Path:
+    """Folder of the frames, for a scan's folder or that folder itself."""
+    return (
+        path
+        if path.name == "sequence" and not (path / "sequence").is_dir()
+        else (path / "sequence")
+    )
+
+
+def dataset_root(path: Path) -> Path:
+    """Root of the data set that a scan's folder (or its frames') belongs to."""
+    return sequence_folder(path.resolve()).parents[2]
+
+
+def has_frames(path: Path, suffix: str) -> bool:
+    """Whether a scan has frame files with this ending."""
+    return any(True for _ in sequence_folder(path).glob(f"frame-*{suffix}"))
+
+
+def looks_like_scan(path: Path) -> bool:
+    """Whether a folder is a scan in 3RScan's layout."""
+    return (sequence_folder(path) / INFO_NAME).exists()
+
+
+def turned_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
+    """Intrinsics of an image turned by 90 degrees clockwise, as 3DSSG's users compute them.
+
+    The principal point goes to H - cy, where pixel centres at integers would make it H - 1 - cy;
+    the numbers that are compared were all made with H - cy.
+    """
+    return Intrinsics(
+        fx=intrinsics.fy,
+        fy=intrinsics.fx,
+        cx=intrinsics.height - intrinsics.cy,
+        cy=intrinsics.cx,
+        width=intrinsics.height,
+        height=intrinsics.width,
+    )
+
+
+def turned_pose(T_world_camera: Float64) -> Float64:
+    """Pose of the camera whose image is turned by 90 degrees clockwise."""
+    T = T_world_camera.copy()
+    T[:3, :3] = T_world_camera[:3, :3] @ TURNED_AXES
+    return T
+
+
+def resample(
+    depth: NDArray[np.uint16], depth_camera: Intrinsics, color_camera: Intrinsics
+) -> NDArray[np.uint16]:
+    """Depth on the colour image's pixels, for two cameras in one place; 0 outside the image."""
+    u = np.arange(color_camera.width, dtype=np.float64)
+    v = np.arange(color_camera.height, dtype=np.float64)
+    columns = (u - color_camera.cx) / color_camera.fx * depth_camera.fx + depth_camera.cx
+    rows = (v - color_camera.cy) / color_camera.fy * depth_camera.fy + depth_camera.cy
+    # The nearest pixel: between a near and a far surface there is nothing.
+    column, row = np.rint(columns).astype(int), np.rint(rows).astype(int)
+    inside_u = (column >= 0) & (column < depth_camera.width)
+    inside_v = (row >= 0) & (row < depth_camera.height)
+    taken = depth[
+        np.clip(row, 0, depth_camera.height - 1)[:, None],
+        np.clip(column, 0, depth_camera.width - 1),
+    ]
+    return np.where(inside_v[:, None] & inside_u, taken, 0).astype(np.uint16)
+
+
+def read_info(path: Path) -> SensorInfo:
+    """Read _info.txt; raises RecordingError with the key that was wanted."""
+    values: dict[str, str] = {}
+    for line in read_file(path).decode(errors="replace").splitlines():
+        key, equals, value = line.partition("=")
+        if equals:
+            values[key.strip()] = value.strip()
+    try:
+        color = _camera(values, "Color")
+        depth = _camera(values, "Depth")
+        units_per_m = float(values.get("m_depthShift", "1000"))
+    except KeyError as error:
+        raise RecordingError(f"{path} has no {error.args[0]}: wanted one") from error
+    except (ValueError, RefusedInput) as error:
+        raise RecordingError(f"{path}: {error}") from error
+    if not units_per_m > 0:
+        raise RecordingError(f"{path}: m_depthShift is {units_per_m}: wanted > 0")
+    return SensorInfo(color, depth, units_per_m)
+
+
+def _camera(values: dict[str, str], which: str) -> Intrinsics:
+    key = f"m_calibration{which}Intrinsic"
+    numbers = [float(word) for word in values[key].split()]
+    if len(numbers) != 16:
+        raise ValueError(f"{key} has {len(numbers)} numbers: wanted 16, row by row")
+    lower = which.lower()
+    size = int(values[f"m_{lower}Width"]), int(values[f"m_{lower}Height"])
+    return Intrinsics(numbers[0], numbers[5], numbers[2], numbers[6], *size)

@@ -1,0 +1,129 @@
+"""Microsoft 7-Scenes: frame-NNNNNN.color.*, .depth.png, .pose.txt.
+
+Two layouts are known. With a camera-intrinsics.txt the depth is taken as registered to colour,
+0 = invalid, the poses are those of the colour camera, and the images are passed on as they are.
+Without one the folder is as Microsoft distributes it: raw Kinect images, 65535 = invalid, poses of
+the depth camera. Then colour is undistorted and depth is projected into the colour camera, with
+the calibration below.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import (
+    DatasetOptions,
+    decode_image,
+    encode_png,
+    image_format,
+    image_size,
+    read_file,
+)
+from deworldsg_ros.recordings.folders.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
+from deworldsg_ros.recordings.folders.registration import register_depth
+from deworldsg_ros.scene.camera import Float64, Intrinsics
+
+INTRINSICS_NAME = "camera-intrinsics.txt"
+SENSOR_RATE_HZ = 30.0
+NO_DEPTH = 65535
+
+# The Kinect v1 of the data set. The depth camera's values are the publisher's; the colour camera
+# was calibrated against it on the RedKitchen sequence (it sits 26 mm to the right of it).
+DEPTH_FX_FY_CX_CY = (585.0, 585.0, 320.0, 240.0)
+COLOR_FX_FY_CX_CY = (528.41, 528.41, 320.32, 236.72)
+COLOR_K1 = -0.0153
+BASELINE_M = 0.026
+
+
+class SevenScenes(FrameFiles):
+    """One sequence folder of 7-Scenes, see the module.
+
+    Raises:
+        RecordingError: names the file that was expected.
+    """
+
+    kind = "7scenes"
+    depth_suffix = ".depth.png"
+    expects = "frame-NNNNNN.color.png (or .jpg), .depth.png and .pose.txt"
+
+    def __init__(self, path: Path, options: DatasetOptions) -> None:
+        super().__init__(path, options)
+        colors = color_files(path)
+        if not colors:
+            raise RecordingError(f"7-Scenes folder {path}: {_where_else(path)}")
+        self.registered = (path / INTRINSICS_NAME).exists() or bool(options.intrinsics)
+        size = image_size(next(iter(colors.values())))
+        fx_fy_cx_cy = options.intrinsics or (
+            _read_intrinsics(path / INTRINSICS_NAME) if self.registered else COLOR_FX_FY_CX_CY
+        )
+        self.intrinsics = Intrinsics(*fx_fy_cx_cy, *size)
+        self._depth_camera = Intrinsics(*DEPTH_FX_FY_CX_CY, *size)
+        # Every fourth frame of the 30 Hz sensor comes at 7.5 Hz.
+        places = range(len(colors)) if options.rate_hz else colors
+        rate_hz = options.rate_hz or SENSOR_RATE_HZ
+        stamps_ns = [FIRST_STAMP_NS + round(place * 1e9 / rate_hz) for place in places]
+        calibration = INTRINSICS_NAME if self.registered else "(built-in calibration)"
+        self._set_frames(colors, stamps_ns, calibration)
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether there are files named frame-NNNNNN.color.*, here or one level below."""
+        # Data sets in 3RScan's layout name theirs alike, and have this besides.
+        if (path / "_info.txt").exists():
+            return False
+        return any(True for _ in path.glob("frame-*.color.*")) or any(
+            True for _ in path.glob("seq-*/frame-*.color.*")
+        )
+
+    def _camera_pose(self, T_world_file: Float64) -> Float64:
+        if self.registered:
+            return T_world_file
+        # The poses are the depth camera's: the colour camera is at x = baseline in it.
+        return T_world_file @ _translation_x(BASELINE_M)
+
+    def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
+        color, depth = read_file(color_path), read_file(depth_path)
+        if self.registered:
+            return color, image_format(color_path), depth
+        bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
+        depth_mm = decode_image(depth, cv2.IMREAD_UNCHANGED, depth_path)
+        if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
+            raise RecordingError(f"{depth_path} is {depth_mm.dtype}: wanted 16-bit grey")
+        undistorted = cv2.undistort(bgr, self.intrinsics.matrix, np.array([COLOR_K1, 0, 0, 0]))
+        registered = register_depth(
+            np.where(depth_mm == NO_DEPTH, 0, depth_mm).astype(np.uint16),
+            self._depth_camera,
+            self.intrinsics,
+            _translation_x(-BASELINE_M),
+        )
+        return (
+            encode_png(np.asarray(undistorted, np.uint8), stored=stored),
+            "png",
+            encode_png(registered, stored=stored),
+        )
+
+
+def _translation_x(x_m: float) -> Float64:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return T
+
+
+def _where_else(path: Path) -> str:
+    sequences = sorted(folder.name for folder in path.glob("seq-*") if folder.is_dir())
+    expected = "expected frame-NNNNNN.color.png (or .jpg) in it"
+    if sequences:
+        return f"{expected}; it holds the sequences {', '.join(sequences)}: name one of them"
+    return expected
+
+
+def _read_intrinsics(path: Path) -> tuple[float, float, float, float]:
+    try:
+        K = np.array(read_file(path).split(), np.float64).reshape(3, 3)
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}; wanted a 3x3 camera matrix") from error
+    return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

@@ -1,0 +1,242 @@
+"""A recording whose poses come from elsewhere: a trajectory file, or nowhere yet."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from deworldsg_ros.config import Config, InputsConfig
+from deworldsg_ros.poses.frames import OnRefusal, track_poses
+from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
+from deworldsg_ros.poses.trajectory import Trajectory, read_trajectory
+from deworldsg_ros.recordings.folders.sequence import turned_pose
+from deworldsg_ros.recordings.messages import (
+    POSE_STAMPED,
+    Role,
+    RoleMessage,
+    encode,
+    pose_stamped,
+)
+from deworldsg_ros.recordings.recording import Recording
+from deworldsg_ros.recordings.source import RawRoleMessage, Source, UsedTopic
+from deworldsg_ros.scene.camera import Float64, RgbdFrame, quaternion_from_rotation
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.streams.jump_gate import JumpGate
+from deworldsg_ros.streams.poses import pose_from_message
+
+# World frame where the recording names none.
+TRAJECTORY_FRAME = "world"
+
+
+@dataclass(frozen=True)
+class PoseChoice:
+    """Whose poses a run takes.
+
+    Attributes:
+        trajectory: file or folder of poses; None = the recording's own.
+        trajectory_format: tum, kitti, 3rscan, slam or auto.
+        odometry: whether the poses are made of the images; they begin at the recording's first.
+        noise: what is added to the poses.
+
+    Raises:
+        ConfigurationError: for a trajectory and odometry at once.
+    """
+
+    trajectory: Path | None = None
+    trajectory_format: str = "auto"
+    odometry: bool = False
+    noise: PoseNoise = PoseNoise()
+
+    def __post_init__(self) -> None:
+        if self.trajectory is not None and self.odometry:
+            raise ConfigurationError("poses from a trajectory and from odometry: wanted one")
+
+    @property
+    def need_poses(self) -> bool:
+        """Whether the recording's own poses are used."""
+        return self.trajectory is None and not self.odometry
+
+
+def choose_poses(source: Source, choice: PoseChoice, config: Config) -> Source:
+    """The source with its poses as chosen; odometry and noise are `posed_frames`' to add.
+
+    Raises:
+        TrajectoryError: where a trajectory cannot be read.
+    """
+    if choice.trajectory is not None:
+        trajectory = read_trajectory(choice.trajectory, choice.trajectory_format)
+        slop_s = config.inputs.pose_slop_s
+        return TrajectorySource(source, trajectory, slop_s, choice.trajectory.name)
+    if choice.odometry:
+        return UnposedSource(source, config.inputs.world_frame or config.odometry.frame_id)
+    return source
+
+
+def posed_frames(
+    recording: Recording, choice: PoseChoice, config: Config, on_refusal: OnRefusal
+) -> Iterator[RgbdFrame]:
+    """Frames of a recording over `choose_poses`, with odometry and noise as chosen.
+
+    Args:
+        recording: its source is what `choose_poses` gave.
+        choice: whose poses.
+        config: sections ``inputs`` and ``odometry`` are used.
+        on_refusal: called with the refusal of each frame that is left out here.
+    """
+    frames = recording.frames()
+    if isinstance(recording.source, UnposedSource):
+        frames = _tracked(frames, recording.source, config, on_refusal)
+    if choice.noise != PoseNoise():
+        frames = perturb_poses(frames, choice.noise)
+        frames = gate_jumps(frames, config.inputs, on_refusal)
+    return frames
+
+
+def gate_jumps(
+    frames: Iterable[RgbdFrame], inputs: InputsConfig, on_refusal: OnRefusal
+) -> Iterator[RgbdFrame]:
+    """The frames without those whose camera jumped (`JumpGate`)."""
+    gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
+    for frame in frames:
+        try:
+            gate.check(frame.T_world_camera, frame.stamp_ns)
+        except RefusedInput as refusal:
+            on_refusal(refusal)
+            continue
+        yield frame
+
+
+def _tracked(
+    frames: Iterator[RgbdFrame], source: UnposedSource, config: Config, on_refusal: OnRefusal
+) -> Iterator[RgbdFrame]:
+    for first in frames:  # by then the source knows its first pose
+        yield from track_poses(chain([first], frames), config.odometry, source.T_first, on_refusal)
+
+
+class PosedSource(ABC):
+    """A `Source` whose poses are replaced, one before each RGB image, with its stamp.
+
+    An RGB image without a pose is left out and counted as ``no_pose``.
+
+    Args:
+        source: as recorded; opened with ``need_poses=False`` it need not have poses.
+        topic: what to call the origin of the poses.
+
+    Attributes:
+        original: as recorded.
+        T_first: the recording's own pose (4, 4) when its first RGB image came; None where it had
+            none.
+    """
+
+    def __init__(self, source: Source, topic: str) -> None:
+        self.original = source
+        self._frame_id = ""
+        self._T_recorded: Float64 | None = None
+        self.T_first: Float64 | None = None
+        self.name = source.name
+        self.frame_count = source.frame_count
+        self.drops = source.drops
+        self.losses = source.losses
+        self.topics = {
+            **source.topics,
+            Role.POSE: UsedTopic(topic, POSE_STAMPED, source.frame_count),
+        }
+
+    @abstractmethod
+    def _pose_at(self, stamp_ns: int, place: int) -> Float64 | None:
+        """The pose (4, 4) of an RGB image, None where there is none."""
+
+    @property
+    def kind(self) -> str:
+        """That of the recording."""
+        return self.original.kind
+
+    def messages(self) -> Iterator[RoleMessage]:
+        """Messages in order; of the recording's own poses only the world frame is kept."""
+        place = -1
+        for item in self.original.messages():
+            if item.role is Role.POSE:
+                self._note_recorded(item)
+                continue
+            if item.role is Role.RGB:
+                place += 1
+                if place == 0:
+                    self.T_first = self._T_recorded
+                T = self._pose_at(item.stamp_ns, place)
+                if T is None:
+                    self.drops["no_pose"] += 1
+                    continue
+                yield pose_stamped(
+                    item.stamp_ns,
+                    self._frame_id or TRAJECTORY_FRAME,
+                    T[:3, 3],
+                    quaternion_from_rotation(T[:3, :3]),
+                )
+            yield item
+
+    def raw_messages(self) -> Iterator[RawRoleMessage]:
+        """The same, serialized."""
+        for item in self.messages():
+            data = encode(item.message, item.msgtype)
+            yield RawRoleMessage(item.role, item.msgtype, item.stamp_ns, item.stamp_ns, data)
+
+    def close(self) -> None:
+        """Close the files."""
+        self.original.close()
+
+    def _note_recorded(self, item: RoleMessage) -> None:
+        try:
+            T, frame_id = pose_from_message(item.message)
+        except RefusedInput:  # it is not used
+            return
+        # One world frame from beginning to end.
+        self._frame_id = self._frame_id or frame_id
+        self._T_recorded = T
+
+
+class TrajectorySource(PosedSource):
+    """A recording with the poses of a trajectory.
+
+    Poses are those of the images as they are stored: where a data set turns its images, the poses
+    turn along.
+
+    Args:
+        source: as recorded.
+        trajectory: poses of its colour camera.
+        slop_s: most time between an image and the poses that stand for it, seconds.
+        topic: what to call the trajectory.
+    """
+
+    def __init__(self, source: Source, trajectory: Trajectory, slop_s: float, topic: str) -> None:
+        super().__init__(source, topic)
+        self._trajectory = trajectory
+        self._slop_ns = round(slop_s * 1e9)
+        self._turned = bool(getattr(source, "turned", False))
+        self._numbers: dict[int, int] = getattr(source, "frame_numbers", {})
+
+    def _pose_at(self, stamp_ns: int, place: int) -> Float64 | None:
+        number = self._numbers.get(stamp_ns, place)
+        T = self._trajectory.at(stamp_ns, number, place, self._slop_ns)
+        return turned_pose(T) if T is not None and self._turned else T
+
+
+class UnposedSource(PosedSource):
+    """A recording whose frames all have the identity as their pose, until odometry gives another.
+
+    Args:
+        source: as recorded.
+        frame_id: world frame, where the recording names none.
+    """
+
+    def __init__(self, source: Source, frame_id: str) -> None:
+        super().__init__(source, "odometry")
+        self._default_frame_id = frame_id
+
+    def _pose_at(self, stamp_ns: int, place: int) -> Float64:
+        self._frame_id = self._frame_id or self._default_frame_id
+        return np.eye(4)

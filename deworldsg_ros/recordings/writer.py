@@ -1,0 +1,108 @@
+"""Write the messages of a recording as one MCAP file that rosbag2 and Foxglove open."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from rosbags.interfaces import (
+    Connection,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    Role,
+    typestore,
+)
+from deworldsg_ros.recordings.source import RawRoleMessage
+
+# Foxglove and RViz find an image's CameraInfo beside it, and take the type from the last word.
+TOPICS = {
+    (Role.RGB, IMAGE): "/rgb/image_raw",
+    (Role.RGB, COMPRESSED_IMAGE): "/rgb/image_raw/compressed",
+    (Role.DEPTH, IMAGE): "/depth/image_raw",
+    (Role.DEPTH, COMPRESSED_IMAGE): "/depth/image_raw/compressedDepth",
+}
+CAMERA_INFO_TOPIC = "/rgb/camera_info"
+POSE_TOPIC = "/camera/pose"
+NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
+
+
+def topic_of(role: Role, msgtype: str) -> str:
+    """Topic on which messages of a role and type are written."""
+    if role is Role.CAMERA_INFO:
+        return CAMERA_INFO_TOPIC
+    if role is Role.POSE:
+        return POSE_TOPIC
+    return TOPICS[role, msgtype]
+
+
+def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
+    """Write messages into one new MCAP file (profile ros2, schemas inside); gives their number.
+
+    The file appears when it is complete: a conversion that is interrupted leaves nothing.
+
+    Raises:
+        RecordingError: as `check_output`, or where nothing came.
+    """
+    check_output(path)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".deworldsg-") as folder:
+        bag = Path(folder) / "bag"
+        count = _write(iter(messages), bag)
+        if not count:
+            raise RecordingError(f"output {path}: the recording gave no messages to write")
+        shutil.move(bag / "bag.mcap", path)
+    return count
+
+
+def check_output(path: Path) -> None:
+    """Refuse a file that cannot be made: RecordingError."""
+    if path.suffix != ".mcap":
+        raise RecordingError(f"output {path}: wanted a file name that ends in .mcap")
+    if path.exists():
+        raise RecordingError(f"output {path} exists already: remove it or take another name")
+    if not path.parent.is_dir():
+        raise RecordingError(f"output {path}: the folder {path.parent} does not exist")
+
+
+def _write(messages: Iterator[RawRoleMessage], bag: Path) -> int:
+    connections: dict[tuple[Role, str], Connection] = {}
+    count = 0
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for raw in messages:
+            key = raw.role, raw.msgtype
+            if key not in connections:
+                connections[key] = writer.add_connection(
+                    topic_of(*key),
+                    raw.msgtype,
+                    typestore=typestore(),
+                    offered_qos_profiles=[_reliable()],
+                )
+            writer.write(connections[key], raw.log_time_ns, raw.data)
+            count += 1
+    return count
+
+
+def _reliable() -> Qos:
+    return Qos(
+        QosHistory.KEEP_LAST,
+        10,
+        QosReliability.RELIABLE,
+        QosDurability.VOLATILE,
+        NO_LIMIT,
+        NO_LIMIT,
+        QosLiveliness.AUTOMATIC,
+        NO_LIMIT,
+        False,
+    )

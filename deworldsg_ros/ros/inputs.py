@@ -1,0 +1,147 @@
+"""Subscriptions to the camera: images, camera_info and poses, whatever form they come in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.node import CHECK_PERIOD_S, StageNode
+from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable, source
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.streams.posed import PosedAssembler
+from deworldsg_ros.streams.poses import stamp_ns_of
+
+try:  # On a full installation of ROS, and not in its wheels.
+    from tf2_msgs.msg import TFMessage as TFMessage  # transform_output has it from here
+except ImportError:
+    TFMessage = None
+
+# Called with a message and its stamp in nanoseconds.
+Taker = Callable[[Any, int], None]
+# An image has to survive one look at a slow network; poses and transforms come faster.
+IMAGE_DEPTH = 10
+POSE_DEPTH = 100
+# How long poses are waited for before TF stands in for them.
+TF_AFTER_S = 3.0
+
+
+def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[Source]:
+    """Where images may come from, in order of preference.
+
+    Args:
+        topic: of the raw images.
+        compressed_suffix: that image_transport appends, e.g. ``/compressed``.
+        transport: auto, raw or compressed.
+    """
+    raw = [source(topic, Image)]
+    compressed = [
+        source(topic + compressed_suffix, CompressedImage),
+        source(topic, CompressedImage),
+    ]
+    return {"raw": raw, "compressed": compressed, "auto": raw + compressed}[transport]
+
+
+def listen_rgb(node: StageNode, take: Taker) -> None:
+    """Take RGB images."""
+    inputs = node.parameters.inputs
+    topic = node.resolve_topic_name("rgb/image_raw")
+    sources = image_sources(topic, "/compressed", inputs.transport)
+    node.listen("rgb", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+
+
+def listen_depth(node: StageNode, take: Taker) -> None:
+    """Take depth images."""
+    inputs = node.parameters.inputs
+    topic = node.resolve_topic_name("depth/image_raw")
+    sources = image_sources(topic, "/compressedDepth", inputs.transport)
+    node.listen("depth", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+
+
+def listen_camera_info(node: StageNode, take: Taker) -> None:
+    """Take camera_info."""
+    sources = [source("rgb/camera_info", CameraInfo)]
+    reliability = node.parameters.inputs.reliability
+    node.listen("camera_info", sources, _stamped(take), reliability, IMAGE_DEPTH)
+
+
+def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
+    """Take poses, and transforms where they are wanted or needed.
+
+    Raises:
+        ConfigurationError: where TF is wanted and its messages are not installed.
+    """
+    wanted = node.parameters.inputs.pose_source
+    transforms = _Transforms(node, frames)
+    if wanted == "tf":
+        transforms.listen()
+        return
+    kinds = {"pose": [PoseStamped], "odometry": [Odometry], "auto": [PoseStamped, Odometry]}
+    carried = wanted == "auto" and TFMessage is not None
+    add = node.taking(frames.add_pose)
+
+    def take(message: Any, stamp_ns: int) -> None:
+        add(message, stamp_ns)
+        if carried and getattr(message, "child_frame_id", "") not in ("", frames.camera_frame):
+            transforms.listen()
+
+    sources = [source("camera/pose", kind) for kind in kinds[wanted]]
+    reliability = node.parameters.inputs.reliability
+    poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
+    if carried:
+        frames.expect_transforms()
+        _fall_back_on_transforms(node, poses, transforms)
+
+
+class _Transforms:
+    """Subscriptions to /tf and /tf_static, made once."""
+
+    def __init__(self, node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
+        self._node = node
+        self._take = node.taking(frames.add_transforms)
+        self._is_listening = False
+
+    def listen(self) -> None:
+        """Subscribe, unless that is done; raises ConfigurationError without tf2_msgs."""
+        if TFMessage is None:
+            raise ConfigurationError(
+                "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a "
+                "full ROS 2 installation, or poses on camera/pose"
+            )
+        if self._is_listening:
+            return
+        self._is_listening = True
+        self._node.get_logger().info("listening to /tf and /tf_static")
+        for topic, static in (("/tf", False), ("/tf_static", True)):
+
+            def received(message: Any, topic: str = topic, static: bool = static) -> None:
+                self._node.health.received(topic)
+                self._take(message, static)
+
+            profile = reliable(POSE_DEPTH, latched=static)
+            self._node.create_subscription(TFMessage, topic, self._node.guarded(received), profile)
+
+
+def _fall_back_on_transforms(
+    node: StageNode, poses: AutoSubscription, transforms: _Transforms
+) -> None:
+    """Listen to TF once nobody has offered poses for a while, and not before.
+
+    The two may be in different world frames: a graph must not begin in one and go on in the other.
+    """
+    started_s = time.monotonic()
+
+    def look() -> None:
+        if not poses.was_published and time.monotonic() - started_s > TF_AFTER_S:
+            transforms.listen()
+
+    node.every(CHECK_PERIOD_S, look)
+
+
+def _stamped(take: Taker) -> Callable[[Any], None]:
+    return lambda message: take(message, stamp_ns_of(message))

@@ -1,0 +1,170 @@
+"""ROS parameters of a node: declared from the typed configuration, checked once, then fixed."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgspec
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+
+from deworldsg_ros.ros.options import Parameters
+from deworldsg_ros.scene.errors import ConfigurationError
+
+# Parameters that rclpy itself reads from the overrides.
+RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
+RCLPY_PREFIXES = ("qos_overrides.",)
+
+P = TypeVar("P", bound=msgspec.Struct)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One parameter.
+
+    Attributes:
+        name: as ROS knows it: section.field, or field alone for how a node runs.
+        path: section and field.
+        kind: float, int, str or bool.
+        default: its default.
+        description: from the configuration.
+        lowest, highest: inclusive bounds, None where there is none.
+        lowest_is_open, highest_is_open: whether the bound itself is refused.
+        choices: the strings that it may be; empty = any.
+    """
+
+    name: str
+    path: tuple[str, str]
+    kind: type
+    default: Any
+    description: str
+    lowest: float | None = None
+    highest: float | None = None
+    lowest_is_open: bool = False
+    highest_is_open: bool = False
+    choices: tuple[str, ...] = ()
+
+    def limits(self) -> str:
+        """The values that are allowed, in words; empty where any is."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        parts = []
+        if self.lowest is not None:
+            parts.append(f"{'>' if self.lowest_is_open else '>='} {self.lowest:g}")
+        if self.highest is not None:
+            parts.append(f"{'<' if self.highest_is_open else '<='} {self.highest:g}")
+        return " and ".join(parts)
+
+
+def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
+    """Every parameter, in the order of the configuration."""
+    return list(_walk(kind))
+
+
+def _walk(struct: type[msgspec.Struct]) -> Iterator[Field]:
+    sections: Any = msgspec.inspect.type_info(struct)
+    for section in sections.fields:
+        for field in section.type.fields:
+            metadata = field.type
+            path = (section.name, field.name)
+            name = field.name if section.name == "node" else ".".join(path)
+            description = metadata.extra_json_schema["description"]
+            yield _field(name, path, metadata.type, field.default, description)
+
+
+def _field(name: str, path: tuple[str, str], kind: Any, default: Any, description: str) -> Field:
+    inspect = msgspec.inspect
+    if isinstance(kind, inspect.LiteralType):
+        return Field(name, path, str, default, description, choices=tuple(map(str, kind.values)))
+    if isinstance(kind, (inspect.FloatType, inspect.IntType)):
+        return Field(
+            name,
+            path,
+            float if isinstance(kind, inspect.FloatType) else int,
+            default,
+            description,
+            lowest=kind.gt if kind.ge is None else kind.ge,
+            highest=kind.lt if kind.le is None else kind.le,
+            lowest_is_open=kind.gt is not None,
+            highest_is_open=kind.lt is not None,
+        )
+    return Field(
+        name, path, bool if isinstance(kind, inspect.BoolType) else str, default, description
+    )
+
+
+def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
+    """Validate overrides, by full name, into the whole set.
+
+    Raises:
+        ConfigurationError: in one line: the name, what was seen, what was wanted.
+    """
+    known = {field.name: field for field in fields(kind)}
+    content: dict[str, dict[str, Any]] = {}
+    for name, value in overrides.items():
+        field = known.get(name)
+        if field is None:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
+        section, key = field.path
+        try:
+            msgspec.convert({section: {key: value}}, kind)
+        except msgspec.ValidationError as error:
+            raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
+        content.setdefault(section, {})[key] = value
+    return msgspec.convert(content, kind)
+
+
+def _complaint(field: Field, value: Any) -> str:
+    wanted = field.limits() or field.kind.__name__
+    if field.kind is not str and not field.choices and field.limits():
+        wanted = f"{field.kind.__name__} {wanted}"
+    hint = ""
+    if field.kind is str and isinstance(value, bool):
+        hint = " (YAML reads a bare y, n, on or off as a truth value: put it in quotes)"
+    return f"parameter {field.name} is {value!r}, wanted {wanted}{hint}: {field.description}"
+
+
+def descriptor(field: Field) -> ParameterDescriptor:
+    """The ROS description of a parameter; read-only, for nodes read them at start-up."""
+    result = ParameterDescriptor(
+        description=field.description, read_only=True, additional_constraints=field.limits()
+    )
+    bounded = field.lowest is not None or field.highest is not None
+    if field.kind is float and bounded:
+        result.floating_point_range = [
+            FloatingPointRange(
+                from_value=float(-sys.float_info.max if field.lowest is None else field.lowest),
+                to_value=float(sys.float_info.max if field.highest is None else field.highest),
+            )
+        ]
+    if field.kind is int and bounded:
+        result.integer_range = [
+            IntegerRange(
+                from_value=int(-(2**63) if field.lowest is None else field.lowest),
+                to_value=int(2**63 - 1 if field.highest is None else field.highest),
+            )
+        ]
+    return result
+
+
+def declare(node: Any, kind: type[P]) -> P:
+    """Declare every parameter on a node, with the values it was started with.
+
+    Raises:
+        ConfigurationError: for an unknown name, a wrong type or a value out of range.
+    """
+    overrides = {
+        name: parameter.value
+        for name, parameter in node._parameter_overrides.items()
+        if name not in RCLPY_NAMES and not name.startswith(RCLPY_PREFIXES)
+    }
+    parameters = resolve(overrides, node.get_name(), kind)
+    for field in fields(kind):
+        value = getattr(getattr(parameters, field.path[0]), field.path[1])
+        node.declare_parameter(field.name, value, descriptor(field), ignore_override=True)
+    return parameters

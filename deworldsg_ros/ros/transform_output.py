@@ -1,0 +1,72 @@
+"""Poses of the camera on /tf."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+
+from deworldsg_ros.ros.inputs import POSE_DEPTH, TFMessage
+from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.streams.poses import set_stamp
+from deworldsg_ros.streams.transforms import TransformTree
+
+
+def camera_transform(
+    tree: TransformTree, stamp_ns: int, world_frame: str, camera_frame: str, T_world_camera: Float64
+) -> TransformStamped:
+    """The transform of a pose, from the world to the root of the tree that the camera is in.
+
+    A frame has one parent, and a camera's optical frame mostly has one: its housing, on a robot.
+    """
+    root = tree.root(camera_frame)
+    T_camera_root = tree.between(stamp_ns, camera_frame, root) if root != camera_frame else None
+    T = T_world_camera if T_camera_root is None else T_world_camera @ T_camera_root
+    message = TransformStamped(child_frame_id=root)
+    message.header.frame_id = world_frame
+    set_stamp(message, stamp_ns)
+    put_pose(T, message.transform.translation, message.transform.rotation)
+    return message
+
+
+def put_pose(T: Float64, position: Any, orientation: Any) -> None:
+    """Write a pose (4, 4) into a Point or Vector3, and a Quaternion."""
+    position.x, position.y, position.z = map(float, T[:3, 3])
+    orientation.x, orientation.y, orientation.z, orientation.w = map(
+        float, quaternion_from_rotation(T[:3, :3])
+    )
+
+
+class TransformOutput:
+    """Publishes the camera's pose on /tf, knowing from /tf_static what it is mounted on.
+
+    Raises:
+        ConfigurationError: where tf2_msgs is not installed.
+    """
+
+    def __init__(self, node: StageNode) -> None:
+        if TFMessage is None:
+            raise ConfigurationError(
+                "parameter odometry.publish_tf is true, but tf2_msgs is not installed: wanted a "
+                "full ROS 2 installation"
+            )
+        self._mounting = TransformTree(0)
+        self._output = node.create_publisher(TFMessage, "/tf", reliable(POSE_DEPTH))
+        node.create_subscription(
+            TFMessage,
+            "/tf_static",
+            node.guarded(lambda message: self._mounting.add(message, static=True)),
+            reliable(POSE_DEPTH, latched=True),
+        )
+
+    def publish(
+        self, stamp_ns: int, world_frame: str, camera_frame: str, T_world_camera: Float64
+    ) -> None:
+        """Publish the pose (4, 4) of a stamp."""
+        transform = camera_transform(
+            self._mounting, stamp_ns, world_frame, camera_frame, T_world_camera
+        )
+        self._output.publish(TFMessage(transforms=[transform]))

@@ -1,0 +1,170 @@
+"""The loop that joins streams in stamp order.
+
+Time is an argument. What comes out depends on what came in on each stream, not on how the
+streams were interleaved, as long as no buffer overflows and nothing times out.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.stamped import Stream
+
+T = TypeVar("T")
+Out = TypeVar("Out")
+OnDrop = Callable[[str, str, int], None]
+
+# A stream that is silent for longer is named in the diagnostics.
+SILENCE_NS = 2 * 10**9
+
+
+class Assembler(ABC, Generic[T, Out]):
+    """Joins a leading stream with what belongs to each of its items, in stamp order.
+
+    Args:
+        leader: the stream whose items become outputs.
+        others: the further streams that an output needs.
+        patience_s: how long an item may wait, by the `now_ns` given, for what it lacks.
+        on_drop: called with the reason, the message and the number of every drop.
+
+    Attributes:
+        drops: number of drops by reason.
+    """
+
+    def __init__(
+        self,
+        leader: Stream[T],
+        others: Sequence[Stream[Any]],
+        *,
+        patience_s: float,
+        on_drop: OnDrop | None,
+    ) -> None:
+        self._leader = leader
+        self._streams: list[Stream[Any]] = [leader, *others]
+        self._patience_ns = int(patience_s * 1e9)
+        self._on_drop = on_drop
+        self._waiting_since_ns: dict[int, int] = {}
+        self._started_ns: int | None = None
+        self.drops: Counter[str] = Counter()
+
+    @abstractmethod
+    def _settled(self, stamp_ns: int, value: T) -> bool:
+        """Whether nothing that is yet to come can change the output of this item."""
+
+    @abstractmethod
+    def _build(self, stamp_ns: int, value: T) -> Out:
+        """The output of an item, from what is there; raises RefusedInput."""
+
+    @abstractmethod
+    def _forget(self, stamp_ns: int) -> None:
+        """Drop what only outputs up to this stamp could need."""
+
+    def _restart(self, stamp_ns: int) -> None:
+        """Forget what lies ahead of a jump back in time, to this stamp.
+
+        Streams jump one after the other: what has come of the new time already stays.
+        """
+        lost = sum(stream.clear() for stream in self._streams if stream.restarts(stamp_ns))
+        self._waiting_since_ns.clear()
+        self._drop("time_jump", f"stamps went back: starting again without {lost} messages")
+
+    def pop_ready(self, now_ns: int | None) -> list[Out]:
+        """What is complete, in stamp order; what waited for too long is decided as it stands.
+
+        Args:
+            now_ns: any clock that only goes forward; None = never give up waiting.
+        """
+        if now_ns is not None:
+            self._note_time(now_ns)
+        ready: list[Out] = []
+        while len(self._leader):
+            item = self._leader.first()
+            if not (
+                self._settled(item.stamp_ns, item.value)
+                or self._leader.full
+                or self._gave_up(item.stamp_ns, now_ns)
+            ):
+                break
+            self._decide(ready)
+        return ready
+
+    def flush(self) -> list[Out]:
+        """Decide everything that still waits, as it stands: nothing more will come."""
+        ready: list[Out] = []
+        while len(self._leader):
+            self._decide(ready)
+        return ready
+
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """What is missing, in words: streams that are silent, stamps that never meet."""
+        self._note_time(now_ns)
+        assert self._started_ns is not None
+        missing = [
+            f"no {stream.name} on {stream.topic} for {silence_ns / 1e9:.0f} s"
+            for stream in self._streams
+            if (silence_ns := stream.silence_ns(now_ns, self._started_ns)) > SILENCE_NS
+        ]
+        return missing or self._stuck(now_ns)
+
+    def _stuck(self, now_ns: int) -> list[str]:
+        if not len(self._leader):
+            return []
+        stamp_ns = self._leader.first().stamp_ns
+        if now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) < self._patience_ns // 2:
+            return []
+        return [
+            f"{self._leader.name} of {stamp_ns / 1e9:.3f} s waits for {stream.name}, whose newest "
+            f"on {stream.topic} is of {stream.newest_ns / 1e9:.3f} s"
+            for stream in self._streams
+            if stream.newest_ns is not None and stream.newest_ns < stamp_ns
+        ]
+
+    def _note_time(self, now_ns: int) -> None:
+        if self._started_ns is None:
+            self._started_ns = now_ns
+        for stream in self._streams:
+            stream.silence_ns(now_ns, self._started_ns)
+        for stamp_ns in self._leader.stamps_ns():
+            self._waiting_since_ns.setdefault(stamp_ns, now_ns)
+
+    def _gave_up(self, stamp_ns: int, now_ns: int | None) -> bool:
+        if now_ns is None:
+            return False
+        return now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) >= self._patience_ns
+
+    def _decide(self, ready: list[Out]) -> None:
+        item = self._leader.take()
+        self._waiting_since_ns.pop(item.stamp_ns, None)
+        try:
+            ready.append(self._build(item.stamp_ns, item.value))
+        except RefusedInput as refusal:
+            self._drop(refusal.reason, str(refusal))
+        self._forget(item.stamp_ns)
+
+    def _add(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
+        """Keep an item; count it where it is refused, and what it pushes out."""
+        if stream.restarts(stamp_ns):
+            self._restart(stamp_ns)
+        try:
+            lost = stream.add(stamp_ns, value)
+        except RefusedInput as refusal:
+            self._drop(refusal.reason, str(refusal))
+            return
+        self._drop_unmatched(stream, lost)
+
+    def _drop_unmatched(self, stream: Stream[Any], number: int) -> None:
+        self._drop(
+            f"unmatched_{stream.name}",
+            f"{stream.name} on {stream.topic} belongs to no {self._leader.name}",
+            number,
+        )
+
+    def _drop(self, reason: str, message: str, number: int = 1) -> None:
+        if number:
+            self.drops[reason] += number
+            if self._on_drop is not None:
+                self._on_drop(reason, message, number)

@@ -1,0 +1,176 @@
+"""What belongs together: RGB, depth, camera_info and pose; what lifting and relations need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph
+from deworldsg_ros.streams.assembler import Assembler, OnDrop
+from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
+from deworldsg_ros.streams.jump_gate import JumpGate
+from deworldsg_ros.streams.posed import TOPICS, PosedAssembler
+from deworldsg_ros.streams.stamped import Stream
+
+
+@dataclass(frozen=True)
+class LiftingFrame:
+    """What lifting needs of one frame.
+
+    Attributes:
+        frame_graph: objects of the image.
+        instances: (H, W) uint16, k = k-th object of the frame graph, from 1.
+        depth_m: (H, W) float32, metres; 0 = invalid.
+        intrinsics: of the image.
+        T_world_camera: (4, 4) float64.
+        frame_id: world frame.
+    """
+
+    frame_graph: FrameGraph
+    instances: NDArray[np.uint16]
+    depth_m: NDArray[np.float32]
+    intrinsics: Intrinsics
+    T_world_camera: Float64
+    frame_id: str
+
+
+@dataclass(frozen=True)
+class PairingFrame:
+    """What relations need of one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
+
+    local: LocalGraph
+    rgb: NDArray[np.uint8]
+
+
+class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
+    """Complete RGB-D frames with poses, in the order of the RGB images' stamps.
+
+    Messages are those of ROS or of a bag: PoseStamped or Odometry, Image or CompressedImage.
+
+    Args:
+        inputs: slops, frames, scales and limits.
+        topics: names for the diagnostics, by stream.
+        capacity: messages kept of each image stream.
+        patience_s: how long an RGB image waits for what it lacks.
+        on_drop: called with the reason, the message and the number of every drop.
+
+    Attributes:
+        drops: number of drops by reason.
+    """
+
+    def __init__(
+        self,
+        inputs: InputsConfig,
+        *,
+        topics: Mapping[str, str] | None = None,
+        capacity: int = 64,
+        patience_s: float = 2.0,
+        on_drop: OnDrop | None = None,
+    ) -> None:
+        super().__init__("rgb", (), inputs, topics, capacity, patience_s, on_drop)
+        self._gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
+
+    def add_rgb(self, message: Any, stamp_ns: int) -> None:
+        """Keep an RGB image, Image or CompressedImage."""
+        self._add(self._leader, stamp_ns, message)
+
+    def _restart(self, stamp_ns: int) -> None:
+        super()._restart(stamp_ns)
+        self._gate = JumpGate(self._inputs.max_step_m, self._inputs.max_turn_deg_s)
+
+    def _settled(self, stamp_ns: int, value: Any) -> bool:
+        return self._posed(stamp_ns)
+
+    def _build(self, stamp_ns: int, value: Any) -> RgbdFrame:
+        # Cheap questions first: what is refused need not be decoded.
+        intrinsics = self._intrinsics_at(stamp_ns)
+        T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
+        depth_m = self._depth_at(stamp_ns)
+        rgb = rgb_from_message(value)
+        frame = RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
+        self._gate.check(T_world_camera, stamp_ns)
+        return frame
+
+
+class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
+    """Frame graphs with the instances, depth, intrinsics and pose that lift them.
+
+    That their sizes agree is lifting's to check. Jumps of the pose are the segmentation's to
+    refuse: what has a frame graph is accepted.
+    """
+
+    def __init__(
+        self,
+        inputs: InputsConfig,
+        *,
+        topics: Mapping[str, str] | None = None,
+        capacity: int = 256,
+        patience_s: float = 2.0,
+        on_drop: OnDrop | None = None,
+    ) -> None:
+        super().__init__(
+            "frame_graph", ("instances",), inputs, topics, capacity, patience_s, on_drop
+        )
+        self._instances = self._others["instances"]
+
+    def add_frame_graph(self, graph: FrameGraph) -> None:
+        """Keep a frame graph."""
+        self._add(self._leader, graph.stamp_ns, graph)
+
+    def add_instances(self, message: Any, stamp_ns: int) -> None:
+        """Keep an instance image."""
+        self._add(self._instances, stamp_ns, message)
+
+    def _settled(self, stamp_ns: int, value: FrameGraph) -> bool:
+        return self._instances.settled(stamp_ns) and self._posed(stamp_ns)
+
+    def _build(self, stamp_ns: int, value: FrameGraph) -> LiftingFrame:
+        intrinsics = self._intrinsics_at(stamp_ns)
+        T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
+        depth_m = self._depth_at(stamp_ns)
+        instances = instances_from_message(self._instances.exact(stamp_ns))
+        return LiftingFrame(value, instances, depth_m, intrinsics, T_world_camera, frame_id)
+
+    def _forget(self, stamp_ns: int) -> None:
+        super()._forget(stamp_ns)
+        self._drop_unmatched(self._instances, self._instances.forget_before(stamp_ns + 1))
+
+
+class RelationAssembler(Assembler[LocalGraph, PairingFrame]):
+    """Local graphs with the RGB image of the same stamp."""
+
+    def __init__(
+        self,
+        *,
+        topics: Mapping[str, str] | None = None,
+        capacity: int = 256,
+        patience_s: float = 2.0,
+        on_drop: OnDrop | None = None,
+    ) -> None:
+        names = {**TOPICS, **(topics or {})}
+        self._rgb: Stream[Any] = Stream("rgb", names["rgb"], capacity)
+        leader: Stream[LocalGraph] = Stream("local_graph", names["local_graph"], capacity)
+        super().__init__(leader, [self._rgb], patience_s=patience_s, on_drop=on_drop)
+
+    def add_rgb(self, message: Any, stamp_ns: int) -> None:
+        """Keep an RGB image, Image or CompressedImage."""
+        self._add(self._rgb, stamp_ns, message)
+
+    def add_local_graph(self, graph: LocalGraph) -> None:
+        """Keep a local graph."""
+        self._add(self._leader, graph.stamp_ns, graph)
+
+    def _settled(self, stamp_ns: int, value: LocalGraph) -> bool:
+        return self._rgb.settled(stamp_ns)
+
+    def _build(self, stamp_ns: int, value: LocalGraph) -> PairingFrame:
+        return PairingFrame(value, rgb_from_message(self._rgb.exact(stamp_ns)))
+
+    def _forget(self, stamp_ns: int) -> None:
+        self._drop_unmatched(self._rgb, self._rgb.forget_before(stamp_ns + 1))

@@ -1,0 +1,137 @@
+"""A small TF tree of /tf and /tf_static messages, for bags and for nodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from deworldsg_ros.scene.camera import Float64, invert_pose
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.poses import PoseBuffer, pose_from_transform, stamp_ns_of
+
+
+class TransformTree:
+    """Frames and the transforms between them, read at any stamp.
+
+    Args:
+        slop_ns: most time between a stamp and the transforms that stand for it.
+        world_frame: frame of the answers; empty = the root of the tree above the camera at the
+            first answer, with something that moves between the two.
+    """
+
+    def __init__(self, slop_ns: int, world_frame: str = "") -> None:
+        self._slop_ns = slop_ns
+        self._world_frame = world_frame
+        self._parents: dict[str, str] = {}
+        self._static: dict[str, Float64] = {}
+        self._moving: dict[str, PoseBuffer] = {}
+
+    def __len__(self) -> int:
+        return len(self._parents)
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Keep the transforms of a `tf2_msgs/TFMessage`.
+
+        Raises:
+            RefusedInput: ``invalid_pose``; the transforms before the bad one are kept.
+        """
+        for transform in message.transforms:
+            # Old bags write frames with a leading slash.
+            parent = str(transform.header.frame_id).lstrip("/")
+            child = str(transform.child_frame_id).lstrip("/")
+            T_parent_child = pose_from_transform(transform.transform)
+            if static:
+                self._static[child] = T_parent_child
+            else:
+                buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
+                buffer.add(stamp_ns_of(transform), T_parent_child)
+            # Last: whoever reads in another thread then finds the transform of each frame.
+            self._parents[child] = parent
+
+    def settled(self, stamp_ns: int, camera_frame: str, parent_frame: str = "") -> bool:
+        """Whether later transforms cannot change the answer of `at` or `between`."""
+        parent_frame = parent_frame or self._world_frame
+        try:
+            ours, theirs, _ = self._paths(camera_frame, parent_frame)
+        except RefusedInput:
+            return False
+        moving = [frame for frame in ours + theirs if frame not in self._static]
+        if not moving and not parent_frame:
+            return False  # The rest of the tree has not arrived yet.
+        return all(self._moving[frame].settled(stamp_ns) for frame in moving)
+
+    def at(self, stamp_ns: int, camera_frame: str) -> tuple[Float64, str]:
+        """T_world_camera (4, 4) and the world frame at a stamp.
+
+        Raises:
+            RefusedInput: as `between`, or ``no_pose`` where nobody names the world and nothing
+                moves above the camera: then the root is its mounting, and no world.
+        """
+        ours, _, world_frame = self._paths(camera_frame, self._world_frame)
+        if not self._world_frame and all(frame in self._static for frame in ours):
+            raise RefusedInput(
+                "no_pose",
+                f"TF knows camera frame '{camera_frame}' as fixed to '{world_frame}', which does "
+                "not move in any world: wanted a localisation's transforms, or inputs.world_frame",
+            )
+        T_world_camera = self.between(stamp_ns, world_frame, camera_frame)
+        self._world_frame = world_frame
+        return T_world_camera, world_frame
+
+    def between(self, stamp_ns: int, parent_frame: str, child_frame: str) -> Float64:
+        """T_parent_child (4, 4) at a stamp.
+
+        Raises:
+            RefusedInput: ``no_pose`` where the frames are not connected, or a transform is
+                further away in time than the slop.
+        """
+        ours, theirs, _ = self._paths(child_frame, parent_frame)
+        return invert_pose(self._chain(theirs, stamp_ns)) @ self._chain(ours, stamp_ns)
+
+    def root(self, frame: str) -> str:
+        """The frame that has no parent, above or at this one."""
+        return self._ancestry(frame)[-1]
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop transforms that no stamp from here on can need."""
+        for buffer in self._moving.values():
+            buffer.forget_before(stamp_ns)
+
+    def restart(self) -> None:
+        """Forget what moves; static transforms are told only once."""
+        for frame in self._moving:
+            self._parents.pop(frame, None)
+        self._moving.clear()
+
+    def _chain(self, frames: list[str], stamp_ns: int) -> Float64:
+        """T_ancestor_frame along a path given from the frame upwards."""
+        T = np.eye(4)
+        for frame in frames:
+            step = self._static.get(frame)
+            T = (self._moving[frame].at(stamp_ns) if step is None else step) @ T
+        return T
+
+    def _ancestry(self, frame: str) -> list[str]:
+        path = [frame]
+        while path[-1] in self._parents and len(path) <= len(self._parents):
+            path.append(self._parents[path[-1]])
+        return path
+
+    def _paths(self, camera_frame: str, world_frame: str) -> tuple[list[str], list[str], str]:
+        """Frames from camera and world up to, without, their common ancestor; the world frame.
+
+        Without a name it is the root of the tree above the camera.
+        """
+        ours = self._ancestry(camera_frame.lstrip("/"))
+        world_frame = world_frame.lstrip("/") or ours[-1]
+        theirs = self._ancestry(world_frame)
+        common = next((frame for frame in ours if frame in theirs), None)
+        if common is None or camera_frame.lstrip("/") == world_frame:
+            raise RefusedInput(
+                "no_pose",
+                f"TF does not connect camera frame '{camera_frame}' with "
+                f"'{world_frame}': known frames are "
+                f"{', '.join(sorted({*self._parents, *self._parents.values()})) or 'none'}",
+            )
+        return ours[: ours.index(common)], theirs[: theirs.index(common)], world_frame

@@ -1,0 +1,61 @@
+"""RGB-D frames before they have a pose, for odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.images import rgb_from_message
+from deworldsg_ros.streams.posed import PosedAssembler
+
+
+@dataclass(frozen=True)
+class UnposedFrame:
+    """One registered RGB-D image.
+
+    Attributes:
+        stamp_ns: time of the RGB image.
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32, metres; 0 = invalid.
+        intrinsics: of both.
+    """
+
+    stamp_ns: int
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    intrinsics: Intrinsics
+
+
+class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
+    """RGB images with depth and camera_info, in stamp order."""
+
+    def __init__(self, inputs: InputsConfig, **options: Any) -> None:
+        values = {"topics": None, "capacity": 64, "patience_s": 2.0, "on_drop": None, **options}
+        super().__init__("rgb", (), inputs, **values)
+        self._streams.remove(self._pose)
+
+    def add_rgb(self, message: Any, stamp_ns: int) -> None:
+        """Keep an RGB image, Image or CompressedImage."""
+        self._add(self._leader, stamp_ns, message)
+
+    def _settled(self, stamp_ns: int, value: Any) -> bool:
+        return bool(self._intrinsics) and self._depth.settled(stamp_ns)
+
+    def _build(self, stamp_ns: int, value: Any) -> UnposedFrame:
+        intrinsics = self._intrinsics_at(stamp_ns)
+        depth_m = self._depth_at(stamp_ns)
+        rgb = rgb_from_message(value)
+        if rgb.shape[:2] != (intrinsics.height, intrinsics.width) or rgb.shape[:2] != depth_m.shape:
+            raise RefusedInput(
+                "grid_mismatch",
+                f"RGB is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x"
+                f"{depth_m.shape[0]}, camera_info {intrinsics.width}x{intrinsics.height}: wanted "
+                "one size (is depth registered to RGB?)",
+            )
+        return UnposedFrame(stamp_ns, rgb, depth_m, intrinsics)

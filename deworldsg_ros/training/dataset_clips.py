@@ -1,0 +1,147 @@
+"""Clips that a probe is trained on: of a folder, or cut out of a data set with annotations."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.annotations import LAYOUTS, Annotations, ScanPoints
+from deworldsg_ros.recordings.folders.dataset import (
+    DatasetOptions,
+    decode_image,
+    image_size,
+    read_file,
+)
+from deworldsg_ros.recordings.folders.frame_files import read_pose
+from deworldsg_ros.recordings.folders.rio import RioScan
+from deworldsg_ros.recordings.folders.sequence import sequence_folder
+from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.training.labelled_clips import LabelledClip, read_clip_folder
+from deworldsg_ros.training.scan_clips import Boxes, cut_clips, read_boxes
+
+# Where boxes have to be made of the annotated points: every so many frames, of points whose depth
+# is that of their pixel, and so many of them.
+BOXES_EVERY_FRAMES = 8
+MAX_DEPTH_GAP_M = 0.05
+MIN_POINTS = 20
+
+
+def read_clips(source: Path, clip_length: int, clips_per_pair: int) -> list[LabelledClip]:
+    """The clips of a folder or of a data set; raises DeWorldSGError where there are none."""
+    found = [name for name, layout in LAYOUTS.items() if (source / layout.relations).is_file()]
+    if not found:
+        return read_clip_folder(source)
+    annotations = Annotations(source, found[0])
+    names = annotations.vocabulary.predicates
+    clips: list[LabelledClip] = []
+    for folder in sorted(path for path in (source / "data").iterdir() if path.is_dir()):
+        scan = folder.name
+        turned = found[0] == "3rscan"
+        frames = list(_rio_frames(annotations, scan) if turned else _replica_frames(folder))
+        if not frames:
+            continue
+        width, height = image_size(frames[0][0])
+        clips += cut_clips(
+            scan,
+            frames,
+            (height, width) if turned else (width, height),
+            [
+                (subject, object_, names[place])
+                for subject, object_, place in annotations.scan(scan).relations
+                if place >= 0
+            ],
+            clip_length=clip_length,
+            clips_per_pair=clips_per_pair,
+            turned=turned,
+        )
+    if not clips:
+        raise ConfigurationError(
+            f"data set '{source}': no related pair is seen in a frame; wanted "
+            "data/SCAN/sequence/frame-NNNNNN.color.jpg, and beside it .bb.txt (ReplicaSSG) or "
+            "depth and pose (3RScan)"
+        )
+    return clips
+
+
+def _replica_frames(folder: Path) -> Iterator[tuple[Path, Boxes]]:
+    for image in sorted(sequence_folder(folder).glob("frame-*.color.jpg")):
+        yield image, read_boxes(image.with_name(image.name.split(".")[0] + ".bb.txt"))
+
+
+def _rio_frames(annotations: Annotations, scan: str) -> Iterator[tuple[Path, Boxes]]:
+    """Image of each frame and, now and then, boxes in the image as it is turned upright."""
+    source = RioScan(annotations.scan_folder(scan), DatasetOptions())
+    points = annotations.points(scan)
+    height = source.info.color.height
+    for place, number in enumerate(source.frame_numbers.values()):
+        boxes: Boxes = {}
+        if place % BOXES_EVERY_FRAMES == 0:
+            # A frame whose files are missing or damaged shows nothing.
+            with contextlib.suppress(RecordingError, RefusedInput):
+                boxes = _boxes_of_frame(source, number, points)
+        # By 90 degrees clockwise, as RioScan turns the images.
+        yield (
+            source.file(number, ".color.jpg"),
+            {
+                object_id: np.array([height - 1 - y2, x1, height - 1 - y1, x2])
+                for object_id, (x1, y1, x2, y2) in boxes.items()
+            },
+        )
+
+
+def _boxes_of_frame(source: RioScan, number: int, points: ScanPoints) -> Boxes:
+    path = source.file(number, source.depth_suffix)
+    depth = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
+    T_world_camera = read_pose(source.file(number, source.pose_suffix))
+    color = source.info.color
+    same = depth.shape == (color.height, color.width)
+    camera = color if same else source.info.depth
+    return visible_boxes(
+        points, T_world_camera, depth / source.info.depth_units_per_m, camera, color
+    )
+
+
+def visible_boxes(
+    points: ScanPoints,
+    T_world_camera: Float64,
+    depth_m: Float64,
+    depth_camera: Intrinsics,
+    color_camera: Intrinsics,
+) -> Mapping[int, Float64]:
+    """Boxes (4,) xyxy, pixels of the colour image, of the annotated objects that are to be seen.
+
+    Args:
+        points: annotated surface points, world frame.
+        T_world_camera: (4, 4), of both cameras.
+        depth_m: (H, W), metres; 0 = invalid.
+        depth_camera: intrinsics of the depth image.
+        color_camera: intrinsics of the colour image.
+    """
+    points_camera = (points.points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    in_front = points_camera[:, 2] > 0
+    x, y, z = points_camera[in_front].T
+    ids = points.object_ids[in_front]
+    column, row = (np.rint(value).astype(np.int64) for value in _project(depth_camera, x, y, z))
+    inside = (column >= 0) & (column < depth_m.shape[1]) & (row >= 0) & (row < depth_m.shape[0])
+    visible = np.zeros(len(z), np.bool_)
+    gaps_m = np.abs(depth_m[row[inside], column[inside]] - z[inside])
+    visible[inside] = gaps_m < MAX_DEPTH_GAP_M
+    u, v = _project(color_camera, x, y, z)
+    visible &= (u >= 0) & (u <= color_camera.width - 1)
+    visible &= (v >= 0) & (v <= color_camera.height - 1)
+    boxes: dict[int, Float64] = {}
+    for object_id in np.unique(ids[visible]).tolist():
+        own = visible & (ids == object_id)
+        if np.count_nonzero(own) >= MIN_POINTS:
+            boxes[object_id] = np.array([u[own].min(), v[own].min(), u[own].max(), v[own].max()])
+    return boxes
+
+
+def _project(camera: Intrinsics, x: Float64, y: Float64, z: Float64) -> tuple[Float64, Float64]:
+    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

@@ -1,0 +1,114 @@
+"""Features of clips, extracted once: a cache on disk from which an interrupted run goes on."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.relations.probing.backbone import FrozenBackbone
+from deworldsg_ros.training.labelled_clips import LabelledClip, of_length
+
+Float32 = NDArray[np.float32]
+
+# Features in one file: what an interruption costs at most.
+SHARD_SIZE = 32
+
+
+class FeatureCache:
+    """Features by clip, of one backbone and preprocessing; others have other folders.
+
+    Args:
+        root: folder of all caches.
+        description: everything that the features depend on besides the clip.
+    """
+
+    def __init__(self, root: Path, description: str) -> None:
+        self.folder = root / _digest(description)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / "description.txt").write_text(description + "\n")
+        self._features: dict[str, Float32] = {}
+        self._unsaved: list[str] = []
+        for path in sorted(self.folder.glob("*.npz")):
+            self._load(path)
+
+    def __len__(self) -> int:
+        return len(self._features)
+
+    def get(self, key: str) -> Float32 | None:
+        """The feature of a clip, (d,) float32; None where it was not extracted yet."""
+        return self._features.get(_digest(key))
+
+    def add(self, key: str, feature: Float32) -> None:
+        """Keep a feature; it is written with the next full file, or by `save`."""
+        digest = _digest(key)
+        self._features[digest] = feature
+        self._unsaved.append(digest)
+        if len(self._unsaved) >= SHARD_SIZE:
+            self.save()
+
+    def save(self) -> None:
+        """Write what was not written yet, as one whole file or not at all."""
+        if not self._unsaved:
+            return
+        digests = self._unsaved
+        path = self.folder / f"{_digest(' '.join(digests))}.npz"
+        partial = path.with_suffix(".part")
+        with partial.open("wb") as file:
+            np.savez(
+                file,
+                digests=np.array(digests),
+                features=np.stack([self._features[digest] for digest in digests]),
+            )
+        partial.replace(path)
+        self._unsaved = []
+
+    def _load(self, path: Path) -> None:
+        try:
+            with np.load(path, allow_pickle=False) as content:
+                rows = zip(content["digests"].tolist(), content["features"])
+                self._features.update((digest, np.asarray(row, np.float32)) for digest, row in rows)
+        except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+            # Extracted again, and then replaced.
+            path.unlink()
+
+
+def extract_features(
+    backbone: FrozenBackbone,
+    clips: Sequence[LabelledClip],
+    cache: FeatureCache,
+    *,
+    batch_size: int,
+    advance: Callable[[int], None] = lambda _: None,
+) -> Float32:
+    """Features of clips, (n, d) float32; only those that the cache lacks are encoded.
+
+    Args:
+        backbone: the frozen network.
+        clips: labelled clips.
+        cache: of that backbone.
+        batch_size: clips encoded at once.
+        advance: told how many more are done.
+    """
+    missing = [clip for clip in clips if cache.get(clip.key) is None]
+    advance(len(clips) - len(missing))
+    try:
+        for start in range(0, len(missing), batch_size):
+            batch = missing[start : start + batch_size]
+            length = backbone.identity.clip_length
+            features = backbone.encode([of_length(clip.read(), length) for clip in batch])
+            for clip, feature in zip(batch, features):
+                cache.add(clip.key, feature)
+            advance(len(batch))
+    finally:
+        cache.save()
+    rows = [feature for clip in clips if (feature := cache.get(clip.key)) is not None]
+    return np.stack(rows) if rows else np.zeros((0, backbone.identity.feature_dim), np.float32)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:20]

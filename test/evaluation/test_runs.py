@@ -1,0 +1,263 @@
+"""A scan through the pipeline and the protocol, from the command line too."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from pathlib import Path
+
+import msgspec
+import pytest
+from support.evaluation import write_dataset, write_json
+from support.sequences import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
+from typer.testing import CliRunner
+
+from deworldsg_ros.cli.app import app
+from deworldsg_ros.config import Config, load_config
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice
+from deworldsg_ros.evaluation.protocol.labels import translate, translation
+from deworldsg_ros.evaluation.protocol.predictions import read_predictions, write_predictions
+from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
+from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
+from deworldsg_ros.evaluation.reports.files import latex_rows, latex_text
+from deworldsg_ros.evaluation.runner import (
+    ScanOutcome,
+    ScanTask,
+    evaluate_graph,
+    evaluate_scan,
+    read_graph,
+)
+from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.wire import Belief
+
+
+def task(root: Path, out: Path, **changes: object) -> ScanTask:
+    values: dict[str, object] = {
+        "root": root,
+        "layout": "replica",
+        "scan": "room_0",
+        "out": out,
+        "config": Config(),
+        "front_end": FrontEndChoice("recorded"),
+        "options": ProtocolOptions(),
+    }
+    return ScanTask(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def test_a_scan_travels_to_another_process_and_back(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    sent = pickle.loads(pickle.dumps(task(root, tmp_path / "out", checkpoints=2)))
+    outcome: ScanOutcome = pickle.loads(pickle.dumps(evaluate_scan(sent)))
+    assert outcome.frames == 3
+    assert outcome.result.object_ranks == [0, 0, 0]
+    assert outcome.result.relationship_ranks == [0, 0]
+    assert (outcome.measures.found, outcome.measures.duplicates) == (3, 0)
+    assert [item.frames for item in outcome.over_time] == [2, 3]
+    assert outcome.over_time[-1].object_recall == 1.0
+    # The graph that was left gives the same numbers, and so do its predictions as a file.
+    annotations = Annotations(root, "replica")
+    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    result, measures = evaluate_graph(annotations, "room_0", graph, ProtocolOptions())
+    assert result == outcome.result
+    assert measures == outcome.measures
+    path = tmp_path / "p.json"
+    prediction = to_prediction(graph, annotations.vocabulary)
+    write_predictions(path, {"room_0": prediction}, 3, 3)
+    again = evaluate_predictions(annotations, read_predictions(path))
+    assert again.scans[0].matching == outcome.result.matching
+    assert again.scans[0].relationship_ranks == outcome.result.relationship_ranks
+    assert load_config(tmp_path / "out" / "room_0" / "config.yaml") == Config()
+
+
+def test_two_runs_leave_the_same_graph(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    texts = []
+    for name in ("a", "b"):
+        evaluate_scan(task(root, tmp_path / name))
+        texts.append((tmp_path / name / "room_0" / "scene_graph.json").read_bytes())
+    assert texts[0] == texts[1]
+
+
+def test_a_graph_of_another_vocabulary_is_refused(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    evaluate_scan(task(root, tmp_path / "out"))
+    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    with pytest.raises(EvaluationError, match="another vocabulary"):
+        to_prediction(graph, Vocabulary(("bed",), ("near",)))
+
+
+def test_labels_of_a_detector_become_classes(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    mapping = root / "ReplicaSSG" / "replica_to_visual_genome.json"
+    content = json.loads(mapping.read_text())
+    content["Replica2VisualGenome"] |= {"stool": "chair", "sofa": "chair", "mat": "unknown"}
+    mapping.write_text(json.dumps(content))
+    annotations = Annotations(root, "replica")
+    names = translation(annotations)
+    assert names == {"stool": "chair", "sofa": "chair", "couch": "chair", "dining table": "table"}
+    evaluate_scan(task(root, tmp_path / "out"))
+    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    beliefs = [Belief("couch", 0.3), Belief("mat", 0.3), Belief("stool", 0.2), Belief("book", 0.1)]
+    node = msgspec.structs.replace(graph.nodes[0], classes=beliefs, label="couch")
+    foreign = msgspec.structs.replace(graph, nodes=[node], edges=[])
+    translated = translate(foreign, annotations)
+    assert translated.nodes[0].label == "chair"
+    scores = to_prediction(translated, annotations.vocabulary).class_scores
+    # book, chair, table; the rest is spread over what is not stated.
+    assert scores[0].tolist() == pytest.approx([0.1, 0.5, 0.1])
+    assert translate(graph, annotations) is graph
+
+
+def test_a_scan_of_3rscan_is_turned_and_found(tmp_path: Path) -> None:
+    objects = [(name, number) for number, name, _, _ in BLOCKS]
+    root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
+    write_surface(write_sequence(root / "data" / "a"))
+    outcome = evaluate_scan(
+        task(
+            root,
+            tmp_path / "out",
+            layout="3rscan",
+            scan="a",
+            front_end=FrontEndChoice("ground-truth"),
+        )
+    )
+    assert outcome.result.object_ranks == [0, 0, 0]
+    assert outcome.result.relationship_ranks == [0, 0]
+
+
+def invoke(*arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+    return result.exit_code, result.output
+
+
+def test_command_on_a_data_set(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    out, json_file = tmp_path / "out", tmp_path / "new" / "numbers.json"
+    code, text = invoke(
+        "--layout", "replica", root, "--front-end", "recorded", "--flip", 0,
+        "--out", out, "--json", json_file,
+    )  # fmt: skip
+    assert code == 0, text
+    values = json.loads(json_file.read_text())
+    for name in ("object_recall", "predicate_recall", "relationship_recall"):
+        assert values[name] == 1.0
+    assert values["object_mean_recall"] == values["predicate_mean_recall"] == 1.0
+    assert values["measures"]["node_precision"] == 1.0
+    assert values["scans"][0]["frames"] == 3
+    assert len(values["scans"][0]["over_time"]) == 3
+    for name in ("results.csv", "classes.csv", "results.tex", "confusion.png", "predicates.png"):
+        assert (out / name).stat().st_size > 0
+    assert (out / "recall_over_time.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "results.tex").read_text().endswith("& 100.0 & 100.0 \\\\\n")
+    header, first, _ = (out / "results.csv").read_text().splitlines()
+    assert header.startswith("scan,object_recall")
+    assert first.startswith("room_0,1.0")
+
+
+def test_command_on_graphs(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    outcome = evaluate_scan(task(root, tmp_path / "out"))
+    json_file = tmp_path / "numbers.json"
+    arguments = ("--layout", "replica", root, "--graphs", tmp_path / "out", "--json", json_file)
+    code, text = invoke(*arguments)
+    assert code == 0, text
+    values = json.loads(json_file.read_text())
+    assert values["object_recall"] == 1.0
+    assert values["measures"]["nodes"] == outcome.nodes
+    (tmp_path / "out" / "room_0" / "scene_graph.json").unlink()
+    code, text = invoke(*arguments)
+    assert code == 2
+    assert "cannot be read" in text
+
+
+def test_command_on_predictions(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    graph = {"nodes": [], "edges": []}
+    path = tmp_path / "p.json"
+    write_json(path, {"num_classes": 3, "num_predicates": 3, "scans": {"room_0": graph}})
+    json_file = tmp_path / "numbers.json"
+    code, text = invoke(
+        "--layout", "replica", root, "--predictions", path, "--skip-no-rel-objects",
+        "--json", json_file, "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert code == 0, text
+    values = json.loads(json_file.read_text())
+    assert values["object_recall"] == 0.0
+    assert values["counts"]["object"] == {"hits": 0, "total": 3}
+    assert values["measures"]["node_precision"] is None
+    assert not values["notes"]
+    assert (tmp_path / "out" / "confusion.png").exists()
+
+
+def test_command_says_what_was_wanted(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    for arguments, wanted in (
+        (["--layout", "replica", root], "give one of"),
+        (["--layout", "scannet", root, "--front-end", "recorded"], "wanted replica, 3rscan"),
+        (["--layout", "3rscan", root, "--front-end", "recorded"], "is missing"),
+        (["--layout", "replica", root, "--front-end", "video"], "wanted backend, recorded"),
+        (["--layout", "replica", root, "--predictions", root / "none.json"], "cannot be read"),
+    ):
+        code, text = invoke(*arguments)
+        assert code == 2
+        assert wanted in " ".join(text.split())
+
+
+def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set")
+    split = root / "ReplicaSSG" / "test_scans.txt"
+    split.write_text("absent\nroom_0\n")
+    json_file = tmp_path / "numbers.json"
+    code, text = invoke(
+        "--layout", "replica", root, "--front-end", "ground-truth", "--json", json_file,
+        "--out", tmp_path / "out", "--checkpoints", 0,
+    )  # fmt: skip
+    assert code == 0
+    assert "failed: absent" in text
+    values = json.loads(json_file.read_text())
+    assert list(values["failed"]) == ["absent"]
+    assert [scan["scan"] for scan in values["scans"]] == ["room_0"]
+    split.write_text("absent\n")
+    assert invoke("--layout", "replica", root, "--front-end", "recorded")[0] == 1
+
+
+def test_latex() -> None:
+    assert latex_text("100 % & a_b") == r"100 \% \& a\_b"
+    assert latex_rows({"x": {"object_recall": 0.5}}) == "x & -- & 50.0 & -- & -- & -- \\\\\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scan", "flip", "nodes", "found", "duplicates"),
+    [("rooms_0", 0.0, 134, 55, 79), ("rooms_1", 0.0, 116, 45, 70)],
+)
+def test_the_paper_on_the_rendered_rooms(
+    shared_dir: Path,
+    root_dir: Path,
+    tmp_path: Path,
+    scan: str,
+    flip: float,
+    nodes: int,
+    found: int,
+    duplicates: int,
+) -> None:
+    import subprocess
+    import sys
+
+    unpack = shared_dir / "data" / "rooms" / "unpack.py"
+    subprocess.run([sys.executable, str(unpack), str(tmp_path / "rooms"), scan], check=True)
+    outcome = evaluate_scan(
+        task(
+            tmp_path / "rooms" / "noisy",
+            tmp_path / "out",
+            scan=scan,
+            config=load_config(root_dir / "config" / "paper.yaml"),
+            front_end=FrontEndChoice("recorded", flip=flip),
+        )
+    )
+    measured = outcome.measures
+    assert (measured.nodes, measured.found, measured.duplicates) == (nodes, found, duplicates)
+    assert all(ranked == 0 for ranked in outcome.result.object_ranks)
+    assert measured.numbers()["centroid_error_best_median_m"] == pytest.approx(0.025, abs=0.004)

@@ -1,0 +1,344 @@
+"""Tables of methods: jobs that are kept and resumed, processes, a cluster, the command."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from support.sequences import write_room
+from typer.testing import CliRunner, Result
+
+from deworldsg_ros.cli.app import app
+from deworldsg_ros.cli.tables import pose_choices
+from deworldsg_ros.config import Config, MergingConfig, OdometryConfig
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
+from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
+from deworldsg_ros.evaluation.protocol.predictions import write_predictions
+from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
+from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
+from deworldsg_ros.evaluation.runner import ScanTask, read_graph
+from deworldsg_ros.evaluation.tables import mapping
+from deworldsg_ros.evaluation.tables.jobs import Job, fingerprint, run_job
+from deworldsg_ros.evaluation.tables.mapping import run_jobs
+from deworldsg_ros.evaluation.tables.printed import RUNTIME_MS, printed_rows
+from deworldsg_ros.evaluation.tables.results import total_ms
+from deworldsg_ros.evaluation.tables.rows import SWITCHES, TABLES, table_rows
+from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_room(tmp_path_factory.mktemp("rooms") / "data_set")
+
+
+def job(root: Path, out: Path, scan: str = "room_0", **changes: object) -> Job:
+    task = ScanTask(
+        root,
+        "replica",
+        scan,
+        out,
+        Config(),
+        FrontEndChoice("recorded"),
+        ProtocolOptions(),
+    )
+    return Job("row", replace(task, **changes))
+
+
+def evaluate(root: Path, *arguments: object) -> Result:
+    words = ["evaluate", "--layout", "replica", root, "--front-end", "recorded", *arguments]
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+def test_a_finished_job_is_taken_from_before(root: Path, tmp_path: Path) -> None:
+    first = run_job(job(root, tmp_path, method="fross"))
+    assert first.outcome is not None
+    assert not first.reused
+    again = run_job(job(root, tmp_path, method="fross"))
+    assert again.reused
+    assert again.outcome == first.outcome
+    assert not run_job(replace(job(root, tmp_path, method="fross"), fresh=True)).reused
+
+
+def test_a_job_is_run_again_where_anything_differs(root: Path, tmp_path: Path) -> None:
+    run_job(job(root, tmp_path))
+    other = msgspec.structs.replace(Config(), merging=MergingConfig(cell_m=0.04))
+    assert not run_job(job(root, tmp_path, config=other)).reused
+    assert run_job(job(root, tmp_path, config=other)).reused
+    assert not run_job(job(root, tmp_path)).reused
+    # A result that was not written to its end, and one whose graph is gone.
+    kept = tmp_path / "room_0" / "outcome.json"
+    kept.write_bytes(kept.read_bytes()[:100])
+    assert not run_job(job(root, tmp_path)).reused
+    (tmp_path / "room_0" / "scene_graph.json").unlink()
+    assert not run_job(job(root, tmp_path)).reused
+
+
+def test_the_fingerprint_is_of_the_task_and_not_of_its_folder(root: Path, tmp_path: Path) -> None:
+    known = fingerprint(job(root, tmp_path).task)
+    assert fingerprint(job(root, tmp_path / "elsewhere").task) == known
+    for changes in (
+        {"method": "kim"},
+        {"max_frames": 2},
+        {"poses": PoseChoice("worse")},
+        {"front_end": FrontEndChoice("recorded", flip=0.1)},
+        {"options": ProtocolOptions(skip_no_rel_objects=True)},
+        {"layout": "3rscan"},
+    ):
+        assert fingerprint(job(root, tmp_path, **changes).task) != known, changes
+
+
+def test_a_failed_scan_does_not_stop_the_rest(root: Path, tmp_path: Path) -> None:
+    jobs = [job(root, tmp_path, scan="room_9"), job(root, tmp_path)]
+    results = list(run_jobs(jobs, workers=1))
+    assert [result.outcome is None for result in results] == [True, False]
+    assert "room_9" in results[0].failure
+
+
+def test_an_unexpected_error_is_told_and_written_down(root: Path, tmp_path: Path) -> None:
+    result = run_job(job(root, tmp_path, options=None))
+    assert "AttributeError" in result.failure
+    assert "Traceback" in (tmp_path / "room_0" / "error.txt").read_text()
+
+
+class Deadly:
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self) -> object:
+        return os._exit, (7,)
+
+
+@pytest.mark.timeout(300)
+def test_processes_give_the_same_results_and_may_die(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+    deadly = job(root, tmp_path / "deadly", scan="deadly", config=Deadly())
+    jobs = [job(root, tmp_path / "fross", method="fross"), deadly, job(root, tmp_path / "kim")]
+    results = {result.scan: result for result in run_jobs(jobs, workers=2)}
+    assert results["deadly"].failure == mapping.DIED
+    wanted = run_job(job(root, tmp_path / "here"))
+    assert results["room_0"].outcome is not None
+    assert wanted.outcome is not None
+    assert results["room_0"].outcome.result.object_ranks == wanted.outcome.result.object_ranks
+    graphs = [tmp_path / name / "room_0" / "scene_graph.json" for name in ("kim", "here")]
+    assert graphs[0].read_bytes() == graphs[1].read_bytes()
+    assert "OMP_NUM_THREADS" not in os.environ or os.environ["OMP_NUM_THREADS"] != "1"
+
+
+@pytest.mark.timeout(300)
+def test_a_cluster_gives_the_same_results(root: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        jobs = [job(root, tmp_path), job(root, tmp_path, scan="room_9")]
+        address = cluster.scheduler_address
+        results = {result.scan: result for result in run_jobs(jobs, scheduler=address)}
+    assert results["room_0"].outcome is not None
+    assert results["room_0"].outcome.result.object_ranks == [0, 0, 0]
+    assert results["room_9"].outcome is None
+
+
+def test_a_scheduler_without_dask_says_what_to_install(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(EvaluationError, match=r"pip install 'deworldsg_ros\[cluster\]'"):
+        list(run_jobs([job(root, tmp_path)], scheduler="tcp://nowhere:1"))
+
+
+def test_the_main_table(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    # One of the methods' graphs, as if it were another method's predictions.
+    run_job(job(root, tmp_path / "before"))
+    graph = read_graph(tmp_path / "before" / "room_0" / "scene_graph.json")
+    vocabulary = Vocabulary(("book", "chair", "table"), ("near", "on", "under"))
+    write_predictions(tmp_path / "p.json", {"room_0": to_prediction(graph, vocabulary)}, 3, 3)
+    arguments = (
+        *("--table", "main", "--workers", 1, "--checkpoints", 0),
+        *("--out", out, "--json", tmp_path / "t.json"),
+        *("--predictions", f"SGFN={tmp_path / 'p.json'}"),
+    )
+    told = evaluate(root, *arguments)
+    assert told.exit_code == 0, told.output
+    values = json.loads((tmp_path / "t.json").read_text())
+    rows = {row["name"]: row for row in values["rows"]}
+    assert list(rows) == [
+        *("printed FROSS", "printed DeWorldSG"),
+        *("fross", "kim", "paper", "robust", "SGFN"),
+    ]
+    assert rows["printed FROSS"]["printed"]
+    assert rows["printed FROSS"]["relationship_recall"] == 0.223
+    for name in ("fross", "kim", "paper", "robust"):
+        assert rows[name]["scan_count"] == 1
+        assert not rows[name]["failed"]
+        assert read_graph(out / name / "room_0" / "scene_graph.json").nodes
+    assert rows["robust"]["object_recall"] == 1.0
+    assert rows["robust"]["nodes_per_object"] == 1.0
+    assert rows["SGFN"]["object_recall"] == 1.0
+    assert rows["paper"]["times_ms"].keys() == {"perception", "lifting", "merging", "relations"}
+    assert "printed" in told.output
+    lines = (out / "table.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(rows)
+    assert len((out / "table.tex").read_text().splitlines()) == len(rows)
+    # What was finished is not done again.
+    told = evaluate(root, *arguments)
+    assert "4 from before, 0 failed" in told.output
+
+
+def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Path) -> None:
+    told = evaluate(
+        *(root, "--table", "ablation", "--workers", 1, "--checkpoints", 0),
+        *("--out", tmp_path, "--json", tmp_path / "t.json", "--set", "a:lifting.min_pixels=20"),
+    )
+    assert told.exit_code == 0, told.output
+    values = json.loads((tmp_path / "t.json").read_text())
+    rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
+    assert [rows[name]["scan_count"] for name in "abcde"] == [1, 1, 1, 0, 0]
+    assert rows["e"]["failed"]["room_0"]
+    assert "failed:" in told.output
+    effective = (tmp_path / "a" / "room_0" / "config.yaml").read_text()
+    assert "regions: boxes" in effective
+    assert "min_pixels: 20" in effective
+    effective = (tmp_path / "c" / "room_0" / "config.yaml").read_text()
+    assert "regions: masks" in effective
+    assert "min_pixels: 10" in effective
+
+
+def test_the_pose_table(root: Path, tmp_path: Path) -> None:
+    told = evaluate(
+        *(root, "--table", "pose", "--workers", 1, "--checkpoints", 0, "--poses", "slam"),
+        *("--poses", "worse", "--pose-noise", "jitter_m=0.001"),
+        # Jitter is movement, and these few frames are too short to be sure of what is seen in it.
+        *("--set", "merging.baseline_deg=0"),
+        *("--out", tmp_path, "--json", tmp_path / "t.json"),
+    )
+    assert told.exit_code == 0, told.output
+    values = json.loads((tmp_path / "t.json").read_text())
+    rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
+    assert rows["robust-worse"]["object_recall"] == 1.0
+    assert "slam.pose.txt" in rows["robust-slam"]["failed"]["room_0"]
+
+
+def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
+    for table, name in (("hard", "robust-jitter"), ("switches", "cell5-label")):
+        told = evaluate(
+            *(root, "--table", table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
+            *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
+        )
+        assert told.exit_code == 0, told.output
+        rows = {row["name"]: row for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
+        assert name in rows
+        assert len(rows) == {"hard": 24, "switches": 5 * len(SWITCHES)}[table]
+        assert not any(row["failed"] for row in rows.values())
+        assert ("merging ms" in told.output) == (table == "switches")
+
+
+def test_each_condition_is_given_to_its_rows() -> None:
+    def configure(file: str, settings: object, row: str) -> Config:
+        return Config()
+
+    front_end = FrontEndChoice("recorded", flip=0.1, miss=0.2)
+    poses = [PoseChoice("odometry")]
+    hard = {row.name: row for row in table_rows("hard", poses, front_end, configure)}
+    assert hard["fross-plain"].front_end == front_end
+    assert hard["fross-plain"].poses == poses[0]
+    assert hard["paper-label"].front_end == replace(front_end, faults=Faults(label=0.1))
+    assert hard["paper-jitter"].front_end == front_end
+    assert hard["paper-jitter"].poses.noise.jitter_deg == 1.0
+    switches = {row.name: row for row in table_rows("switches", poses, front_end, configure)}
+    assert switches["robust-flip0"].front_end == replace(front_end, flip=0.0)
+    assert switches["robust-label"].front_end.flip == 0.1
+
+
+def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
+    told = evaluate(
+        *(root, "--table", "runtime", "--checkpoints", 0),
+        *("--out", tmp_path, "--json", tmp_path / "t.json"),
+    )
+    assert told.exit_code == 0, told.output
+    rows = json.loads((tmp_path / "t.json").read_text())["rows"]
+    assert rows[0]["device"] == "NVIDIA RTX A6000"
+    assert all(row["device"] and total_ms(row["times_ms"]) > 0 for row in rows)
+    assert "milliseconds" in told.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--table", "first"), "wanted main, hard, pose, ablation, switches, runtime"),
+        (("--table", "main", "--predictions", "p.json"), "wanted NAME=FILE"),
+        (("--table", "main", "--predictions", "IMP=none.json"), "there is no file none.json"),
+        (("--table", "main", "--poses", "guessed"), "--poses guessed"),
+        (("--table", "main", "--poses", "slam", "--poses", "worse"), "takes one --poses"),
+        (("--table", "main", "--set", "best:lifting.tau=0.1"), "no row best"),
+        (("--table", "main", "--set", "paper:lifting.tao=0.1"), "there is no lifting.tao"),
+    ],
+)
+def test_what_a_table_refuses(
+    root: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    told = evaluate(root, *arguments, "--out", tmp_path)
+    assert told.exit_code == 2
+    assert words in " ".join(told.stderr.split())
+
+
+def test_nothing_done_is_an_error(root: Path, tmp_path: Path) -> None:
+    told = evaluate(
+        *(root, "--table", "main", "--scan", "room_9", "--workers", 1, "--out", tmp_path)
+    )
+    assert told.exit_code == 1
+    assert "failed:" in told.output
+
+
+def test_rows_of_every_table_have_names_of_their_own() -> None:
+    def configure(file: str, settings: object, row: str) -> Config:
+        return Config()
+
+    for table in TABLES:
+        poses = pose_choices(table, [], "")
+        rows = table_rows(table, poses, FrontEndChoice("recorded"), configure)
+        assert len({row.name for row in rows}) == len(rows)
+        assert len({row.title for row in rows}) == len(rows)
+
+
+def test_the_printed_numbers_are_the_paper_s(shared_dir: Path) -> None:
+    """Every printed row stands in the paper's source, number by number."""
+    text = (shared_dir / "paper" / "deworldsg.tex").read_text(encoding="utf-8")
+    for wrapper in ("\\textbf{", "}", " ", "\n"):
+        text = text.replace(wrapper, "")
+    for table, layout in (("main", "3rscan"), ("main", "replica"), ("pose", ""), ("ablation", "")):
+        for row in printed_rows(table, layout):
+            assert "&".join(f"{value:.1f}" for value in row.percents) in text, row
+    for value in RUNTIME_MS.values():
+        assert f"{value:.2f}ms" in text.replace("~", "").replace("\\", "")
+
+
+def test_slam_poses_begin_where_the_camera_truly_was(tmp_path: Path) -> None:
+    root = write_room(tmp_path / "data_set", frames=4)
+    source = open_source(root / "data" / "room_0")
+    true = [frame.T_world_camera for frame in Recording(source, Config().inputs).frames()]
+    # A tracker that lost the second frame, whose world is its first camera.
+    for number, T in enumerate(true):
+        moved = np.linalg.inv(true[0]) @ T
+        moved[0, 3] += 0.01 * number
+        if number == 1:
+            moved[:] = -np.inf
+        path = root / "data" / "room_0" / "sequence" / f"frame-{number:06d}.slam.pose.txt"
+        np.savetxt(path, moved)
+    drops: Counter[str] = Counter()
+    frames = Recording(source, Config().inputs).frames()
+    posed = list(repose(frames, PoseChoice("slam"), source, OdometryConfig(), drops))
+    assert drops == {"no_slam_pose": 1}
+    np.testing.assert_allclose(posed[0].T_world_camera, true[0], atol=1e-9)
+    offset = np.linalg.inv(true[0]) @ posed[2].T_world_camera
+    assert offset[0, 3] == pytest.approx((np.linalg.inv(true[0]) @ true[3])[0, 3] + 0.03)

@@ -1,0 +1,204 @@
+"""The surface rule on objects that a camera sees in parts, with flipping labels, side by side."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.merging import VOCABULARY
+from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.graph import SceneGraph
+
+
+@pytest.fixture
+def graph() -> SceneGraph:
+    return SceneGraph(VOCABULARY, "world")
+
+
+CONFIG = MergingConfig(association="surface")
+
+
+@pytest.fixture
+def merging() -> SurfaceMerging:
+    return SurfaceMerging(CONFIG)
+
+
+LEFT = slab((-0.5, 0, 1), (1.2, 0.8, 0.01))
+RIGHT = slab((0.5, 0, 1), (1.2, 0.8, 0.01))
+
+
+@pytest.mark.parametrize("parts", [(LEFT, WHOLE, RIGHT), (WHOLE, LEFT, RIGHT), (RIGHT, WHOLE)])
+def test_partial_views_are_one_object(graph, merging, parts) -> None:
+    for stamp, points in enumerate(parts):
+        assert merging.merge(graph, frame(stamp, (points, TABLE))) == [1]
+    assert len(graph) == 1
+
+
+def test_a_label_that_flips_founds_no_node(graph, merging) -> None:
+    for stamp in range(10):
+        kind = CHAIR if stamp % 5 == 3 else TABLE
+        assert merging.merge(graph, frame(stamp, (WHOLE, kind))) == [1]
+    told = graph.node_states(3)[1]
+    assert told.label == VOCABULARY.classes[TABLE]
+    assert told.classes[0].probability == pytest.approx((8 * 0.85 + 2 * 0.05) / 10)
+    assert told.classes[1].label == VOCABULARY.classes[CHAIR]  # the disagreement is visible
+
+
+def test_objects_that_touch_stay_two(graph, merging) -> None:
+    cup = slab((0.3, 0.1, 1.05), (0.08, 0.08, 0.09))
+    for stamp in range(5):
+        order = [(WHOLE, TABLE), (cup, CUP)]
+        ids = merging.merge(graph, frame(stamp, *order[:: -1 if stamp % 2 else 1]))
+        assert ids == ([2, 1] if stamp % 2 else [1, 2])
+    assert merging.merge(graph, frame(9, (cup, CUP))) == [2]
+    assert merging.merge(graph, frame(10, (WHOLE, TABLE))) == [1]
+
+
+def test_neighbours_of_one_class_stay_two_while_both_are_seen(graph, merging) -> None:
+    books = [slab((x, 0, 1), (0.04, 0.15, 0.2)) for x in (0.0, 0.045, 0.09)]
+    for stamp in range(10):
+        assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
+
+
+def test_a_neighbour_that_is_often_missed_is_not_swallowed(graph, merging) -> None:
+    books = [slab((x, 0, 1), (0.035, 0.15, 0.2)) for x in (0.0, 0.036, 0.072)]
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
+    for stamp in range(3, 40):
+        seen = [0, 2] if stamp % 8 else [0, 1, 2]
+        ids = merging.merge(graph, frame(stamp, *[(books[index], CUP) for index in seen]))
+        assert ids == [index + 1 for index in seen]
+    assert merging.merge(graph, frame(50, (books[1], CUP))) == [2]
+
+
+def test_of_neighbours_a_newcomer_is_the_one_that_is_new(graph, merging) -> None:
+    left, middle, right = (slab((x, 0, 1), (0.02, 0.15, 0.2)) for x in (0.0, 0.022, 0.044))
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, (left, CUP), (right, CUP))) == [1, 2]
+    # The newcomer's label is the surest, and its cells touch those of both neighbours.
+    classes = np.array([[0.97, 0.01, 0.01, 0.01], [0.7, 0.1, 0.1, 0.1], [0.7, 0.1, 0.1, 0.1]])
+    for stamp in range(3, 10):
+        local = frame(stamp, (middle, CUP), (left, CUP), (right, CUP), class_probabilities=classes)
+        assert merging.merge(graph, local) == [3, 1, 2]
+
+
+def test_a_small_thing_on_a_large_one_is_no_other_name_for_it(graph, merging) -> None:
+    for stamp in range(3):
+        assert merging.merge(graph, frame(stamp, (WHOLE, TABLE))) == [1]
+    mat = slab((0.5, 0.1, 1.005), (0.2, 0.15, 0.01))
+    for stamp in range(3, 6):
+        assert merging.merge(graph, frame(stamp, (mat, CUP))) == [2]
+    # Nor is the large one another name for the small.
+    assert merging.merge(graph, frame(6, (WHOLE, TABLE))) == [1]
+    # A part of the table that is called a chair is the table.
+    assert merging.merge(graph, frame(7, (LEFT, CHAIR))) == [1]
+
+
+def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
+    gap_left, gap_right = slab((-0.7, 0, 1), (0.7, 0.8, 0.01)), slab((0.7, 0, 1), (0.7, 0.8, 0.01))
+    assert merging.merge(graph, frame(0, (gap_left, TABLE))) == [1]
+    assert merging.merge(graph, frame(1, (gap_right, TABLE))) == [2]
+    for stamp in range(2, 8):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1]
+    assert graph.take_removals() == {2: 1}
+    assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
+
+
+def split_after_one_mask_over_two(graph, **config) -> list[list[int]]:
+    """Ten frames that take two things for one, six that tell them apart, then each alone."""
+    merging = SurfaceMerging(MergingConfig(association="surface", **config))
+    left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.1)), slab((0.06, 0, 1), (0.12, 0.3, 0.1))
+    views = [[np.concatenate((left, right))]] * 10 + [[left, right]] * 6 + [[right], [left]]
+    return [
+        merging.merge(graph, frame(stamp, *((points, CUP) for points in view)))
+        for stamp, view in enumerate(views)
+    ]
+
+
+def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart(graph) -> None:
+    ids = split_after_one_mask_over_two(graph)
+    assert ids[9] == [1] and ids[15] == [1, 2]
+    assert ids[16:] == [[2], [1]]
+    means = graph.nodes.means[:, 0]
+    assert means[1] == pytest.approx(0.06, abs=0.005)
+    # Its Gaussian has the ten frames in it, but they count for half.
+    uncorrected = SceneGraph(VOCABULARY, "world")
+    split_after_one_mask_over_two(uncorrected, contest_cells=False)
+    assert means[0] < uncorrected.nodes.means[0, 0] - 0.005
+    # Of its surface nothing is left that lies on the other, but for a border of two cells.
+    assert graph.nodes.surface(0)[:, 0].max() < 2 * CONFIG.cell_m
+    assert uncorrected.nodes.surface(0)[:, 0].max() > 0.1
+
+
+def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:
+    cup = slab((3, 0, 1), (0.08, 0.08, 0.09))
+    merging.merge(graph, frame(0, (WHOLE, TABLE), (cup, CUP)))
+    assert not graph.nodes.confirmed.any()
+    for stamp in (1, 2):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    assert graph.nodes.confirmed.tolist() == [True, False]
+    assert list(graph.node_states(1)) == [1]
+    merging.merge(graph, frame(100, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1, 2]  # 10 s have not quite passed
+    merging.merge(graph, frame(101, (WHOLE, TABLE)))
+    assert graph.nodes.ids.tolist() == [1]
+    assert merging.merge(graph, frame(102, (cup, CUP))) == [3]
+
+
+def test_a_confirmed_node_out_of_view_stays(graph, merging) -> None:
+    for stamp in range(3):
+        merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
+    merging.merge(graph, frame(10_000))
+    assert graph.nodes.ids.tolist() == [1]
+
+
+def test_more_pixels_weigh_more(graph, merging) -> None:
+    few = frame(0, (LEFT, TABLE), pixel_counts=np.array([1000]))
+    many = frame(1, (WHOLE, TABLE), pixel_counts=np.array([9000]))
+    merging.merge(graph, few)
+    merging.merge(graph, many)
+    wanted = (few.means_world[0] + 9 * many.means_world[0]) / 10
+    assert graph.nodes.means[0] == pytest.approx(wanted)
+    assert graph.nodes.observations.tolist() == [2]
+
+
+def test_the_result_does_not_depend_on_the_world_frame() -> None:
+    rng = np.random.default_rng(3)
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    shift = np.array([10.0, -4.0, 2.0])
+    cup = slab((0.3, 0.1, 1.05), (0.08, 0.08, 0.09))
+    views = [[(LEFT, TABLE)], [(WHOLE, TABLE), (cup, CUP)], [(cup, CHAIR), (RIGHT, TABLE)]]
+    results = []
+    for move in (False, True):
+        graph = SceneGraph(VOCABULARY, "world")
+        merging = SurfaceMerging(CONFIG)
+        ids = []
+        for stamp, view in enumerate(views):
+            moved = [
+                ((points @ rotation.T + shift).astype(np.float32) if move else points, kind)
+                for points, kind in view
+            ]
+            ids.append(merging.merge(graph, frame(stamp, *moved)))
+        means = graph.nodes.means if not move else (graph.nodes.means - shift) @ rotation
+        results.append((ids, means.copy()))
+    assert results[0][0] == results[1][0] == [[1], [1, 2], [2, 1]]
+    assert results[0][1] == pytest.approx(results[1][1], abs=1e-5)
+
+
+def test_what_does_not_fit_is_refused_and_changes_nothing(graph, merging) -> None:
+    merging.merge(graph, frame(0, (WHOLE, TABLE)))
+    revision = graph.revision
+    for changes, reason in (
+        ({"vocabulary": Vocabulary(("a", "b", "c", "d"), ("x", "y", "z"))}, "vocabulary_mismatch"),
+        ({"frame_id": "odom"}, "wrong_frame"),
+    ):
+        with pytest.raises(RefusedInput) as refused:
+            merging.merge(graph, frame(1, (WHOLE, TABLE), **changes))
+        assert refused.value.reason == reason
+    assert graph.revision == revision

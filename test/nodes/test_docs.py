@@ -1,0 +1,95 @@
+"""The pages say what the code does; `python test/nodes/test_docs.py` writes their tables."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+from deworldsg_ros.nodes.replay_options import ReplayParameters  # noqa: E402
+from deworldsg_ros.ros.options import Parameters  # noqa: E402
+from deworldsg_ros.ros.parameters import fields  # noqa: E402
+from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
+
+PAGES = (ROOT / "docs" / "nodes.md", ROOT / "docs" / "recordings.md")
+# What the nodes run.
+PACKAGES = (
+    "bridge",
+    "nodes",
+    "poses",
+    "perception",
+    "lifting",
+    "merging",
+    "relations",
+    "graph_builder.py",
+)
+SCENE = ("camera.py", "codec.py", "wire.py")
+
+
+def reasons_table() -> str:
+    rows = [f"| `{reason}` | {advice} |" for reason, advice in REASONS.items()]
+    return "\n".join(["| reason | what it means, what to do |", "|---|---|", *rows])
+
+
+def parameters_table(parameters: type[msgspec.Struct]) -> str:
+    rows = []
+    for field in fields(parameters):
+        default = "''" if field.default == "" else str(field.default).lower()
+        limits = field.limits() or ("true, false" if field.kind is bool else "")
+        kind = field.kind.__name__
+        rows.append(f"| `{field.name}` | {kind} | `{default}` | {limits} | {field.description} |")
+    return "\n".join(["| name | type | default | allowed | |", "|---|---|---|---|---|", *rows])
+
+
+def with_tables(text: str) -> str:
+    tables = {
+        "reasons": reasons_table(),
+        "parameters": parameters_table(Parameters),
+        "replay": parameters_table(ReplayParameters),
+    }
+    pattern = re.compile(r"(<!-- (\w+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
+    return pattern.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", text)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_tables_of_the_page_are_those_of_the_code(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert "<!-- /" in text
+    assert text == with_tables(text), "run: python test/nodes/test_docs.py"
+
+
+def reasons_in(path: Path) -> set[str]:
+    """First arguments of every RefusedInput and drop that are literals."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call) and node.args:
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            literal = isinstance(node.args[0], ast.Constant)
+            if name in ("RefusedInput", "drop", "_drop") and literal:
+                found.add(node.args[0].value)
+    return found
+
+
+def test_every_reason_of_the_code_is_explained() -> None:
+    package = ROOT / "deworldsg_ros"
+    paths = [package / "scene" / name for name in SCENE]
+    for name in PACKAGES:
+        path = package / name
+        paths += [path] if path.is_file() else sorted(path.rglob("*.py"))
+    # Training runs from the command line, and says itself what it refuses.
+    training = package / "relations" / "training"
+    used = set().union(*(reasons_in(path) for path in paths if training not in path.parents))
+    assert used
+    assert used <= set(REASONS)
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

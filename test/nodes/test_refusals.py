@@ -1,0 +1,253 @@
+"""Every refusal, provoked by a message on a topic, and the node alive and at work after it."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from support.nodes_bench import (
+    CAMERA,
+    HEIGHT,
+    LIMIT_S,
+    STEP_NS,
+    Bench,
+    bench,
+    camera_info,
+    changed,
+    depth,
+    evidence,
+    frame_graph,
+    instances,
+    local_graph,
+    pose,
+    rgb,
+    send_frame,
+    works,
+)
+
+from deworldsg_ros.nodes.graph_node import GraphNode
+from deworldsg_ros.nodes.lifting_node import LiftingNode
+from deworldsg_ros.nodes.relation_node import RelationNode
+from deworldsg_ros.nodes.segmentation_node import SegmentationNode
+from deworldsg_ros.scene import wire
+
+
+@pytest.fixture(scope="module")
+def segmentation() -> Iterator[Bench]:
+    yield from bench(SegmentationNode, CAMERA)
+
+
+SEGMENTATION_CASES = {
+    "unknown_encoding": {"rgb__image_raw": changed(rgb, encoding="yuv422")},
+    "bad_step": {"rgb__image_raw": changed(rgb, step=5)},
+    "short_buffer": {"rgb__image_raw": changed(rgb, data=bytes(10))},
+    "empty_image": {"rgb__image_raw": changed(rgb, width=0)},
+    "grid_mismatch": {"depth__image_raw": lambda stamp_ns: depth(stamp_ns, HEIGHT // 2)},
+    "invalid_intrinsics": {"rgb__camera_info": changed(camera_info, k=[0.0] * 9)},
+    "invalid_pose": {"camera__pose": lambda stamp_ns: pose(stamp_ns, math.nan)},
+    "wrong_frame": {"camera__pose": lambda stamp_ns: pose(stamp_ns, frame_id="odom")},
+    "pose_jump": {"camera__pose": lambda stamp_ns: pose(stamp_ns, 50.0)},
+    "no_depth": {"depth__image_raw": None},
+    "stale": {"depth__image_raw": lambda stamp_ns: depth(stamp_ns - STEP_NS)},
+}
+
+
+@pytest.mark.parametrize("reason", SEGMENTATION_CASES)
+def test_segmentation_refuses_and_lives_on(segmentation: Bench, reason: str) -> None:
+    works(segmentation, lambda: send_frame(segmentation))
+
+    def provoke() -> None:
+        send_frame(segmentation, **SEGMENTATION_CASES[reason])
+        send_frame(segmentation)
+
+    segmentation.refuses(reason, provoke)
+    works(segmentation, lambda: send_frame(segmentation))
+
+
+def test_a_zero_quaternion_is_refused(segmentation: Bench) -> None:
+    def zero(stamp_ns: int) -> PoseStamped:
+        message = pose(stamp_ns)
+        message.pose.orientation.w = 0.0
+        return message
+
+    segmentation.refuses("invalid_pose", lambda: send_frame(segmentation, camera__pose=zero))
+    works(segmentation, lambda: send_frame(segmentation))
+
+
+def test_an_image_without_a_pose_near_it_is_refused(segmentation: Bench) -> None:
+    works(segmentation, lambda: send_frame(segmentation))
+
+    def provoke() -> None:
+        for _ in range(5):
+            send_frame(segmentation, camera__pose=None)
+        send_frame(segmentation)
+
+    segmentation.refuses("no_pose", provoke)
+    works(segmentation, lambda: send_frame(segmentation))
+
+
+def test_a_recording_played_again_is_followed(segmentation: Bench) -> None:
+    works(segmentation, lambda: send_frame(segmentation))
+    segmentation.stamp_ns -= 100 * 10**9
+    segmentation.refuses("time_jump", lambda: send_frame(segmentation))
+    works(segmentation, lambda: [send_frame(segmentation) for _ in range(3)])
+
+
+def test_what_nobody_foresaw_is_counted_and_survived(
+    segmentation: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(frame: Any) -> None:
+        raise ZeroDivisionError("for the test")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(segmentation.node._perception, "perceive", fail)
+        segmentation.refuses("internal_error", lambda: send_frame(segmentation))
+    works(segmentation, lambda: send_frame(segmentation))
+
+
+def test_slow_work_lets_the_oldest_frames_go(
+    segmentation: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = threading.Event()
+    perceive = segmentation.node._perception.perceive
+
+    def wait(frame: Any) -> Any:
+        assert begin.wait(LIMIT_S)
+        return perceive(frame)
+
+    size = segmentation.node.parameters.node.queue_size
+    with monkeypatch.context() as patch:
+        patch.setattr(segmentation.node._perception, "perceive", wait)
+
+        def provoke() -> None:
+            for _ in range(size + 3):
+                send_frame(segmentation)
+                segmentation.peer.spin_for(0.02)
+
+        segmentation.refuses("overrun", provoke, 2)
+        begin.set()
+        assert segmentation.node.wait_idle(LIMIT_S)
+    works(segmentation, lambda: send_frame(segmentation))
+
+
+@pytest.fixture(scope="module")
+def lifting() -> Iterator[Bench]:
+    topics = {name: kind for name, kind in CAMERA.items() if name != "rgb/image_raw"}
+    topics |= {"deworldsg/frame_graph": String, "deworldsg/instances": Image}
+    yield from bench(LiftingNode, topics)
+
+
+def send_lifting(at: Bench, **changes: Any) -> None:
+    makers = {
+        "rgb__image_raw": None,
+        "deworldsg__instances": instances,
+        "deworldsg__frame_graph": frame_graph,
+    }
+    send_frame(at, **{**makers, **changes})
+
+
+LIFTING_CASES = {
+    "invalid_message": {"deworldsg__frame_graph": lambda stamp_ns: "{not json"},
+    "unknown_schema": {
+        "deworldsg__frame_graph": lambda stamp_ns: changed(
+            frame_graph, schema=wire.Schema("frame_graph", 99)
+        )(stamp_ns)
+    },
+    "unknown_instance": {"deworldsg__instances": lambda stamp_ns: instances(stamp_ns, 1)},
+    "grid_mismatch": {"depth__image_raw": lambda stamp_ns: depth(stamp_ns, HEIGHT // 2)},
+    "unknown_encoding": {"deworldsg__instances": changed(instances, encoding="mono8")},
+    "no_instances": {"deworldsg__instances": None},
+    "no_depth": {"depth__image_raw": None},
+    "unmatched_depth": {"deworldsg__frame_graph": lambda stamp_ns: "{not json"},
+}
+
+
+@pytest.mark.parametrize("reason", LIFTING_CASES)
+def test_lifting_refuses_and_lives_on(lifting: Bench, reason: str) -> None:
+    works(lifting, lambda: send_lifting(lifting))
+
+    def provoke() -> None:
+        send_lifting(lifting, **LIFTING_CASES[reason])
+        send_lifting(lifting)
+
+    lifting.refuses(reason, provoke)
+    works(lifting, lambda: send_lifting(lifting))
+
+
+@pytest.fixture(scope="module")
+def relation() -> Iterator[Bench]:
+    yield from bench(RelationNode, {"rgb/image_raw": Image, "deworldsg/local_graph": String})
+
+
+def send_relation(at: Bench, **changes: Any) -> None:
+    stamp_ns = at.next_stamp()
+    makers = {"rgb__image_raw": rgb, "deworldsg__local_graph": local_graph, **changes}
+    at.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
+
+
+RELATION_CASES = {
+    "no_rgb": {"rgb__image_raw": None},
+    "unmatched_rgb": {"deworldsg__local_graph": None},
+    "invalid_message": {"deworldsg__local_graph": lambda stamp_ns: "[]"},
+    "unknown_encoding": {"rgb__image_raw": changed(rgb, encoding="yuv422")},
+}
+
+
+@pytest.mark.parametrize("reason", RELATION_CASES)
+def test_relation_refuses_and_lives_on(relation: Bench, reason: str) -> None:
+    works(relation, lambda: send_relation(relation))
+
+    def provoke() -> None:
+        send_relation(relation, **RELATION_CASES[reason])
+        send_relation(relation)
+
+    relation.refuses(reason, provoke)
+    works(relation, lambda: send_relation(relation))
+
+
+@pytest.fixture(scope="module")
+def graph() -> Iterator[Bench]:
+    topics = {"deworldsg/local_graph": String, "deworldsg/relation_evidence": String}
+    yield from bench(GraphNode, topics)
+
+
+def send_graph(at: Bench, make: Callable[[int], Any] = local_graph) -> None:
+    at.send(deworldsg__local_graph=make(at.next_stamp()))
+
+
+GRAPH_CASES = {
+    "wrong_frame": changed(local_graph, frame_id="odom"),
+    "vocabulary_mismatch": changed(local_graph, predicates=["on", "under"]),
+    "out_of_order": lambda stamp_ns: local_graph(stamp_ns - 2 * STEP_NS),
+    "invalid_message": changed(local_graph, T_world_camera=[0.0] * 15),
+}
+
+
+@pytest.mark.parametrize("reason", GRAPH_CASES)
+def test_graph_refuses_and_lives_on(graph: Bench, reason: str) -> None:
+    works(graph, lambda: send_graph(graph))
+    graph.refuses(reason, lambda: send_graph(graph, GRAPH_CASES[reason]))
+    works(graph, lambda: send_graph(graph))
+
+
+def test_evidence_of_no_frame_is_refused(graph: Bench) -> None:
+    works(graph, lambda: send_graph(graph))
+    stray = evidence(graph.stamp_ns - 1)
+    graph.refuses("unknown_frame", lambda: graph.send(deworldsg__relation_evidence=stray))
+    works(graph, lambda: send_graph(graph))
+
+
+def test_evidence_waits_for_its_frame(graph: Bench) -> None:
+    works(graph, lambda: send_graph(graph))
+    drops = dict(graph.node.health.drops)
+    graph.send(deworldsg__relation_evidence=evidence(graph.stamp_ns + STEP_NS))
+    graph.expect(lambda: len(graph.node._pending) == 1, "the evidence to wait")
+    works(graph, lambda: send_graph(graph))
+    assert len(graph.node._pending) == 0
+    assert graph.node.health.drops == drops

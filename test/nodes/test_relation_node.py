@@ -1,0 +1,182 @@
+"""relation_node and the graph that it hears of: which pairs the world model looks at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import rclpy
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Image
+from std_msgs.msg import String
+from support.nodes_bench import Bench, changed, local_graph, rgb
+
+from deworldsg_ros.checkpoints.card import CheckpointCard, write_card
+from deworldsg_ros.nodes import relation_node
+from deworldsg_ros.nodes.relation_node import RelationNode
+from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import ConfigurationError
+
+WORLD_MODEL = [
+    Parameter("relations.world_model", value="fake"),
+    Parameter("relations.clip_length", value=4),
+]
+TWO_CLASSES = {"classes": ["chair", "cup"], "predicates": ["on", "under", "near"]}
+
+
+def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
+    """A chair and a cup beside it."""
+    message = changed(local_graph, **TWO_CLASSES)(stamp_ns)
+    chair = message.objects[0]
+    cup = msgspec.structs.replace(chair, instance=2, class_probabilities=[0.1, 0.9])
+    message.objects = [chair, cup]
+    return message
+
+
+def send_two_objects(at: Bench) -> int:
+    stamp_ns = at.next_stamp()
+    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
+    return stamp_ns
+
+
+def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
+    """Updates lost, a graph that starts anew: the relation node goes on by what it is told."""
+    topics = {
+        "rgb/image_raw": Image,
+        "deworldsg/local_graph": String,
+        "/scene_graph/updates": String,
+        "/scene_graph": String,
+    }
+    at = Bench(RelationNode, topics, reliable(50, latched=True), parameter_overrides=WORLD_MODEL)
+    graph = {"schema": None, "frame_id": "map", "edges": []}
+
+    def nodes(observations: int) -> list[wire.NodeState]:
+        return [
+            wire.NodeState(
+                id=node_id,
+                label=label,
+                classes=[wire.Belief(label, 1.0)],
+                mean_m=[0.0, 0.0, 1.0],
+                covariance_m2=np.eye(3).ravel().tolist(),
+                observations=observations,
+                first_seen=wire.Stamp(0, 0),
+                last_seen=wire.Stamp(0, 0),
+            )
+            for node_id, label in ((1, "chair"), (2, "cup"))
+        ]
+
+    def publish(sequence: int, stamp_ns: int, observations: int) -> None:
+        stamp = wire.stamp_from_ns(stamp_ns)
+        common = {**graph, "stamp": stamp, "sequence": sequence, "nodes": nodes(observations)}
+        update = wire.SceneGraphUpdateMessage(
+            **{**common, "schema": wire.schema_of(wire.SceneGraphUpdateMessage)},
+            removed_nodes=[],
+            removed_edges=[],
+            associations=[wire.Association(stamp, [1, 2])],
+        )
+        snapshot = wire.SceneGraphMessage(
+            **{**common, "schema": wire.schema_of(wire.SceneGraphMessage)}
+        )
+        at.send(**{"/scene_graph/updates": update, "/scene_graph": snapshot})
+
+    def clips(**wanted: int) -> None:
+        def told() -> bool:
+            values = at.node.more_values()
+            return all(
+                values.get(f"clips {name.replace('__', ' ')}", "0") == str(count)
+                for name, count in wanted.items()
+            )
+
+        at.expect(told, f"clips {wanted}, not {at.node.more_values()}")
+
+    try:
+        stamp_ns = send_two_objects(at)
+        clips(encoded=1)  # no graph is known: all are
+        publish(1, stamp_ns, 3)
+        at.expect(lambda: at.node._graph.newest_ns == stamp_ns, "the update to come")
+        stamp_ns = send_two_objects(at)
+        clips(encoded=1, waiting=1)  # until the graph has answered
+        publish(2, stamp_ns, 4)
+        clips(encoded=2, waiting=0)
+        publish(3, send_two_objects(at), 5)
+        clips(encoded=2, dropped__looked_at=1)
+        publish(7, send_two_objects(at), 8)  # updates are lost, and twice as often seen
+        clips(encoded=3, waiting=0)
+        publish(1, send_two_objects(at), 3)  # another graph
+        clips(encoded=4, waiting=0)
+        assert "dropped internal_error" not in at.node.health.drops
+    finally:
+        at.close()
+
+
+def test_a_recording_that_starts_again_is_looked_at_again() -> None:
+    at = Bench(
+        RelationNode,
+        {"rgb/image_raw": Image, "deworldsg/local_graph": String},
+        parameter_overrides=WORLD_MODEL,
+    )
+
+    def encoded() -> int:
+        return int(at.node.more_values()["clips encoded"])
+
+    try:
+        at.peer.spin_for(0.5)
+        started_ns = at.stamp_ns
+        for count in range(1, 13):  # more than the buffer of eight holds
+            send_two_objects(at)
+            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+        at.stamp_ns = started_ns
+        for count in (13, 14):
+            send_two_objects(at)
+            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+        assert at.node.more_values().get("clips dropped no_frame") is None
+    finally:
+        at.close()
+
+
+def start(**overrides: str) -> RelationNode:
+    """The node as it starts with a world model and parameters, named with __ for a dot."""
+    parameters = [
+        Parameter(name.replace("__", "."), value=value) for name, value in overrides.items()
+    ]
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        node = RelationNode(context=context, parameter_overrides=[*WORLD_MODEL, *parameters])
+        node.close()
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+    return node
+
+
+class Bound(FakeWorldModel):
+    """A world model of certain predicates, as one with a probe is."""
+
+    def require_predicates(self, predicates: tuple[str, ...]) -> None:
+        if predicates != ("on", "under"):
+            raise ConfigurationError(f"the probe was trained on others than {predicates}")
+
+
+def test_predicates_of_an_imported_checkpoint_are_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The relation node runs no perception, and may run where its checkpoint is not."""
+    monkeypatch.setattr(relation_node, "build_world_model", lambda config: Bound(4, 0))
+    chosen = {"perception__predicate_set": "checkpoint"}
+    for predicates in (("on", "under"), ("on", "near"), ()):
+        write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
+        if predicates == ("on", "under"):
+            start(**chosen, perception__detector_path=str(tmp_path))
+            start(**chosen, perception__relation_head_path=str(tmp_path))
+            continue
+        told = "trained on others" if predicates else "names no predicates"
+        with pytest.raises(ConfigurationError, match=told):
+            start(**chosen, perception__detector_path=str(tmp_path))
+    start(**chosen, perception__detector_path="somebody/elsewhere")
+    with pytest.raises(ConfigurationError, match="trained on others"):
+        start(perception__predicate_set="3dssg")

@@ -1,0 +1,191 @@
+"""The geometric relation head on layouts whose relations are plain to see."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.perception import (
+    CUP_ON_TABLE,
+    INTRINSICS,
+    SHAPE,
+    TABLE_LEG,
+    TABLE_TOP,
+    UP_CAMERA,
+    Slab,
+    box_of,
+    render,
+)
+
+from deworldsg_ros.perception.backends.geometric import (
+    CEILING_LOGIT,
+    FLOOR_LOGIT,
+    GeometricRelationHead,
+)
+from deworldsg_ros.perception.geometry.layout import upright_axes
+from deworldsg_ros.perception.geometry.up_direction import estimate_up
+from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, SCANNET_PREDICATES
+
+SHELF = Slab((-0.5, 2.6, 0.75), (0.5, 2.95, 1.05), (90, 90, 100))
+CHEST = Slab((-0.5, 2.5, 0.0), (0.5, 2.98, 0.4), (100, 60, 60))
+
+
+def see(named, predicates=REPLICA_SSG_PREDICATES, up=UP_CAMERA, top=100):
+    """Relations of named objects, each a list of slabs, as {(subject, object): predicate}."""
+    slabs = [slab for _, parts in named for slab in parts]
+    _, depth_m, owner = render(slabs, 0.001)
+    instances = np.zeros(SHAPE, np.uint16)
+    boxes, first = [], 1
+    for row, (_, parts) in enumerate(named):
+        mask = (owner >= first) & (owner < first + len(parts))
+        instances[mask] = row + 1
+        boxes.append(box_of(mask))
+        first += len(parts)
+    head = GeometricRelationHead(predicates)
+    names = [name for name, _ in named]
+    found = head.relate(
+        depth_m, INTRINSICS, np.array(boxes), names, np.full(len(named), 0.8), instances, up, top
+    )
+    assert found.logits.shape == (len(found.pairs), len(predicates))
+    assert (found.logits >= FLOOR_LOGIT).all() and (found.logits <= CEILING_LOGIT).all()
+    assert (np.diff(found.scores) <= 0).all()
+    return {
+        (names[s], names[o]): predicates[row.argmax()]
+        for (s, o), row in zip(found.pairs, found.logits)
+    }
+
+
+TABLE = ("table", [TABLE_TOP, TABLE_LEG])
+CUP = ("cup", [CUP_ON_TABLE])
+
+
+def test_a_cup_on_a_table():
+    told = see([TABLE, CUP])
+    assert told["cup", "table"] == "on"
+    assert told.get(("table", "cup")) not in {"on", "in", "under"}
+
+
+def test_the_same_without_knowing_up():
+    assert see([TABLE, CUP], up=None)["cup", "table"] == "on"
+
+
+def test_the_same_in_the_words_of_3dssg():
+    assert see([TABLE, CUP], SCANNET_PREDICATES)["cup", "table"] == "supported by"
+
+
+def test_two_cups_side_by_side_are_near_each_other():
+    other = ("bowl", [Slab((-0.05, 1.6, 0.70), (0.08, 1.73, 0.80), (40, 120, 60))])
+    told = see([TABLE, CUP, other])
+    assert told["cup", "bowl"] == told["bowl", "cup"] == "near"
+    assert told["bowl", "table"] == "on"
+
+
+def test_small_things_far_apart_are_not_related():
+    other = ("bowl", [Slab((0.35, 1.6, 0.70), (0.48, 1.73, 0.80), (40, 120, 60))])
+    told = see([TABLE, CUP, other])
+    assert ("cup", "bowl") not in told
+
+
+def test_a_plant_in_a_vase():
+    vase = ("vase", [Slab((-0.1, 1.6, 0.70), (0.05, 1.75, 0.9), (200, 200, 40))])
+    plant = ("plant", [Slab((-0.15, 1.58, 0.9), (0.1, 1.77, 1.1), (30, 140, 30))])
+    told = see([TABLE, vase, plant])
+    assert told["plant", "vase"] == "in"
+    assert told["vase", "table"] == "on"
+
+
+def test_a_wall_shelf_above_a_chest():
+    told = see([("shelf", [SHELF]), ("cabinet", [CHEST])])
+    assert told["shelf", "cabinet"] == "above"
+    assert told["cabinet", "shelf"] == "under"
+
+
+def test_a_table_with_its_chair():
+    chair = ("chair", [Slab((0.75, 1.5, 0.0), (1.2, 1.95, 0.9), (30, 60, 120))])
+    told = see([TABLE, chair])
+    assert told["table", "chair"] == "with"
+    assert told["chair", "table"] == "near"
+
+
+def test_furniture_side_by_side():
+    low = ("cabinet", [Slab((-0.9, 2.6, 0.0), (-0.1, 3.1, 0.6), (30, 60, 120))])
+    high = ("shelf", [Slab((-0.08, 2.6, 0.0), (0.7, 3.1, 0.95), (120, 60, 30))])
+    told = see([low, high])
+    assert told["cabinet", "shelf"] == "against"
+
+
+def test_a_window_has_a_curtain_attached():
+    window = ("window", [Slab((-0.5, 3.98, 0.7), (0.3, 4.0, 1.4), (90, 160, 220))])
+    curtain = ("curtain", [Slab((0.32, 3.9, 0.4), (0.6, 3.98, 1.5), (30, 120, 60))])
+    assert see([window, curtain])["curtain", "window"] == "attached to"
+    assert see([window, curtain], SCANNET_PREDICATES)["curtain", "window"] == "attached to"
+
+
+@pytest.mark.parametrize("top", [0, 1, 3])
+def test_as_many_as_asked_for(top):
+    other = ("bowl", [Slab((-0.05, 1.6, 0.70), (0.08, 1.73, 0.80), (40, 120, 60))])
+    assert len(see([TABLE, CUP, other], top=top)) == top
+
+
+def test_objects_without_pixels_or_depth_are_not_related():
+    _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
+    boxes = np.array([[0.0, 0, 9, 9], [20, 20, 40, 40]])
+    head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
+    for instances, depth in (
+        (np.zeros(SHAPE, np.uint16), depth_m),
+        (owner.astype(np.uint16), np.zeros_like(depth_m)),
+    ):
+        found = head.relate(
+            depth, INTRINSICS, boxes, ["table", "cup"], np.ones(2), instances, UP_CAMERA, 10
+        )
+        assert len(found.pairs) == 0
+
+
+def test_one_object_has_no_relation():
+    head = GeometricRelationHead(SCANNET_PREDICATES)
+    found = head.relate(
+        np.ones(SHAPE, np.float32),
+        INTRINSICS,
+        np.zeros((1, 4)),
+        ["cup"],
+        np.ones(1),
+        np.ones(SHAPE, np.uint16),
+        UP_CAMERA,
+        10,
+    )
+    assert found.pairs.shape == (0, 2) and found.logits.shape == (0, 7)
+
+
+def test_predicates_that_geometry_cannot_judge_weigh_nothing():
+    _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
+    head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
+    boxes = np.stack([box_of(owner == k) for k in (1, 2)])
+    found = head.relate(
+        depth_m,
+        INTRINSICS,
+        boxes,
+        ["table", "cup"],
+        np.ones(2),
+        owner.astype(np.uint16),
+        UP_CAMERA,
+        1,
+    )
+    weights = np.exp(found.logits[0]) / np.exp(found.logits[0]).sum()
+    assert weights[REPLICA_SSG_PREDICATES.index("on")] > 0.9
+
+
+@pytest.mark.parametrize("slabs", [[], [TABLE_TOP, CUP_ON_TABLE], [CHEST, SHELF]])
+def test_up_is_found_in_the_depth(slabs):
+    _, depth_m, _ = render(slabs, 0.003)
+    angle = np.degrees(np.arccos(np.clip(estimate_up(depth_m, INTRINSICS) @ UP_CAMERA, -1, 1)))
+    assert angle < 4
+
+
+def test_up_without_depth_is_the_images():
+    assert estimate_up(np.zeros(SHAPE, np.float32), INTRINSICS).tolist() == [0, -1, 0]
+
+
+@pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, -0.8, 0], [1, 0, 0]])
+def test_upright_axes_are_a_rotation_with_up_on_top(up):
+    axes = upright_axes(np.array(up, dtype=float))
+    assert np.allclose(axes @ axes.T, np.eye(3)) and np.isclose(np.linalg.det(axes), 1)
+    assert np.allclose(axes @ np.array(up), [0, 0, 1])

@@ -1,0 +1,157 @@
+"""The RGB-D segmenter on scenes whose masks are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.perception import (
+    CUP_ON_TABLE,
+    INTRINSICS,
+    SHAPE,
+    TABLE_LEG,
+    TABLE_TOP,
+    Slab,
+    box_of,
+    overlap,
+    render,
+)
+
+from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
+from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
+
+SEGMENTER = RgbdSegmenter()
+
+
+def segment(rgb, depth_m, boxes):
+    return SEGMENTER.segment(rgb, depth_m, INTRINSICS, np.asarray(boxes, dtype=float))
+
+
+def test_no_boxes():
+    rgb, depth_m, _ = render([])
+    assert segment(rgb, depth_m, np.zeros((0, 4))) == []
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.004])
+def test_a_box_on_the_floor(noise_m):
+    rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))], noise_m)
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.85
+
+
+def test_a_box_of_the_floors_colour_is_told_by_its_shape():
+    rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (150, 140, 130))], 0.002)
+    rgb[:] = (150, 140, 130)
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.8
+
+
+def test_a_cup_on_a_table_is_not_the_table_nor_the_reverse():
+    rgb, depth_m, owner = render([TABLE_TOP, TABLE_LEG, CUP_ON_TABLE], 0.002)
+    table = (owner == 1) | (owner == 2)
+    cup = owner == 3
+    table_box = box_of(table | cup)
+    masks = segment(rgb, depth_m, [table_box, box_of(cup)])
+    assert overlap(masks[1], cup) > 0.85
+    assert overlap(masks[0], table) > 0.85
+    assert not (masks[0].to_image(SHAPE) & masks[1].to_image(SHAPE)).any()
+
+
+def test_alone_the_cup_leaves_the_table_behind():
+    rgb, depth_m, owner = render([TABLE_TOP, TABLE_LEG, CUP_ON_TABLE], 0.002)
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 3)])
+    assert overlap(mask, owner == 3) > 0.85
+
+
+def test_a_planar_table_is_an_object():
+    rgb, depth_m, owner = render([TABLE_TOP], 0.002)
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.85
+
+
+def test_a_picture_on_the_wall_has_only_its_colour():
+    rgb, depth_m, owner = render([Slab((-0.4, 3.999, 0.5), (0.4, 4.0, 1.1), (20, 60, 90))], 0.003)
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.8
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_holes_in_the_depth_are_filled(share):
+    rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))], 0.002)
+    holes = np.random.default_rng(1).random(SHAPE) < share
+    box = box_of(owner == 1).astype(int)
+    # And one large hole in the object's face.
+    x, y = (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
+    holes[y - 12 : y + 12, x - 12 : x + 12] = True
+    depth_m[holes] = 0
+    (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.75
+    assert mask.to_image(SHAPE)[y, x]
+
+
+@pytest.mark.parametrize("invalid", [0.0, np.nan, np.inf, -1.0])
+def test_without_any_depth_colour_remains(invalid):
+    rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))])
+    (mask,) = segment(rgb, np.full_like(depth_m, invalid), [box_of(owner == 1)])
+    assert overlap(mask, owner == 1) > 0.7
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        [-50, -50, -10, -10],
+        [400, 300, 500, 400],
+        [-20, 100, -1, 200],
+        [319, 239, 319, 239],
+        [-30, -30, 500, 400],
+        [100, 100, 100.2, 100.2],
+    ],
+)
+def test_boxes_at_and_beyond_the_border(box):
+    rgb, depth_m, _ = render([TABLE_TOP], 0.002)
+    (mask,) = segment(rgb, depth_m, [box])
+    image = mask.to_image(SHAPE)
+    rows, columns = np.nonzero(image)
+    if len(rows):
+        assert columns.min() >= round(box[0]) and columns.max() <= round(box[2])
+        assert rows.min() >= round(box[1]) and rows.max() <= round(box[3])
+
+
+def test_masks_are_disjoint_and_in_the_order_of_the_boxes():
+    slabs = [TABLE_TOP, CUP_ON_TABLE, Slab((0.1, 1.7, 0.7), (0.25, 1.85, 0.8), (40, 120, 60))]
+    rgb, depth_m, owner = render(slabs, 0.003)
+    boxes = np.stack([box_of(owner == k) for k in (1, 2, 3)])
+    masks = segment(rgb, depth_m, boxes)
+    assert sum(m.to_image(SHAPE).astype(int) for m in masks).max() == 1
+    order = [2, 0, 1]
+    shuffled = segment(rgb, depth_m, boxes[order])
+    for position, row in enumerate(order):
+        assert np.array_equal(shuffled[position].to_image(SHAPE), masks[row].to_image(SHAPE))
+
+
+def test_the_same_frame_twice_gives_the_same_and_keeps_its_input():
+    rgb, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE], 0.003)
+    boxes = np.stack([box_of(owner == k) for k in (1, 2)])
+    before = rgb.copy(), depth_m.copy(), boxes.copy()
+    first, second = segment(rgb, depth_m, boxes), segment(rgb, depth_m, boxes)
+    assert all(np.array_equal(a.pixels, b.pixels) for a, b in zip(first, second))
+    assert all(np.array_equal(a, b) for a, b in zip(before, (rgb, depth_m, boxes)))
+
+
+def test_a_narrow_image():
+    rgb, depth_m, _ = render([TABLE_TOP])
+    patches = SEGMENTER.segment(
+        rgb[:100, :90], depth_m[:100, :90], INTRINSICS, np.array([[5.0, 5, 80, 90]])
+    )
+    assert patches[0].pixels.shape == (86, 76)
+
+
+def test_images_of_a_message_and_of_a_file_run_the_same_code():
+    rgb, depth_m, owner = render([TABLE_TOP], 0.002)
+    box = [box_of(owner == 1)]
+    compiled = len(upsample_labels.signatures)
+    (expected,) = segment(rgb, depth_m, box)
+    from_message = np.frombuffer(rgb.tobytes(), np.uint8).reshape(rgb.shape)
+    from_slice = np.repeat(depth_m, 2, axis=1)[:, ::2]
+    (found,) = segment(from_message, from_slice, box)
+    assert np.array_equal(found.pixels, expected.pixels)
+    assert len(upsample_labels.signatures) == compiled == 1

@@ -1,0 +1,163 @@
+"""Raw messages of whole, split and damaged bags."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import struct
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from support.recordings import camera_items, stamp_ns, write_bag
+
+from deworldsg_ros.recordings.bags.storage import RawBag
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import typestore
+
+RGB = "/camera/color/image_raw/compressed"
+COUNT = 40
+
+
+def read(path, topics=(RGB,)):
+    bag = RawBag(path)
+    try:
+        return [m for m in bag.messages(topics)], bag.losses
+    finally:
+        bag.close()
+
+
+@pytest.fixture(scope="module", params=["mcap", "sqlite3"])
+def bag(request, tmp_path_factory):
+    return write_bag(tmp_path_factory.mktemp("bags") / "bag", camera_items(COUNT), request.param)
+
+
+def storage_file(bag):
+    return next(file for file in bag.iterdir() if file.suffix in (".mcap", ".db3"))
+
+
+def test_folder_and_bare_file_give_all_messages_in_order(bag):
+    for path in (bag, storage_file(bag)):
+        messages, losses = read(path)
+        assert [m.log_time_ns for m in messages] == [stamp_ns(i) for i in range(COUNT)]
+        assert not losses
+    topics = RawBag(bag).topics
+    assert {topic.count for topic in topics} == {COUNT}
+    assert len(topics) == 4
+
+
+def test_unknown_topics_are_no_messages(bag):
+    assert read(bag, ["/nothing"]) == ([], [])
+
+
+def test_missing_metadata_is_told_and_the_files_are_read(bag, tmp_path):
+    folder = tmp_path / "killed"
+    shutil.copytree(bag, folder)
+    (folder / "metadata.yaml").unlink()
+    messages, losses = read(folder)
+    assert len(messages) == COUNT
+    assert "metadata.yaml is missing" in losses[0]
+
+
+@pytest.mark.parametrize("kept", [0.95, 0.6])
+def test_truncated_file_gives_its_beginning_and_says_so(bag, tmp_path, kept):
+    file = storage_file(bag)
+    cut = tmp_path / file.name
+    content = file.read_bytes()
+    cut.write_bytes(content[: int(len(content) * kept)])
+    whole, _ = read(file)
+    messages, losses = read(cut)
+    assert losses
+    assert all("lost" in loss or "damaged" in loss for loss in losses), losses
+    # What is left is in order and unchanged, but for one that the end of the file may cut.
+    assert 0 < len(messages) <= COUNT
+    times_ns = [message.log_time_ns for message in messages]
+    assert times_ns == sorted(set(times_ns))
+    assert sum(message not in whole for message in messages) <= 1
+
+
+def chunk_starts(content):
+    """Offsets of the chunk records of an MCAP file."""
+    position, starts = 8, []
+    while position < len(content) - 9:
+        opcode, length = struct.unpack_from("<BQ", content, position)
+        if opcode == 0x06:
+            starts.append(position)
+        position += 9 + length
+    return starts
+
+
+def test_a_damaged_chunk_costs_that_chunk_alone(tmp_path):
+    # Chunks of a megabyte: large messages make several.
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    text = typestore().types["std_msgs/msg/String"]
+    noise = np.random.default_rng(0)
+    with writer:
+        connection = writer.add_connection("/s", "std_msgs/msg/String", typestore=typestore())
+        for index in range(12):
+            payload = bytes(noise.integers(65, 90, 400_000, dtype=np.uint8)).decode()
+            data = typestore().serialize_cdr(text(data=payload), "std_msgs/msg/String")
+            writer.write(connection, index, data)
+    file = tmp_path / "bag" / "bag.mcap"
+    whole, losses = read(file, ["/s"])
+    assert len(whole) == 12 and not losses
+    content = bytearray(file.read_bytes())
+    start = chunk_starts(content)[1]
+    content[start + 60 : start + 2000] = b"\xff" * 1940
+    file.write_bytes(content)
+    messages, losses = read(file, ["/s"])
+    assert any("damaged" in loss for loss in losses)
+    assert 0 < len(messages) < 12
+    assert len({m.log_time_ns for m in messages}) == len(messages)
+    assert {m.log_time_ns for m in messages} >= {0, 11}
+    assert all(m in whole for m in messages)
+
+
+def test_damaged_pages_of_a_database_cost_their_rows_alone(tmp_path):
+    bag = write_bag(tmp_path / "bag", camera_items(COUNT), "sqlite3")
+    file = storage_file(bag)
+    content = bytearray(file.read_bytes())
+    # The middle of the file holds messages; the schema is in the first pages.
+    start = len(content) // 2 // 4096 * 4096
+    content[start : start + 4096] = b"\xff" * 4096
+    file.write_bytes(content)
+    messages, losses = read(bag)
+    assert messages
+    assert len(messages) < COUNT or losses
+    with sqlite3.connect(file) as database, pytest.raises(sqlite3.DatabaseError):
+        database.execute("SELECT sum(length(data)) FROM messages").fetchall()
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing of the kind", b"\x89MCAP0\r\n"])
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_what_is_no_bag_is_refused_by_name(tmp_path, content, suffix):
+    file = tmp_path / f"broken{suffix}"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match="broken"):
+        RawBag(file)
+
+
+def test_missing_and_empty_places_are_refused(tmp_path):
+    with pytest.raises(RecordingError, match="no such file"):
+        RawBag(tmp_path / "nothing")
+    with pytest.raises(RecordingError, match=r"no \.mcap or \.db3"):
+        RawBag(tmp_path)
+
+
+def test_files_of_two_bags_in_one_folder_are_not_taken_for_one(tmp_path):
+    bag = write_bag(tmp_path / "bag", camera_items(1))
+    for name in ("a.mcap", "b.mcap"):
+        shutil.copy(storage_file(bag), tmp_path / name)
+    with pytest.raises(RecordingError):
+        RawBag(tmp_path)
+
+
+def test_parts_of_a_split_bag_are_read_in_order_of_their_numbers(tmp_path):
+    for part in range(12):
+        items = [item for item in camera_items(12) if item[2] == stamp_ns(part)]
+        bag = write_bag(tmp_path / f"part{part}", items)
+        shutil.move(storage_file(bag), tmp_path / f"room_{part}.mcap")
+        shutil.rmtree(bag)
+    messages, _ = read(tmp_path)
+    assert [m.log_time_ns for m in messages] == [stamp_ns(part) for part in range(12)]

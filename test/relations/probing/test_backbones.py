@@ -1,0 +1,260 @@
+"""V-JEPA 2 and DINOv2 from checkpoints in the real format; what is refused, and how."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+transformers = pytest.importorskip("transformers")
+pytestmark = pytest.mark.models
+
+from safetensors.torch import load_file, save_file  # noqa: E402
+from support.checkpoints import (  # noqa: E402  after the guards
+    CLIP_LENGTH,
+    clip,
+    config_of,
+    request,
+    save_dinov2,
+    save_random_probe,
+    save_vjepa2,
+)
+from support.relations import VOCABULARY, pair_graph, picture  # noqa: E402
+
+from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype  # noqa: E402
+from deworldsg_ros.relations import RelationReasoner, build_world_model  # noqa: E402
+from deworldsg_ros.relations.probing.preprocessing import normalise, resize_and_crop  # noqa: E402
+from deworldsg_ros.relations.world_models import dinov2, vjepa2  # noqa: E402
+from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
+
+SAVERS = {"vjepa2": save_vjepa2, "dinov2": save_dinov2}
+LOADERS = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
+IMAGE_SIZES = {"vjepa2": 32, "dinov2": 56}
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    root = tmp_path_factory.mktemp("checkpoints")
+    return {family: save(root / family) for family, save in SAVERS.items()}
+
+
+def load(family, folder, **changes):
+    size = {"image_size": 56} if family == "dinov2" else {}
+    return LOADERS[family](config_of(family, folder, **{**size, **changes}))
+
+
+@pytest.mark.parametrize("family", SAVERS)
+def test_a_clip_gives_one_feature_whatever_is_beside_it(checkpoints, family):
+    backbone = load(family, checkpoints[family])
+    assert backbone.identity.family == family and backbone.identity.feature_dim == 48
+    assert backbone.identity.image_size == IMAGE_SIZES[family]
+    clips = [clip(0), clip(1, 30, 90), clip(2, 64, 20)]
+    features = backbone.encode(clips)
+    assert features.shape == (3, 48) and features.dtype == np.float32
+    assert backbone.encode([]).shape == (0, 48)
+    for row, alone in zip(features, clips):
+        np.testing.assert_allclose(row, backbone.encode([alone])[0], atol=1e-5)
+    assert not np.allclose(features[0], features[1], atol=1e-3)
+    with pytest.raises(ValueError, match="clip of 3 frames: wanted 4"):
+        backbone.encode([clip(length=3)])
+
+
+def test_vjepa2_is_the_mean_of_the_encoders_tokens(checkpoints):
+    backbone = load("vjepa2", checkpoints["vjepa2"])
+    model = transformers.VJEPA2Model.from_pretrained(checkpoints["vjepa2"]).eval()
+    images = normalise(resize_and_crop(clip(), backbone.geometry), torch.float32)[None]
+    assert images.shape == (1, CLIP_LENGTH, 3, 32, 32)
+    with torch.inference_mode():
+        tokens = model(images, skip_predictor=True).last_hidden_state
+    assert tokens.shape[1] == CLIP_LENGTH // 2 * 2 * 2  # T/2 * H/16 * W/16
+    np.testing.assert_allclose(backbone.encode([clip()]), tokens.mean(dim=1), atol=1e-5)
+
+
+def test_dinov2_is_the_mean_of_the_frames_class_tokens(checkpoints):
+    backbone = load("dinov2", checkpoints["dinov2"])
+    model = transformers.Dinov2Model.from_pretrained(checkpoints["dinov2"]).eval()
+    images = normalise(resize_and_crop(clip(), backbone.geometry), torch.float32)
+    with torch.inference_mode():
+        frames = model(images).pooler_output
+    np.testing.assert_allclose(backbone.encode([clip()])[0], frames.mean(dim=0), atol=1e-5)
+    # The order of frames is nothing to it.
+    np.testing.assert_allclose(
+        backbone.encode([clip()]), backbone.encode([clip()[::-1]]), atol=1e-5
+    )
+
+
+def test_vjepa2_sees_the_order_of_frames(checkpoints):
+    backbone = load("vjepa2", checkpoints["vjepa2"])
+    assert not np.allclose(backbone.encode([clip()]), backbone.encode([clip()[::-1]]), atol=1e-3)
+
+
+def test_another_image_size_gives_vjepa2_the_positions_of_that_size(checkpoints, tmp_path):
+    """The rotary positions come from the configured size: as if trained at it."""
+    weights = load_file(checkpoints["vjepa2"] / "model.safetensors")
+    save_vjepa2(tmp_path, crop_size=64)
+    save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
+    set_size = load("vjepa2", checkpoints["vjepa2"], image_size=64)
+    own_size = load("vjepa2", tmp_path)
+    assert set_size.identity == own_size.identity and set_size.identity.image_size == 64
+    np.testing.assert_allclose(set_size.encode([clip()]), own_size.encode([clip()]), atol=1e-6)
+
+
+@pytest.mark.parametrize("family", SAVERS)
+def test_the_fingerprint_is_of_the_weights_and_not_of_the_folder(checkpoints, family, tmp_path):
+    here = load(family, checkpoints[family]).identity
+    assert load(family, SAVERS[family](tmp_path / "same", seed=0)).identity == here
+    other = load(family, SAVERS[family](tmp_path / "other", seed=1)).identity
+    assert other.fingerprint != here.fingerprint
+
+
+@pytest.mark.parametrize("family", SAVERS)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
+def test_int8_gives_nearly_the_same_features(checkpoints, family):
+    whole = load(family, checkpoints[family])
+    small = load(family, checkpoints[family], quantise=True)
+    assert small.identity == whole.identity and small.description != whole.description
+    expected = whole.encode([clip()])
+    error = np.linalg.norm(small.encode([clip()]) - expected) / np.linalg.norm(expected)
+    assert 0 < error < 0.1
+
+
+@pytest.mark.parametrize("family", SAVERS)
+@pytest.mark.parametrize("inputs", ["clip", "clip_and_boxes"])
+def test_backbone_and_probe_are_a_world_model(checkpoints, family, inputs, tmp_path):
+    identity = load(family, checkpoints[family]).identity
+    save_random_probe(tmp_path, identity, inputs=inputs)
+    size = {"image_size": 56} if family == "dinov2" else {}
+    model = build_world_model(
+        config_of(family, checkpoints[family], probe_path=str(tmp_path), **size)
+    )
+    assert model.name == family and model.predicates == VOCABULARY.predicates
+    answers = model.predict_batch([request(0), request(1, height=20)])
+    assert [answer.shape for answer in answers] == [(2, 4), (2, 4)]
+    for answer in answers:
+        np.testing.assert_allclose(answer.sum(axis=1), 1)
+        # Without the boxes a probe cannot tell one direction from the other.
+        assert np.allclose(answer[0], answer[1]) == (inputs == "clip")
+    assert model.predict_batch([]) == []
+
+
+def test_the_stage_encodes_in_batches_and_gives_the_same(checkpoints, tmp_path):
+    identity = load("vjepa2", checkpoints["vjepa2"]).identity
+    save_random_probe(tmp_path, identity)
+    told = []
+    for batch_size in (1, 3):
+        config = config_of(
+            "vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path), batch_size=batch_size
+        )
+        stage = RelationReasoner(config, build_world_model(config))
+        for stamp in range(1, 6):
+            stage.observe(pair_graph(stamp), picture(stamp))
+        told.append(stage.drain())
+        assert stage.counters().encoded == 5
+    for single, batched in zip(*told):
+        assert single.stamp_ns == batched.stamp_ns and single.source == "vjepa2"
+        np.testing.assert_allclose(single.predictions, batched.predictions, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "path, told",
+    [
+        ("", "relations.model_path is empty"),
+        ("/no/such/folder", "there is no such folder"),
+        ("nobody/no-such-model", "local_files_only"),
+    ],
+)
+def test_missing_checkpoint_is_one_sentence(path, told):
+    with pytest.raises(ConfigurationError, match=told) as refusal:
+        vjepa2.load_backbone(config_of("vjepa2", path))
+    assert "\n" not in str(refusal.value)
+
+
+def test_folder_without_a_model_is_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="cannot be loaded"):
+        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+
+
+@pytest.mark.parametrize("family, other", [("vjepa2", "dinov2"), ("dinov2", "vjepa2")])
+def test_other_architecture_is_refused_by_name(checkpoints, family, other):
+    with pytest.raises(ConfigurationError, match=f"a checkpoint of {other}: wanted {family}"):
+        load(family, checkpoints[other])
+
+
+def test_damaged_or_incomplete_weights_are_refused(checkpoints, tmp_path):
+    save_vjepa2(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    state = load_file(weights)
+    key = "encoder.layer.1.mlp.fc1.weight"
+    del state[key]
+    save_file(state, weights, metadata={"format": "pt"})
+    with pytest.raises(ConfigurationError, match=f"lacks 1 parameters of VJEPA2Model.*{key}"):
+        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+    weights.write_bytes(b"not a checkpoint")
+    with pytest.raises(ConfigurationError, match="cannot be loaded"):
+        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+    (tmp_path / "config.json").write_text(json.dumps({"model_type": "no_such_model"}))
+    with pytest.raises(ConfigurationError, match="cannot be loaded"):
+        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+
+
+def test_the_unused_predictor_need_not_be_there(checkpoints, tmp_path):
+    save_vjepa2(tmp_path)
+    weights = tmp_path / "model.safetensors"
+    state = load_file(weights)
+    kept = {name: value for name, value in state.items() if not name.startswith("predictor.")}
+    assert len(kept) < len(state)
+    save_file(kept, weights, metadata={"format": "pt"})
+    identity = load("vjepa2", checkpoints["vjepa2"]).identity
+    assert vjepa2.load_backbone(config_of("vjepa2", tmp_path)).identity == identity
+
+
+@pytest.mark.parametrize(
+    "family, changes, told",
+    [
+        ("vjepa2", {"image_size": 40}, "multiple of its patch size 16"),
+        ("vjepa2", {"clip_length": 5}, "multiple of its tubelet size 2"),
+        ("dinov2", {"image_size": 60}, "multiple of its patch size 14"),
+    ],
+)
+def test_sizes_that_do_not_fit_are_refused(checkpoints, family, changes, told):
+    with pytest.raises(ConfigurationError, match=told):
+        load(family, checkpoints[family], **changes)
+
+
+def test_cuda_asked_for_and_absent(checkpoints, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    chosen = {choose_device("relations.device", wanted) for wanted in ("auto", "cpu")}
+    assert chosen == {torch.device("cpu")}
+    with pytest.raises(ConfigurationError, match="finds no CUDA device: set it to 'auto' or 'cpu'"):
+        load("vjepa2", checkpoints["vjepa2"], device="cuda")
+
+
+def test_half_precision_on_cuda_alone():
+    assert choose_dtype(torch.device("cpu")) == torch.float32
+    assert choose_dtype(torch.device("cuda")) == torch.float16
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")]
+)
+def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
+    checkpoints, tmp_path, monkeypatch, error
+):
+    identity = load("vjepa2", checkpoints["vjepa2"]).identity
+    save_random_probe(tmp_path, identity)
+    config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path), batch_size=2)
+    told = []
+    stage = RelationReasoner(config, build_world_model(config), told.append)
+
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(transformers.VJEPA2Model, "forward", fail)
+    for stamp in (1, 2):
+        evidence = stage.observe(pair_graph(stamp), picture(stamp))
+        assert len(evidence.pairs) == 2
+    assert stage.drain() == []
+    assert stage.counters().dropped == {"world_model_error": 2}
+    assert "out of memory while encoding 2 clips: lower relations.batch_size" in told[0]

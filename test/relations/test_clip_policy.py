@@ -1,0 +1,225 @@
+"""The choice of clips: what is uncertain, each pair once, within the budget; nothing is lost."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.relations import VOCABULARY, RecordingModel, config, crowd_graph, pair_graph, picture
+
+from deworldsg_ros.relations import NodeView, RelationReasoner
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
+SECOND_NS = 10**9
+
+
+class Graph:
+    """A graph as a test wants it; row r of every frame is node r + 1."""
+
+    def __init__(self, count=2, newest_ns=10**12):
+        self.generation = 0
+        self.newest_ns = newest_ns
+        self.labels = {node: VOCABULARY.classes[(node - 1) % 3] for node in range(1, count + 1)}
+        self.observations = dict.fromkeys(self.labels, 3)
+        self.tentative = set()
+        self.entropies = {}
+        self.rows = list(self.labels)
+        self.unknown = set()
+
+    def nodes_of_frame(self, stamp_ns):
+        return None if stamp_ns in self.unknown else self.rows
+
+    def node(self, node_id):
+        if node_id in self.tentative:
+            return None
+        return NodeView(self.labels[node_id], self.observations[node_id])
+
+    def visual_entropy_nats(self, a_id, b_id):
+        return self.entropies.get((a_id, b_id), math.inf)
+
+
+def watching(graph, model=None, **changes):
+    stage = RelationReasoner(config(**changes), model or RecordingModel(), report=lambda _: None)
+    stage.watch(graph)
+    return stage
+
+
+def of_pair():
+    """The graph of `pair_graph`: a table and a cup."""
+    graph = Graph()
+    graph.labels = {1: "table", 2: "cup"}
+    return graph
+
+
+def looks(stage, *stamps):
+    """Number of clips encoded at each of these frames of the pair."""
+    counts = []
+    for stamp in stamps:
+        stage.observe(pair_graph(stamp), picture(stamp))
+        counts.append(len(stage.drain()))
+    return counts
+
+
+@pytest.mark.parametrize(("entropy_nats", "encoded"), [(0.99, 0), (1.0, 0), (1.01, 1), (1e9, 1)])
+def test_only_pairs_above_the_entropy_threshold_are_encoded(entropy_nats, encoded):
+    graph = of_pair()
+    graph.entropies[1, 2] = entropy_nats
+    stage = watching(graph)
+    assert looks(stage, 1) == [encoded]
+    assert stage.counters().dropped == ({} if encoded else {"certain": 1})
+
+
+def test_over_two_predicates_the_prior_never_enters_and_nothing_is_encoded():
+    graph = of_pair()
+    stage = watching(graph)
+    local = pair_graph(1)
+    small = Vocabulary(VOCABULARY.classes, ("on", "near"))
+    object.__setattr__(local, "vocabulary", small)
+    stage.observe(local, picture(1))
+    assert stage.drain() == [] and stage.counters().dropped == {"certain": 1}
+
+
+def test_a_pair_is_looked_at_once_and_again_when_seen_twice_as_often():
+    graph, counts = of_pair(), []
+    stage = watching(graph)
+    for frame in range(3, 100):
+        graph.observations = {1: frame, 2: 2 * frame}
+        counts += looks(stage, frame)
+    assert [frame for frame, count in enumerate(counts, 3) if count] == [3, 6, 12, 24, 48, 96]
+    assert stage.counters().dropped == {"looked_at": 97 - 6}
+
+
+def test_a_frame_that_names_an_object_otherwise_is_passed_over():
+    graph = of_pair()
+    graph.labels[1] = "chair"
+    stage = watching(graph)
+    assert looks(stage, 1) == [0] and stage.counters().dropped == {"other_class": 1}
+    graph.labels[1] = "table"  # the graph has come to believe otherwise: another class pair
+    assert looks(stage, 2, 3) == [1, 0]
+
+
+@pytest.mark.parametrize("frames", [1, 40])
+def test_a_tentative_pair_waits_and_its_clip_is_not_lost(frames):
+    """40 frames are more than the buffer holds: the clip is cut before they leave."""
+    early, late = RecordingModel(), RecordingModel()
+    assert looks(watching(of_pair(), early), 1) == [1]
+    graph = of_pair()
+    graph.tentative = {2}
+    stage = watching(graph, late)
+    assert looks(stage, 1) == [0]
+    for stamp in range(2, frames):
+        stage.add_frame(stamp, picture(stamp))
+    assert stage.drain() == [] and stage.counters().ready == 0
+    graph.tentative.clear()
+    (evidence,) = stage.drain()
+    assert evidence.stamp_ns == 1 and evidence.pairs.tolist() == [[0, 1], [1, 0]]
+    assert (late.requests[0].clip == early.requests[0].clip).all()
+
+
+def test_a_clip_waits_for_the_graph_to_know_its_frame():
+    graph = of_pair()
+    graph.newest_ns, graph.unknown = 5, {6}
+    stage = watching(graph)
+    assert looks(stage, 6) == [0] and stage.counters().pending == 1
+    graph.unknown.clear()
+    assert len(stage.drain()) == 1
+
+
+def test_a_frame_that_the_graph_passed_over_is_passed_over():
+    graph = of_pair()
+    graph.newest_ns, graph.unknown = 7, {6}
+    stage = watching(graph)
+    assert looks(stage, 6) == [0] and stage.counters().dropped == {"node_gone": 1}
+
+
+@pytest.mark.parametrize("rows", [[0, 1], [1, 1], [1]])
+def test_clips_of_nodes_that_are_gone_or_one_are_passed_over(rows):
+    graph = of_pair()
+    graph.rows = rows
+    stage = watching(graph)
+    assert looks(stage, 1) == [0] and stage.counters().dropped == {"node_gone": 1}
+
+
+def test_nodes_are_those_of_today():
+    """What was one pair when it was queued may be another, already looked at, when it is judged."""
+    graph = of_pair()
+    stage = watching(graph)
+    assert looks(stage, 1) == [1]
+    graph.labels.update({3: "cup"})
+    graph.observations[3] = 3
+    graph.rows, graph.tentative = [1, 3], {3}
+    assert looks(stage, 2) == [0]
+    graph.rows = [1, 2]  # merged
+    assert stage.drain() == [] and stage.counters().dropped == {"looked_at": 1}
+
+
+def test_without_a_graph_and_where_all_is_asked_for_the_newest_is_first():
+    graph = of_pair()
+    graph.newest_ns = None
+    assert looks(watching(graph), 1, 2, 3) == [1, 1, 1]
+    certain = of_pair()
+    certain.entropies[1, 2] = 0.0
+    assert looks(watching(certain, encode="all"), 1, 2, 3) == [1, 1, 1]
+
+
+def test_another_graph_is_a_new_beginning():
+    graph = of_pair()
+    stage = watching(graph)
+    assert looks(stage, 1, 2) == [1, 0]
+    graph.generation += 1
+    assert looks(stage, 3, 4) == [1, 0]
+
+
+def test_order_class_pairs_without_a_prior_then_uncertainty_then_observations():
+    graph = Graph(6)
+    graph.entropies = {(1, 2): 1.1, (4, 5): 1.3, (1, 3): 1.2, (2, 3): 1.2, (5, 6): 1.35}
+    graph.observations.update({1: 9, 3: 9})
+    asked = set(graph.entropies)
+    graph.entropies.update(
+        {(a, b): 0.0 for a in range(1, 7) for b in range(a + 1, 7) if (a, b) not in asked}
+    )
+    stage = watching(graph, queue_size=100)
+    stage.observe(crowd_graph(1, 6), picture(1))
+    order = [tuple(row + 1 for row in item.pairs[0].tolist()) for item in stage.drain()]
+    # (2, 3) and (5, 6) are of one class pair, and so are (1, 2) and (4, 5).
+    assert order == [(5, 6), (4, 5), (1, 3), (2, 3), (1, 2)]
+
+
+def test_of_two_equally_uncertain_pairs_the_one_seen_more_often_is_first():
+    graph = Graph(4)
+    graph.entropies = {(1, 2): 0.0, (2, 3): 0.0, (2, 4): 0.0, (3, 4): 0.0, (1, 4): 1.2, (1, 3): 1.2}
+    graph.observations.update({1: 9, 3: 8})
+    stage = watching(graph)
+    stage.observe(crowd_graph(1, 4), picture(1))
+    assert [item.pairs[0].tolist() for item in stage.drain()] == [[0, 2], [0, 3]]
+
+
+@settings(max_examples=25)
+@given(
+    st.lists(st.tuples(st.integers(1, 2 * SECOND_NS), st.integers(0, 6)), max_size=12),
+    st.sampled_from([0.3, 1.0, 2.5, 10.0]),
+)
+def test_no_more_is_encoded_than_the_budget_allows(frames, clips_per_s):
+    stage = watching(Graph(6), clips_per_s=clips_per_s, queue_size=100, encode="all")
+    stamp_ns, encoded = SECOND_NS, 0
+    for step_ns, count in frames:
+        stamp_ns += step_ns
+        stage.observe(crowd_graph(stamp_ns, count), picture(1))
+        encoded += len(stage.drain())
+        passed_s = (stamp_ns - SECOND_NS) / SECOND_NS
+        assert encoded <= max(1.0, clips_per_s) + clips_per_s * passed_s + 1e-6
+    counters = stage.counters()
+    assert counters.encoded == encoded
+    assert counters.queued == encoded + counters.pending + sum(counters.dropped.values())
+
+
+def test_what_has_to_wait_for_the_budget_is_encoded_when_it_has_grown():
+    stage = watching(Graph(6), clips_per_s=2.0, queue_size=100)
+    stage.observe(crowd_graph(1, 6), picture(1))
+    assert len(stage.drain()) == 2 and stage.counters().pending == 13
+    stage.observe(crowd_graph(1 + SECOND_NS // 2, 0), picture(1))
+    assert len(stage.drain()) == 1
+    stage.observe(crowd_graph(1 + 60 * SECOND_NS, 0), picture(1))
+    assert len(stage.drain()) == 2  # a pause is not saved up

@@ -1,0 +1,178 @@
+"""What is asked of the graph has one answer, in process and from what is published."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from support.scripted import PAPER, VOCABULARY, Scripted, frame
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.relations import (
+    LiveGraph,
+    PublishedGraph,
+    RelationReasoner,
+    build_world_model,
+)
+from deworldsg_ros.scene import wire
+
+SURE, UNSURE = (3.0, -3.0, -3.0), (0.001, 0.0, 0.0)
+
+
+def answers(view, stamps_ns):
+    """Everything that can be asked of a graph of three nodes."""
+    told = {stamp_ns: view.nodes_of_frame(stamp_ns) for stamp_ns in stamps_ns}
+    live = {node_id for node_ids in told.values() for node_id in node_ids or () if node_id}
+    nodes = {node_id: view.node(node_id) for node_id in live}
+    entropies = {(a, b): view.visual_entropy_nats(a, b) for a in live for b in live}
+    return told, nodes, entropies
+
+
+def sent(message):
+    """A message as it comes out of DDS."""
+    return wire.decode(wire.encode(message), type(message))
+
+
+def running(logits=UNSURE):
+    """A pipeline's builder after each of some frames, with its update and its snapshot."""
+    pipeline = Pipeline(PAPER, Scripted(logits))
+    for index in range(8):
+        result = pipeline.process(frame(index))
+        builder = pipeline.builder
+        yield builder, builder.update(), builder.snapshot(), result.local.stamp_ns
+
+
+@pytest.mark.parametrize("logits", [SURE, UNSURE])
+def test_published_graph_answers_as_the_live_one(logits):
+    published, stamps_ns = PublishedGraph(), []
+    for builder, update, _, stamp_ns in running(logits):
+        stamps_ns.append(stamp_ns)
+        published.apply(sent(update))
+        assert not published.wants_snapshot and published.generation == 0
+        assert published.newest_ns == stamp_ns
+        assert answers(published, stamps_ns) == answers(LiveGraph(builder.graph), stamps_ns)
+    told, nodes, entropies = answers(published, stamps_ns)
+    assert told[stamps_ns[0]] == [1, 2, 3] and nodes[1].label == "cup"
+    assert nodes[1].observations == 8 and math.isinf(entropies[1, 3])
+    assert (entropies[1, 2] > 1.0) == (logits is UNSURE)
+
+
+def test_a_tentative_node_is_known_by_its_frame_and_has_no_name():
+    (builder, update, _, stamp_ns), *_ = running()
+    published = PublishedGraph()
+    published.apply(msgspec.structs.replace(update, nodes=update.nodes[:2]))
+    builder.graph.set_confirmed(3, False)
+    for view in (published, LiveGraph(builder.graph)):
+        assert view.nodes_of_frame(stamp_ns) == [1, 2, 3]
+        assert view.node(3) is None and view.node(2) is not None
+
+
+@pytest.mark.parametrize("lost", [{1}, {3}, {2, 3, 4}])
+def test_after_lost_updates_a_snapshot_puts_it_right(lost):
+    published, stamps_ns = PublishedGraph(), []
+    for builder, update, snapshot, stamp_ns in running():
+        if update.sequence in lost:
+            continue
+        stamps_ns.append(stamp_ns)
+        published.apply(sent(update))
+        assert published.wants_snapshot == (update.sequence - 1 in lost)
+        if published.wants_snapshot:
+            published.reset(sent(snapshot))
+        assert answers(published, stamps_ns) == answers(LiveGraph(builder.graph), stamps_ns)
+    assert len(stamps_ns) == 8 - len(lost)
+
+
+def test_an_older_snapshot_than_the_last_update_is_of_no_use():
+    published, snapshots = PublishedGraph(), []
+    for _, update, snapshot, _ in running():
+        snapshots.append(snapshot)
+        if update.sequence != 4:
+            published.apply(update)
+            if update.sequence == 5:
+                published.reset(snapshots[2])
+                assert published.wants_snapshot
+                break
+
+
+def test_a_graph_that_starts_anew_replaces_the_one_before():
+    published = PublishedGraph()
+    for logits in (SURE, UNSURE):
+        run = list(running(logits))
+        for _, update, _, _ in run:
+            published.apply(update)
+    builder, _, _, stamp_ns = run[-1]
+    assert published.generation == 1
+    assert answers(published, [stamp_ns]) == answers(LiveGraph(builder.graph), [stamp_ns])
+
+
+def test_removed_and_merged_nodes_are_followed_and_hidden_ones_come_back():
+    _, update, snapshot, stamp_ns = next(running())
+    published = PublishedGraph()
+    published.apply(update)
+    gone = msgspec.structs.replace(
+        update,
+        sequence=2,
+        removed_nodes=[wire.RemovedNode(1), wire.RemovedNode(3, merged_into=2)],
+        nodes=[],
+        edges=[],
+        associations=[],
+    )
+    published.apply(gone)
+    assert published.nodes_of_frame(stamp_ns) == [0, 2, 2]
+    back = msgspec.structs.replace(gone, sequence=3, removed_nodes=[], nodes=[snapshot.nodes[0]])
+    published.apply(back)
+    assert published.nodes_of_frame(stamp_ns) == [1, 2, 2]
+
+
+def test_what_is_remembered_is_bounded(monkeypatch):
+    monkeypatch.setattr("deworldsg_ros.relations.graph_view.REMEMBERED_FRAMES", 3)
+    published = PublishedGraph()
+    stamps_ns = []
+    for _, update, _, stamp_ns in running():
+        published.apply(update)
+        stamps_ns.append(stamp_ns)
+    known = [published.nodes_of_frame(stamp_ns) is not None for stamp_ns in stamps_ns]
+    assert known == [False] * 5 + [True] * 3
+
+
+def test_chosen_clips_end_in_the_edges_of_all_clips():
+    def final(**changes):
+        relations = RelationsConfig(world_model="fake", clip_length=4, **changes)
+        config = msgspec.structs.replace(PAPER, relations=relations)
+        pipeline = Pipeline(config, Scripted(UNSURE))
+        for index in range(30):
+            pipeline.process(frame(index))
+        return pipeline.graph().edges, pipeline.relations.counters()
+
+    chosen, few = final()
+    every, many = final(encode="all", clips_per_s=0.0)
+    assert many.encoded == 30 and few.encoded == 5  # seen 1, 2, 4, 8 and 16 times
+    assert [(edge.subject, edge.object, edge.predicate, edge.provenance) for edge in chosen] == [
+        (edge.subject, edge.object, edge.predicate, edge.provenance) for edge in every
+    ]
+    assert len(chosen) == 1 and chosen[0].provenance == "fused"
+
+
+def test_updates_that_come_late_and_in_lumps_choose_the_same_pairs():
+    """The graph node publishes a few times a second: clips wait, and are judged by then."""
+    relations = RelationsConfig(world_model="fake", clip_length=4, clips_per_s=0.0)
+    config = msgspec.structs.replace(PAPER, relations=relations)
+    builder = GraphBuilder(config, VOCABULARY, "map")
+    pipeline = Pipeline(PAPER, Scripted(UNSURE))
+    stage = RelationReasoner(relations, build_world_model(relations))
+    published = PublishedGraph()
+    stage.watch(published)
+    encoded = []
+    for index in range(30):
+        local = pipeline.process(frame(index)).local
+        builder.integrate(local)
+        stage.observe(local, frame(index).rgb)
+        if index % 5 == 4:
+            published.apply(sent(builder.update()))
+        encoded += [evidence.stamp_ns for evidence in stage.drain()]
+    # Before the first update nothing is known of a graph, and all are encoded; then 5, 10, 20 times
+    # seen are as often as updates tell.
+    assert encoded == [index * 10**8 for index in (0, 1, 2, 3, 4, 9, 19)]

@@ -1,0 +1,151 @@
+"""The worker's thread: never in the way, ends when told; order of events by locks, not by time."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+from support.relations import GatedModel, RecordingModel, config, crowd_graph, pair_graph, picture
+
+from deworldsg_ros.relations import EvidenceWorker, RelationReasoner
+
+LONG_S = 30.0
+
+
+class Receiver:
+    """What the worker delivers, and an event for each."""
+
+    def __init__(self):
+        self.evidence = []
+        self.threads = set()
+
+    def __call__(self, evidence):
+        self.evidence.append(evidence)
+        self.threads.add(threading.get_ident())
+
+
+def worker_of(model, receiver, report=lambda _: None, **changes):
+    return EvidenceWorker(RelationReasoner(config(**changes), model, report), receiver, report)
+
+
+def test_delivers_every_prediction_in_its_own_thread():
+    receiver = Receiver()
+    worker = worker_of(RecordingModel(), receiver, queue_size=100)
+    worker.start()
+    try:
+        for stamp in range(3):
+            assert not worker.observe(crowd_graph(stamp, 4), picture(stamp)).predicted.any()
+        assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+    assert len(receiver.evidence) == 18 and all(e.predicted.all() for e in receiver.evidence)
+    assert threading.get_ident() not in receiver.threads
+
+
+def test_slow_model_blocks_nothing_and_what_is_lost_is_counted():
+    model, receiver = GatedModel(), Receiver()
+    worker = worker_of(model, receiver, queue_size=2)
+    worker.start()
+    try:
+        worker.observe(pair_graph(0), picture(0))
+        assert model.begun.acquire(timeout=LONG_S)
+        for stamp in range(1, 6):  # the model holds the first clip all the while
+            assert len(worker.observe(pair_graph(stamp), picture(stamp)).pairs) == 2
+        assert receiver.evidence == [] and not worker.wait_idle(0.01)
+        counters = worker.reasoner.counters()
+        assert counters.pending == 2 and counters.dropped == {"queue_full": 3}
+        for _ in range(3):
+            model.allowed.release()
+        assert worker.wait_idle(LONG_S)
+    finally:
+        model.allowed.release()
+        assert worker.stop(LONG_S)
+    assert [evidence.stamp_ns for evidence in receiver.evidence] == [0, 5, 4]
+
+
+def test_stop_gives_up_on_a_model_that_hangs_and_nothing_comes_after_it():
+    model, receiver = GatedModel(), Receiver()
+    worker = worker_of(model, receiver)
+    worker.start()
+    worker.observe(pair_graph(0), picture(0))
+    worker.observe(pair_graph(1), picture(1))
+    assert model.begun.acquire(timeout=LONG_S)
+    assert not worker.stop(0.05)
+    for _ in range(2):
+        model.allowed.release()
+    assert worker.stop(LONG_S)
+    assert receiver.evidence == [] and worker.reasoner.counters().pending == 0
+
+
+def test_stop_of_an_idle_worker_and_of_one_never_started():
+    idle, unused = (worker_of(RecordingModel(), Receiver()) for _ in range(2))
+    idle.start()
+    assert idle.stop(LONG_S) and idle.stop(LONG_S)
+    assert unused.stop(LONG_S)
+
+
+def test_without_a_world_model_it_is_idle():
+    worker = EvidenceWorker(RelationReasoner(config(world_model="none"), None), Receiver())
+    worker.start()
+    try:
+        assert len(worker.observe(pair_graph(0), picture(0)).pairs) == 2
+        assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+
+
+class FailsAtFirst(RecordingModel):
+    """A model that fails on its first clip."""
+
+    def predict_batch(self, requests):
+        if not self.requests:
+            self.requests.extend(requests)
+            raise RuntimeError("not loaded yet")
+        return super().predict_batch(requests)
+
+
+def test_lives_on_after_failures_of_model_and_receiver():
+    told, delivered = [], []
+
+    def deliver(evidence):
+        if evidence.stamp_ns == 1:
+            raise RuntimeError("publisher is gone")
+        delivered.append(evidence)
+
+    worker = worker_of(FailsAtFirst(), deliver, told.append)
+    worker.start()
+    try:
+        for stamp in range(3):
+            worker.observe(pair_graph(stamp), picture(stamp))
+            assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+    assert [evidence.stamp_ns for evidence in delivered] == [2]
+    assert told == [
+        "world model 'fake' failed: RuntimeError: not loaded yet",
+        "evidence was not delivered: RuntimeError: publisher is gone",
+    ]
+
+
+@pytest.mark.parametrize("observers", [3])
+def test_many_threads_may_observe(observers):
+    receiver = Receiver()
+    worker = worker_of(RecordingModel(), receiver, queue_size=64)
+    worker.start()
+
+    def observe(first):
+        for stamp in range(first, first + 2):
+            worker.observe(pair_graph(stamp), picture(stamp))
+
+    threads = [threading.Thread(target=observe, args=(2 * n,)) for n in range(observers)]
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(LONG_S)
+        assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+    counters = worker.reasoner.counters()
+    assert counters.queued == counters.encoded + sum(counters.dropped.values())
+    assert len(receiver.evidence) == counters.encoded

@@ -1,0 +1,100 @@
+"""ROS parameters: from the configuration, checked once, told in one line where they are wrong."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import pytest
+from rcl_interfaces.msg import ParameterDescriptor
+
+from deworldsg_ros import config as configuration
+from deworldsg_ros.ros import parameters as ros_parameters
+from deworldsg_ros.ros.options import NodeOptions, Parameters
+from deworldsg_ros.ros.parameters import descriptor, fields
+from deworldsg_ros.scene.errors import ConfigurationError
+
+FIELDS = {field.name: field for field in fields()}
+
+
+def resolve(overrides: dict[str, Any], source: str = "parameters") -> Parameters:
+    return ros_parameters.resolve(overrides, source, Parameters)
+
+
+def complaint(overrides: dict) -> str:
+    with pytest.raises(ConfigurationError) as caught:
+        resolve(overrides, "lifting_node")
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_without_overrides_they_are_the_configuration() -> None:
+    parameters = resolve({})
+    assert parameters == Parameters()
+    defaults = configuration.to_mapping(configuration.Config())
+    for section, values in defaults.items():
+        assert configuration.to_mapping(getattr(parameters, section)) == values
+
+
+def test_every_field_of_the_configuration_is_a_parameter() -> None:
+    names = {
+        f"{section}.{name}"
+        for section, values in configuration.to_mapping(configuration.Config()).items()
+        for name in values
+    }
+    assert set(FIELDS) == names | set(NodeOptions.__struct_fields__)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_parameter_is_described_and_its_default_is_allowed(name: str) -> None:
+    field = FIELDS[name]
+    described = descriptor(field)
+    assert isinstance(described, ParameterDescriptor)
+    assert described.description
+    assert described.read_only
+    assert type(field.default) is field.kind
+    resolve({name: field.default})
+    for bounds in (*described.floating_point_range, *described.integer_range):
+        assert bounds.from_value <= field.default <= bounds.to_value
+
+
+def test_overrides_by_full_name() -> None:
+    parameters = resolve({"lifting.tau": 0.1, "inputs.world_up": "y", "queue_size": 3})
+    assert parameters.lifting.tau == 0.1
+    assert parameters.inputs.world_up == "y"
+    assert parameters.node.queue_size == 3
+
+
+def test_a_whole_number_is_a_number() -> None:
+    assert resolve({"output.rate_hz": 5}).output.rate_hz == 5.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"lifting.tua": 0.1}, "there is no parameter lifting.tua (did you mean lifting.tau?)"),
+        ({"queuesize": 1}, "did you mean queue_size?"),
+        ({"xyzzy": 1}, "there is no parameter xyzzy"),
+        ({"lifting.tau": 7.0}, "parameter lifting.tau is 7.0, wanted float >= 0 and <= 1"),
+        ({"inputs.max_step_m": 0.0}, "wanted float > 0"),
+        ({"lifting.tau": "much"}, "is 'much', wanted float"),
+        ({"lifting.min_pixels": 1}, "wanted int >= 2 and <= 100000"),
+        ({"lifting.min_pixels": 10.5}, "wanted int"),
+        ({"inputs.reliability": "often"}, "wanted one of auto, best_effort, reliable"),
+        ({"inputs.world_up": True}, "put it in quotes"),
+        ({"output.surface_points": "yes"}, "wanted bool"),
+        ({"inputs.world_frame": 3}, "wanted str"),
+    ],
+)
+def test_a_bad_override_is_told_in_one_line(overrides: dict, says: str) -> None:
+    text = complaint(overrides)
+    assert text.startswith("lifting_node: ")
+    assert says in text
+
+
+def test_unbounded_sides_have_the_type_s_limits() -> None:
+    (bounds,) = descriptor(FIELDS["inputs.max_step_m"]).floating_point_range
+    assert (bounds.from_value, bounds.to_value) == (0.0, sys.float_info.max)
+    assert descriptor(FIELDS["inputs.max_step_m"]).additional_constraints == "> 0"
+    (bounds,) = descriptor(FIELDS["relations.seed"]).integer_range
+    assert bounds.to_value == 2**63 - 1

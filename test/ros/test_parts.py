@@ -1,0 +1,152 @@
+"""The small parts of the nodes: the choice of a subscription, the worker, the waiting room."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import CompressedImage, Image
+from visualization_msgs.msg import Marker
+
+from deworldsg_ros.ros.inputs import image_sources
+from deworldsg_ros.ros.markers import marker_array
+from deworldsg_ros.ros.qos import Offer, choose
+from deworldsg_ros.ros.worker import Worker
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import RelationEvidence, Vocabulary
+from deworldsg_ros.streams.pending import PendingEvidence
+
+RAW = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+AUTO = image_sources("/rgb", "/compressed", "auto")
+
+
+@pytest.mark.parametrize(
+    ("offers", "topic", "kind", "reliable"),
+    [
+        ([], "/rgb", Image, True),
+        ([Offer("/rgb", RAW, True)], "/rgb", Image, True),
+        ([Offer("/rgb", RAW, False)], "/rgb", Image, False),
+        ([Offer("/rgb", RAW, True), Offer("/rgb", RAW, False)], "/rgb", Image, False),
+        ([Offer("/rgb/compressed", COMPRESSED, True)], "/rgb/compressed", CompressedImage, True),
+        ([Offer("/rgb", COMPRESSED, False)], "/rgb", CompressedImage, False),
+        (
+            [Offer("/rgb/compressed", COMPRESSED, False), Offer("/rgb", RAW, True)],
+            "/rgb",
+            Image,
+            True,
+        ),
+        ([Offer("/rgb", "std_msgs/msg/String", False)], "/rgb", Image, True),
+    ],
+)
+def test_what_is_published_is_chosen(
+    offers: list[Offer], topic: str, kind: type, reliable: bool
+) -> None:
+    choice = choose(AUTO, offers, "auto")
+    assert (choice.source.topic, choice.source.kind, choice.reliable) == (topic, kind, reliable)
+
+
+@pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
+def test_a_given_reliability_is_kept(reliability: str) -> None:
+    for offered in (True, False):
+        choice = choose(AUTO, [Offer("/rgb", RAW, offered)], reliability)
+        assert choice.reliable == (reliability == "reliable")
+
+
+def test_a_given_transport_is_kept() -> None:
+    offers = [Offer("/rgb", RAW, True), Offer("/rgb/compressed", COMPRESSED, True)]
+    sources = image_sources("/rgb", "/compressed", "compressed")
+    assert choose(sources, offers, "auto").source.kind is CompressedImage
+
+
+def test_a_worker_keeps_the_order_and_lets_the_oldest_go() -> None:
+    begin, done, overruns = threading.Event(), [], []
+
+    def work(item: int) -> None:
+        assert begin.wait(10)
+        done.append(item)
+
+    worker: Worker[int] = Worker("test", work, size=3, on_overrun=lambda: overruns.append(1))
+    worker.submit(0)
+    while worker.waiting:  # taken by the thread
+        threading.Event().wait(0.001)
+    for item in range(1, 6):
+        worker.submit(item)
+    assert (worker.waiting, len(overruns)) == (3, 2)
+    assert not worker.wait_idle(0.0)
+    begin.set()
+    assert worker.wait_idle(10)
+    assert done == [0, 3, 4, 5]
+    assert worker.stop(10)
+
+
+def test_a_worker_stops_with_work_left() -> None:
+    begin, done = threading.Event(), []
+    worker: Worker[int] = Worker(
+        "test", lambda item: (begin.wait(10), done.append(item)), size=9, on_overrun=lambda: None
+    )
+    for item in range(5):
+        worker.submit(item)
+    while worker.waiting == 5:  # the first is taken by the thread
+        threading.Event().wait(0.001)
+    assert not worker.stop(0.01)
+    begin.set()
+    assert worker.stop(10)
+    assert len(done) <= 1
+
+
+def evidence(stamp_ns: int) -> RelationEvidence:
+    return RelationEvidence(
+        stamp_ns=stamp_ns,
+        vocabulary=Vocabulary(("chair",), ("on",)),
+        pairs=np.zeros((0, 2), np.int64),
+        pair_classes=np.zeros((0, 2), np.int64),
+        geo_costs=np.zeros(0),
+        predictions=np.zeros((0, 1)),
+        source="none",
+    )
+
+
+def test_evidence_waits_for_its_frame() -> None:
+    waiting = PendingEvidence()
+    for stamp_ns in (3, 1, 2, 2, 5):
+        waiting.add(evidence(stamp_ns))
+    assert [item.stamp_ns for item in waiting.take(2)] == [2, 2]
+    assert len(waiting) == 2
+    assert waiting.take(4) == []
+    assert [item.stamp_ns for item in waiting.take(5)] == [5]
+
+
+def test_evidence_does_not_wait_without_bound() -> None:
+    waiting = PendingEvidence(capacity=2)
+    waiting.add(evidence(1))
+    waiting.add(evidence(2))
+    with pytest.raises(RefusedInput) as caught:
+        waiting.add(evidence(3))
+    assert caught.value.reason == "unmatched_evidence"
+    assert [item.stamp_ns for item in waiting.take(3)] == [3]
+
+
+def test_markers_replace_the_whole_picture() -> None:
+    item = SimpleNamespace(
+        namespace="nodes",
+        id=7,
+        kind="sphere",
+        position=np.array([1.0, 2.0, 3.0]),
+        quat_xyzw=(0.0, 0.0, 0.0, 1.0),
+        scale=(0.1, 0.2, 0.3),
+        rgba=(1.0, 0.0, 0.0, 0.5),
+        text="",
+        points=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+    )
+    array = marker_array([item], "map", Time(sec=5))
+    clear, marker = array.markers
+    assert clear.action == Marker.DELETEALL
+    assert (marker.ns, marker.id, marker.type) == ("nodes", 7, Marker.SPHERE)
+    assert (marker.header.frame_id, marker.header.stamp.sec) == ("map", 5)
+    assert (marker.pose.position.z, marker.scale.y, marker.color.a) == (3.0, 0.2, 0.5)
+    assert marker.points[1].x == 1.0
+    assert [m.action for m in marker_array([], "map", Time()).markers] == [Marker.DELETEALL]

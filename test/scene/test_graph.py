@@ -1,0 +1,335 @@
+"""The global graph: ids, bookkeeping of merges, memory of frames, messages, save and load."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from support.merging import (
+    VOCABULARY,
+    edit_at_random,
+    random_classes,
+    random_covariances,
+    seeds,
+)
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.gaussian import fuse, log_determinant
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.graph_io import state_of
+
+SURE = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def graph_of(count: int, **options: int) -> SceneGraph:
+    """Unit spheres 10 m apart, ids 1 to count."""
+    graph = SceneGraph(VOCABULARY, "world", **options)
+    for index in range(count):
+        graph.add_node(np.array([10.0 * index, 0, 0]), np.eye(3), SURE, index)
+    return graph
+
+
+def equal(a: SceneGraph, b: SceneGraph) -> bool:
+    one, other = state_of(a), state_of(b)
+    return one.keys() == other.keys() and all(
+        one[name].dtype == other[name].dtype and np.array_equal(one[name], other[name])
+        for name in one
+    )
+
+
+def test_an_empty_graph() -> None:
+    graph = SceneGraph(VOCABULARY, "world")
+    assert len(graph) == 0
+    assert graph.nodes.means.shape == (0, 3)
+    assert dict(graph.edges) == {}
+    assert graph.node_states(3) == {}
+    assert graph.take_removals() == {}
+    assert graph.resolve(1) == 0
+
+
+def test_ids_start_at_1_and_are_never_reused() -> None:
+    graph = graph_of(3)
+    assert graph.nodes.ids.tolist() == [1, 2, 3]
+    graph.remove_node(3)
+    graph.merge_nodes(2, 1)
+    assert graph.add_node(np.zeros(3), np.eye(3), SURE, 0) == 4
+    assert graph.nodes.ids.tolist() == [1, 4]
+    assert 2 not in graph
+    assert 4 in graph
+
+
+def test_rows_stay_compact_and_grow() -> None:
+    graph = graph_of(200)
+    for node_id in range(1, 151):
+        graph.remove_node(node_id)
+    assert len(graph) == len(graph.nodes.means) == 50
+    for node_id in range(151, 201):
+        row = graph.nodes.row(node_id)
+        assert graph.nodes.ids[row] == node_id
+        assert graph.nodes.means[row, 0] == 10 * (node_id - 1)
+        assert graph.nodes.first_seen_ns[row] == node_id - 1
+
+
+def test_observations_average_with_their_weights() -> None:
+    graph = graph_of(1)
+    flat = np.full(4, 0.25)
+    graph.observe(1, np.array([3.0, 0, 0]), np.eye(3), flat, 7)
+    graph.observe(1, np.array([0.0, 0, 0]), np.eye(3), flat, 5)
+    assert graph.nodes.weights.tolist() == [3]
+    assert graph.nodes.means[0] == pytest.approx([1, 0, 0])
+    assert graph.nodes.covariances[0] == pytest.approx(np.diag([3.0, 1, 1]))
+    assert graph.nodes.class_probabilities[0] == pytest.approx([0.5, 1 / 6, 1 / 6, 1 / 6])
+    assert (graph.nodes.first_seen_ns[0], graph.nodes.last_seen_ns[0]) == (0, 7)
+
+
+def test_observing_many_is_observing_each() -> None:
+    rng = np.random.default_rng(0)
+    means, covariances = rng.normal(size=(3, 3)), random_covariances(rng, 3)
+    classes, weights = random_classes(rng, 3), rng.uniform(0.1, 3, 3)
+    surfaces = rng.normal(size=(3, 5, 3)).astype(np.float32)
+    one, many = graph_of(4), graph_of(4)
+    many.observe_each([4, 1, 3], means, covariances, classes, 9, surfaces, weights)
+    for index, node_id in enumerate([4, 1, 3]):
+        one.observe(
+            node_id,
+            means[index],
+            covariances[index],
+            classes[index],
+            9,
+            surfaces[index],
+            float(weights[index]),
+        )
+    assert equal(one, many)
+    for index, node_id in enumerate([4, 1, 3]):
+        row = many.nodes.row(node_id)
+        known = (1.0, np.array([10.0 * (node_id - 1), 0, 0]), np.eye(3))
+        mean, covariance = fuse(*known, weights[index], means[index], covariances[index])
+        assert many.nodes.means[row] == pytest.approx(mean, rel=1e-14)
+        assert many.nodes.covariances[row] == pytest.approx(covariance, rel=1e-14)
+        cached = many.nodes.log_determinants[row]
+        assert cached == log_determinant(many.nodes.covariances[row])
+    many.observe_each(
+        [], *(np.zeros((0, *shape)) for shape in ((3,), (3, 3), (4,))), 9, [], np.zeros(0)
+    )
+    assert equal(one, many)
+
+
+def test_a_merge_moves_edges_and_sums_their_evidence() -> None:
+    graph = graph_of(4)
+    ones = np.ones(3)
+    graph.add_visual(1, 3, 1 * ones, 10)
+    graph.add_visual(2, 3, 2 * ones, 20)
+    graph.add_visual(3, 2, 4 * ones, 30)
+    graph.add_visual(1, 2, 8 * ones, 40)
+    graph.add_visual(2, 1, 8 * ones, 40)
+    graph.add_visual(3, 4, 16 * ones, 50)
+    graph.add_neighbour(1, 3, 60)
+    graph.add_neighbour(2, 3, 15)
+    graph.add_neighbour(2, 4, 70)
+    assert graph.merge_nodes(2, 1) == 1
+    found = {
+        pair: (edge.visual_logits[0], edge.frames, edge.neighbour_frames, edge.last_seen_ns)
+        for pair, edge in graph.edges.items()
+    }
+    assert found == {
+        (1, 3): (3, 2, 2, 60),
+        (3, 1): (4, 1, 0, 30),
+        (3, 4): (16, 1, 0, 50),
+        (1, 4): (0, 0, 1, 70),
+    }
+
+
+def test_evidence_of_ids_that_are_gone_reaches_who_lives() -> None:
+    graph = graph_of(5)
+    graph.merge_nodes(3, 4)
+    graph.merge_nodes(3, 2)
+    graph.remove_node(5)
+    assert [graph.resolve(node_id) for node_id in range(7)] == [0, 1, 2, 2, 2, 0, 0]
+    assert graph.add_visual(4, 1, np.ones(3), 0)
+    assert list(graph.edges) == [(2, 1)]
+    revision = graph.revision
+    assert not graph.add_visual(4, 3, np.ones(3), 0)  # became one node
+    assert not graph.add_visual(1, 5, np.ones(3), 0)
+    assert not graph.add_neighbour(6, 1, 0)
+    assert graph.revision == revision
+    assert graph.take_removals() == {4: 2, 3: 2, 5: None}
+    assert graph.take_removals() == {}
+
+
+def test_removing_a_node_removes_its_edges() -> None:
+    graph = graph_of(3)
+    for pair in ((1, 2), (2, 1), (2, 3), (1, 3)):
+        graph.add_visual(*pair, np.ones(3), 0)
+    graph.remove_node(2)
+    assert list(graph.edges) == [(1, 3)]
+    graph.remove_node(3)
+    assert not graph.edges
+
+
+def test_frames_are_remembered_up_to_a_number() -> None:
+    graph = graph_of(3, remembered_frames=2)
+    graph.remember_frame(10, [1, 2])
+    graph.remember_frame(20, [3])
+    graph.merge_nodes(1, 2)
+    assert graph.nodes_of_frame(10) == [1, 1]
+    graph.remember_frame(30, [])
+    assert graph.nodes_of_frame(10) is None
+    assert graph.nodes_of_frame(20) == [3]
+    graph.remove_node(3)
+    assert graph.nodes_of_frame(20) == [0]
+
+
+def test_mistakes_are_named_and_change_nothing() -> None:
+    graph = graph_of(2)
+    graph.take_removals()
+    before = state_of(graph)
+    with pytest.raises(ValueError, match="not positive definite"):
+        graph.add_node(np.zeros(3), np.zeros((3, 3)), SURE, 0)
+    with pytest.raises(ValueError, match="node 1 cannot be merged with itself"):
+        graph.merge_nodes(1, 1)
+    with pytest.raises(KeyError, match="node 9 is not in the graph"):
+        graph.merge_nodes(1, 9)
+    with pytest.raises(KeyError, match="node 9 is not in the graph"):
+        graph.remove_node(9)
+    with pytest.raises(ValueError, match=r"shape \(2,\): wanted \(3,\)"):
+        graph.add_visual(1, 2, np.ones(2), 0)
+    after = state_of(graph)
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
+def test_what_did_not_change_keeps_its_message() -> None:
+    graph = graph_of(3)
+    first = graph.node_states(2, with_points=True)
+    graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
+    second = graph.node_states(2, with_points=True)
+    assert [second[node_id] is first[node_id] for node_id in (1, 2, 3)] == [True, False, True]
+    graph.merge_nodes(1, 2)
+    third = graph.node_states(2, with_points=True)
+    assert list(third) == [1, 3]
+    assert third[1].observations == 3
+    assert third[3] is first[3]
+
+
+def test_tentative_nodes_are_told_only_on_request() -> None:
+    graph = graph_of(1)
+    for x in (5.0, 9.0):
+        graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
+    assert list(graph.node_states(2)) == [1]
+    asked = graph.node_states(2, tentative=True)
+    assert [(node.id, node.confirmed) for node in asked.values()] == [
+        (1, True),
+        (2, False),
+        (3, False),
+    ]
+    graph.set_confirmed(3, True)
+    assert list(graph.node_states(2)) == [1, 3]
+    assert graph.node_states(2)[3].confirmed
+    assert graph.merge_nodes(2, 3) == 2  # what was sure of one is sure of both
+    assert list(graph.node_states(2)) == [1, 2]
+
+
+def test_the_message_of_a_node() -> None:
+    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=2)
+    points = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], np.float32)
+    classes = np.array([0.1, 0.4, 0.4, 0.1])
+    graph.add_node(np.array([1.0, 2, 3]), np.diag([1.0, 2, 3]), classes, 1_500_000_000, points)
+    state = graph.node_states(3, with_points=True)[1]
+    assert state.label == "table"  # of equals the first
+    assert [belief.label for belief in state.classes] == ["table", "chair", "cup"]
+    assert state.mean_m == [1, 2, 3]
+    assert state.covariance_m2 == [1, 0, 0, 0, 2, 0, 0, 0, 3]
+    assert state.observations == 1
+    assert state.first_seen == state.last_seen == wire.Stamp(1, 500_000_000)
+    assert len(state.surface_points_m) == 2
+    assert graph.node_states(3)[1].surface_points_m == []
+
+
+def test_class_distributions_are_scaled_to_one() -> None:
+    graph = SceneGraph(VOCABULARY, "world")
+    graph.add_node(np.zeros(3), np.eye(3), np.array([1.000001, 0, 0, 0]), 0)
+    assert graph.nodes.class_probabilities[0].sum() == 1
+
+
+@given(seeds)
+@settings(max_examples=40)
+def test_invariants_hold_through_any_edits(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
+    given_ids: set[int] = set()
+    gone: set[int] = set()
+    for _ in range(15):
+        edit_at_random(graph, rng, 5)
+        live = set(graph.nodes.ids.tolist())
+        assert not live & gone
+        gone |= given_ids - live
+        given_ids |= live
+        assert all(graph.resolve(node_id) == node_id for node_id in live)
+        assert all(graph.resolve(node_id) in live | {0} for node_id in gone)
+        for subject, object_ in graph.edges:
+            assert subject != object_
+            assert {subject, object_} <= live
+            assert object_ in graph._edges.partners(subject)
+            assert subject in graph._edges.partners(object_)
+        for node_id in live:
+            for partner in graph._edges.partners(node_id):
+                assert {(node_id, partner), (partner, node_id)} & graph.edges.keys()
+        assert (graph.nodes.surface_counts <= 6).all()
+        assert len(graph._frames) <= 3
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
+    edit_at_random(graph, rng, int(rng.integers(0, 60)))
+    path = tmp_path_factory.mktemp("graph") / "graph.npz"
+    graph.save(path)
+    assert [item.name for item in path.parent.iterdir()] == ["graph.npz"]
+    loaded = SceneGraph.load(path)
+    assert equal(loaded, graph)
+    assert loaded.node_states(4, with_points=True) == graph.node_states(4, with_points=True)
+    for name in ("log_determinants", "eigenvalue_bounds"):
+        np.testing.assert_array_equal(getattr(loaded.nodes, name), getattr(graph.nodes, name))
+    # Both go on alike.
+    edit_at_random(graph, np.random.default_rng(seed + 1), 20)
+    edit_at_random(loaded, np.random.default_rng(seed + 1), 20)
+    assert equal(loaded, graph)
+
+
+def test_files_that_are_no_graph_are_refused(tmp_path: Path) -> None:
+    graph_of(3).save(tmp_path / "good.npz")
+    whole = (tmp_path / "good.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.npz").write_text("hello")
+    (tmp_path / "empty.npz").write_bytes(b"")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    names = ("cut.npz", "text.npz", "empty.npz", "other.npz", "array.npy", "absent.npz")
+    for name in names:
+        with pytest.raises(RefusedInput, match=name) as refused:
+            SceneGraph.load(tmp_path / name)
+        assert refused.value.reason == "invalid_graph_file"
+
+
+def test_a_file_of_a_later_version_is_refused(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("deworldsg_ros.scene.graph_io.FORMAT_VERSION", 2)
+    graph_of(1).save(tmp_path / "later.npz")
+    monkeypatch.undo()
+    with pytest.raises(RefusedInput, match="version 2: wanted 1 or older"):
+        SceneGraph.load(tmp_path / "later.npz")
+
+
+@pytest.mark.parametrize(
+    ("classes", "entropy_nats"),
+    [([1.0, 0.0, 0.0, 0.0], 0.0), ([0.5, 0.5, 0.0, 0.0], np.log(2)), ([0.25] * 4, np.log(4))],
+)
+def test_a_node_tells_how_much_its_labels_disagree(classes, entropy_nats) -> None:
+    graph = SceneGraph(VOCABULARY, "world")
+    graph.add_node(np.zeros(3), np.eye(3), np.array(classes), 1)
+    (state,) = graph.node_states(1).values()
+    assert len(state.classes) == 1  # the entropy is of all classes
+    assert state.entropy_nats == pytest.approx(entropy_nats)

@@ -1,0 +1,110 @@
+"""The bounded sample of surface points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.merging import seeds
+
+from deworldsg_ros.scene.surface import add_points, even_moments
+
+
+class Samples:
+    """Some samples of surface points, as a table of nodes keeps them."""
+
+    def __init__(self, count: int, capacity: int) -> None:
+        self.hashes = np.zeros((count, capacity), np.uint64)
+        self.points_world = np.zeros((count, capacity, 3), np.float32)
+        self.counts = np.zeros(count, np.int64)
+
+    def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
+        add_points(self.hashes, self.points_world, self.counts, rows, point_sets)
+
+    def of(self, row: int) -> tuple[list[int], list[list[float]]]:
+        count = self.counts[row]
+        return self.hashes[row, :count].tolist(), self.points_world[row, :count].tolist()
+
+    def points(self, row: int) -> np.ndarray:
+        return self.points_world[row, : self.counts[row]]
+
+
+def sample_of(points: np.ndarray, capacity: int) -> Samples:
+    samples = Samples(1, capacity)
+    samples.add([0], [points.astype(np.float32)])
+    return samples
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_few_points_are_all_kept(count: int) -> None:
+    points = np.random.default_rng(0).normal(size=(count, 3))
+    sample = sample_of(points, 3)
+    assert sorted(sample.of(0)[1]) == sorted(points.astype(np.float32).tolist())
+
+
+@given(seeds, st.integers(0, 20), st.integers(0, 60))
+def test_it_is_bounded_and_depends_on_the_set_alone(seed: int, capacity: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    # A coarse grid: many points come more than once.
+    points = rng.integers(0, 3, (count, 3)).astype(np.float32) / 7
+    hashes, kept = sample_of(points, capacity).of(0)
+    assert len(hashes) == min(capacity, len(np.unique(points, axis=0)))
+    assert (np.diff(np.array(hashes, object)) > 0).all()
+    # In any order, in parts, several samples at a time, and by way of merged parts.
+    first, second, third = np.split(
+        points[rng.permutation(count)], np.sort(rng.integers(0, count + 1, 2))
+    )
+    parts = Samples(4, capacity)
+    parts.add([2, 0], [third, first])
+    parts.add([0, 1], [second, second])
+    parts.add([0], [third])
+    parts.add([3, 1], [parts.points(2), parts.points(2)])
+    parts.add([3], [parts.points(1)])
+    parts.add([3], [first])
+    parts.add([0], [parts.points(0)])
+    assert parts.of(0) == parts.of(3) == (hashes, kept)
+
+
+def test_hashes_depend_on_values_and_axes() -> None:
+    points = np.array([[1, 2, 3], [3, 2, 1], [0, 0, 0], [1, 2, 3], [-0.0, 0, -0.0]], np.float32)
+    hashes, kept = sample_of(points, 10).of(0)
+    assert len(set(hashes)) == 3
+    assert sorted(kept) == [[0, 0, 0], [1, 2, 3], [3, 2, 1]]
+
+
+def test_the_draw_is_uniform_over_the_surface() -> None:
+    grid = np.stack(np.meshgrid(np.arange(100), np.arange(100), [0]), -1).reshape(-1, 3)
+    kept = sample_of(grid * 0.01, 1000).points(0)
+    quarters = np.histogram2d(kept[:, 0], kept[:, 1], bins=2)[0]
+    assert (np.abs(quarters - 250) < 60).all()
+
+
+def test_even_moments_lean_less_to_where_points_are_dense() -> None:
+    rng = np.random.default_rng(8)
+    plate = rng.uniform((-0.3, -0.2, 0.0), (0.3, 0.2, 0.001), (4000, 3))
+    looked_at_long = rng.uniform((0.2, -0.2, 0.0), (0.3, 0.2, 0.001), (20_000, 3))
+    points = np.concatenate((plate, looked_at_long)).astype(np.float32)
+    assert points.mean(axis=0)[0] > 0.15
+    mean, covariance = even_moments(points)
+    assert 0.0 < mean[0] < 0.75 * points.mean(axis=0)[0]
+    assert np.abs(mean[1:]).max() < 0.005
+    assert np.sqrt(covariance[1, 1]) == pytest.approx(0.4 / 12**0.5, rel=0.1)
+    assert np.array_equal(covariance, covariance.T)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_even_moments_of_one_point() -> None:
+    mean, covariance = even_moments(np.full((1, 3), 1.005, np.float32))
+    assert np.allclose(mean, 1.005)
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_even_moments_move_with_the_world_frame() -> None:
+    rng = np.random.default_rng(9)
+    points = rng.uniform(-0.2, 0.2, (300, 3)) * (1, 1, 0.1)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    mean, covariance = even_moments(points.astype(np.float32))
+    moved = even_moments((points @ rotation.T + (1, 2, 3)).astype(np.float32))
+    assert np.allclose(moved[0], rotation @ mean + (1, 2, 3), atol=1e-3)
+    assert np.allclose(moved[1], rotation @ covariance @ rotation.T, atol=1e-4)

@@ -1,0 +1,239 @@
+"""Messages of a frame: both ways without the loss of a bit, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.merging import (
+    VOCABULARY,
+    random_classes,
+    random_covariances,
+    random_local_graphs,
+    random_pose,
+    seeds,
+)
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.codec import (
+    evidence_from_message,
+    evidence_to_message,
+    frame_graph_from_message,
+    frame_graph_to_message,
+    local_graph_from_message,
+    local_graph_to_message,
+)
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import (
+    DepthGrid,
+    FrameGraph,
+    LocalGraph,
+    RelationEvidence,
+    Relations,
+)
+
+
+def random_relations(rng: np.random.Generator, count: int) -> Relations:
+    pairs = [(i, j) for i in range(count) for j in range(count) if i != j and rng.random() < 0.4]
+    return Relations(
+        np.array(pairs, np.int64).reshape(-1, 2),
+        rng.normal(0, 10 ** rng.uniform(-6, 6), (len(pairs), 3)),
+        rng.random(len(pairs)),
+    )
+
+
+def random_frame_graph(rng: np.random.Generator) -> FrameGraph:
+    count = int(rng.integers(0, 5))
+    return FrameGraph(
+        stamp_ns=int(rng.integers(0, 2**31 * 10**9 - 1)),
+        frame_id="camera",
+        width=640,
+        height=480,
+        vocabulary=VOCABULARY,
+        boxes_xyxy=rng.uniform(0, 480, (count, 4)),
+        class_probabilities=random_classes(rng, count),
+        scores=rng.random(count),
+        relations=random_relations(rng, count),
+    )
+
+
+def random_depth_grid(rng: np.random.Generator) -> DepthGrid | None:
+    stride_px = int(rng.integers(0, 100))
+    if stride_px == 0:
+        return None
+    shape = [len(range(stride_px // 2, size, stride_px)) for size in (480, 640)]
+    depth_mm = rng.integers(0, 2**16, shape).astype(np.uint16)
+    return DepthGrid(depth_mm, stride_px, Intrinsics(*rng.uniform(1, 900, 4).tolist(), 640, 480))
+
+
+def random_local_graph(rng: np.random.Generator) -> LocalGraph:
+    count = int(rng.integers(0, 5))
+    return LocalGraph(
+        stamp_ns=int(rng.integers(0, 2**31 * 10**9 - 1)),
+        frame_id="map",
+        width=640,
+        height=480,
+        T_world_camera=random_pose(rng),
+        vocabulary=VOCABULARY,
+        instance_ids=rng.permutation(np.arange(1, count + 1)),
+        boxes_xyxy=rng.uniform(0, 480, (count, 4)),
+        class_probabilities=random_classes(rng, count),
+        scores=rng.random(count),
+        means_world=rng.normal(0, 10 ** rng.uniform(-9, 3), (count, 3)),
+        covariances_world=random_covariances(rng, count),
+        depths_m=rng.random(count),
+        pixel_counts=rng.integers(10, 10**6, count),
+        surface_points_world=tuple(
+            rng.normal(size=(rng.integers(0, 4), 3)).astype(np.float32) for _ in range(count)
+        ),
+        relations=random_relations(rng, count),
+        drops={"too_few_pixels": 2},
+        depth_grid=random_depth_grid(rng),
+    )
+
+
+def random_evidence(rng: np.random.Generator) -> RelationEvidence:
+    count = int(rng.integers(0, 5))
+    predictions = random_classes(rng, count, 3)
+    predictions[rng.random(count) < 0.5] = np.nan
+    return RelationEvidence(
+        stamp_ns=int(rng.integers(0, 2**31 * 10**9 - 1)),
+        vocabulary=VOCABULARY,
+        pairs=rng.integers(0, 5, (count, 2)),
+        pair_classes=rng.integers(0, 4, (count, 2)),
+        geo_costs=rng.random(count),
+        predictions=predictions,
+        source="fake",
+    )
+
+
+def assert_same(a: object, b: object) -> None:
+    """Equal to the last bit, type by type."""
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype
+        assert a.shape == b.shape
+        assert a.tobytes() == b.tobytes()
+    elif isinstance(a, tuple):
+        assert len(a) == len(b)
+        for one, other in zip(a, b):
+            assert_same(one, other)
+    elif hasattr(a, "__dataclass_fields__"):
+        for item in fields(a):
+            assert_same(getattr(a, item.name), getattr(b, item.name))
+    else:
+        assert a == b
+
+
+@given(seeds)
+def test_frame_graphs_survive_the_wire(seed: int) -> None:
+    graph = random_frame_graph(np.random.default_rng(seed))
+    text = wire.encode(frame_graph_to_message(graph))
+    assert_same(frame_graph_from_message(wire.decode(text, wire.FrameGraphMessage)), graph)
+
+
+@given(seeds)
+def test_local_graphs_survive_the_wire(seed: int) -> None:
+    graph = random_local_graph(np.random.default_rng(seed))
+    text = wire.encode(local_graph_to_message(graph))
+    assert_same(local_graph_from_message(wire.decode(text, wire.LocalGraphMessage)), graph)
+
+
+@given(seeds)
+def test_relation_evidence_survives_the_wire(seed: int) -> None:
+    evidence = random_evidence(np.random.default_rng(seed))
+    text = wire.encode(evidence_to_message(evidence, "map"))
+    message = wire.decode(text, wire.RelationEvidenceMessage)
+    assert message.frame_id == "map"
+    assert_same(evidence_from_message(message), evidence)
+
+
+@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+def test_stamps_survive(stamp_ns: int) -> None:
+    stamp = wire.stamp_from_ns(stamp_ns)
+    assert wire.ns_from_stamp(stamp) == stamp_ns
+    assert 0 <= stamp.nanosec < 10**9
+
+
+def local_message() -> wire.LocalGraphMessage:
+    local = next(
+        graph
+        for graph in random_local_graphs(np.random.default_rng(3), 20)
+        if len(graph) > 1 and len(graph.relations.pairs)
+    )
+    return local_graph_to_message(local)
+
+
+def _set(path: str, value: object) -> Callable[[dict], None]:
+    """Set a value deep in a message, e.g. `objects.0.mean_m`."""
+
+    def change(content: dict) -> None:
+        *parents, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+        for key in parents:
+            content = content[key]
+        content[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_set("objects.0.mean_m", [0.0, 1.0]), "invalid_message"),
+        (_set("objects.0.mean_m", [0.0, 1.0, None]), "invalid_message"),
+        (_set("objects.0.covariance_m2", [0.0] * 9), "invalid_message"),
+        (_set("objects.0.covariance_m2", [1, 0.5, 0, 0, 1, 0, 0, 0, 1.0]), "invalid_message"),
+        (_set("objects.0.class_probabilities", [1.0]), "invalid_message"),
+        (_set("objects.0.class_probabilities", [1.0, 1.0, 0.0, 0.0]), "invalid_message"),
+        (_set("relations.0.object", 99), "invalid_message"),
+        (_set("relations.0.logits", [1.0]), "invalid_message"),
+        (_set("relations.0.score", 2.0), "invalid_message"),
+        (_set("stamp.nanosec", 10**9), "invalid_message"),
+        (_set("T_world_camera", [0.0] * 15), "invalid_message"),
+        (_set("classes", "cup"), "invalid_message"),
+        (_set("schema.name", "scene_graph"), "unknown_schema"),
+        (_set("schema.version", wire.VERSION + 1), "unknown_schema"),
+    ],
+)
+def test_what_does_not_fit_is_refused(change: Callable[[dict], None], reason: str) -> None:
+    content = json.loads(wire.encode(local_message()))
+    change(content)
+    with pytest.raises(RefusedInput) as refused:
+        local_graph_from_message(wire.decode(json.dumps(content), wire.LocalGraphMessage))
+    assert refused.value.reason == reason
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"schema": 3}', "\x00"])
+@pytest.mark.parametrize("kind", list(wire.MESSAGES.values()))
+def test_what_is_no_message_is_refused(text: str, kind: type[wire.Message]) -> None:
+    with pytest.raises(RefusedInput) as refused:
+        wire.decode(text, kind)
+    assert refused.value.reason == "invalid_message"
+    assert kind.__name__ in str(refused.value)
+
+
+def test_other_messages_name_what_does_not_fit() -> None:
+    rng = np.random.default_rng(5)
+    graph = next(g for g in (random_frame_graph(rng) for _ in range(50)) if len(g) > 1)
+    message = frame_graph_to_message(graph)
+    message.objects[1].class_probabilities.pop()
+    with pytest.raises(RefusedInput, match="class probabilities of row 1 have 3 values: wanted 4"):
+        frame_graph_from_message(message)
+    evidence = next(e for e in (random_evidence(rng) for _ in range(50)) if len(e.pairs))
+    told = evidence_to_message(evidence, "map")
+    told.pairs[0].prediction = [1.0]
+    with pytest.raises(RefusedInput, match="prediction of row 0 have 1 values: wanted 3"):
+        evidence_from_message(told)
+
+
+def test_times_are_never_one_number() -> None:
+    content = msgspec.json.decode(wire.encode(local_message()))
+    assert set(content["stamp"]) == {"sec", "nanosec"}
+    assert content["schema"] == {"name": "local_graph", "version": wire.VERSION}

@@ -1,0 +1,226 @@
+"""Poses, their interpolation, the gate against jumps, and the TF tree."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.streams import MS, T0, header, odometry, pose, tf, transform
+
+from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.jump_gate import JumpGate
+from deworldsg_ros.streams.pose_stream import PoseStream
+from deworldsg_ros.streams.poses import (
+    PoseBuffer,
+    pose_from_message,
+    set_stamp,
+    stamp_ns_of,
+)
+from deworldsg_ros.streams.transforms import TransformTree
+
+SLOP = 100 * MS
+
+
+def at(x: float, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
+    """A pose at (x, y, 0), turned about z."""
+    quat = np.array([0, 0, math.sin(turn_rad / 2), math.cos(turn_rad / 2)])
+    return pose_from_quaternion(np.array([x, y, 0.0]), quat)
+
+
+def test_stamps_keep_every_nanosecond() -> None:
+    from types import SimpleNamespace
+
+    message = SimpleNamespace(header=header(0))
+    set_stamp(message, T0)
+    assert stamp_ns_of(message) == T0
+
+
+def test_pose_and_odometry_are_the_same_pose() -> None:
+    T_pose, frame = pose_from_message(pose(x=2.0))
+    T_odometry, odometry_frame = pose_from_message(odometry(x=2.0))
+    np.testing.assert_array_equal(T_pose, T_odometry)
+    assert frame == odometry_frame == "map"
+
+
+@pytest.mark.parametrize("changes", [{"x": math.nan}, {"x": math.inf}, {"w": 0.0}, {"w": math.nan}])
+def test_a_bad_pose_is_refused(changes: dict) -> None:
+    with pytest.raises(RefusedInput) as caught:
+        pose_from_message(pose(**changes))
+    assert caught.value.reason == "invalid_pose"
+
+
+def test_interpolation_is_linear_in_position_and_spherical_in_rotation() -> None:
+    buffer = PoseBuffer(SLOP)
+    buffer.add(T0, at(0.0))
+    buffer.add(T0 + 80 * MS, at(4.0, turn_rad=1.0))
+    np.testing.assert_allclose(buffer.at(T0 + 20 * MS), at(1.0, turn_rad=0.25), atol=1e-12)
+    np.testing.assert_array_equal(buffer.at(T0), at(0.0))
+
+
+@pytest.mark.parametrize(
+    ("offset_ms", "x"), [(-100, 0.0), (-1, 0.0), (0, 0.0), (100, 0.0), (401, 5.0), (600, 5.0)]
+)
+def test_outside_of_a_bracket_the_nearest_pose_counts(offset_ms: int, x: float) -> None:
+    buffer = PoseBuffer(SLOP)
+    buffer.add(T0, at(0.0))
+    buffer.add(T0 + 500 * MS, at(5.0))
+    assert buffer.at(T0 + offset_ms * MS)[0, 3] == x
+
+
+@pytest.mark.parametrize("offset_ms", [-101, 101, 250, 399, 601])
+def test_beyond_the_slop_there_is_no_pose(offset_ms: int) -> None:
+    buffer = PoseBuffer(SLOP)
+    buffer.add(T0, at(0.0))
+    buffer.add(T0 + 500 * MS, at(5.0))
+    with pytest.raises(RefusedInput, match="wanted one within 0.1 s") as caught:
+        buffer.at(T0 + offset_ms * MS)
+    assert caught.value.reason == "no_pose"
+
+
+def test_an_empty_buffer_has_no_pose() -> None:
+    with pytest.raises(RefusedInput, match="there is no pose"):
+        PoseBuffer(SLOP).at(T0)
+
+
+@given(st.permutations(range(8)))
+def test_poses_may_come_in_any_order(order: list[int]) -> None:
+    buffer = PoseBuffer(SLOP)
+    for step in order:
+        buffer.add(T0 + step * 10 * MS, at(float(step)))
+    assert buffer.at(T0 + 35 * MS)[0, 3] == pytest.approx(3.5)
+
+
+def test_a_buffer_is_bounded() -> None:
+    buffer = PoseBuffer(SLOP, capacity=10)
+    for step in range(100):
+        buffer.add(T0 + step * MS, at(float(step)))
+    assert len(buffer) <= 20
+    assert buffer.at(T0 + 99 * MS)[0, 3] == 99.0
+
+
+def test_forgetting_keeps_what_is_still_needed() -> None:
+    buffer = PoseBuffer(SLOP)
+    for step in range(1000):
+        buffer.add(T0 + step * MS, at(float(step)))
+    buffer.forget_before(T0 + 900 * MS)
+    assert len(buffer) < 250
+    assert buffer.at(T0 + 800 * MS)[0, 3] == 800.0
+
+
+def test_a_pose_in_another_frame_is_refused() -> None:
+    expected = PoseStream(SLOP, "odom")
+    with pytest.raises(RefusedInput, match="pose is in frame 'map', expected 'odom'") as caught:
+        expected.add(pose(), T0)
+    assert caught.value.reason == "wrong_frame"
+    first = PoseStream(SLOP)
+    first.add(pose(), T0)
+    with pytest.raises(RefusedInput, match="expected 'map'"):
+        first.add(pose(frame_id="odom"), T0 + MS)
+
+
+def reasons(
+    gate: JumpGate, xs: list[float], turns_deg: list[float] | None = None, step_ns: int = 100 * MS
+) -> list[str]:
+    result = []
+    for place, (x, turn_deg) in enumerate(zip(xs, turns_deg or [0.0] * len(xs))):
+        try:
+            gate.check(at(x, turn_rad=math.radians(turn_deg)), T0 + place * step_ns)
+            result.append("")
+        except RefusedInput as refusal:
+            result.append(refusal.reason)
+    return result
+
+
+def test_one_wild_pose_is_refused_and_the_next_is_not() -> None:
+    assert reasons(JumpGate(1.0, 360.0), [0.0, 0.9, 7.0, 1.0]) == ["", "", "pose_jump", ""]
+
+
+def test_a_new_place_is_believed_after_a_while() -> None:
+    seen = reasons(JumpGate(1.0, 360.0, believed_after=3), [0.0, 7.0, 7.1, 7.2, 7.3])
+    assert seen == ["", "pose_jump", "pose_jump", "", ""]
+
+
+def test_poses_that_jump_about_are_never_believed() -> None:
+    seen = reasons(
+        JumpGate(1.0, 360.0, believed_after=3), [0.0, *(7.0 * step for step in range(1, 20))]
+    )
+    assert seen == ["", *["pose_jump"] * 19]
+
+
+@pytest.mark.parametrize(
+    ("turns_deg", "step_ms", "wanted"),
+    [
+        ([0, 30, 60, 90], 100, ["", "", "", ""]),  # as fast as a hand turns
+        ([0, 60, 10, 20], 100, ["", "pose_jump", "", ""]),
+        ([0, 60, 60, 60], 33, ["", "pose_jump", "pose_jump", ""]),  # held: relocalised
+        ([0, 60, 120], 500, ["", "", ""]),  # the frames are seconds apart
+        ([0, 5, -5, 5], 1, ["", "", "", ""]),  # noise of a fast tracker
+    ],
+)
+def test_a_camera_that_turns_too_fast_has_jumped(
+    turns_deg: list[float], step_ms: int, wanted: list[str]
+) -> None:
+    gate = JumpGate(1.0, 360.0, believed_after=3)
+    assert reasons(gate, [0.0] * len(turns_deg), turns_deg, step_ms * MS) == wanted
+
+
+def test_tf_chains_static_and_moving_transforms() -> None:
+    tree = TransformTree(SLOP, "map")
+    base_camera, map_odom = at(0.1, 0.2, 0.3), at(10.0, turn_rad=math.pi / 2)
+    tree.add(tf(transform("base", "camera", base_camera)), static=True)
+    assert not tree.settled(T0, "camera")
+    for step in range(3):
+        stamp_ns = T0 + 50 * MS * step
+        tree.add(tf(transform("odom", "base", at(float(step)), stamp_ns)), static=False)
+        tree.add(tf(transform("map", "odom", map_odom, stamp_ns)), static=False)
+    assert tree.settled(T0 + 100 * MS, "camera")
+    assert not tree.settled(T0 + 101 * MS, "camera")
+    T, frame = tree.at(T0 + 75 * MS, "/camera")
+    np.testing.assert_allclose(T, map_odom @ at(1.5) @ base_camera, atol=1e-12)
+    assert frame == "map"
+
+
+def test_tf_finds_its_way_down_to_a_world_below_the_root() -> None:
+    tree = TransformTree(SLOP, "world")
+    tree.add(tf(transform("root", "world", at(5.0))), static=True)
+    tree.add(tf(transform("root", "camera", at(7.0), T0)), static=False)
+    np.testing.assert_allclose(tree.at(T0, "camera")[0], invert_pose(at(5.0)) @ at(7.0))
+
+
+def test_without_a_name_the_world_is_the_root_and_stays() -> None:
+    tree = TransformTree(SLOP)
+    tree.add(tf(transform("base", "camera", at(0.1))), static=True)
+    assert not tree.settled(T0, "camera")
+    tree.add(tf(transform("odom", "base", at(1.0), T0)), static=False)
+    assert tree.settled(T0, "camera")
+    assert tree.at(T0, "camera")[1] == "odom"
+    tree.add(tf(transform("map", "odom", at(1.0), T0)), static=False)
+    assert tree.at(T0, "camera")[1] == "odom"
+
+
+def test_what_the_camera_is_mounted_on_is_no_world() -> None:
+    tree = TransformTree(SLOP)
+    tree.add(tf(transform("camera_link", "camera", at(0.1))), static=True)
+    with pytest.raises(RefusedInput, match="fixed to 'camera_link', which does not move"):
+        tree.at(T0, "camera")
+    named = TransformTree(SLOP, "camera_link")  # a camera on a wall
+    named.add(tf(transform("camera_link", "camera", at(0.1))), static=True)
+    np.testing.assert_allclose(named.at(T0, "camera")[0], at(0.1))
+
+
+def test_tf_says_which_frames_it_knows() -> None:
+    tree = TransformTree(SLOP, "map")
+    tree.add(tf(transform("odom", "base", at(1.0))), static=False)
+    with pytest.raises(RefusedInput, match="'camera' with 'map': known frames are base, odom"):
+        tree.at(T0, "camera")
+
+
+def test_a_loop_in_tf_ends() -> None:
+    tree = TransformTree(SLOP, "map")
+    tree.add(tf(transform("a", "b", at(1.0)), transform("b", "a", at(1.0))), static=True)
+    with pytest.raises(RefusedInput):
+        tree.at(T0, "a")

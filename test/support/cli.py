@@ -1,0 +1,69 @@
+"""The command line as a user has it: a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from deworldsg_ros.recordings.source import Source
+from deworldsg_ros.recordings.writer import write_mcap
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO_ROOM = ROOT / "bags" / "demo_room"
+COMMAND = [sys.executable, "-m", "deworldsg_ros.cli"]
+
+
+def environment(folder: Path) -> dict[str, str]:
+    return {
+        **os.environ,
+        "PYTHONPATH": str(ROOT),
+        "COLUMNS": "120",
+        "ROS_LOG_DIR": str(folder / "ros"),
+    }
+
+
+def deworldsg(
+    folder: Path, *arguments: object, limit_s: float = 60.0
+) -> subprocess.CompletedProcess[str]:
+    """Run it to its end; INT and not KILL at the limit, so that the demo can end its nodes."""
+    process = start(folder, *arguments)
+    try:
+        out, err = process.communicate(timeout=limit_s)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+        raise AssertionError(f"took more than {limit_s:g} s:\n{out}\n{err}") from None
+    return subprocess.CompletedProcess(process.args, process.returncode, out, err)
+
+
+def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*COMMAND, *map(str, arguments)],
+        cwd=folder,
+        env=environment(folder),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def first_frames(source: Source, count: int, path: Path) -> Path:
+    """An MCAP file of the first frames of a recording."""
+
+    def messages():
+        last_ns = None
+        stamps = set()
+        for message in source.raw_messages():
+            stamps.add(message.stamp_ns)
+            if len(stamps) > count:
+                last_ns = message.stamp_ns
+                break
+            yield message
+        assert last_ns is not None
+
+    write_mcap(messages(), path)
+    source.close()
+    return path

@@ -1,0 +1,42 @@
+"""A backend of perception that fails on demand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.perception import Detections, MaskPatch
+from deworldsg_ros.scene.frame_graph import Relations
+
+SHAPE = (40, 50)
+
+
+class Backend:
+    """All three backends in one; fails where told."""
+
+    classes = ("table", "cup")
+    predicates = ("on", "near")
+    default_score_threshold = 0.5
+
+    def __init__(self, failing=""):
+        self.failing = failing
+        self.features = None
+
+    def _work(self, part):
+        if self.failing == part:
+            raise RuntimeError(f"CUDA out of memory in the {part}")
+
+    def detect(self, rgb, score_threshold):
+        self._work("detector")
+        boxes = np.array([[2.0, 2, 20, 20], [10.0, 10, 40, 35], [4.0, 4, 30, 30]])
+        probabilities = np.array([[0.9, 0.1], [0.2, 0.8], [0.6, 0.4]])
+        features = np.arange(6, dtype=np.float32).reshape(3, 2)
+        return Detections(boxes, probabilities, np.array([0.6, 0.9, 0.8]), features)
+
+    def segment(self, rgb, depth_m, intrinsics, boxes_xyxy, class_names=None):
+        self._work("segmenter")
+        return [MaskPatch(3 * row, 2, np.ones((3, 4), bool)) for row in range(len(boxes_xyxy))]
+
+    def relate(self, *arguments):
+        self._work("relation head")
+        self.features = arguments[-1]
+        return Relations(np.array([[0, 1]]), np.zeros((1, 2)), np.ones(1))

@@ -1,0 +1,192 @@
+"""Node processes, and a camera that replays a recording to them, for tests."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import String
+
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.ros.qos import reliable
+
+ROOT = Path(__file__).resolve().parents[2]
+KINDS = {
+    "sensor_msgs/msg/Image": Image,
+    "sensor_msgs/msg/CompressedImage": CompressedImage,
+    "sensor_msgs/msg/CameraInfo": CameraInfo,
+    "geometry_msgs/msg/PoseStamped": PoseStamped,
+    "nav_msgs/msg/Odometry": Odometry,
+}
+TOPICS = {
+    Role.RGB: "rgb/image_raw",
+    Role.DEPTH: "depth/image_raw",
+    Role.CAMERA_INFO: "rgb/camera_info",
+    Role.POSE: "camera/pose",
+}
+# How many of the four nodes listen to each.
+LISTENERS = {Role.RGB: 2, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
+
+
+class NodeProcess:
+    """One node, started as a user starts it; ended by INT, then TERM, then KILL."""
+
+    def __init__(self, name: str, folder: Path, *arguments: str) -> None:
+        self.name = name
+        self.log_path = folder / f"{name}.log"
+        # In front of what a sourced ROS 2 put there.
+        python_path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = {
+            **os.environ,
+            "PYTHONPATH": python_path,
+            "ROS_LOG_DIR": str(folder / "ros"),
+        }
+        command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *arguments]
+        with self.log_path.open("w") as log:
+            self._process = subprocess.Popen(
+                command, env=environment, cwd=folder, stdout=log, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def log(self) -> str:
+        """What it printed."""
+        return self.log_path.read_text()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still runs."""
+        return self._process.poll() is None
+
+    def wait_ready(self, limit_s: float = 60.0) -> None:
+        """Wait until it says that it is ready."""
+        wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
+        assert self.alive, self.log
+
+    def wait(self, limit_s: float) -> int:
+        """The exit code."""
+        return self._process.wait(limit_s)
+
+    def interrupt(self, limit_s: float = 20.0) -> int:
+        """Send SIGINT; the exit code."""
+        if self.alive:
+            self._process.send_signal(signal.SIGINT)
+        return self._process.wait(limit_s)
+
+    def end(self) -> None:
+        """End it, whatever it takes."""
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            if not self.alive:
+                return
+            self._process.send_signal(number)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(5)
+
+
+def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None:
+    """Wait for a condition; fails by name when time runs out."""
+    end_s = time.monotonic() + limit_s
+    while not condition():
+        assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
+        time.sleep(0.02)
+
+
+class Peer:
+    """A node of the test itself, with its own context."""
+
+    def __init__(self, name: str) -> None:
+        self.context = rclpy.Context()
+        rclpy.init(context=self.context)
+        self.node = Node(name, context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.also_spin: list[SingleThreadedExecutor] = []
+
+    def spin_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
+        """Run callbacks until a condition holds."""
+        end_s = time.monotonic() + limit_s
+        while not condition():
+            assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
+            self._spin_once()
+
+    def spin_for(self, duration_s: float) -> None:
+        """Run callbacks for a while."""
+        end_s = time.monotonic() + duration_s
+        while time.monotonic() < end_s:
+            self._spin_once()
+
+    def _spin_once(self) -> None:
+        for executor in (self._executor, *self.also_spin):
+            executor.spin_once(timeout_sec=0.01)
+
+    def collect(self, topic: str, depth: int = 100, *, latched: bool = False) -> list[str]:
+        """A list that receives the texts of a topic."""
+        texts: list[str] = []
+        self.node.create_subscription(
+            String,
+            topic,
+            lambda message: texts.append(message.data),
+            reliable(depth, latched=latched),
+        )
+        return texts
+
+    def close(self) -> None:
+        """End the node and its context."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+@contextlib.contextmanager
+def peer(name: str = "test_peer") -> Iterator[Peer]:
+    """A peer, closed at the end."""
+    made = Peer(name)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+class Camera:
+    """Publishes a recording's messages as they are."""
+
+    def __init__(self, peer: Peer, messages: list[RawRoleMessage]) -> None:
+        self._peer = peer
+        self._messages = messages
+        kinds = {message.role: KINDS[message.msgtype] for message in messages}
+        self._publishers = {
+            role: peer.node.create_publisher(kind, TOPICS[role], reliable(10))
+            for role, kind in kinds.items()
+        }
+
+    def wait_for_listeners(self, limit_s: float = 30.0) -> None:
+        """Wait until all nodes listen, so that nothing of the start is lost."""
+        self._peer.spin_until(
+            lambda: all(
+                publisher.get_subscription_count() >= LISTENERS[role]
+                for role, publisher in self._publishers.items()
+            ),
+            limit_s,
+            "the nodes to listen to the camera",
+        )
+
+    def frames(self) -> Iterator[int]:
+        """Publish frame by frame; yields the stamp of each RGB image after its messages."""
+        stamps_ns = sorted({item.stamp_ns for item in self._messages})
+        for stamp_ns in stamps_ns:
+            for item in self._messages:
+                if item.stamp_ns == stamp_ns:
+                    self._publishers[item.role].publish(bytes(item.data))
+            yield stamp_ns

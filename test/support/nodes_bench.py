@@ -1,0 +1,223 @@
+"""One node in the test's process, fed through DDS, and the messages that feed it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import String
+from support.nodes import Peer
+
+from deworldsg_ros.nodes.graph_node import GraphNode
+from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene import wire
+from deworldsg_ros.streams.images import fill_image
+from deworldsg_ros.streams.poses import set_stamp
+
+WIDTH, HEIGHT = 64, 48
+STEP_NS = 100 * 10**6
+LIMIT_S = 20.0
+
+
+def stamped(message: Any, stamp_ns: int, frame_id: str = "camera") -> Any:
+    set_stamp(message, stamp_ns)
+    message.header.frame_id = frame_id
+    return message
+
+
+def image(pixels: np.ndarray, encoding: str, stamp_ns: int) -> Image:
+    message = Image()
+    fill_image(message, pixels, encoding)
+    return stamped(message, stamp_ns)
+
+
+def rgb(stamp_ns: int) -> Image:
+    return image(np.zeros((HEIGHT, WIDTH, 3), np.uint8), "rgb8", stamp_ns)
+
+
+def depth(stamp_ns: int, height: int = HEIGHT) -> Image:
+    return image(np.full((height, WIDTH), 1500, np.uint16), "16UC1", stamp_ns)
+
+
+def camera_info(stamp_ns: int) -> CameraInfo:
+    message = CameraInfo(width=WIDTH, height=HEIGHT)
+    message.k = [60.0, 0.0, 32.0, 0.0, 60.0, 24.0, 0.0, 0.0, 1.0]
+    return stamped(message, stamp_ns)
+
+
+def pose(stamp_ns: int, x: float = 0.0, frame_id: str = "map") -> PoseStamped:
+    message = PoseStamped()
+    message.pose.position.x = x
+    message.pose.orientation.w = 1.0
+    return stamped(message, stamp_ns, frame_id)
+
+
+def instances(stamp_ns: int, value: int = 0) -> Image:
+    return image(np.full((HEIGHT, WIDTH), value, np.uint16), "mono16", stamp_ns)
+
+
+def schema(kind: type[wire.Message], stamp_ns: int, frame_id: str) -> dict[str, Any]:
+    return {
+        "schema": wire.schema_of(kind),
+        "stamp": wire.stamp_from_ns(stamp_ns),
+        "frame_id": frame_id,
+        "classes": ["chair", "cup"],
+        "predicates": ["on"],
+    }
+
+
+def frame_graph(stamp_ns: int) -> wire.FrameGraphMessage:
+    return wire.FrameGraphMessage(
+        **schema(wire.FrameGraphMessage, stamp_ns, "camera"),
+        width=WIDTH,
+        height=HEIGHT,
+        objects=[],
+        relations=[],
+    )
+
+
+def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
+    return wire.LocalGraphMessage(
+        **schema(wire.LocalGraphMessage, stamp_ns, "map"),
+        width=WIDTH,
+        height=HEIGHT,
+        T_world_camera=np.eye(4).ravel().tolist(),
+        objects=[
+            wire.LiftedObject(
+                instance=1,
+                box_xyxy=[1.0, 1.0, 9.0, 9.0],
+                score=0.9,
+                class_probabilities=[0.9, 0.1],
+                mean_m=[0.0, 0.0, 1.0],
+                covariance_m2=(0.01 * np.eye(3)).ravel().tolist(),
+                depth_m=1.0,
+                pixel_count=50,
+                surface_points_m=[],
+            )
+        ],
+        relations=[],
+    )
+
+
+def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
+    return wire.RelationEvidenceMessage(
+        **schema(wire.RelationEvidenceMessage, stamp_ns, "map"), source="none", pairs=[]
+    )
+
+
+class Bench:
+    """One node in this process, fed through DDS."""
+
+    def __init__(
+        self,
+        make: type[StageNode],
+        topics: dict[str, type],
+        qos: QoSProfile | None = None,
+        **options: Any,
+    ) -> None:
+        self.peer = Peer("bench")
+        # A context of its own, as in a process of its own: one context has one type a topic.
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = make(context=self._context, **options)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self.peer.also_spin.append(self._executor)
+        self._publishers = {
+            topic: self.peer.node.create_publisher(kind, topic, qos or reliable(50))
+            for topic, kind in topics.items()
+        }
+        self.stamp_ns = 1_700_000_000 * 10**9
+        self.peer.spin_until(
+            lambda: all(p.get_subscription_count() > 0 for p in self._publishers.values()),
+            LIMIT_S,
+            "the node to listen",
+        )
+
+    def send(self, **messages: Any) -> None:
+        """Publish messages on topics, named with __ for /."""
+        for name, message in messages.items():
+            if isinstance(message, msgspec.Struct):
+                message = String(data=wire.encode(message))
+            elif isinstance(message, str):
+                message = String(data=message)
+            self._publishers[name.replace("__", "/")].publish(message)
+
+    def next_stamp(self) -> int:
+        self.stamp_ns += STEP_NS
+        return self.stamp_ns
+
+    def products(self) -> int:
+        """Something that grows with every frame that the node has worked on."""
+        if isinstance(self.node, GraphNode):  # what it publishes depends on the merging rule
+            return self.node._newest_ns
+        return self.node.health._published
+
+    def expect(self, condition: Callable[[], bool], what: str) -> None:
+        self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")
+
+    def refuses(self, reason: str, provoke: Callable[[], None], number: int = 1) -> None:
+        before = self.node.health.drops.get(reason, 0)
+        provoke()
+        self.expect(
+            lambda: self.node.health.drops.get(reason, 0) >= before + number, f"a drop of {reason}"
+        )
+
+    def close(self) -> None:
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.close()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self._context)
+        self.peer.close()
+
+
+def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
+    made = Bench(make, topics)
+    yield made
+    made.close()
+
+
+CAMERA = {
+    "rgb/image_raw": Image,
+    "depth/image_raw": Image,
+    "rgb/camera_info": CameraInfo,
+    "camera/pose": PoseStamped,
+}
+
+
+def send_frame(at: Bench, **changes: Any) -> None:
+    """A complete frame, with some messages changed (a function of the stamp) or left out."""
+    stamp_ns = at.next_stamp()
+    makers = {
+        "rgb__camera_info": camera_info,
+        "camera__pose": pose,
+        "depth__image_raw": depth,
+        "rgb__image_raw": rgb,
+        **changes,
+    }
+    at.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
+
+
+def works(at: Bench, send: Callable[[], None]) -> None:
+    """Good input gives a product."""
+    before = at.products()
+    send()
+    at.expect(lambda: at.products() > before, "a product")
+
+
+def changed(make: Callable[[int], Any], **fields: Any) -> Callable[[int], Any]:
+    def changing(stamp_ns: int) -> Any:
+        message = make(stamp_ns)
+        for name, value in fields.items():
+            setattr(message, name, value)
+        return message
+
+    return changing

@@ -1,0 +1,159 @@
+"""Small recordings for tests: a camera that moves, in whatever form a bag or folder has it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+
+from deworldsg_ros.recordings import messages as ros
+from deworldsg_ros.recordings.messages import RoleMessage, typestore
+from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
+
+WIDTH, HEIGHT = 64, 48
+INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, WIDTH, HEIGHT)
+STEP_NS = 100_000_000
+T0_NS = 5_000_000_000
+CAMERA, WORLD = "camera_optical", "map"
+
+
+def stamp_ns(index: int) -> int:
+    return T0_NS + index * STEP_NS
+
+
+def rgb_pixels(index: int) -> np.ndarray:
+    """Smooth, so that JPEG keeps it nearly."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return np.stack([rows * 4, columns * 3, np.full_like(rows, 40 + index)], axis=2).astype(
+        np.uint8
+    )
+
+
+def depth_mm(index: int) -> np.ndarray:
+    depth = np.full((HEIGHT, WIDTH), 1000 + 7 * index, np.uint16)
+    depth[:5] = 0
+    return depth
+
+
+def pose(index: int) -> np.ndarray:
+    quat = np.array([0.01 * index, 0.2, -0.1, 0.9])
+    return pose_from_quaternion(np.array([0.05 * index, 0.1, 1.2]), quat / np.linalg.norm(quat))
+
+
+def encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
+    return bytes(cv2.imencode(suffix, pixels)[1])
+
+
+def raw_image(
+    index: int, pixels: np.ndarray, encoding: str, offset_ns: int = 0, frame_id: str = CAMERA
+) -> Any:
+    return typestore().types[ros.IMAGE](
+        header=ros.header(stamp_ns(index) + offset_ns, frame_id),
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=pixels.strides[0],
+        data=np.frombuffer(np.ascontiguousarray(pixels).tobytes(), np.uint8),
+    )
+
+
+def pose_message(index: int, offset_ns: int = 0, T_camera_child: Any = None) -> RoleMessage:
+    T = pose(index) if T_camera_child is None else pose(index) @ T_camera_child
+    return ros.pose_stamped(
+        stamp_ns(index) + offset_ns, WORLD, T[:3, 3], quaternion_from_rotation(T[:3, :3])
+    )
+
+
+def odometry(index: int, child: str = CAMERA, T_camera_child: Any = None) -> Any:
+    types = typestore().types
+    at = pose_message(index, T_camera_child=T_camera_child).message
+    zero = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    return types[ros.ODOMETRY](
+        header=at.header,
+        child_frame_id=child,
+        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=at.pose, covariance=np.zeros(36)),
+        twist=types["geometry_msgs/msg/TwistWithCovariance"](
+            twist=types["geometry_msgs/msg/Twist"](linear=zero, angular=zero),
+            covariance=np.zeros(36),
+        ),
+    )
+
+
+def transform(time_ns: int, parent: str, child: str, T: np.ndarray) -> Any:
+    types = typestore().types
+    x, y, z = map(float, T[:3, 3])
+    qx, qy, qz, qw = map(float, quaternion_from_rotation(T[:3, :3]))
+    return types[ros.TF_MESSAGE](
+        transforms=[
+            types["geometry_msgs/msg/TransformStamped"](
+                header=ros.header(time_ns, parent),
+                child_frame_id=child,
+                transform=types["geometry_msgs/msg/Transform"](
+                    translation=types["geometry_msgs/msg/Vector3"](x=x, y=y, z=z),
+                    rotation=types["geometry_msgs/msg/Quaternion"](x=qx, y=qy, z=qz, w=qw),
+                ),
+            )
+        ]
+    )
+
+
+Item = tuple[str, str, int, Any]
+
+
+def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True) -> list[Item]:
+    """(topic, type, log time, message) of a camera; depth in metres where not compressed."""
+    items: list[Item] = []
+    for index in range(count):
+        time_ns = stamp_ns(index)
+        info = ros.camera_info(time_ns, CAMERA, INTRINSICS).message
+        items.append(("/camera/color/camera_info", ros.CAMERA_INFO, time_ns, info))
+        if with_pose:
+            items.append(("/camera/pose", ros.POSE_STAMPED, time_ns, pose_message(index).message))
+        bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
+        if compressed:
+            depth = ros.compressed_depth(time_ns, CAMERA, encoded(depth_mm(index))).message
+            rgb = ros.compressed_image(time_ns, CAMERA, encoded(bgr), "png").message
+            items += [
+                ("/camera/depth/image_raw/compressedDepth", ros.COMPRESSED_IMAGE, time_ns, depth),
+                ("/camera/color/image_raw/compressed", ros.COMPRESSED_IMAGE, time_ns, rgb),
+            ]
+        else:
+            metres = (depth_mm(index) * np.float32(1e-3)).astype(np.float32)
+            items += [
+                ("/camera/depth/image_raw", ros.IMAGE, time_ns, raw_image(index, metres, "32FC1")),
+                ("/camera/color/image_raw", ros.IMAGE, time_ns, raw_image(index, bgr, "bgr8")),
+            ]
+    return items
+
+
+def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
+    """A rosbag2 folder of the items, messages or the bytes of them."""
+    plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
+    connections: dict[str, Any] = {}
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        for topic, msgtype, time_ns, message in items:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore())
+            if not isinstance(message, bytes):
+                message = bytes(typestore().serialize_cdr(message, msgtype))
+            writer.write(connections[topic], time_ns, message)
+    return folder
+
+
+def write_seven_scenes(folder: Path, count: int, step: int = 4) -> Path:
+    """A registered 7-Scenes folder; frame k has index k * step."""
+    folder.mkdir()
+    K = INTRINSICS.matrix
+    (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, r)) for r in K))
+    for index in range(count):
+        stem = folder / f"frame-{index * step:06d}"
+        bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
+        stem.with_suffix(".color.jpg").write_bytes(encoded(bgr, ".jpg"))
+        stem.with_suffix(".depth.png").write_bytes(encoded(depth_mm(index)))
+        np.savetxt(stem.with_suffix(".pose.txt"), pose(index), "%.9g")
+    return folder

@@ -1,0 +1,64 @@
+"""Objects as points on their surfaces, and frames of them, for the surface rule."""
+
+from __future__ import annotations
+
+import numpy as np
+from support.merging import VOCABULARY
+
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations
+from deworldsg_ros.scene.gaussian import moments
+
+CUP, TABLE, CHAIR = 0, 1, 2
+
+
+def slab(centre: tuple[float, float, float], size: tuple[float, float, float]) -> np.ndarray:
+    """Points on the surface of a thin box, 5 mm of noise, a thousand a square metre and more."""
+    rng = np.random.default_rng(abs(hash((centre, size))) % 2**32)
+    count = int(np.clip(2000 * max(size[0] * size[1], size[1] * size[2], 0.05), 100, 4000))
+    points = rng.uniform(-0.5, 0.5, (count, 3)) * size + centre
+    return (points + rng.normal(0, 0.003, points.shape)).astype(np.float32)
+
+
+def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph:
+    """A local graph of objects given by surface points and class."""
+    count = len(objects)
+    gaussians = [moments(points, 1e-6) for points, _ in objects]
+    classes = np.full((count, 4), 0.05)
+    for row, (_, kind) in enumerate(objects):
+        classes[row, kind] = 0.85
+    fields = {
+        "stamp_ns": stamp * 10**8,
+        "frame_id": "world",
+        "width": 640,
+        "height": 480,
+        "T_world_camera": np.eye(4),
+        "vocabulary": VOCABULARY,
+        "instance_ids": np.arange(1, count + 1),
+        "boxes_xyxy": np.tile([10.0, 10, 100, 100], (count, 1)),
+        "class_probabilities": classes.reshape(count, 4),
+        "scores": np.full(count, 0.9),
+        "means_world": np.array([mean for mean, _ in gaussians]).reshape(-1, 3),
+        "covariances_world": np.array([cov for _, cov in gaussians]).reshape(-1, 3, 3),
+        "depths_m": np.full(count, 2.0),
+        "pixel_counts": np.array([len(points) for points, _ in objects], np.int64),
+        "surface_points_world": tuple(points for points, _ in objects),
+        "relations": Relations.none(len(VOCABULARY.predicates)),
+    }
+    return LocalGraph(**{**fields, **changes})
+
+
+WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))
+CAMERA = Intrinsics(300.0, 300.0, 319.5, 239.5, 640, 480)
+WALL_M = 1.0  # the table top, seen from in front; cups float before it
+HERE = slab((0.3, 0.1, 0.7), (0.08, 0.08, 0.06))
+
+
+def depth_grid(*surfaces: np.ndarray, background_m: float = WALL_M) -> DepthGrid:
+    """What a camera at the origin that looks along z sees of points before a wall."""
+    depth_mm = np.full((60, 80), background_m * 1000, np.uint16)
+    for points in surfaces:
+        columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)
+        rows = np.floor((300 * points[:, 1] / points[:, 2] + 239.5) / 8).astype(int)
+        np.minimum.at(depth_mm, (rows, columns), (points[:, 2] * 1000).astype(np.uint16))
+    return DepthGrid(depth_mm, 8, CAMERA)

@@ -1,0 +1,194 @@
+"""Small checkpoints of the detectors and segmenters: real architectures, saved in real formats."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+transformers = pytest.importorskip("transformers")
+
+from safetensors.torch import save_file  # noqa: E402  after the guards
+
+from deworldsg_ros.checkpoints.card import (  # noqa: E402
+    CARD_FILE,
+    CheckpointCard,
+    write_card,
+)
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork  # noqa: E402
+from deworldsg_ros.config import PerceptionConfig  # noqa: E402
+
+WIDTH = 32
+LAYERS = 4
+QUERIES = 30
+CLASSES = ("bed", "chair", "desk", "lamp", "sofa", "table")
+PREDICATES = ("above", "near", "on")
+IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+
+
+def image(height=48, width=64, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3)).astype(np.uint8)
+
+
+def rtdetr_config(version=1, labels=CLASSES, **changes):
+    backbone = transformers.RTDetrResNetConfig(
+        embedding_size=8,
+        hidden_sizes=[16, 24, 32, 40],
+        depths=[1, 1, 2, 1],
+        layer_type="bottleneck",
+        out_features=["stage2", "stage3", "stage4"],
+    )
+    settings = {
+        "encoder_hidden_dim": WIDTH,
+        "encoder_in_channels": [24, 32, 40],
+        "encoder_ffn_dim": 48,
+        "d_model": WIDTH,
+        "num_queries": QUERIES,
+        "decoder_in_channels": [WIDTH] * 3,
+        "decoder_ffn_dim": 40,
+        "decoder_layers": LAYERS,
+        "hidden_expansion": 0.5,
+        "id2label": dict(enumerate(labels)),
+        "label2id": {name: index for index, name in enumerate(labels)},
+    }
+    family = transformers.RTDetrConfig if version == 1 else transformers.RTDetrV2Config
+    return family(backbone_config=backbone, **{**settings, **changes})
+
+
+def random_rtdetr(version=1, seed=0, **changes):
+    """An RT-DETR whose queries do not all say the same, unlike those of a fresh one."""
+    torch.manual_seed(seed)
+    config = rtdetr_config(version, **changes)
+    family = (
+        transformers.RTDetrForObjectDetection
+        if version == 1
+        else transformers.RTDetrV2ForObjectDetection
+    )
+    model = family(config).eval()
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            if value.ndim > 1:
+                value.normal_(0, 1.4 / value[0].numel() ** 0.5)
+            elif name.endswith("weight"):  # of a normalisation
+                value.uniform_(0.5, 1.5)
+            elif "class_embed" in name:
+                value.normal_(-1, 0.5)
+        for name, value in model.named_buffers():
+            if name.endswith("running_var"):
+                value.uniform_(0.5, 1.5)
+    return model
+
+
+def save_rtdetr(folder, version=1, seed=0, card=None, side=64, normalise=False, **changes):
+    """A folder as `deworldsg models import-fross` writes it, or without card as the hub has it."""
+    random_rtdetr(version, seed, **changes).save_pretrained(folder)
+    preprocessing = {"size": {"height": side, "width": side}, "do_normalize": normalise, **IMAGENET}
+    (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
+    if card is not None:
+        write_card(folder / CARD_FILE, card)
+    return folder
+
+
+def random_head(seed=0, layers=LAYERS, classes=len(CLASSES), predicates=len(PREDICATES)):
+    torch.manual_seed(seed)
+    network = EgtrNetwork(WIDTH, layers, predicates, (classes + 1, classes + 1, predicates))
+    with torch.no_grad():
+        for value in network.parameters():
+            value.normal_(0, 0.3)
+    return network.eval()
+
+
+def save_paper_checkpoint(folder, card_changes=None, **changes):
+    """Softmax detector and relation head in one folder."""
+    card = {"class_scores": "softmax", "score_threshold": 0.3, "predicates": PREDICATES}
+    card = CheckpointCard(**{**card, "frequency_bias": True, **(card_changes or {})})
+    save_rtdetr(folder, card=card, normalise=True, **changes)
+    save_file(random_head().state_dict(), folder / "egtr_head.safetensors")
+    return folder
+
+
+def save_sam2(folder, seed=0, video=False):
+    torch.manual_seed(seed)
+    backbone = {
+        "hidden_size": 12,
+        "image_size": [128, 128],
+        "embed_dim_per_stage": [12, 24, 48, 96],
+        "num_attention_heads_per_stage": [1, 2, 4, 8],
+        "blocks_per_stage": [1, 1, 2, 1],
+        "global_attention_blocks": [3],
+        "window_positional_embedding_background_size": [4, 4],
+    }
+    vision = transformers.Sam2VisionConfig(
+        backbone_config=transformers.Sam2HieraDetConfig(**backbone),
+        backbone_channel_list=[96, 48, 24, 12],
+        backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
+        fpn_hidden_size=32,
+    )
+    prompt = {"hidden_size": 32, "image_size": 128, "patch_size": 16, "mask_input_channels": 4}
+    decoder = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
+    if video:
+        config = transformers.Sam2VideoConfig(
+            vision_config=vision,
+            prompt_encoder_config=prompt,
+            mask_decoder_config=decoder,
+            image_size=128,
+            memory_attention_hidden_size=32,
+            memory_attention_feed_forward_hidden_size=32,
+            memory_encoder_hidden_size=32,
+            memory_encoder_output_channels=16,
+            mask_downsampler_embed_dim=32,
+            memory_fuser_embed_dim=32,
+            memory_fuser_intermediate_dim=32,
+        )
+        model = transformers.Sam2VideoModel(config)
+    else:
+        model = transformers.Sam2Model(
+            transformers.Sam2Config(
+                vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
+            )
+        )
+    _stir(model)
+    model.save_pretrained(folder)
+    return folder
+
+
+def save_sam(folder, seed=0):
+    torch.manual_seed(seed)
+    config = transformers.SamConfig(
+        vision_config={
+            "hidden_size": 24,
+            "output_channels": 32,
+            "num_pos_feats": 16,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 2,
+            "image_size": 128,
+            "window_size": 4,
+            "global_attn_indexes": [1],
+            "mlp_dim": 48,
+        },
+        prompt_encoder_config={
+            "hidden_size": 32,
+            "image_size": 128,
+            "image_embedding_size": 8,
+            "mask_input_channels": 4,
+        },
+        mask_decoder_config={"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32},
+    )
+    model = transformers.SamModel(config)
+    _stir(model)
+    model.save_pretrained(folder)
+    return folder
+
+
+def _stir(model):
+    """Weights of a size at which masks are neither empty nor full."""
+    with torch.no_grad():
+        for name, value in model.mask_decoder.named_parameters():
+            if "norm" not in name:
+                value.normal_(0, 0.3)
+
+
+def settings(**changes):
+    return PerceptionConfig(**{"device": "cpu", "threads": 1, **changes})

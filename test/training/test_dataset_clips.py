@@ -1,0 +1,72 @@
+"""Clips to train a probe on are cut out of data sets as the stage cuts them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from support.sequences import (
+    BLOCKS,
+    HEIGHT,
+    RELATIONS,
+    ROWS,
+    WIDTH,
+    instance_image,
+    write_dataset,
+    write_sequence,
+    write_surface,
+)
+
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.training.dataset_clips import read_clips
+
+# Blue, green, red of each block.
+COLOURS = {1: (250, 10, 10), 2: (10, 250, 10), 3: (10, 10, 250)}
+
+
+@pytest.fixture
+def rio(tmp_path):
+    """3RScan's layout: one scan of three blocks in a row, whose images lie on their side."""
+    objects = [(name, number) for number, name, _, _ in BLOCKS]
+    root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
+    write_surface(write_sequence(root / "data" / "a", frames=10))
+    picture = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
+    for number, colour in COLOURS.items():
+        picture[instance_image() == number] = colour
+    for path in (root / "data" / "a" / "sequence").glob("*.color.jpg"):
+        cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    return root
+
+
+def test_clips_of_3rscan_are_upright_and_of_what_is_seen(rio):
+    clips = read_clips(rio, clip_length=4, clips_per_pair=2)
+    # Boxes are looked for in every eighth frame: the first and the ninth.
+    assert [clip.predicate for clip in clips] == ["near", "near", "on", "on"]
+    assert {clip.group for clip in clips} == {"a"}
+    clip = clips[0].read()
+    height, width = clip.shape[1:3]
+    assert clip.shape[0] == 4
+    # Turned by 90 degrees the columns are rows; within a pixel, as points are pixels' centres.
+    assert (
+        abs(width - (ROWS[1] - ROWS[0])) <= 2 and abs(height - (BLOCKS[1][3] - BLOCKS[0][2])) <= 2
+    )
+    for sample, object_id in zip(clips[0].boxes.reshape(2, 4), (1, 2)):
+        x1, y1, x2, y2 = sample * (width, height, width, height)
+        middle = clip[-1, int((y1 + y2) / 2), int((x1 + x2) / 2)]
+        assert np.abs(middle[::-1].astype(int) - COLOURS[object_id]).max() < 60
+
+
+def test_what_is_hidden_is_not_seen(rio):
+    for path in (rio / "data" / "a" / "sequence").glob("*.depth.pgm"):
+        depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        depth[:, BLOCKS[1][2] :] = 1000  # something else is in front of the table and the book
+        cv2.imwrite(str(path), depth)
+    with pytest.raises(ConfigurationError, match="no related pair is seen"):
+        read_clips(rio, clip_length=4, clips_per_pair=2)
+
+
+def test_a_frame_that_cannot_be_read_shows_nothing(rio):
+    sequence = rio / "data" / "a" / "sequence"
+    (sequence / "frame-000000.pose.txt").write_text("no matrix")
+    clips = read_clips(rio, clip_length=4, clips_per_pair=2)
+    assert [clip.predicate for clip in clips] == ["near", "on"]

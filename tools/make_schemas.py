@@ -1,0 +1,198 @@
+#!/usr/bin/env python3
+"""Write msg_schemas/: one JSON Schema (2020-12) and one example of each message.
+
+python tools/make_schemas.py [FOLDER]
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from deworldsg_ros.scene import wire  # noqa: E402
+
+CLASSES = ["cup", "table", "chair"]
+PREDICATES = ["on", "near", "under"]
+STAMP = wire.Stamp(sec=12, nanosec=300_000_000)
+EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
+
+
+def message_schema(name: str) -> dict[str, Any]:
+    """JSON Schema of a message, which says the name that it must carry."""
+    schema = wire.json_schema(wire.MESSAGES[name])
+    definition = schema["$defs"][wire.MESSAGES[name].__name__]
+    for described in schema["$defs"].values():
+        if "description" in described:  # A docstring, which Python 3.13 strips of its indentation.
+            described["description"] = inspect.cleandoc(described["description"])
+    definition["properties"]["schema"] = {
+        "allOf": [
+            {"$ref": "#/$defs/Schema"},
+            {"properties": {"name": {"const": name}, "version": {"maximum": wire.VERSION}}},
+        ]
+    }
+    return {**schema, "title": f"deworldsg_ros {name}, version {wire.VERSION}"}
+
+
+def examples() -> dict[str, wire.Message]:
+    """A cup on a table and a chair under it, in each message."""
+    relations = [wire.RelationLogits(subject=0, object=1, score=0.87, logits=[4.0, 1.5, -3.0])]
+    head: dict[str, dict[str, Any]] = {
+        name: {"schema": wire.schema_of(kind)} for name, kind in wire.MESSAGES.items()
+    }
+    world: dict[str, Any] = {"stamp": STAMP, "frame_id": "map"}
+    words: dict[str, Any] = {"classes": CLASSES, "predicates": PREDICATES}
+    image: dict[str, Any] = {"width": 640, "height": 480}
+    return {
+        "frame_graph": wire.FrameGraphMessage(
+            **head["frame_graph"],
+            stamp=STAMP,
+            frame_id="camera_color_optical_frame",
+            **image,
+            **words,
+            objects=[
+                wire.DetectedObject([310.0, 180.5, 352.0, 231.0], 0.91, [0.94, 0.03, 0.03]),
+                wire.DetectedObject([120.0, 215.0, 560.0, 402.5], 0.83, [0.02, 0.9, 0.08]),
+            ],
+            relations=relations,
+        ),
+        "local_graph": wire.LocalGraphMessage(
+            **head["local_graph"],
+            **world,
+            **image,
+            T_world_camera=[
+                1.0, 0.0, 0.0, 0.4,
+                0.0, 0.0, 1.0, -1.8,
+                0.0, -1.0, 0.0, 1.3,
+                0.0, 0.0, 0.0, 1.0,
+            ],
+            **words,
+            objects=[
+                _lifted(1, [310.0, 180.5, 352.0, 231.0], 0, [0.42, 0.02, 0.8], 0.0009, 1780),
+                _lifted(2, [120.0, 215.0, 560.0, 402.5], 1, [0.45, 0.1, 0.71], 0.09, 41_250),
+            ],
+            relations=relations,
+            drops={"few_mask_pixels": 1},
+            # As coarse as can be: one sample, 1.85 m, in the middle of the image.
+            depth_grid=wire.DepthGridState(640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07"),
+        ),
+        "relation_evidence": wire.RelationEvidenceMessage(
+            **head["relation_evidence"],
+            **world,
+            **words,
+            source="fake",
+            pairs=[
+                wire.PairEvidence(0, 1, 0, 1, 0.12, [0.7, 0.2, 0.1]),
+                wire.PairEvidence(1, 0, 1, 0, 0.12),
+            ],
+        ),
+        "scene_graph": wire.SceneGraphMessage(
+            **head["scene_graph"],
+            **world,
+            sequence=41,
+            nodes=[_cup(), _node(2, "table", [0.45, 0.1, 0.71], 0.09, 29)],
+            edges=[_cup_on_table()],
+        ),
+        "scene_graph_updates": wire.SceneGraphUpdateMessage(
+            **head["scene_graph_updates"],
+            **world,
+            sequence=42,
+            removed_nodes=[wire.RemovedNode(id=7, merged_into=2), wire.RemovedNode(id=9)],
+            removed_edges=[wire.RemovedEdge(subject=1, object=7)],
+            nodes=[_cup()],
+            edges=[_cup_on_table()],
+            associations=[wire.Association(stamp=STAMP, nodes=[1, 2])],
+        ),
+    }  # fmt: skip
+
+
+def _lifted(
+    instance: int,
+    box: list[float],
+    class_index: int,
+    mean: list[float],
+    variance: float,
+    count: int,
+) -> wire.LiftedObject:
+    probabilities = [0.04, 0.04, 0.04]
+    probabilities[class_index] = 0.92
+    return wire.LiftedObject(
+        instance=instance,
+        box_xyxy=box,
+        score=0.9,
+        class_probabilities=probabilities,
+        mean_m=mean,
+        covariance_m2=_diagonal(variance),
+        depth_m=1.82,
+        pixel_count=count,
+        surface_points_m=[[mean[0] - 0.02, mean[1], mean[2]], [mean[0] + 0.02, mean[1], mean[2]]],
+    )
+
+
+def _diagonal(variance: float) -> list[float]:
+    return [variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance / 4]
+
+
+def _node(
+    node_id: int, label: str, mean: list[float], variance: float, observations: int
+) -> wire.NodeState:
+    return wire.NodeState(
+        id=node_id,
+        label=label,
+        classes=[wire.Belief(label, 0.92), wire.Belief("chair", 0.05)],
+        mean_m=mean,
+        covariance_m2=_diagonal(variance),
+        observations=observations,
+        first_seen=EARLIER,
+        last_seen=STAMP,
+        entropy_nats=0.32,
+    )
+
+
+def _cup() -> wire.NodeState:
+    return _node(1, "cup", [0.42, 0.02, 0.8], 0.0009, 24)
+
+
+def _cup_on_table() -> wire.EdgeState:
+    return wire.EdgeState(
+        subject=1,
+        object=2,
+        predicate="on",
+        probability=0.91,
+        predicates=[wire.Belief("on", 0.91), wire.Belief("near", 0.08)],
+        provenance="visual",
+        entropy_nats=0.34,
+        observations=23,
+    )
+
+
+def files() -> dict[str, str]:
+    """Text of each file of msg_schemas/, by its name."""
+    texts: dict[str, str] = {}
+    for name, example in examples().items():
+        texts[f"{name}.schema.json"] = _pretty(message_schema(name))
+        texts[f"{name}.example.json"] = _pretty(msgspec.to_builtins(example))
+    return texts
+
+
+def _pretty(content: Any) -> str:
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+
+
+def main(folder: Path) -> None:
+    """Write them all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files().items():
+        (folder / name).write_text(text, encoding="utf-8")
+        print(folder / name)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "msg_schemas")
