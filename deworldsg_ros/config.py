@@ -1,7 +1,7 @@
 """One typed configuration for the nodes and the command line.
 
-The defaults are those of config/robust.yaml: the paper's values, and what goes beyond the paper
-because measurement shows it to be better. config/paper.yaml turns the latter off.
+The defaults are the paper's values, plus what goes beyond the paper because measurement shows it to
+be better. config/paper.yaml turns the latter off.
 
 A section is a stage. Each field states its description and range once: here. The ROS parameters
 `section.field` are declared from this, and a YAML file is a ROS parameter file that also works

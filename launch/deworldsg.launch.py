@@ -36,7 +36,7 @@ def generate_launch_description() -> LaunchDescription:
     arguments = [
         DeclareLaunchArgument(
             "params_file",
-            default_value=PathJoinSubstitution([share, "config", "robust.yaml"]),
+            default_value=PathJoinSubstitution([share, "config", "default.yaml"]),
             description="ROS parameter file for all nodes",
         ),
         DeclareLaunchArgument(

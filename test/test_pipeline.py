@@ -185,12 +185,12 @@ def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
 
 
 def test_the_shipped_configurations_are_what_they_say() -> None:
-    assert load_config(CONFIGURATIONS / "robust.yaml") == Config()
-    robust, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
+    assert load_config(CONFIGURATIONS / "default.yaml") == Config()
+    default, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
     assert {
         (section, field)
-        for section in robust
-        for field, value in robust[section].items()
+        for section in default
+        for field, value in default[section].items()
         if paper[section][field] != value
     } == {
         ("perception", "join_nested"),

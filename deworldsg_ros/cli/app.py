@@ -42,7 +42,7 @@ RecordingPath = Annotated[
 OutFolder = Annotated[Path, typer.Option("--out", help="folder for the results; made if need be")]
 ConfigFile = Annotated[
     Optional[Path],
-    typer.Option("--config", help="parameter file; without one config/robust.yaml"),
+    typer.Option("--config", help="ROS parameter file; the defaults without one"),
 ]
 Settings = Annotated[
     Optional[list[str]],

@@ -1,4 +1,4 @@
-"""The configuration that a command runs with: the shipped default, a file, single values."""
+"""The configuration that a command runs with: the defaults, a file, single values."""
 
 from __future__ import annotations
 
@@ -8,25 +8,20 @@ from typing import Any
 
 import msgspec
 
-from deworldsg_ros.cli.installation import find_shared
 from deworldsg_ros.config import Config, from_mapping, load_config, to_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 
-DEFAULT = "config/robust.yaml"
-
 
 def effective_config(path: Path | None, settings: list[str] | None = None) -> Config:
-    """Configuration of a file (or the shipped default) with single values put in.
+    """Configuration of a file (or the defaults) with single values put in.
 
     Args:
-        path: ROS parameter file; None = the shipped default.
+        path: ROS parameter file; None = the defaults.
         settings: ``section.field=value`` each.
 
     Raises:
         ConfigurationError: names the file or setting, what was seen and what was wanted.
     """
-    if path is None:
-        path = find_shared(DEFAULT)
     config = Config() if path is None else load_config(path)
     for setting in settings or []:
         config = _put(config, setting)

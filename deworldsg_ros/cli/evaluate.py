@@ -74,7 +74,7 @@ def evaluate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="seed of all faults")] = 0,
     config: Annotated[
         Optional[Path],
-        typer.Option("--config", help="parameter file; without one config/robust.yaml"),
+        typer.Option("--config", help="ROS parameter file; the defaults without one"),
     ] = None,
     settings: Annotated[
         Optional[list[str]],

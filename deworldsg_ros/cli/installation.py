@@ -30,7 +30,7 @@ def prefixes() -> list[Path]:
 
 
 def find_shared(relative: str) -> Path | None:
-    """A file or folder of the package's share, e.g. ``config/robust.yaml``."""
+    """A file or folder of the package's share, e.g. ``config/paper.yaml``."""
     source = checkout()
     folders = [source] if source else []
     folders += [prefix / "share" / PACKAGE for prefix in prefixes()]

@@ -51,7 +51,7 @@ def evaluate_table(
         annotations: of the data set.
         table: which one.
         tasks: a scan each, whose method, configuration and poses the rows replace.
-        config_path: in place of config/robust.yaml.
+        config_path: in place of the default configuration.
         settings: ``section.field=value``, or ``ROW:section.field=value`` of one row.
         predictions: ``NAME=FILE`` of further rows.
         poses: of the rows.
@@ -168,9 +168,9 @@ def _named_predictions(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
-def _config_path(file: str, robust: Path | None) -> Path:
-    if file == "robust" and robust is not None:
-        return robust
+def _config_path(file: str, default: Path | None) -> Path:
+    if file == "default" and default is not None:
+        return default
     path = find_shared(f"config/{file}.yaml")
     if path is None:
         raise ConfigurationError(f"config/{file}.yaml is not installed: the table needs it")

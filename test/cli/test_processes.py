@@ -90,7 +90,7 @@ def test_a_terminal_s_ctrl_c_does_not_reach_it(tmp_path):
 
 
 def test_files_of_the_package_are_found():
-    assert find_shared("config/robust.yaml").is_file()
+    assert find_shared("config/default.yaml").is_file()
     assert find_shared("config/fastdds.xml").is_file()
     assert find_shared("config/no_such_file.yaml") is None
     assert node_command("graph_node")[-1].endswith("graph_node")

@@ -174,16 +174,16 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
     rows = {row["name"]: row for row in values["rows"]}
     assert list(rows) == [
         *("printed FROSS", "printed DeWorldSG"),
-        *("fross", "kim", "paper", "robust", "SGFN"),
+        *("fross", "kim", "paper", "default", "SGFN"),
     ]
     assert rows["printed FROSS"]["printed"]
     assert rows["printed FROSS"]["relationship_recall"] == 0.223
-    for name in ("fross", "kim", "paper", "robust"):
+    for name in ("fross", "kim", "paper", "default"):
         assert rows[name]["scan_count"] == 1
         assert not rows[name]["failed"]
         assert read_graph(out / name / "room_0" / "scene_graph.json").nodes
-    assert rows["robust"]["object_recall"] == 1.0
-    assert rows["robust"]["nodes_per_object"] == 1.0
+    assert rows["default"]["object_recall"] == 1.0
+    assert rows["default"]["nodes_per_object"] == 1.0
     assert rows["SGFN"]["object_recall"] == 1.0
     assert rows["paper"]["times_ms"].keys() == {"perception", "lifting", "merging", "relations"}
     assert "printed" in told.output
@@ -225,12 +225,12 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
     assert told.exit_code == 0, told.output
     values = json.loads((tmp_path / "t.json").read_text())
     rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
-    assert rows["robust-worse"]["object_recall"] == 1.0
-    assert "slam.pose.txt" in rows["robust-slam"]["failed"]["room_0"]
+    assert rows["default-worse"]["object_recall"] == 1.0
+    assert "slam.pose.txt" in rows["default-slam"]["failed"]["room_0"]
 
 
 def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
-    for table, name in (("hard", "robust-jitter"), ("switches", "cell5-label")):
+    for table, name in (("hard", "default-jitter"), ("switches", "cell5-label")):
         told = evaluate(
             *(root, "--table", table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
@@ -256,8 +256,8 @@ def test_each_condition_is_given_to_its_rows() -> None:
     assert hard["paper-jitter"].front_end == front_end
     assert hard["paper-jitter"].poses.noise.jitter_deg == 1.0
     switches = {row.name: row for row in table_rows("switches", poses, front_end, configure)}
-    assert switches["robust-flip0"].front_end == replace(front_end, flip=0.0)
-    assert switches["robust-label"].front_end.flip == 0.1
+    assert switches["default-flip0"].front_end == replace(front_end, flip=0.0)
+    assert switches["default-label"].front_end.flip == 0.1
 
 
 def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:

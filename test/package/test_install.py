@@ -139,7 +139,7 @@ def test_share_has_what_the_checkout_has(sourced: Install, root_dir: Path) -> No
         if folder != "launch":
             wanted = {name for name in wanted if not name.endswith(".py")}
         assert wanted <= files_below(share / folder)
-    assert {"robust.yaml", "paper.yaml", "fastdds.xml"} <= files_below(share / "config")
+    assert {"default.yaml", "paper.yaml", "fastdds.xml"} <= files_below(share / "config")
     assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
 
 

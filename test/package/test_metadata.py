@@ -36,7 +36,7 @@ def test_package_xml_is_an_ament_python_package_that_depends_on_what_is_imported
     assert imported <= declared
 
 
-@pytest.mark.parametrize("name", ["robust.yaml", "paper.yaml"])
+@pytest.mark.parametrize("name", ["default.yaml", "paper.yaml"])
 def test_configurations_are_those_of_the_package(root_dir: Path, name: str) -> None:
     from deworldsg_ros.config import load_config
 

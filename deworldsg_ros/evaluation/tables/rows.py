@@ -72,7 +72,7 @@ METHODS = (
     ("fross", "FROSS", "fross", "paper"),
     ("kim", "Kim et al.", "kim", "paper"),
     ("paper", "DeWorldSG, paper.yaml", PIPELINE, "paper"),
-    ("robust", "DeWorldSG, robust.yaml", PIPELINE, "robust"),
+    ("default", "DeWorldSG, default", PIPELINE, "default"),
 )
 # name, title, settings on config/paper.yaml
 ABLATION = (
@@ -101,9 +101,9 @@ HARD = (
         "all", "all of it", Faults(label=0.1, false=1.0, bleed=0.3, merge=0.1, cut=0.3), TREMBLING
     ),
 )
-# name, title, settings on config/robust.yaml
+# name, title, settings on the default configuration
 SWITCHES = (
-    ("robust", "robust.yaml", ()),
+    ("default", "default", ()),
     ("paper", "the paper's association", ("merging.association=paper",)),
     ("cell2", "cells of 2 cm", ("merging.cell_m=0.02",)),
     ("cell5", "cells of 5 cm", ("merging.cell_m=0.05",)),
@@ -183,7 +183,7 @@ def table_rows(
         return [
             _harder(
                 Row(
-                    name, title, PIPELINE, configure("robust", settings, name), front_end, poses[0]
+                    name, title, PIPELINE, configure("default", settings, name), front_end, poses[0]
                 ),
                 condition,
             )
