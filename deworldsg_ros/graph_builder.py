@@ -28,7 +28,8 @@ from deworldsg_ros.relations.evidence import (
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import graph_io as storage
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import Float64, check_pose
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import check_pose
 from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair

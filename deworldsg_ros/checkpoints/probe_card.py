@@ -9,12 +9,9 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 CARD_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.up import UpEstimator
 

@@ -28,7 +28,7 @@ from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.timing import STAGES, device_name, total_ms
 

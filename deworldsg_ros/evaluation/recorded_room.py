@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.annotations import (
@@ -27,6 +26,7 @@ from deworldsg_ros.recordings.folders.annotations import (
 )
 from deworldsg_ros.recordings.folders.dataset import read_file
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.scene.arrays import UInt8, UInt16
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
@@ -121,7 +121,7 @@ class RecordedRoom(Annotations):
             "relationships": [(s, o, 0, name) for s, o, name in self._named],
         }
 
-    def instances(self, stamp_ns: int) -> NDArray[np.uint16] | None:
+    def instances(self, stamp_ns: int) -> UInt16 | None:
         """Object ids of a frame's pixels, (H, W); None for a stamp that is no frame's."""
         number = self.frame_numbers.get(stamp_ns)
         if number is None:
@@ -144,7 +144,7 @@ def _beside(recording: Path, suffix: str) -> Path:
 
 
 @functools.lru_cache(maxsize=1)
-def _read_instances(path: Path) -> NDArray[np.uint8]:
+def _read_instances(path: Path) -> UInt8:
     """Instance images (frames, H, W) uint8; raises RecordingError."""
     try:
         with np.load(io.BytesIO(read_file(path))) as packed:

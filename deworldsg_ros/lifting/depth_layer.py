@@ -15,12 +15,9 @@ the means do not depend on the order of the pixels.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.lifting.pixels import Float32, Int64
-
-Float64 = NDArray[np.float64]
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 
 MOST_BUCKETS = 1 << 16
 LEAST_BUCKETS = 64

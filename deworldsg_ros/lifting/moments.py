@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.lifting.pixels import Float32, Int32, Pixels
+from deworldsg_ros.lifting.pixels import Pixels
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.gaussian import transform
-
-Float64 = NDArray[np.float64]
 
 
 def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import borrowed, kernel
-
-Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ def valid_depth(depth_m: Float32) -> Float32:
     return _valid_depth(borrowed(depth_m, np.float32))
 
 
-def valid_pixel_counts(depth_m: Float32, instances: NDArray[np.uint16], count: int) -> Int64:
+def valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64:
     """Number of valid pixels in the mask of each object.
 
     Args:
@@ -67,7 +63,7 @@ def _valid_depth(depth_m: Float32) -> Float32:
 
 
 @kernel
-def _valid_pixel_counts(depth_m: Float32, instances: NDArray[np.uint16], count: int) -> Int64:
+def _valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64:
     counts = np.zeros(count + 1, np.int64)
     depths, labels = depth_m.reshape(-1), instances.reshape(-1)
     index = 0

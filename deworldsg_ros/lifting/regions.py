@@ -4,33 +4,30 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from deworldsg_ros.lifting.pixels import Float32, Int64, Pixels
+from deworldsg_ros.lifting.pixels import Pixels
 from deworldsg_ros.lifting.spatial import spatial_inliers
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 
 
-def mask_pixels(
-    depth_m: Float32, instances: NDArray[np.uint16], valid_counts: Int64
-) -> list[Pixels]:
+def mask_pixels(depth_m: Float32, instances: UInt16, valid_counts: Int64) -> list[Pixels]:
     """Every valid pixel of each object's mask; arguments as of `spatial_inliers`."""
     return spatial_inliers(depth_m, instances, valid_counts, 0.0, np.inf)
 
 
-def valid_pixels(depth_m: Float32) -> NDArray[np.bool_]:
+def valid_pixels(depth_m: Float32) -> Bool:
     """(H, W) bool: pixels of a depth image with 0 for invalid that carry depth."""
     return np.asarray(depth_m > 0)
 
 
-def smooth_pixels(depth_m: Float32, tau: float, epsilon_m: float) -> NDArray[np.bool_]:
+def smooth_pixels(depth_m: Float32, tau: float, epsilon_m: float) -> Bool:
     """(H, W) bool: pixels whose depth is near the median of their neighbourhood (Eq. 1)."""
     median_m = cv2.medianBlur(depth_m, 3).astype(np.float64)
     near = np.abs(depth_m - median_m) < tau * median_m + epsilon_m
     return np.asarray(near & (depth_m > 0))
 
 
-def box_pixels(depth_m: Float32, kept: NDArray[np.bool_], boxes_xyxy: Float64) -> list[Pixels]:
+def box_pixels(depth_m: Float32, kept: Bool, boxes_xyxy: Float64) -> list[Pixels]:
     """The kept pixels of each box, whatever lies in it; boxes may overlap.
 
     Args:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import borrowed, kernel
-from deworldsg_ros.lifting.pixels import Float32, Int32, Int64, Pixels
+from deworldsg_ros.lifting.pixels import Pixels
+from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16, UInt64
 
 
 def spatial_inliers(
     depth_m: Float32,
-    instances: NDArray[np.uint16],
+    instances: UInt16,
     valid_counts: Int64,
     tau: float,
     epsilon_m: float,
@@ -50,11 +50,11 @@ def spatial_inliers(
 def _scatter_inliers(
     depth_m: Float32,
     median_m: Float32,
-    instances: NDArray[np.uint16],
+    instances: UInt16,
     starts: Int64,
     tau: float,
     epsilon_m: float,
-) -> tuple[Int32, Int32, Float32, NDArray[np.uint64]]:
+) -> tuple[Int32, Int32, Float32, UInt64]:
     """One pass over the image.
 
     The inliers of object k, which has places from starts[k - 1] to starts[k], lie from

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import LiftingConfig
 from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.moments import Float64, back_project, estimate_gaussians
+from deworldsg_ros.lifting.moments import back_project, estimate_gaussians
 from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
 from deworldsg_ros.lifting.regions import box_pixels, mask_pixels, smooth_pixels, valid_pixels
 from deworldsg_ros.lifting.spatial import spatial_inliers
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
@@ -38,8 +38,8 @@ class Lifting:
     def lift(
         self,
         frame_graph: FrameGraph,
-        instances: NDArray[np.uint16],
-        depth_m: NDArray[np.float32],
+        instances: UInt16,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         T_world_camera: Float64,
         frame_id: str,
@@ -114,7 +114,7 @@ class Lifting:
         Lifting(LiftingConfig()).lift(graph, instances, depth_m, intrinsics, np.eye(4), "")
 
     def _refine(
-        self, depth_m: NDArray[np.float32], instances: NDArray[np.uint16], frame_graph: FrameGraph
+        self, depth_m: Float32, instances: UInt16, frame_graph: FrameGraph
     ) -> tuple[dict[int, Pixels], dict[str, int]]:
         """Final inliers by object (row of the frame graph), and the drops by reason."""
         config = self.config
@@ -154,9 +154,9 @@ class Lifting:
 
     def _spatial(
         self,
-        depth_m: NDArray[np.float32],
-        instances: NDArray[np.uint16],
-        valid_counts: NDArray[np.int64],
+        depth_m: Float32,
+        instances: UInt16,
+        valid_counts: Int64,
         boxes_xyxy: Float64,
     ) -> list[Pixels]:
         """Pixels of each object, of its mask or box, after Eq. 1 or without it."""
@@ -171,8 +171,8 @@ class Lifting:
 
 def _check_grids(
     frame_graph: FrameGraph,
-    instances: NDArray[np.uint16],
-    depth_m: NDArray[np.float32],
+    instances: UInt16,
+    depth_m: Float32,
     intrinsics: Intrinsics,
 ) -> None:
     wanted = (frame_graph.height, frame_graph.width)
@@ -201,7 +201,7 @@ def _point_numbers(
 
 def _surface_points(
     objects: list[Pixels], numbers: list[int], intrinsics: Intrinsics, T_world_camera: Float64
-) -> tuple[NDArray[np.float32], ...]:
+) -> tuple[Float32, ...]:
     """So many points of each object, world frame: every n-th of its inliers."""
     if not objects:
         return ()
@@ -218,9 +218,7 @@ def _surface_points(
     return tuple(np.split(points, np.cumsum(numbers)[:-1]))
 
 
-def _depth_grid(
-    depth_m: NDArray[np.float32], intrinsics: Intrinsics, stride_px: int
-) -> DepthGrid | None:
+def _depth_grid(depth_m: Float32, intrinsics: Intrinsics, stride_px: int) -> DepthGrid | None:
     """Valid depth on every n-th pixel, in whole millimetres; None where n is 0."""
     if stride_px == 0:
         return None
@@ -229,7 +227,7 @@ def _depth_grid(
     return DepthGrid(samples_mm, stride_px, intrinsics)
 
 
-def _kept_relations(relations: Relations, rows: NDArray[np.int64], count: int) -> Relations:
+def _kept_relations(relations: Relations, rows: Int64, count: int) -> Relations:
     """Relations whose both ends are among these rows, with the rows renumbered."""
     renumbered = np.full(count, -1, np.int64)
     renumbered[rows] = np.arange(len(rows))

@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
+from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.frame_graph import DepthGrid, Float64, Int64
+from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
 
 # A surface this far, and this share of its depth, in front of what was measured was seen through:

@@ -13,8 +13,9 @@ from numba import njit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.gaussian import Float64, transform
+from deworldsg_ros.scene.gaussian import transform
 from deworldsg_ros.scene.graph import SceneGraph
 
 # Points of a frame that are compared, and of each node; both are uniform draws.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.absence import VIEWS, WHOLE
-from deworldsg_ros.scene.frame_graph import Float64, Int64
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 # Another look comes soon where the camera moves, and is waited for this long, so that what it sees
 # is found well within two seconds. A camera that stands gives none, and is not waited for.

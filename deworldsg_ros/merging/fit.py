@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.nodes import NodeTable
 
 # Classes agree where two labels drawn from the two distributions are the same this often.
@@ -28,10 +27,10 @@ MAX_DEVIATIONS = 4.0
 def fit(
     local: LocalGraph,
     nodes: NodeTable,
-    rows: NDArray[np.int64],
+    rows: Int64,
     shares: Float64,
     config: MergingConfig,
-) -> tuple[Float64, NDArray[np.bool_]]:
+) -> tuple[Float64, Bool]:
     """How well each object fits each node; 0 where they cannot be the same.
 
     Args:
@@ -46,7 +45,7 @@ def fit(
         BD of the two Gaussians, both blurred by the size of a cell; (n, k) bool: whether they touch
         and their classes agree.
     """
-    result: tuple[Float64, NDArray[np.bool_]] = _fit(
+    result: tuple[Float64, Bool] = _fit(
         local.means_world,
         local.covariances_world,
         local.class_probabilities,

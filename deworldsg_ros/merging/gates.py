@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.arrays import Float64
 
 
 def class_distance(class_probabilities_i: Float64, class_probabilities_j: Float64) -> Float64:

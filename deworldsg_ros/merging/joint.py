@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.arrays import Bool, Float64
 
 Pair = tuple[int, int]
 
@@ -54,7 +53,7 @@ class JointEvidence:
         places: list[int],
         owners: list[int],
         values: Float64,
-        touching: NDArray[np.bool_],
+        touching: Bool,
         matched: list[int],
     ) -> None:
         """Take in one frame of n objects that met k owners.

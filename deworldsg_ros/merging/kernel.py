@@ -17,8 +17,8 @@ import math
 import numpy as np
 from numba import njit
 
-from deworldsg_ros.scene.gaussian import Float64
-from deworldsg_ros.scene.nodes import Int64, NodeTable
+from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.nodes import NodeTable
 
 # Rounding must not let a bound reject what the exact comparison would keep.
 _SLACK = 1.0 + 1e-9

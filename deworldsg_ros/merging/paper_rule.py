@@ -6,10 +6,10 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.gates import bhattacharyya_bound
 from deworldsg_ros.merging.kernel import nearest_row, warm_up
 from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_up_graph
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
+from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import Float32
 
 
 class PaperMerging:

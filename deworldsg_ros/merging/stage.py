@@ -8,8 +8,8 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.local import Memory
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.gaussian import Float64
 from deworldsg_ros.scene.graph import SceneGraph
 
 

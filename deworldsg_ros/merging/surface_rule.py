@@ -21,9 +21,9 @@ from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_
 from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
 from deworldsg_ros.merging.voxel_map import CellSets, VoxelMap
+from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import DepthGrid, Int64, LocalGraph
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.nodes import NodeTable
 

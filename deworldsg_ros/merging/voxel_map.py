@@ -13,14 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Int64 = NDArray[np.int64]
-Int32 = NDArray[np.int32]
-UInt64 = NDArray[np.uint64]
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Bool = NDArray[np.bool_]
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int32, Int64, UInt64
 
 # An owner of fewer cells than this says too little by lying within a set.
 MIN_REVERSE_CELLS = 4

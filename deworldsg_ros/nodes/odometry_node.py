@@ -19,7 +19,7 @@ from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.transform_output import TransformOutput, put_pose
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.streams.poses import set_stamp
 from deworldsg_ros.streams.unposed import UnposedAssembler, UnposedFrame
 

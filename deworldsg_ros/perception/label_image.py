@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.protocols import MaskPatch
-from deworldsg_ros.scene.frame_graph import Float64, Int64
+from deworldsg_ros.scene.arrays import Float64, Int64, UInt16
 
 
 def label_image(
     masks: Sequence[MaskPatch], classes: Int64, scores: Float64, shape: tuple[int, int]
-) -> NDArray[np.uint16]:
+) -> UInt16:
     """One label image of masks that may overlap (paper, Section 4.1).
 
     A pixel that masks of different classes claim is ambiguous and belongs to nobody. Of masks of

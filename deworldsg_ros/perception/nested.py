@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
-from deworldsg_ros.scene.frame_graph import Float64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64
 
 # Σ p q of two class distributions above which they speak of one class.
 SAME_CLASS = 0.3
@@ -20,7 +19,7 @@ DEPTH_STEP_SHARE = 0.03
 
 
 def join_nested(
-    objects: Detections, masks: list[MaskPatch], depth_m: NDArray[np.float32]
+    objects: Detections, masks: list[MaskPatch], depth_m: Float32
 ) -> tuple[Detections, list[MaskPatch]]:
     """Make one object of each that was detected as a whole and in part.
 
@@ -67,15 +66,13 @@ def in_front_of(objects: Detections, unsure: Detections) -> Detections:
     return unsure.take(np.flatnonzero((inside & ~same_class).any(axis=1) & ~part))
 
 
-def _nested(objects: Detections) -> NDArray[np.bool_]:
+def _nested(objects: Detections) -> Bool:
     """(n, n): the box of the row lies in the larger one of the column, and is of its class."""
     inside, _, same_class = _placed(objects, objects)
     return inside & same_class
 
 
-def _placed(
-    a: Detections, b: Detections
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+def _placed(a: Detections, b: Detections) -> tuple[Bool, Bool, Bool]:
     """(n, m) each: a lies within b, which is larger; they overlap; they are of one class."""
     area_a, area_b = ((x.boxes_xyxy[:, 2:] - x.boxes_xyxy[:, :2]).prod(axis=1) for x in (a, b))
     low = np.maximum(a.boxes_xyxy[:, None, :2], b.boxes_xyxy[None, :, :2])
@@ -86,14 +83,14 @@ def _placed(
     return inside, shared > 0, same_class
 
 
-def _at_one_depth(inner: MaskPatch, outer: MaskPatch, depth_m: NDArray[np.float32]) -> bool:
+def _at_one_depth(inner: MaskPatch, outer: MaskPatch, depth_m: Float32) -> bool:
     """Whether nothing tells that one is behind the other; what has no depth tells nothing."""
     medians = [_median_depth(mask, depth_m) for mask in (inner, outer)]
     step_m = DEPTH_STEP_M + DEPTH_STEP_SHARE * min(medians)
     return not abs(medians[0] - medians[1]) > step_m
 
 
-def _median_depth(mask: MaskPatch, depth_m: NDArray[np.float32]) -> float:
+def _median_depth(mask: MaskPatch, depth_m: Float32) -> float:
     values = depth_m[mask.window][mask.pixels]
     values = values[values > 0]
     return float(np.median(values)) if len(values) else float("nan")

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64, Relations
+from deworldsg_ros.scene.frame_graph import Relations
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Detections:
     boxes_xyxy: Float64
     class_probabilities: Float64
     scores: Float64
-    features: NDArray[np.float32] | None = None
+    features: Float32 | None = None
 
     def __post_init__(self) -> None:
         count = len(self.scores)
@@ -42,7 +42,7 @@ class Detections:
     def __len__(self) -> int:
         return len(self.scores)
 
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detections:
+    def take(self, rows: Int64 | Bool | slice) -> Detections:
         """The objects of `rows`, in that order."""
         return Detections(
             self.boxes_xyxy[rows],
@@ -63,7 +63,7 @@ class MaskPatch:
 
     top: int
     left: int
-    pixels: NDArray[np.bool_]
+    pixels: Bool
 
     @property
     def window(self) -> tuple[slice, slice]:
@@ -71,7 +71,7 @@ class MaskPatch:
         height, width = self.pixels.shape
         return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
-    def to_image(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    def to_image(self, shape: tuple[int, int]) -> Bool:
         """The mask on the whole image, (H, W) bool."""
         image = np.zeros(shape, dtype=bool)
         image[self.window] = self.pixels
@@ -92,7 +92,7 @@ class Detector(Protocol):
         The paper's 0.7 is one for softmax scores; sigmoid scores of a small network are lower.
         """
 
-    def detect(self, rgb: NDArray[np.uint8], score_threshold: float) -> Detections:
+    def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8 in RGB order, with score >= `score_threshold`."""
 
 
@@ -101,8 +101,8 @@ class Segmenter(Protocol):
 
     def segment(
         self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str] | None = None,
@@ -130,15 +130,15 @@ class RelationHead(Protocol):
 
     def relate(
         self,
-        depth_m: NDArray[np.float32],
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str],
         scores: Float64,
-        instances: NDArray[np.uint16],
+        instances: UInt16,
         up_camera: Float64 | None,
         top_relations: int,
-        features: NDArray[np.float32] | None = None,
+        features: Float32 | None = None,
     ) -> Relations:
         """The `top_relations` best ordered pairs of the frame, best first.
 

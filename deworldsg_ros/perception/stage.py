@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.label_image import label_image
@@ -19,9 +18,10 @@ from deworldsg_ros.perception.protocols import (
     RelationHead,
     Segmenter,
 )
+from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.up import UpEstimator
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Perceived:
     """
 
     frame_graph: FrameGraph
-    instances: NDArray[np.uint16]
+    instances: UInt16
     drops: dict[str, int] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
 
@@ -162,7 +162,7 @@ class Perception:
         self,
         frame: RgbdFrame,
         objects: Detections,
-        instances: NDArray[np.uint16],
+        instances: UInt16,
         up_camera: Float64,
     ) -> Relations | None:
         """The best relations between the objects; None where the relation head failed."""
@@ -224,7 +224,7 @@ class Perception:
         return np.asarray(T_world_camera[:3, :3].T @ self._up.up_world())
 
 
-def is_the_view(boxes_xyxy: Float64, width: int, height: int) -> NDArray[np.bool_]:
+def is_the_view(boxes_xyxy: Float64, width: int, height: int) -> Bool:
     """Which boxes (n, 4) reach all four borders of the image.
 
     Nothing tells where such a thing ends: it is named after the scene, and holds what is in it.

@@ -9,12 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.poses.motion import rigid_motion
-from deworldsg_ros.scene.camera import Float64, Intrinsics
-
-Float32 = NDArray[np.float32]
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.camera import Intrinsics
 
 # Points are compared on every so many pixels; normals are taken from a finer grid.
 POINT_STEP_PX = 8
@@ -129,9 +127,7 @@ def refine(
     return T_b_a
 
 
-def _project(
-    points: Float64, intrinsics: Intrinsics
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def _project(points: Float64, intrinsics: Intrinsics) -> tuple[Int64, Int64, Bool]:
     """Row and column of the pixel of each point, and whether it is in the image."""
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.inf)
     column = np.rint(intrinsics.fx * points[:, 0] / z + intrinsics.cx).astype(np.int64)

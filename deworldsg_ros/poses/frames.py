@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.odometry import RgbdOdometry
-from deworldsg_ros.scene.camera import Float64, RgbdFrame
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 
 OnRefusal = Callable[[RefusedInput], None]

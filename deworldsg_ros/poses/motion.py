@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 
 
 def rigid_motion(translation_m: Float64, rotation_vector: Float64) -> Float64:

@@ -15,7 +15,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.depth_alignment import (
@@ -26,13 +25,8 @@ from deworldsg_ros.poses.depth_alignment import (
     surface_of,
 )
 from deworldsg_ros.poses.motion import rotation_angle_deg
-from deworldsg_ros.scene.camera import (
-    Float64,
-    Intrinsics,
-    check_pose,
-    interpolate_pose,
-    invert_pose,
-)
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.camera import Intrinsics, check_pose, interpolate_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 
 # Where the first camera is when nobody says: at the origin, looking along x, z up (REP 103).
@@ -85,9 +79,7 @@ class RgbdOdometry:
         self._lost_in_a_row = 0
         self.tracked = self.lost = self.restarts = 0
 
-    def track(
-        self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], intrinsics: Intrinsics
-    ) -> Float64:
+    def track(self, rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics) -> Float64:
         """T_world_camera (4, 4) of the next frame.
 
         Args:
@@ -140,7 +132,7 @@ class RgbdOdometry:
         )
         self._odometry = cv2.Odometry(kind, settings, cv2.OdometryAlgoType_COMMON)
 
-    def _prepare(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Any:
+    def _prepare(self, rgb: UInt8, depth_m: Float32) -> Any:
         if not HAS_ODOMETRY:
             return None
         holes = np.where(depth_m > 0, depth_m, np.float32(np.nan)).astype(np.float32)
@@ -149,7 +141,7 @@ class RgbdOdometry:
         return frame
 
     def _align(
-        self, view: _View, frame: Any, depth_m: NDArray[np.float32], intrinsics: Intrinsics
+        self, view: _View, frame: Any, depth_m: Float32, intrinsics: Intrinsics
     ) -> tuple[Float64 | None, str]:
         """T_camera_view, or None and why it is not believed."""
         guesses = self._guesses(view, frame, depth_m, intrinsics)
@@ -164,7 +156,7 @@ class RgbdOdometry:
         return best, ""
 
     def _guesses(
-        self, view: _View, frame: Any, depth_m: NDArray[np.float32], intrinsics: Intrinsics
+        self, view: _View, frame: Any, depth_m: Float32, intrinsics: Intrinsics
     ) -> list[Float64]:
         """T_camera_view as it may be, most trusted first."""
         predicted = self._predicted(view)
@@ -186,7 +178,7 @@ class RgbdOdometry:
     @staticmethod
     def _best(
         points: Float64,
-        depth_m: NDArray[np.float32],
+        depth_m: Float32,
         guesses: list[Float64],
         intrinsics: Intrinsics,
     ) -> tuple[Float64, float]:

@@ -9,7 +9,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from deworldsg_ros.poses.motion import rigid_motion
-from deworldsg_ros.scene.camera import Float64, RgbdFrame, invert_pose
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import ConfigurationError
 
 

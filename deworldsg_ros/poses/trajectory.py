@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
-    Float64,
     check_pose,
     interpolate_pose,
     pose_from_quaternion,

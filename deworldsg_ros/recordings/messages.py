@@ -17,7 +17,8 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import Intrinsics
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"

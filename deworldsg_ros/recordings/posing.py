@@ -24,7 +24,8 @@ from deworldsg_ros.recordings.messages import (
 )
 from deworldsg_ros.recordings.recording import Recording
 from deworldsg_ros.recordings.source import RawRoleMessage, Source, UsedTopic
-from deworldsg_ros.scene.camera import Float64, RgbdFrame, quaternion_from_rotation
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import RgbdFrame, quaternion_from_rotation
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.streams.jump_gate import JumpGate
 from deworldsg_ros.streams.poses import pose_from_message

@@ -12,12 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
-Float64 = NDArray[np.float64]
-Rgb = NDArray[np.uint8]
+Rgb = UInt8
 CropBox = tuple[int, int, int, int]
 
 

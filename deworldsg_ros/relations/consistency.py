@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.relations.evidence import (
     PROVENANCES,
@@ -14,10 +13,7 @@ from deworldsg_ros.relations.evidence import (
     opposite_rows,
     visual_distribution,
 )
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
 _VISUAL = PROVENANCES.index("visual")
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.scene.arrays import Bool, Float64, Int8, Int64
 
 __all__ = [
     "bounded_logits",
@@ -27,9 +27,6 @@ __all__ = [
     "visual_distribution",
 ]
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
-Bool = NDArray[np.bool_]
 Provenance = Literal["visual", "prior", "fused"]
 
 PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
@@ -132,7 +129,7 @@ class FusedEdges:
     """
 
     probabilities: Float64
-    provenance_codes: NDArray[np.int8]
+    provenance_codes: Int8
     entropies_nats: Float64
     known: Bool
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 
 def geometric_costs(boxes_xyxy: Float64, depths_m: Float64, width: int, height: int) -> Float64:

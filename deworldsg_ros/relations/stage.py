@@ -9,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.clip_policy import ClipPolicy
@@ -19,11 +18,10 @@ from deworldsg_ros.relations.graph_view import GraphView
 from deworldsg_ros.relations.pairing import neighbour_pairs
 from deworldsg_ros.relations.prior import SUM_TOLERANCE
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
+from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 Waiting = tuple[QueuedClip, list[Rgb]]
 
 # Frames kept, in clip lengths: a clip stays encodable while one more clip length of frames comes.

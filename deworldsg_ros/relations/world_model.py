@@ -12,15 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations import world_models
+from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
-
-Float64 = NDArray[np.float64]
 
 # What the optional world models are made with; the package's own extra installs them.
 MODEL_LIBRARIES = ("torch", "transformers", "safetensors")
@@ -55,7 +51,7 @@ class ClipRequest:
         vocabulary: whose predicates the answer is over.
     """
 
-    clip: NDArray[np.uint8]
+    clip: UInt8
     pairs: tuple[PairContext, ...]
     vocabulary: Vocabulary
 

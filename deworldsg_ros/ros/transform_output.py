@@ -9,7 +9,8 @@ from geometry_msgs.msg import TransformStamped
 from deworldsg_ros.ros.inputs import POSE_DEPTH, TFMessage
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.streams.poses import set_stamp
 from deworldsg_ros.streams.transforms import TransformTree

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.errors import RefusedInput
-
-Float64 = NDArray[np.float64]
 
 # A rotation whose R Rᵀ differs from the identity by more than this is not a rotation.
 ROTATION_TOLERANCE = 1e-3
@@ -73,8 +72,8 @@ class RgbdFrame:
     """
 
     stamp_ns: int
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: UInt8
+    depth_m: Float32
     intrinsics: Intrinsics
     T_world_camera: Float64
     frame_id: str = "world"

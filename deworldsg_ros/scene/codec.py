@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
     DepthGrid,
-    Float64,
     FrameGraph,
     LocalGraph,
     RelationEvidence,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deworldsg_ros.scene.gaussian import Float64
+from deworldsg_ros.scene.arrays import Float64
 
 Pair = tuple[int, int]
 

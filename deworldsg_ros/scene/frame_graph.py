@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.gaussian import log_determinant
-
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class DepthGrid:
         intrinsics: of the whole image.
     """
 
-    depth_mm: NDArray[np.uint16]
+    depth_mm: UInt16
     stride_px: int
     intrinsics: Intrinsics
 
@@ -151,7 +149,7 @@ class LocalGraph:
     covariances_world: Float64
     depths_m: Float64
     pixel_counts: Int64
-    surface_points_world: tuple[NDArray[np.float32], ...]
+    surface_points_world: tuple[Float32, ...]
     relations: Relations
     drops: dict[str, int] = field(default_factory=dict)
     depth_grid: DepthGrid | None = None
@@ -249,6 +247,6 @@ class RelationEvidence:
             )
 
     @property
-    def predicted(self) -> NDArray[np.bool_]:
+    def predicted(self) -> Bool:
         """(m,) bool: rows that carry a prediction."""
         return np.asarray(~np.isnan(self.predictions).any(axis=1))

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from deworldsg_ros.scene.arrays import Float64
 
 
 def moments(points_xyz: Float64, ridge_m2: float) -> tuple[Float64, Float64]:

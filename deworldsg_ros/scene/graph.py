@@ -9,12 +9,13 @@ import numpy as np
 
 from deworldsg_ros.scene import graph_io as storage
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.gaussian import Float64, transform
+from deworldsg_ros.scene.gaussian import transform
 from deworldsg_ros.scene.node_states import NodeStateCache
-from deworldsg_ros.scene.nodes import Int64, NodeTable
-from deworldsg_ros.scene.surface import NO_POINTS, Float32
+from deworldsg_ros.scene.nodes import NodeTable
+from deworldsg_ros.scene.surface import NO_POINTS
 
 
 class SceneGraph:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
@@ -150,7 +151,7 @@ def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
     return graph
 
 
-def _split(flat: NDArray[Any], counts: NDArray[np.int64]) -> list[NDArray[Any]]:
+def _split(flat: NDArray[Any], counts: Int64) -> list[NDArray[Any]]:
     return np.split(flat, np.cumsum(counts)[:-1]) if len(counts) else []
 
 

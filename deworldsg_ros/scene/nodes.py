@@ -15,10 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from deworldsg_ros.scene.gaussian import Float64, eigenvalue_bound, log_determinant
-from deworldsg_ros.scene.surface import Float32, UInt64, add_points
-
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt64
+from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
+from deworldsg_ros.scene.surface import add_points
 
 _FIRST_CAPACITY = 64
 
@@ -50,7 +49,7 @@ class NodeTable:
     class_probabilities: Float64
     weights: Float64
     observations: Int64
-    confirmed: NDArray[np.bool_]
+    confirmed: Bool
     log_determinants: Float64
     eigenvalue_bounds: Float64
     first_seen_ns: Int64

@@ -12,12 +12,8 @@ from itertools import accumulate
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-UInt64 = NDArray[np.uint64]
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt64
 
 # Within this distance points of a surface are of one part of it: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Float64 = NDArray[np.float64]
 
 AXES = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 

@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float32, UInt8, UInt16
 from deworldsg_ros.scene.errors import RefusedInput
-
-UInt8 = NDArray[np.uint8]
 
 # encoding -> (dtype, channels)
 LAYOUTS: dict[str, tuple[str, int]] = {
@@ -101,9 +100,7 @@ def rgb_from_message(message: Any) -> UInt8:
     return np.asarray(cv2.cvtColor(pixels, _TO_RGB[str(message.encoding)]), np.uint8)
 
 
-def depth_from_message(
-    message: Any, *, depth_scale_m: float, max_depth_m: float
-) -> NDArray[np.float32]:
+def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float) -> Float32:
     """(H, W) float32 depth in metres of an Image or CompressedImage; 0 = invalid.
 
     NaN, infinity, negative values and what lies beyond `max_depth_m` become 0.
@@ -118,7 +115,7 @@ def depth_from_message(
         RefusedInput: as `image_view`, or ``decode_failed``.
     """
     raw = _decode_depth(message) if is_compressed(message) else image_view(message, DEPTH_ENCODINGS)
-    depth_m: NDArray[np.float32] = raw.astype(np.float32)
+    depth_m: Float32 = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         depth_m *= np.float32(depth_scale_m)
     # Written so that NaN fails it too.
@@ -126,7 +123,7 @@ def depth_from_message(
     return depth_m
 
 
-def instances_from_message(message: Any) -> NDArray[np.uint16]:
+def instances_from_message(message: Any) -> UInt16:
     """(H, W) uint16 instance values of a mono16 Image; not copied in native byte order."""
     pixels = image_view(message, ("mono16",))
     return pixels.astype(np.uint16, copy=False)

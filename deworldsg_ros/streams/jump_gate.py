@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.poses.motion import rotation_angle_deg
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 
 # Frames that come faster are judged as if they came at this interval: of two of them the noise of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from deworldsg_ros.scene.camera import Float64
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import PoseBuffer, pose_from_message
 from deworldsg_ros.streams.transforms import TransformTree

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.assembler import Assembler, OnDrop, Out, T
@@ -160,7 +158,7 @@ class PosedAssembler(Assembler[T, Out]):
                 current = intrinsics
         return current
 
-    def _depth_at(self, stamp_ns: int) -> NDArray[np.float32]:
+    def _depth_at(self, stamp_ns: int) -> Float32:
         return depth_from_message(
             self._depth.nearest(stamp_ns, self._slop_ns),
             depth_scale_m=self._inputs.depth_scale,

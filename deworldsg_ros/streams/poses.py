@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.scene.camera import Float64, interpolate_pose, pose_from_quaternion
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import interpolate_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
 
 NANOSECONDS = 10**9

@@ -6,11 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from deworldsg_ros.config import InputsConfig
-from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph
 from deworldsg_ros.streams.assembler import Assembler, OnDrop
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
@@ -33,8 +31,8 @@ class LiftingFrame:
     """
 
     frame_graph: FrameGraph
-    instances: NDArray[np.uint16]
-    depth_m: NDArray[np.float32]
+    instances: UInt16
+    depth_m: Float32
     intrinsics: Intrinsics
     T_world_camera: Float64
     frame_id: str
@@ -45,7 +43,7 @@ class PairingFrame:
     """What relations need of one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
 
     local: LocalGraph
-    rgb: NDArray[np.uint8]
+    rgb: UInt8
 
 
 class FrameAssembler(PosedAssembler[Any, RgbdFrame]):

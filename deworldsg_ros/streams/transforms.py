@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.scene.camera import Float64, invert_pose
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import PoseBuffer, pose_from_transform, stamp_ns_of
 

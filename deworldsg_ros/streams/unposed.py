@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.scene.arrays import Float32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.images import rgb_from_message
@@ -27,8 +25,8 @@ class UnposedFrame:
     """
 
     stamp_ns: int
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
+    rgb: UInt8
+    depth_m: Float32
     intrinsics: Intrinsics
 
 

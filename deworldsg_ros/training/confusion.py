@@ -7,7 +7,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from deworldsg_ros.scene.arrays import Int64, UInt8
 
 CELL_PX = 44
 MARGIN_PX = 12
@@ -15,7 +16,7 @@ FONT, FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 DARK, LIGHT = (40, 40, 40), (255, 255, 255)
 
 
-def draw_confusion(confusion: NDArray[np.int64], names: Sequence[str]) -> NDArray[np.uint8]:
+def draw_confusion(confusion: Int64, names: Sequence[str]) -> UInt8:
     """Rows are the true predicates, columns the answers; only those that occur are drawn.
 
     Args:
@@ -52,13 +53,11 @@ def draw_confusion(confusion: NDArray[np.int64], names: Sequence[str]) -> NDArra
     return picture
 
 
-def write_confusion(path: Path, confusion: NDArray[np.int64], names: Sequence[str]) -> None:
+def write_confusion(path: Path, confusion: Int64, names: Sequence[str]) -> None:
     """Write the picture as PNG."""
     _, encoded = cv2.imencode(".png", draw_confusion(confusion, names))
     path.write_bytes(encoded.tobytes())
 
 
-def _text(
-    picture: NDArray[np.uint8], text: str, x: int, y: int, colour: tuple[int, int, int] = DARK
-) -> None:
+def _text(picture: UInt8, text: str, x: int, y: int, colour: tuple[int, int, int] = DARK) -> None:
     cv2.putText(picture, text, (x, y), FONT, FONT_SCALE, colour, 1, cv2.LINE_AA)

@@ -20,7 +20,8 @@ from deworldsg_ros.recordings.folders.dataset import (
 from deworldsg_ros.recordings.folders.frame_files import read_pose
 from deworldsg_ros.recordings.folders.rio import RioScan
 from deworldsg_ros.recordings.folders.sequence import sequence_folder
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.training.labelled_clips import LabelledClip, read_clip_folder
 from deworldsg_ros.training.scan_clips import Boxes, cut_clips, read_boxes

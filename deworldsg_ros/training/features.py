@@ -8,12 +8,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
+from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.training.labelled_clips import LabelledClip, of_length
-
-Float32 = NDArray[np.float32]
 
 # Features in one file: what an interruption costs at most.
 SHARD_SIZE = 32

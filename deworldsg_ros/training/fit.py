@@ -8,14 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.probe_card import ProbeCard
 from deworldsg_ros.relations.probing.probe_network import Probe, build_network
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ from typing import Annotated, Any, Optional
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.relations.clips import Rgb
+from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
-Float32 = NDArray[np.float32]
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Box = tuple[Share, Share, Share, Share]
 

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.probe_card import relative_box_pair
 from deworldsg_ros.relations.clips import CropBox, Rgb, crop_clip, union_box
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.training.labelled_clips import LabelledClip
 
-Float64 = NDArray[np.float64]
 # Boxes of the objects in a frame by object id, (4,) float64 xyxy pixels.
 Boxes = Mapping[int, Float64]
 

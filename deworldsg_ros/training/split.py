@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Int64 = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

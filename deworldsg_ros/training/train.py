@@ -11,11 +11,11 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.probe_card import BOX_INPUTS, ProbeCard
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.relations.probing.probe_network import probe_inputs, save_probe
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.training.confusion import write_confusion
 from deworldsg_ros.training.features import FeatureCache, extract_features
@@ -142,7 +142,7 @@ def train_probe(
     return metrics
 
 
-def _labels(clips: Sequence[LabelledClip], predicates: tuple[str, ...]) -> NDArray[np.int64]:
+def _labels(clips: Sequence[LabelledClip], predicates: tuple[str, ...]) -> Int64:
     places = {name: place for place, name in enumerate(predicates)}
     unknown = Counter(clip.predicate for clip in clips if clip.predicate not in places)
     if unknown:
@@ -154,10 +154,10 @@ def _labels(clips: Sequence[LabelledClip], predicates: tuple[str, ...]) -> NDArr
     return np.array([places[clip.predicate] for clip in clips], np.int64)
 
 
-def _answers(network: torch.nn.Module, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+def _answers(network: torch.nn.Module, inputs: Float32) -> Float64:
     with torch.inference_mode():
         logits = network(torch.from_numpy(inputs)).double()
-        answers: NDArray[np.float64] = torch.softmax(logits, dim=1).numpy()
+        answers: Float64 = torch.softmax(logits, dim=1).numpy()
     return answers
 
 

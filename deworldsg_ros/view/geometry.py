@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.scene import wire
-
-Float64 = NDArray[np.float64]
+from deworldsg_ros.scene.arrays import Float64
 
 # Ellipses and ellipsoids are drawn at this many standard deviations.
 SIGMAS = 2.0

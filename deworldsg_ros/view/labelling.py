@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float64 = NDArray[np.float64]
+from deworldsg_ros.scene.arrays import Float64
 
 DIRECTIONS = 16
 DISTANCES_PX = (9.0, 18.0, 30.0, 45.0, 62.0, 85.0, 112.0, 145.0)

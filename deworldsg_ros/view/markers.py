@@ -8,15 +8,10 @@ from typing import Literal
 import numpy as np
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.view.colours import class_colours, to_rgb
-from deworldsg_ros.view.geometry import (
-    SIGMAS,
-    Float64,
-    covariances_of,
-    means_of,
-    principal_axes,
-)
+from deworldsg_ros.view.geometry import SIGMAS, covariances_of, means_of, principal_axes
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -14,10 +14,10 @@ import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import class_colours, predicate_colours
 from deworldsg_ros.view.geometry import (
     SIGMAS,
-    Float64,
     covariances_of,
     drawable_edges,
     means_of,

@@ -22,15 +22,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, FancyArrowPatch
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import class_colours, predicate_colours, shade
-from deworldsg_ros.view.geometry import (
-    SIGMAS,
-    Float64,
-    covariances_of,
-    drawable_edges,
-    means_of,
-    view_axes,
-)
+from deworldsg_ros.view.geometry import SIGMAS, covariances_of, drawable_edges, means_of, view_axes
 from deworldsg_ros.view.labelling import Placement, nearest_on_box, place, place_if_free
 
 DPI = 130

@@ -5,11 +5,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deworldsg_ros.view.geometry import SIGMAS, Float64, principal_axes
-
-Int64 = NDArray[np.int64]
+from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.view.geometry import SIGMAS, principal_axes
 
 LEAST_SEMI_AXIS_M = 0.006
 HEAD_SIDES = 10

@@ -9,11 +9,11 @@ from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineNode, fuse_nodes
 from deworldsg_ros.evaluation.baselines.lifting import Lifted, back_project
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
 from deworldsg_ros.scene.gaussian import hellinger_distance, transform
 
@@ -30,8 +30,8 @@ class Fross:
     def lift(
         self,
         frame_graph: FrameGraph,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         T_world_camera: Float64,
     ) -> Lifted:
@@ -123,7 +123,7 @@ def evaluation_points(
     v: int,
     width: int,
     height: int,
-    depth_m: NDArray[np.float32],
+    depth_m: Float32,
     intrinsics: Intrinsics,
     T_world_camera: Float64,
 ) -> Float64:

@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.frame_graph import Float64, Relations, Vocabulary
+from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.frame_graph import Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import fuse
 
 # Classes and predicates that a message tells of each node and edge.
@@ -43,7 +43,7 @@ class BaselineNode:
     first_ns: int
     last_ns: int
     observations: int = 1
-    colours: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    colours: Int64 = field(default_factory=lambda: np.zeros(0, np.int64))
 
     @property
     def label(self) -> int:
@@ -104,7 +104,7 @@ class BaselineGraph:
         self.vocabulary = vocabulary
         self.frame_id = frame_id
         self.nodes: dict[int, BaselineNode] = {}
-        self.counts: dict[tuple[int, int], NDArray[np.int64]] = {}
+        self.counts: dict[tuple[int, int], Int64] = {}
         self._choose = choose
         self._fuse = fuse
         self._next_id = 1
@@ -212,7 +212,7 @@ def _resolve(node_id: int, merged_into: dict[int, int]) -> int:
     return node_id
 
 
-def _shares(scores: NDArray[np.float64] | NDArray[np.int64]) -> Float64:
+def _shares(scores: Float64 | Int64) -> Float64:
     return np.asarray(scores / scores.sum(), np.float64)
 
 

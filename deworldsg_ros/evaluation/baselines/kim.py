@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineNode, fuse_nodes
 from deworldsg_ros.evaluation.baselines.lifting import Lifted, back_project
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
 
 # The window around the centre of the box, as a share of the box: of sides shorter than
@@ -53,8 +53,8 @@ class Kim:
     def lift(
         self,
         frame_graph: FrameGraph,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         T_world_camera: Float64,
     ) -> Lifted:
@@ -109,9 +109,7 @@ class Kim:
         return fuse_nodes(keeper, other, keeper.class_scores + other.class_scores)
 
 
-def window_points(
-    box_xyxy: Float64, depth_m: NDArray[np.float32], intrinsics: Intrinsics
-) -> Float64:
+def window_points(box_xyxy: Float64, depth_m: Float32, intrinsics: Intrinsics) -> Float64:
     """Points (n, 3) of the window around the box's centre, camera frame."""
     x1, y1, x2, y2 = box_xyxy.tolist()
     columns = _window(x1, x2, intrinsics.width)
@@ -123,7 +121,7 @@ def window_points(
     return np.asarray(points[(np.abs(points) <= FARTHEST_M).all(axis=1)])
 
 
-def _window(low: float, high: float, size: int) -> NDArray[np.int64]:
+def _window(low: float, high: float, size: int) -> Int64:
     side = high - low
     share = SHORT_SHARE if side < SHORT_SIDE_PX else SHARE
     first = int(low + side * (1 - share) / 2)
@@ -159,7 +157,7 @@ def position_similarities(mean: Float64, means: Float64) -> Float64:
     return np.asarray((POSITION_REACH / np.maximum(scaled, POSITION_REACH)).mean(axis=1))
 
 
-def colour_histogram(rgb: NDArray[np.uint8], box_xyxy: Float64) -> NDArray[np.int64]:
+def colour_histogram(rgb: UInt8, box_xyxy: Float64) -> Int64:
     """Colours in a box, (512,): 8 bins a channel."""
     x1, y1, x2, y2 = (int(value) for value in box_xyxy)
     bins = (rgb[y1 : y2 + 1, x1 : x2 + 1].reshape(-1, 3) // (256 // COLOUR_BINS)).astype(np.int64)
@@ -167,7 +165,7 @@ def colour_histogram(rgb: NDArray[np.uint8], box_xyxy: Float64) -> NDArray[np.in
     return np.bincount(flat, minlength=COLOUR_BINS**3).astype(np.int64)
 
 
-def densest_colour(histogram: NDArray[np.int64]) -> tuple[int, int, int]:
+def densest_colour(histogram: Int64) -> tuple[int, int, int]:
     """RGB of the CSS colour that names a histogram's densest bin."""
     return _named_colour(int(histogram.argmax()))
 

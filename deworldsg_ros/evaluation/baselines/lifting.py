@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineNode
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.camera import Intrinsics
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,7 @@ class Lifted:
     drops: Counter[str]
 
 
-def back_project(
-    pixels: NDArray[np.int64], depths_m: NDArray[np.floating], intrinsics: Intrinsics
-) -> Float64:
+def back_project(pixels: Int64, depths_m: NDArray[np.floating], intrinsics: Intrinsics) -> Float64:
     """Points (n, 3) in the camera frame of pixels (n, 2) column, row, at their depths (n,)."""
     depths = np.asarray(depths_m, np.float64)
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx * depths

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode
 from deworldsg_ros.evaluation.baselines.lifting import Lifted
 from deworldsg_ros.pipeline import Perceiver, watch_parts
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import Float64, Intrinsics, RgbdFrame
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations
 from deworldsg_ros.timing import timed
@@ -27,8 +27,8 @@ class Baseline(Protocol):
     def lift(
         self,
         frame_graph: FrameGraph,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         T_world_camera: Float64,
     ) -> Lifted:

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.label_image import label_image
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.scene.arrays import Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.frame_graph import Float64, FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 # Probabilities are kept this far from 0 and 1 before they become logits.
 LOGIT_MARGIN = 1e-6
@@ -63,7 +63,7 @@ class Seen:
 
     detections: Sequence[Detection]
     relations: Sequence[Relation]
-    instance_image: NDArray[np.uint16]
+    instance_image: UInt16
 
 
 def logits(probabilities: Float64) -> Float64:
@@ -82,7 +82,7 @@ def spread(stated: Mapping[int, float], count: int) -> Float64:
     return np.asarray(distribution / distribution.sum())
 
 
-def visible_box(instances: NDArray[np.uint16], object_id: int) -> Float64 | None:
+def visible_box(instances: UInt16, object_id: int) -> Float64 | None:
     """Corners x1, y1, x2, y2 of an object's pixels; None where too little is visible."""
     mask = instances == object_id
     if int(np.count_nonzero(mask)) < MIN_PIXELS:
@@ -132,7 +132,7 @@ def assemble(frame: RgbdFrame, vocabulary: Vocabulary, seen: Seen, top_relations
     return Perceived(graph, instances, {"empty_mask": empty} if empty else {})
 
 
-def _cut(instance_image: NDArray[np.uint16], value: int, box_xyxy: Float64) -> MaskPatch:
+def _cut(instance_image: UInt16, value: int, box_xyxy: Float64) -> MaskPatch:
     # Every pixel that the box touches.
     left, top = np.floor(box_xyxy[:2]).astype(int).tolist()
     right, bottom = np.ceil(box_xyxy[2:]).astype(int).tolist()

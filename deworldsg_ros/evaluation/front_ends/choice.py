@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -22,6 +20,7 @@ from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.instances import read_instances
 from deworldsg_ros.recordings.folders.sequence import SequenceDataset
 from deworldsg_ros.recordings.source import Source
+from deworldsg_ros.scene.arrays import UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
@@ -126,7 +125,7 @@ def build_front_end(
             injection=injection,
         )
 
-    def instances(frame: RgbdFrame) -> NDArray[np.uint16] | None:
+    def instances(frame: RgbdFrame) -> UInt16 | None:
         if isinstance(annotations, RecordedRoom):
             return annotations.instances(frame.stamp_ns)
         return read_instances(source, frame.stamp_ns)

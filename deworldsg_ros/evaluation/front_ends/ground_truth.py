@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -24,6 +23,7 @@ from deworldsg_ros.evaluation.front_ends.assembly import (
 from deworldsg_ros.evaluation.front_ends.injection import Injection
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.folders.annotations import ScanAnnotation, ScanPoints
+from deworldsg_ros.scene.arrays import UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
@@ -53,7 +53,7 @@ class GroundTruthFrontEnd:
     def __init__(
         self,
         frame_numbers: Mapping[int, int],
-        instances: Callable[[RgbdFrame], NDArray[np.uint16] | None],
+        instances: Callable[[RgbdFrame], UInt16 | None],
         annotation: ScanAnnotation,
         points: ScanPoints,
         vocabulary: Vocabulary,
@@ -113,7 +113,7 @@ class GroundTruthFrontEnd:
             )
         return relations
 
-    def _nearest_objects(self, frame: RgbdFrame) -> NDArray[np.uint16]:
+    def _nearest_objects(self, frame: RgbdFrame) -> UInt16:
         """Instance image from the annotated point nearest to each depth pixel."""
         labels = np.zeros(frame.depth_m.shape, np.uint16)
         depth_m = frame.depth_m[::PIXEL_STRIDE, ::PIXEL_STRIDE]

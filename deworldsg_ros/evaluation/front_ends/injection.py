@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.front_ends.assembly import (
     Detection,
@@ -22,8 +21,9 @@ from deworldsg_ros.evaluation.front_ends.assembly import (
     visible_box,
 )
 from deworldsg_ros.evaluation.front_ends.faults import MOST_FALSE_BOXES, Faults
+from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+from deworldsg_ros.scene.frame_graph import Vocabulary
 
 # Draws of one kind do not repeat those of another.
 FRAME, LABEL, BLEED, MERGE, CUT, FALSE = 0, 2, 3, 4, 5, 6
@@ -209,8 +209,8 @@ class Injection:
         generator: np.random.Generator,
         key: tuple[int, int],
         frame: RgbdFrame,
-        background: NDArray[np.bool_],
-    ) -> NDArray[np.bool_] | None:
+        background: Bool,
+    ) -> Bool | None:
         """A cube of the room around what the first frame of the spell showed at some pixel."""
         camera = frame.intrinsics
         half_m = generator.uniform(*FALSE_SIZE_M) / 2
@@ -255,7 +255,7 @@ def keep(seen: Seen, detections: Sequence[Detection | None]) -> Seen:
     return Seen([item for item in detections if item is not None], relations, seen.instance_image)
 
 
-def _neighbour(image: NDArray[np.uint16], object_id: int, ids: Sequence[int]) -> int:
+def _neighbour(image: UInt16, object_id: int, ids: Sequence[int]) -> int:
     """The detected object with most pixels beside this one; itself where there is none."""
     beside = image[_grown(image == object_id, BORDER_PX)]
     values, counts = np.unique(beside, return_counts=True)
@@ -263,12 +263,12 @@ def _neighbour(image: NDArray[np.uint16], object_id: int, ids: Sequence[int]) ->
     return int(values[others][counts[others].argmax()]) if others.any() else object_id
 
 
-def _grown(mask: NDArray[np.bool_], by_px: int) -> NDArray[np.bool_]:
+def _grown(mask: Bool, by_px: int) -> Bool:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * by_px + 1, 2 * by_px + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
-def _cut(image: NDArray[np.uint16], object_id: int, side: int, left_over: float) -> None:
+def _cut(image: UInt16, object_id: int, side: int, left_over: float) -> None:
     """Leave of an object's pixels a share of its extent: the left, right, upper or lower part."""
     rows, columns = np.nonzero(image == object_id)
     if not len(rows):
@@ -281,9 +281,7 @@ def _cut(image: NDArray[np.uint16], object_id: int, side: int, left_over: float)
     image[rows[gone], columns[gone]] = 0
 
 
-def _moving(
-    generator: np.random.Generator, age_s: float, frame: RgbdFrame
-) -> NDArray[np.bool_] | None:
+def _moving(generator: np.random.Generator, age_s: float, frame: RgbdFrame) -> Bool | None:
     """A box that moves through the image, begun anywhere in it."""
     height, width = frame.depth_m.shape
     centre = generator.random(2) * (width, height)

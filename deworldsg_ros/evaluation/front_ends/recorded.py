@@ -13,13 +13,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.assembly import Detection, Relation, Seen, assemble, spread
 from deworldsg_ros.evaluation.front_ends.injection import Injection
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
+from deworldsg_ros.scene.arrays import UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
@@ -120,6 +120,6 @@ class RecordedFrontEnd:
         return Seen(detections, relations, instance_image)
 
 
-def read_instances(path: Path) -> NDArray[np.uint16]:
+def read_instances(path: Path) -> UInt16:
     """Instance image (H, W) of a 16-bit PNG; raises RecordingError."""
     return np.asarray(decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path), np.uint16)

@@ -15,7 +15,8 @@ import numpy as np
 from deworldsg_ros.evaluation.measures.reference import ReferenceScene, read_reference
 from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.frame_graph import Vocabulary
 
 __all__ = ["Measures", "ReferenceScene", "measure", "measure_prediction", "pool", "read_reference"]
 

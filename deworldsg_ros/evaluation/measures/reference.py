@@ -9,7 +9,7 @@ import numpy as np
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
 from deworldsg_ros.recordings.folders.rooms import GROUND_TRUTH_NAME
-from deworldsg_ros.scene.frame_graph import Float64
+from deworldsg_ros.scene.arrays import Float64
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.pipeline import FrameResult
 from deworldsg_ros.recordings.folders.instances import read_instances
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import UInt16
 
 # Pixels that a detection and an object of the ground truth have to share, of the detection's.
 LEAST_SHARE = 0.5
@@ -187,9 +187,7 @@ def _pair(a: int, b: int) -> tuple[int, int]:
     return (a, b) if a < b else (b, a)
 
 
-def true_objects(
-    instance_ids: Sequence[int], instances: NDArray[np.uint16], truth: NDArray[np.uint16]
-) -> list[int]:
+def true_objects(instance_ids: Sequence[int], instances: UInt16, truth: UInt16) -> list[int]:
     """The object of the ground truth that most pixels of each detection show; 0 = none does.
 
     Args:

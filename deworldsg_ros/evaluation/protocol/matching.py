@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from deworldsg_ros.scene.arrays import Float64, Int64
+
 OVERLAP_THRESHOLD_M = 0.1
 MIN_SHARE = 0.5
 MAX_SECOND_SHARE = 0.75
@@ -40,8 +42,8 @@ class Matching:
 
 def match(
     object_ids: Sequence[int],
-    points_world: NDArray[np.float64],
-    point_objects: NDArray[np.int64],
+    points_world: Float64,
+    point_objects: Int64,
     segments: Sequence[NDArray[np.floating[Any]]],
     threshold_m: float = OVERLAP_THRESHOLD_M,
 ) -> Matching:
@@ -78,12 +80,12 @@ def match(
 
 def _votes(
     tree: Any,
-    surface: NDArray[np.float64],
-    rows: NDArray[np.int64],
-    points: NDArray[np.float64],
+    surface: Float64,
+    rows: Int64,
+    points: Float64,
     object_count: int,
     threshold_m: float,
-) -> NDArray[np.int64]:
+) -> Int64:
     _, nearest = tree.query(points)
     delta = points - surface[nearest]
     # The tree's own distances went through a square root: 1 nm decides, and so does one rounding.
@@ -92,7 +94,7 @@ def _votes(
     return np.bincount(rows[nearest[inside]], minlength=object_count).astype(np.int64)
 
 
-def _supported(votes: NDArray[np.int64], point_count: int) -> int | None:
+def _supported(votes: Int64, point_count: int) -> int | None:
     """Place of the object that these votes support; None for a void prediction."""
     if point_count == 0 or not votes.any():
         return None

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.pickles import load_pickle
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 FORMAT = "scene graph predictions 1"
 
@@ -35,7 +36,7 @@ class ScanPrediction:
 
     points_world: tuple[NDArray[np.floating[Any]], ...]
     class_scores: NDArray[Any]
-    edges: NDArray[np.int64]
+    edges: Int64
     edge_scores: NDArray[Any]
     notes: list[str] = field(default_factory=list)
 
@@ -166,13 +167,13 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
     return ScanPrediction(points, class_scores, ends, edge_scores, notes)
 
 
-def _one_hot(index: Any, count: int) -> NDArray[np.float64]:
+def _one_hot(index: Any, count: int) -> Float64:
     if not isinstance(index, int) or not 0 <= index < count:
         raise EvaluationError(f"index {index!r}: wanted a whole number from 0 to {count - 1}")
     return np.eye(count)[index]
 
 
-def _vector(values: Any, count: int) -> NDArray[np.float64]:
+def _vector(values: Any, count: int) -> Float64:
     # null is how strict writers spell NaN; numpy reads it so.
     vector = np.array(values, np.float64)
     if vector.shape != (count,):

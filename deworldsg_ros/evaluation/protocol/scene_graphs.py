@@ -9,7 +9,8 @@ import numpy as np
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.frame_graph import Float64, Vocabulary
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.frame_graph import Vocabulary
 
 # About what one frame adds to the surface of a node.
 POINTS_PER_OBSERVATION = 64

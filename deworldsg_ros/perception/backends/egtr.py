@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file
 
 from deworldsg_ros.checkpoints.architectures import HEAD_FILE
@@ -14,9 +13,10 @@ from deworldsg_ros.checkpoints.loading import CheckpointSource, enough_memory
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.perception.protocols import Detector
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.frame_graph import Float64, Relations
+from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 
@@ -66,15 +66,15 @@ class EgtrRelationHead:
 
     def relate(
         self,
-        depth_m: NDArray[np.float32],
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str],
         scores: Float64,
-        instances: NDArray[np.uint16],
+        instances: UInt16,
         up_camera: Float64 | None,
         top_relations: int,
-        features: NDArray[np.float32] | None = None,
+        features: Float32 | None = None,
     ) -> Relations:
         """The best ordered pairs, best first; see `RelationHead`. Needs nothing but `features`."""
         if len(scores) < 2 or top_relations < 1:

@@ -8,12 +8,12 @@ against the predicate. What geometry cannot judge ("eating", "made of") keeps `F
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.geometry.layout import Layout, measure_layout
 from deworldsg_ros.perception.geometry.up_direction import estimate_up
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64, Relations
+from deworldsg_ros.scene.frame_graph import Relations
 
 # Predicates that layout says nothing about. The softmax of 50 logits at -6 beside one at 3 leaves
 # it 99.4 % of the mass; the sums over frames (Eq. 9) stay of the same order as a network's.
@@ -101,15 +101,15 @@ class GeometricRelationHead:
 
     def relate(
         self,
-        depth_m: NDArray[np.float32],
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str],
         scores: Float64,
-        instances: NDArray[np.uint16],
+        instances: UInt16,
         up_camera: Float64 | None,
         top_relations: int,
-        features: NDArray[np.float32] | None = None,
+        features: Float32 | None = None,
     ) -> Relations:
         """The best ordered pairs; see `RelationHead`."""
         count = len(boxes_xyxy)
@@ -243,10 +243,10 @@ class _Kinds:
     def __init__(self, class_names: list[str]) -> None:
         self._names = class_names
 
-    def of(self, names: frozenset[str]) -> NDArray[np.bool_]:
+    def of(self, names: frozenset[str]) -> Bool:
         return np.array([name in names for name in self._names], dtype=bool)
 
-    def fixed_to(self) -> NDArray[np.bool_]:
+    def fixed_to(self) -> Bool:
         return np.array(
             [
                 [target in FIXED_TO.get(subject, frozenset()) for target in self._names]
@@ -256,7 +256,7 @@ class _Kinds:
         )
 
 
-def _flag(condition: NDArray[np.bool_]) -> Float64:
+def _flag(condition: Bool) -> Float64:
     """A condition that holds or does not, as a logit bound."""
     return np.where(condition, CEILING_LOGIT, FLOOR_LOGIT)
 

@@ -8,13 +8,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import onnxruntime
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
 from deworldsg_ros.perception.networks.nms import cluster_boxes, pairwise_iou
 from deworldsg_ros.perception.protocols import Detections
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.frame_graph import Float64
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "nanodet_g_416_coco.onnx"
@@ -60,12 +59,12 @@ class NanoDetDetector:
         )
         self._input = self._session.get_inputs()[0].name
 
-    def detect(self, rgb: NDArray[np.uint8], score_threshold: float) -> Detections:
+    def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8, with score >= `score_threshold`, best first."""
         boxes, class_scores = self.candidates(rgb)
         return combine(boxes, class_scores, score_threshold)
 
-    def candidates(self, rgb: NDArray[np.uint8]) -> tuple[Float64, Float64]:
+    def candidates(self, rgb: UInt8) -> tuple[Float64, Float64]:
         """What the network says before suppression: boxes (k, 4) in pixels, scores (k, 80)."""
         tensor, scale = letterbox(rgb)
         heads = self._session.run(None, {self._input: tensor})
@@ -75,7 +74,7 @@ class NanoDetDetector:
         return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
 
 
-def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
+def letterbox(rgb: UInt8) -> tuple[Float32, float]:
     """Network input (1, 3, 416, 416) float32 BGR, image in the top left, and the scale used."""
     height, width = rgb.shape[:2]
     scale = INPUT_SIZE / max(height, width)
@@ -88,7 +87,7 @@ def letterbox(rgb: NDArray[np.uint8]) -> tuple[NDArray[np.float32], float]:
     return np.ascontiguousarray(canvas.transpose(2, 0, 1))[None], scale
 
 
-def decode(heads: list[NDArray[np.float32]]) -> tuple[Float64, Float64]:
+def decode(heads: list[Float32]) -> tuple[Float64, Float64]:
     """Candidate boxes (k, 4) in input pixels and their sigmoid class scores (k, 80).
 
     Args:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.arrays import read_only
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
 from deworldsg_ros.perception.superpixels.region_cut import cut_boxes
 from deworldsg_ros.perception.superpixels.superpixels import cut_regions, reduce_frame
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64
 
 # Cells across the image; fewer lose chair legs, more cost time.
 TARGET_WIDTH = 213
@@ -32,8 +31,8 @@ class RgbdSegmenter:
 
     def segment(
         self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str] | None = None,

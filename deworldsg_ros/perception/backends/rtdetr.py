@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.architectures import DETECTORS
 from deworldsg_ros.checkpoints.card import (
@@ -27,6 +26,7 @@ from deworldsg_ros.checkpoints.loading import (
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing
 from deworldsg_ros.perception.protocols import Detections
+from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # The public checkpoints': no mean, no standard deviation.
@@ -82,7 +82,7 @@ class RtDetrDetector:
         if self._recorder is None:
             self._recorder = QueryRecorder(self.model)
 
-    def detect(self, rgb: NDArray[np.uint8], score_threshold: float) -> Detections:
+    def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8, with score >= `score_threshold`, best first."""
         output = self._forward(rgb)
         probabilities, scores = class_distributions(output.logits[0].float(), self.card)
@@ -100,7 +100,7 @@ class RtDetrDetector:
         )
 
     @torch.inference_mode()
-    def _forward(self, rgb: NDArray[np.uint8]) -> Any:
+    def _forward(self, rgb: UInt8) -> Any:
         pixels = self._preprocess(rgb, self.device, self.dtype)
         return self.model(pixels.contiguous(memory_format=torch.channels_last))
 
@@ -194,16 +194,16 @@ def _use_layers(model: Any, wanted: int, there: int) -> None:
         setattr(decoder, part, getattr(decoder, part)[: wanted or there])
 
 
-def _pixel_boxes(boxes_cxcywh: NDArray[np.float64], width: int, height: int) -> Any:
+def _pixel_boxes(boxes_cxcywh: Float64, width: int, height: int) -> Any:
     """Centre, width and height in [0, 1] to corners in pixels, pixel centres at integers."""
     centres, halves = boxes_cxcywh[:, :2], boxes_cxcywh[:, 2:] / 2
     corners = np.hstack([centres - halves, centres + halves])
     return corners * [width, height, width, height] - 0.5
 
 
-def _normalised(probabilities: NDArray[np.float64]) -> Any:
+def _normalised(probabilities: Float64) -> Any:
     return probabilities / probabilities.sum(axis=1, keepdims=True)
 
 
-def _numpy(tensor: torch.Tensor) -> NDArray[np.float64]:
+def _numpy(tensor: torch.Tensor) -> Float64:
     return tensor.detach().cpu().double().numpy()

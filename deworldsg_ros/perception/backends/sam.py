@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from transformers import SamModel
 
 from deworldsg_ros.checkpoints.loading import CheckpointSource
 from deworldsg_ros.perception.networks.box_prompts import BoxPromptedSegmenter
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing, resize
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
@@ -28,7 +27,7 @@ class SamSegmenter(BoxPromptedSegmenter):
             )
         return source.load(SamModel, config), edge
 
-    def _input(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
+    def _input(self, rgb: UInt8) -> torch.Tensor:
         height, width = self._used(*rgb.shape[:2])
         pixels = Preprocessing(height, width, self.mean, self.std)(rgb, self.device, self.dtype)
         right, bottom = self.image_size - width, self.image_size - height

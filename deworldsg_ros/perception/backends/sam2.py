@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from transformers import Sam2Config, Sam2Model
 
 from deworldsg_ros.checkpoints.loading import CheckpointSource
 from deworldsg_ros.perception.networks.box_prompts import BoxPromptedSegmenter
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing, resize
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # The published checkpoints are those of the video model; its image part is used.
@@ -48,7 +47,7 @@ class Sam2Segmenter(BoxPromptedSegmenter):
         ]
         return source.load(Sam2Model, config), edge
 
-    def _input(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
+    def _input(self, rgb: UInt8) -> torch.Tensor:
         preprocess = Preprocessing(self.image_size, self.image_size, self.mean, self.std)
         return preprocess(rgb, self.device, self.dtype)
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.arrays import read_only
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64
 
 POINTS_PER_OBJECT = 256
 # An object of fewer points with depth has no place.
@@ -40,7 +39,7 @@ class Layout:
         covered: (n, n) share of the footprint of i that lies inside that of j.
     """
 
-    valid: NDArray[np.bool_]
+    valid: Bool
     low: Float64
     high: Float64
     contact_m: Float64
@@ -52,9 +51,9 @@ class Layout:
 
 
 def measure_layout(
-    depth_m: NDArray[np.float32],
+    depth_m: Float32,
     intrinsics: Intrinsics,
-    instances: NDArray[np.uint16],
+    instances: UInt16,
     count: int,
     up_camera: Float64,
 ) -> Layout:
@@ -128,7 +127,7 @@ def upright_axes(up_camera: Float64) -> Float64:
 @numba.njit(cache=True, nogil=True)
 def _sample(  # type: ignore[no-untyped-def]
     depth_m, instances, count, most
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Int64, Int64]:
     """Pixels (k, 2) as row, column, and the row of their object, in the order of the objects.
 
     Of an object with many pixels, `most` that are evenly spread in scan order.
@@ -164,10 +163,10 @@ def _sample(  # type: ignore[no-untyped-def]
 
 def _contacts(
     points: Float64,
-    owners: NDArray[np.int64],
+    owners: Int64,
     low: Float64,
     high: Float64,
-    valid: NDArray[np.bool_],
+    valid: Bool,
     count: int,
 ) -> Float64:
     contact = np.full((count, count), np.inf)

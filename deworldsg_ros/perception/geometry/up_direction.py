@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64
 
 # A hand-held or mounted camera looks from level to steeply down; a wall it faces squarely has its
 # normal at 90 degrees from image up, and must not be taken for the floor.
@@ -17,7 +16,7 @@ MIN_SUPPORT = 0.03
 STEP_PX = 8
 
 
-def estimate_up(depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> Float64:
+def estimate_up(depth_m: Float32, intrinsics: Intrinsics) -> Float64:
     """Unit vector against gravity in the camera frame, (3,).
 
     The direction, within 65 degrees of image up, that most surface normals share: floors, tables,
@@ -48,7 +47,7 @@ def estimate_up(depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> Float64
     return np.asarray(best)
 
 
-def _normals(depth_m: NDArray[np.float32], intrinsics: Intrinsics) -> Float64:
+def _normals(depth_m: Float32, intrinsics: Intrinsics) -> Float64:
     """Unit normals (k, 3) towards the camera, on a coarse grid, where the depth is smooth."""
     rows = np.arange(STEP_PX // 2, depth_m.shape[0], STEP_PX)
     columns = np.arange(STEP_PX // 2, depth_m.shape[1], STEP_PX)

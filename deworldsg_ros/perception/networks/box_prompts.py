@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD
 from deworldsg_ros.checkpoints.loading import (
@@ -18,8 +17,8 @@ from deworldsg_ros.checkpoints.loading import (
 )
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import Float64
 
 TOO_LITTLE_MEMORY = (
     "lower perception.sam_box_batch, choose a smaller perception.sam_image_size (SAM 2) or "
@@ -65,7 +64,7 @@ class BoxPromptedSegmenter(ABC):
         """The network and the edge of its input; `image_size` 0 = the checkpoint's."""
 
     @abstractmethod
-    def _input(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
+    def _input(self, rgb: UInt8) -> torch.Tensor:
         """(1, 3, S, S) of an image."""
 
     @abstractmethod
@@ -78,8 +77,8 @@ class BoxPromptedSegmenter(ABC):
 
     def segment(
         self,
-        rgb: NDArray[np.uint8],
-        depth_m: NDArray[np.float32],
+        rgb: UInt8,
+        depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
         class_names: list[str] | None = None,
@@ -88,7 +87,7 @@ class BoxPromptedSegmenter(ABC):
         return [as_patch(mask) for mask in self._masks(rgb, boxes_xyxy)] if len(boxes_xyxy) else []
 
     @torch.inference_mode()
-    def _masks(self, rgb: NDArray[np.uint8], boxes_xyxy: Float64) -> NDArray[np.bool_]:
+    def _masks(self, rgb: UInt8, boxes_xyxy: Float64) -> Bool:
         """(n, H, W) masks of n >= 1 boxes."""
         height, width = rgb.shape[:2]
         scale = np.tile(self._scale(height, width), 2)
@@ -109,7 +108,7 @@ class BoxPromptedSegmenter(ABC):
         return np.concatenate(masks)
 
 
-def as_patch(mask: NDArray[np.bool_]) -> MaskPatch:
+def as_patch(mask: Bool) -> MaskPatch:
     """The part of a mask (H, W) that holds all its pixels."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):

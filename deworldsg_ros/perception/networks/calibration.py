@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.scene.frame_graph import Float64
+from deworldsg_ros.scene.arrays import Float64
 
 # Keeps the logit finite; far below the scores that the network gives to absent classes.
 SCORE_FLOOR = 1e-6

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.loading import CheckpointSource
+from deworldsg_ros.scene.arrays import UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
@@ -56,9 +57,7 @@ class Preprocessing:
                 "image_std"
             ) from error
 
-    def __call__(
-        self, rgb: NDArray[np.uint8], device: torch.device, dtype: torch.dtype
-    ) -> torch.Tensor:
+    def __call__(self, rgb: UInt8, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
         """(H, W, 3) uint8 as (1, 3, height, width), normalised."""
         pixels = to_device(rgb, device).permute(2, 0, 1)[None].float()
         if pixels.shape[-2:] != (self.height, self.width):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.scene.frame_graph import Float64, Int64
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 
 def pairwise_iou(boxes_a: Float64, boxes_b: Float64) -> Float64:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+
+from deworldsg_ros.scene.arrays import Int32
 
 # Differences that count 1: of colour (RGB, 8 bit), of depth relative to depth, of a cell's width.
 COLOUR_STEP = 12.0
@@ -17,7 +18,7 @@ DEPTH_LIMIT = 9.0
 @numba.njit(cache=True, nogil=True)
 def upsample_labels(  # type: ignore[no-untyped-def]
     labels, cell_rgb, cell_depth, rgb, depth_m, stride
-) -> NDArray[np.int32]:
+) -> Int32:
     """Each pixel takes the label of the most similar of its own cell and the four beside it.
 
     Args:

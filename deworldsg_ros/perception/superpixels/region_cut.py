@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.perception.superpixels.superpixels import Regions
+from deworldsg_ros.scene.arrays import Int32, Int64
 
 
 class CutSettings(NamedTuple):
@@ -57,9 +57,7 @@ class CutSettings(NamedTuple):
 SETTINGS = CutSettings()
 
 
-def cut_boxes(
-    regions: Regions, boxes_cells: NDArray[np.int64], settings: CutSettings = SETTINGS
-) -> NDArray[np.int32]:
+def cut_boxes(regions: Regions, boxes_cells: Int64, settings: CutSettings = SETTINGS) -> Int32:
     """The object of each region, (c,) int32: row of the box, or -1.
 
     Small boxes choose first: a cup's regions lie in the table's box too, but not the reverse.

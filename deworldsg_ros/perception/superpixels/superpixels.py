@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
 # Differences between neighbouring cells that count 1, of CIE Lab colour (8-bit scale), of depth
@@ -44,10 +44,10 @@ class Cells:
     """
 
     stride: int
-    rgb: NDArray[np.uint8]
-    lab: NDArray[np.float32]
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32]
+    rgb: UInt8
+    lab: Float32
+    points: Float32
+    normals: Float32
 
 
 @dataclass(frozen=True)
@@ -66,20 +66,18 @@ class Regions:
         strength: (m,) mean edge weight along the border.
     """
 
-    labels: NDArray[np.int32]
-    area: NDArray[np.float64]
-    lab: NDArray[np.float64]
-    valid: NDArray[np.float64]
-    point: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    flatness: NDArray[np.float64]
-    pairs: NDArray[np.int32]
-    strength: NDArray[np.float64]
+    labels: Int32
+    area: Float64
+    lab: Float64
+    valid: Float64
+    point: Float64
+    normal: Float64
+    flatness: Float64
+    pairs: Int32
+    strength: Float64
 
 
-def reduce_frame(
-    rgb: NDArray[np.uint8], depth_m: NDArray[np.float32], intrinsics: Intrinsics, stride: int
-) -> Cells:
+def reduce_frame(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics, stride: int) -> Cells:
     """The cells of a frame: mean colour, median depth, normals by plane gradients."""
     height, width = depth_m.shape[0] // stride, depth_m.shape[1] // stride
     middle = slice(stride // 2, None, stride)

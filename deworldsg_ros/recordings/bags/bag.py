@@ -24,7 +24,8 @@ from deworldsg_ros.recordings.messages import (
     stamp_ns_of_cdr,
 )
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
-from deworldsg_ros.scene.camera import Float64, quaternion_from_rotation
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import pose_from_message
 from deworldsg_ros.streams.transforms import TransformTree

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import read_file
 from deworldsg_ros.recordings.folders.ply import read_vertices
 from deworldsg_ros.recordings.folders.rooms import read_ground_truth
+from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 SPLIT_FILES = {
@@ -104,8 +104,8 @@ class ScanAnnotation:
 class ScanPoints:
     """Annotated surface points: (n, 3) float64 metres, world; (n,) int64 object ids."""
 
-    points_world: NDArray[np.float64]
-    object_ids: NDArray[np.int64]
+    points_world: Float64
+    object_ids: Int64
 
 
 class Annotations:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import Role, RoleMessage, encode
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.scene.arrays import UInt8, UInt16
 
 CAMERA_FRAME = "camera_rgb_optical_frame"
 WORLD_FRAME = "world"
@@ -138,7 +139,7 @@ def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:
     return pixels
 
 
-def encode_png(pixels: NDArray[np.uint8] | NDArray[np.uint16], *, stored: bool = False) -> bytes:
+def encode_png(pixels: UInt8 | UInt16, *, stored: bool = False) -> bytes:
     """PNG file of BGR or grey pixels; fast rather than small, `stored` = not compressed at all."""
     if not stored:
         return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])

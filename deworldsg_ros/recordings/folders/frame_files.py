@@ -19,8 +19,8 @@ from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, serialized
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
-    Float64,
     Intrinsics,
     check_pose,
     pose_from_quaternion,

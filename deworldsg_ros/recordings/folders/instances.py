@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
 from deworldsg_ros.recordings.folders.sequence import SequenceDataset
+from deworldsg_ros.scene.arrays import UInt16
 
 
-def read_instances(source: object, stamp_ns: int) -> NDArray[np.uint16] | None:
+def read_instances(source: object, stamp_ns: int) -> UInt16 | None:
     """Object ids of a frame's pixels, (H, W) uint16, 0 = none; None where there is no such image.
 
     Raises:

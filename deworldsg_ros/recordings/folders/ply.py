@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.scene.arrays import Float64
 
 # Both families of names that PLY knows.
 _TYPES = {
@@ -129,7 +130,7 @@ def _ascii_columns(
     }
 
 
-def _ascii_with_lists(rows: list[bytes], element: _Element) -> list[NDArray[np.float64]]:
+def _ascii_with_lists(rows: list[bytes], element: _Element) -> list[Float64]:
     values = np.zeros((len(element.properties), len(rows)))
     for number, row in enumerate(rows):
         words = iter(row.split())

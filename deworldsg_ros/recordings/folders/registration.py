@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deworldsg_ros.scene.camera import Float64, Intrinsics
-
-UInt16 = NDArray[np.uint16]
+from deworldsg_ros.scene.arrays import Float64, UInt16
+from deworldsg_ros.scene.camera import Intrinsics
 
 
 def register_depth(

@@ -8,7 +8,6 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import (
@@ -20,7 +19,8 @@ from deworldsg_ros.recordings.folders.dataset import (
     read_file,
 )
 from deworldsg_ros.recordings.folders.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float64, UInt16
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 
 INFO_NAME = "_info.txt"
@@ -124,7 +124,7 @@ class SequenceDataset(FrameFiles):
             depth_mm = np.asarray(cv2.rotate(depth_mm, cv2.ROTATE_90_CLOCKWISE), np.uint16)
         return color, color_format, encode_png(depth_mm, stored=stored)
 
-    def _depth_mm(self, path: Path) -> NDArray[np.uint16]:
+    def _depth_mm(self, path: Path) -> UInt16:
         """Depth of the colour image's pixels, (H, W) uint16 millimetres; raises RecordingError."""
         units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
         if units.dtype != np.uint16 or units.ndim != 2:
@@ -189,9 +189,7 @@ def turned_pose(T_world_camera: Float64) -> Float64:
     return T
 
 
-def resample(
-    depth: NDArray[np.uint16], depth_camera: Intrinsics, color_camera: Intrinsics
-) -> NDArray[np.uint16]:
+def resample(depth: UInt16, depth_camera: Intrinsics, color_camera: Intrinsics) -> UInt16:
     """Depth on the colour image's pixels, for two cameras in one place; 0 outside the image."""
     u = np.arange(color_camera.width, dtype=np.float64)
     v = np.arange(color_camera.height, dtype=np.float64)

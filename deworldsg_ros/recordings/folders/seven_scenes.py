@@ -25,7 +25,8 @@ from deworldsg_ros.recordings.folders.dataset import (
 )
 from deworldsg_ros.recordings.folders.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
 from deworldsg_ros.recordings.folders.registration import register_depth
-from deworldsg_ros.scene.camera import Float64, Intrinsics
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import Intrinsics
 
 INTRINSICS_NAME = "camera-intrinsics.txt"
 SENSOR_RATE_HZ = 30.0

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.loading import (
     CheckpointSource,
@@ -22,9 +21,8 @@ from deworldsg_ros.checkpoints.loading import (
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry, normalise, resize_and_crop
+from deworldsg_ros.scene.arrays import Float32, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Float32 = NDArray[np.float32]
 
 # Values of each tensor that its fingerprint is made of.
 FINGERPRINT_SAMPLES = 64
@@ -60,7 +58,7 @@ class FrozenBackbone:
         number = "int8" if self.quantised else str(self.dtype).removeprefix("torch.")
         return f"{self.identity}; {self.geometry}; {number}"
 
-    def encode(self, clips: Sequence[NDArray[np.uint8]]) -> Float32:
+    def encode(self, clips: Sequence[UInt8]) -> Float32:
         """Features of clips, all of them in one batch.
 
         Args:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD
+from deworldsg_ros.scene.arrays import UInt8
 
 # Only the middle square is looked at; of a longer image no more than this is ever resized.
 MAX_ASPECT_RATIO = 4
@@ -36,7 +36,7 @@ class ClipGeometry:
         return f"{self.interpolation} {self.short_edge}, middle {self.crop}"
 
 
-def resize_and_crop(clip: NDArray[np.uint8], geometry: ClipGeometry) -> torch.Tensor:
+def resize_and_crop(clip: UInt8, geometry: ClipGeometry) -> torch.Tensor:
     """(T, h, w, 3) uint8 to (T, 3, crop, crop) uint8."""
     height, width = clip.shape[1:3]
     limit = MAX_ASPECT_RATIO * min(height, width)

@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 import safetensors
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 
 from deworldsg_ros.checkpoints.probe_card import (
@@ -20,10 +19,8 @@ from deworldsg_ros.checkpoints.probe_card import (
     read_card,
     write_card,
 )
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 DROPOUT = 0.2
 

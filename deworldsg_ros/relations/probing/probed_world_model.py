@@ -6,17 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.checkpoints.probe_card import relative_box_pair
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.relations.probing.probe_network import Probe, load_probe
 from deworldsg_ros.relations.world_model import ClipRequest
+from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
-
-Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 
 class ProbedWorldModel:

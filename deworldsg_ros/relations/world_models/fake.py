@@ -11,12 +11,10 @@ import hashlib
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
-
-Float64 = NDArray[np.float64]
+from deworldsg_ros.scene.arrays import Float64
 
 # Ranges of the logits that a class pair and a clip contribute.
 CLASS_PAIR_LOGIT = 4.0
