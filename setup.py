@@ -1,29 +1,13 @@
-"""Build of the ROS 2 package `deworldsg_ros`, for `colcon build` and for `pip install`."""
+"""The files that ROS 2 expects beside the Python package; pyproject.toml has most of the rest."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-from setuptools import find_packages, setup
+from setuptools import setup
 
 PACKAGE = "deworldsg_ros"
 ROOT = Path(__file__).resolve().parent
-
-
-def read_version() -> str:
-    """Return the version in `deworldsg_ros/__init__.py`, without importing the package."""
-    text = (ROOT / PACKAGE / "__init__.py").read_text(encoding="utf-8")
-    found = re.search(r'^__version__ = "([^"]+)"', text, re.MULTILINE)
-    if found is None:
-        raise RuntimeError(f'{PACKAGE}/__init__.py has no line __version__ = "…"')
-    return found.group(1)
-
-
-def read_requirements() -> list[str]:
-    """Return the run-time requirements, which have one home: requirements.txt."""
-    lines = (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
-    return [line.strip() for line in lines if line.strip() and not line.startswith(("#", "-"))]
 
 
 def files_below(folder: str, target: str) -> list[tuple[str, list[str]]]:
@@ -39,20 +23,10 @@ def files_below(folder: str, target: str) -> list[tuple[str, list[str]]]:
 
 setup(
     name=PACKAGE,
-    version=read_version(),
-    description="Live 3D semantic scene graphs from an RGB-D camera, with world-model relations",
-    maintainer="deworldsg_ros maintainers",
-    maintainer_email="maintainers@deworldsg-ros.invalid",
     license="Apache-2.0",
     python_requires=">=3.10,<3.14",
-    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "**/weights/*", "**/assets/*"]},
-    install_requires=read_requirements(),
-    extras_require={
-        "models": ["torch>=2.5,<3", "transformers>=5.0,<6", "safetensors>=0.4.5,<1"],
-        "cluster": ["distributed>=2024.8,<2027"],
-    },
-    # Executables: see the shim itself for how it finds its Python.
+    # The nodes' executables (scripts/ros) go to lib/deworldsg_ros, where `ros2 run` looks, with
+    # `colcon build` and with `pip install` alike. Each is a shim that finds its Python.
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -62,6 +36,4 @@ setup(
         *files_below("bags", f"share/{PACKAGE}/bags"),
         *files_below("scripts/ros", f"lib/{PACKAGE}"),
     ],
-    entry_points={"console_scripts": [f"deworldsg = {PACKAGE}.cli:main"]},
-    zip_safe=False,
 )

@@ -1,3 +1,3 @@
 """DeWorldSG for ROS 2: posed RGB-D images in, a live 3D semantic scene graph out."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

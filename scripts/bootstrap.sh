@@ -1,11 +1,11 @@
 # shellcheck shell=bash
 # The environment of scripts/demo and scripts/test. Source it, then call `bootstrap run` or
-# `bootstrap test`: afterwards .venv has what the project's requirement files name and the project
-# itself, PATH begins with it, and the ROS variables are set. Nothing outside the checkout is
-# touched, save pip's own cache.
+# `bootstrap test`. Afterwards .venv holds the requirements of pyproject.toml and the project
+# itself, PATH begins with .venv/bin, and the ROS variables are set. Nothing outside the checkout
+# changes, except pip's cache.
 #
-# Each step that took time leaves the hash of what it was made from in .venv/.bootstrap, so a
-# start without changes does no work, and an interrupted one continues where it stopped.
+# Each slow step stores the hash of its input in .venv/.bootstrap. A start without changes does no
+# work; an interrupted start continues where it stopped.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$root/.venv"
@@ -46,15 +46,15 @@ quietly() {
   say "  $label: done in $((SECONDS - began)) s"
 }
 
-# Whether ROS 2 Jazzy is sourced in this shell, with a python3 that can use it.
+# True if ROS 2 Jazzy is sourced in this shell and its python3 can import rclpy.
 jazzy_is_sourced() {
   [ "${ROS_DISTRO:-}" = jazzy ] && python3 -c 'import rclpy' 2>/dev/null
 }
 
-# Variables that another ROS, or an interpreter of another environment, left in this shell.
+# Remove the variables that another ROS or another environment set in this shell.
 forget_other_ros() {
   if [ -n "${ROS_DISTRO:-}" ]; then
-    say "  ROS 2 ${ROS_DISTRO} is sourced but not usable here (wanted: jazzy, with rclpy for" \
+    say "  ROS 2 ${ROS_DISTRO} is sourced but not usable here (expected: jazzy, with rclpy for" \
       "python3); using the project's own ROS 2 Jazzy instead"
   fi
   # The wheels re-execute each interpreter once to set LD_LIBRARY_PATH; inherited from another
@@ -92,7 +92,7 @@ hash_of() { (cd "$root" && find "$@" -type f ! -name '*.py[cod]' ! -name '*.nb[i
 
 is_current() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; }
 
-# Make .venv, or make it again when it belongs to another place, Python or ROS.
+# Make .venv. Make it again if the folder, the Python or the ROS has changed.
 make_venv() {
   local ros=$1 python=${PYTHON:-"$venv/bin/python"} options=()
   is_current venv "$root $ros $(version_of "$python")" && return
@@ -111,39 +111,41 @@ make_venv() {
 pip_install() { "$venv/bin/python" -m pip install --no-input --prefer-binary \
   --disable-pip-version-check "$@"; }
 
-# The requirement files of a profile (run or test; with DEWORLDSG_TEST_MODELS set test has those of
-# the models on torch, too); with a sourced ROS without the ROS wheels, and with the numpy
-# generation that its message types were compiled against.
+# Install the requirements of a profile (run or test) from pyproject.toml. With
+# DEWORLDSG_TEST_MODELS set, test includes torch and transformers. A sourced ROS needs no ROS
+# wheels, but the numpy generation that its message types were compiled against.
 install_requirements() {
-  local ros=$1 profile=$2 file arguments=() files=(requirements-build.txt requirements.txt)
-  [ "$ros" = sourced ] || files+=(requirements-ros.txt)
-  [ "$profile" = run ] || files+=(requirements-test.txt)
+  local ros=$1 profile=$2 extras=(build run) arguments=() list expected
+  [ "$ros" = sourced ] || extras+=(ros)
+  [ "$profile" = run ] || extras+=(test)
   if [ "$profile" = test ] && [ -n "${DEWORLDSG_TEST_MODELS:-}" ]; then
-    files+=(requirements-models.txt)
+    extras+=(test-models)
   fi
-  local wanted
-  wanted=$(hash_of "${files[@]}")
-  is_current "$profile" "$wanted" && return
-  for file in "${files[@]}"; do arguments+=(-r "$root/$file"); done
+  list=$("$venv/bin/python" "$root/scripts/requirements.py" "${extras[@]}") ||
+    fail "scripts/requirements.py cannot read pyproject.toml"
+  expected=$(sha256sum <<<"$list" | cut -d ' ' -f 1)
+  is_current "$profile" "$expected" && return
+  echo "$list" >"$stamps/requirements.txt"
+  arguments+=(-r "$stamps/requirements.txt")
   if [ "$ros" = sourced ] && python3 -c 'import numpy, sys; sys.exit(numpy.__version__[0] != "1")' 2>/dev/null; then
     echo 'numpy<2' >"$stamps/constraints.txt"
     arguments+=(-c "$stamps/constraints.txt")
   fi
   rm -f "$stamps/$profile"
-  quietly "installing ${files[*]}" pip_install "${arguments[@]}"
-  echo "$wanted" >"$stamps/$profile"
+  quietly "installing the requirements (${extras[*]})" pip_install "${arguments[@]}"
+  echo "$expected" >"$stamps/$profile"
 }
 
 # Install the project from a clean copy, so that no build/ is left in the checkout and no module
 # deleted since the last build comes back.
 install_project() {
-  local name wanted sources=()
-  for name in package.xml setup.py setup.cfg pyproject.toml requirements.txt LICENSE \
+  local name expected sources=()
+  for name in package.xml setup.py setup.cfg pyproject.toml README.md LICENSE \
     deworldsg_ros resource launch config msg_schemas bags scripts/ros; do
     [ ! -e "$root/$name" ] || sources+=("$name")
   done
-  wanted=$(hash_of "${sources[@]}")
-  is_current project "$wanted" && [ -x "$venv/bin/deworldsg" ] && return
+  expected=$(hash_of "${sources[@]}")
+  is_current project "$expected" && [ -x "$venv/bin/deworldsg" ] && return
   rm -rf "$stamps/source" "$stamps/project"
   mkdir "$stamps/source"
   (cd "$root" && cp -r --parents "${sources[@]}" "$stamps/source")
@@ -151,7 +153,7 @@ install_project() {
   quietly "installing deworldsg_ros" pip_install --no-deps --no-build-isolation --force-reinstall \
     "$stamps/source"
   rm -rf "$stamps/source"
-  echo "$wanted" >"$stamps/project"
+  echo "$expected" >"$stamps/project"
 }
 
 # Each process of the graph takes 32 MB of shared memory for images (config/fastdds.xml).

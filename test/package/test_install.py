@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -23,7 +24,7 @@ EXECUTABLES = {
     *("odometry_node", "replay_node"),
 }
 SOURCES = (
-    *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "requirements.txt", "LICENSE"),
+    *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"),
     *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),
 )
 SHARED = ("launch", "config", "msg_schemas", "bags")
@@ -51,8 +52,8 @@ class Install:
         }
 
 
-def run(*command: str | Path, cwd: Path, **options: object) -> None:
-    """Run a command; its output is in the failure's text."""
+def run(*command: str | Path, cwd: Path, **options: object) -> str:
+    """Run a command and return its output; a failure shows the output."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
@@ -63,6 +64,7 @@ def run(*command: str | Path, cwd: Path, **options: object) -> None:
         **options,  # type: ignore[call-overload]
     )
     assert done.returncode == 0, done.stdout
+    return done.stdout
 
 
 def copy_sources(root: Path, target: Path) -> Path:
@@ -90,7 +92,7 @@ def install_with_pip(source: Path, folder: Path) -> Path:
 def install_with_colcon(source: Path, folder: Path) -> Path:
     """The prefix of a `colcon build`."""
     colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    assert colcon is not None, "no colcon: pip install -r requirements-test.txt"
+    assert colcon is not None, "colcon is missing: scripts/test installs it"
     run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
     return folder / "install" / PACKAGE
 
@@ -170,8 +172,11 @@ def test_executable_starts_its_node(install: Install, tmp_path: Path, executable
     assert "no_such_thing" in done.stderr
 
 
-def test_deworldsg_tells_how_to_use_it(install: Install, tmp_path: Path) -> None:
-    run(install.prefix / "bin" / "deworldsg", "--help", cwd=tmp_path, env=install.environment())
+def test_deworldsg_help_lists_the_commands(install: Install, tmp_path: Path) -> None:
+    command = install.prefix / "bin" / "deworldsg"
+    text = run(command, "--help", cwd=tmp_path, env=install.environment())
+    for name in ("run", "demo", "convert", "info", "config", "evaluate"):
+        assert re.search(rf"^ +{name} +[A-Z]", text, re.M), text
 
 
 @pytest.mark.parametrize("prefix_has_python", [True, False])

@@ -1,58 +1,115 @@
-"""What the package says of itself in more than one place agrees."""
+"""Package metadata that stands in more than one file agrees."""
 
 from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
-from importlib.metadata import requires, version
+from importlib.metadata import metadata, requires, version
 from pathlib import Path
 
 import pytest
+import yaml
 
 import deworldsg_ros
+from deworldsg_ros.config import Config, load_config, to_mapping
 
 ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
+# Modules whose distribution has another name.
+DISTRIBUTIONS = {"cv2": "opencv-python-headless", "yaml": "pyyaml"}
+
+
+def requirements(root: Path, *extras: str) -> dict[str, str]:
+    """Requirement lines by lower-case distribution name."""
+    script = root / "scripts" / "requirements.py"
+    done = subprocess.run(
+        [sys.executable, script, *extras], capture_output=True, text=True, check=True, timeout=60
+    )
+    return {re.split(r"[<>=!]", line)[0].lower(): line for line in done.stdout.split()}
 
 
 def test_versions_agree(root_dir: Path) -> None:
     manifest = ElementTree.parse(root_dir / "package.xml").getroot()
     assert manifest.findtext("version") == deworldsg_ros.__version__
+    citation = yaml.safe_load((root_dir / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == deworldsg_ros.__version__
     changelog = (root_dir / "CHANGELOG.md").read_text(encoding="utf-8")
-    assert deworldsg_ros.__version__ in changelog or "[Unreleased]" in changelog
+    newest = re.search(r"^## \[(\d[^\]]*)\]", changelog, re.M)
+    assert newest is not None and newest.group(1) == deworldsg_ros.__version__
 
 
-def test_package_xml_is_an_ament_python_package_that_depends_on_what_is_imported(
-    root_dir: Path,
-) -> None:
+def test_descriptions_and_licences_agree(root_dir: Path) -> None:
+    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
+    pyproject = (root_dir / "pyproject.toml").read_text(encoding="utf-8")
+    assert f'description = "{(manifest.findtext("description") or "").rstrip(".")}"' in pyproject
+    setup = (root_dir / "setup.py").read_text(encoding="utf-8")
+    assert manifest.findtext("license") == "Apache-2.0" and 'license="Apache-2.0"' in setup
+
+
+def test_package_xml_declares_every_ros_package_that_is_imported(root_dir: Path) -> None:
     manifest = ElementTree.parse(root_dir / "package.xml").getroot()
     assert manifest.findtext("name") == "deworldsg_ros"
     assert manifest.findtext("export/build_type") == "ament_python"
     declared = {element.text for element in manifest.findall("exec_depend")}
-    imported = set()
-    for path in (root_dir / "deworldsg_ros").rglob("*.py"):
-        found = re.findall(r"^ *(?:from|import) (\w+)", path.read_text(encoding="utf-8"), re.M)
-        imported |= {name for name in found if re.fullmatch(ROS_NAMES, name)}
+    imported = {name for name in imported_modules(root_dir) if re.fullmatch(ROS_NAMES, name)}
+    assert {"rclpy", "sensor_msgs"} <= imported
     assert imported <= declared
 
 
+def imported_modules(root: Path) -> set[str]:
+    """Top-level names of everything that the package imports."""
+    imported: set[str] = set()
+    for path in (root / "deworldsg_ros").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        imported |= set(
+            re.findall(r"^ *(?:from|import) (\w+)(?=[\w.]* import |$| as )", text, re.M)
+        )
+    return imported
+
+
+def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
+    known = {*requirements(root_dir), *requirements(root_dir, "models", "cluster")}
+    libraries = {
+        DISTRIBUTIONS.get(name, name).lower()
+        for name in imported_modules(root_dir)
+        if name not in sys.stdlib_module_names
+        and name not in ("deworldsg_ros", "__future__")
+        and not re.fullmatch(ROS_NAMES, name)
+    }
+    assert {"numpy", "msgspec", "torch"} <= libraries
+    assert libraries <= known
+
+
 @pytest.mark.parametrize("name", ["default.yaml", "paper.yaml"])
-def test_configurations_are_those_of_the_package(root_dir: Path, name: str) -> None:
-    from deworldsg_ros.config import load_config
+def test_a_shipped_configuration_lists_only_what_differs(root_dir: Path, name: str) -> None:
+    path = root_dir / "config" / name
+    content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
+    content.pop("use_sim_time", None)
+    assert bool(content) == (name != "default.yaml")
+    loaded, default = to_mapping(load_config(path)), to_mapping(Config())
+    for section, values in content.items():
+        for field, value in values.items():
+            assert loaded[section][field] == value != default[section][field], (section, field)
 
-    assert load_config(root_dir / "config" / name)
+
+def test_run_time_requirements_are_bounded_and_without_torch(root_dir: Path) -> None:
+    lines = requirements(root_dir)
+    assert {"numpy", "scipy", "rosbags"} <= set(lines)
+    assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in lines.values())
+    assert not {"torch", "transformers"} & set(lines)
 
 
-def test_run_time_requirements_have_one_home_and_no_torch(root_dir: Path) -> None:
-    lines = (root_dir / "requirements.txt").read_text(encoding="utf-8").splitlines()
-    wanted = {line for line in lines if line and not line.startswith("#")}
-    assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in wanted)
-    assert not any(line.startswith(("torch", "transformers")) for line in wanted)
+def test_an_unknown_extra_is_refused(root_dir: Path) -> None:
+    with pytest.raises(subprocess.CalledProcessError):
+        requirements(root_dir, "no-such-extra")
 
 
 def test_metadata_of_the_installed_package_names_the_requirements(root_dir: Path) -> None:
     if "VIRTUAL_ENV" not in os.environ:
         pytest.skip("deworldsg_ros is installed where scripts/test runs the tests")
     assert version("deworldsg_ros") == deworldsg_ros.__version__
+    assert metadata("deworldsg_ros")["Summary"].startswith("Live 3D semantic scene graphs")
     names = {re.split(r"[<>=!~;\[ ]", line)[0].lower() for line in requires("deworldsg_ros") or []}
-    assert {"numpy", "msgspec", "rosbags"} <= names
+    assert set(requirements(root_dir)) <= names
