@@ -1,4 +1,4 @@
-"""Numba settings of the kernels, and arrays in the one form that they are compiled for."""
+"""The decorator of all compiled kernels, and arrays in the one layout they are compiled for."""
 
 from __future__ import annotations
 
@@ -15,21 +15,26 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel(function: F) -> F:
     """Compile with numba: strict IEEE arithmetic, without the GIL, cached on disk if possible.
 
-    A kernel may call kernels of its own module only: numba invalidates a cached kernel when its
-    own file changes, and does not look at the files of those it calls.
+    A kernel may call kernels of its own module only. Numba invalidates a cached kernel when the
+    kernel's own file changes, but ignores changes in the files of the kernels that it calls.
     """
     try:
         compiled: Any = numba.njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # no writable place for the cache: compile in every process
+    except RuntimeError:  # the cache folder is not writable: compile in every process
         compiled = numba.njit(nogil=True)(function)
     return cast(F, compiled)
 
 
-def borrowed(array: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-    """Read-only, aligned, C-contiguous view of an array; a copy only where it is none already.
+def read_only(array: NDArray[Any], dtype: DTypeLike | None = None) -> NDArray[Any]:
+    """Read-only, aligned, C-contiguous view of an array; copies only if the layout differs.
 
-    To numba, an array that is read-only (a message's buffer) has another type than one that is
-    not, and would be compiled for again in mid-run.
+    Numba compiles a kernel once for each combination of layout and writability of its arguments.
+    An image from a message is read-only, an image from a file is writable. With this function, both
+    use the same compiled kernel, and no frame waits for the compiler.
+
+    Args:
+        array: any shape.
+        dtype: of the result; None keeps the array's own.
     """
     view = np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"]).view()
     view.flags.writeable = False

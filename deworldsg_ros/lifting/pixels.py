@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.kernels import borrowed, kernel
+from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16
 
 
@@ -34,7 +34,7 @@ class Pixels:
 
 def valid_depth(depth_m: Float32) -> Float32:
     """Depth image with 0 in place of NaN, infinity and negative values; (H, W) float32 metres."""
-    return _valid_depth(borrowed(depth_m, np.float32))
+    return _valid_depth(read_only(depth_m, np.float32))
 
 
 def valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64:
@@ -48,7 +48,9 @@ def valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64
     Returns:
         (count + 1,) int64: the k-th is that of object k, the 0th that of all values > count.
     """
-    return _valid_pixel_counts(borrowed(depth_m, np.float32), borrowed(instances, np.uint16), count)
+    return _valid_pixel_counts(
+        read_only(depth_m, np.float32), read_only(instances, np.uint16), count
+    )
 
 
 @kernel

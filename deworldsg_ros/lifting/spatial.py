@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from deworldsg_ros.kernels import borrowed, kernel
+from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.lifting.pixels import Pixels
 from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16, UInt64
 
@@ -35,9 +35,9 @@ def spatial_inliers(
     places = np.append(valid_counts[1:] + 1, 0)
     starts = np.cumsum(places) - places
     columns, rows, depths_m, ends = _scatter_inliers(
-        borrowed(depth_m, np.float32),
-        borrowed(median_m, np.float32),
-        borrowed(instances, np.uint16),
+        read_only(depth_m, np.float32),
+        read_only(median_m, np.float32),
+        read_only(instances, np.uint16),
         starts,
         tau,
         epsilon_m,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
@@ -101,8 +101,17 @@ class SeenThrough:
         return gone.tolist(), views
 
 
-@njit(cache=True, nogil=True)
-def _renew(kept_points, kept_counts, balls, frames, owners, points, counts, rows):  # type: ignore[no-untyped-def]
+@kernel
+def _renew(
+    kept_points: Float32,
+    kept_counts: Int64,
+    balls: Float64,
+    frames: Int64,
+    owners: Int64,
+    points: Float32,
+    counts: Int64,
+    rows: Int64,
+) -> None:
     for index in range(len(owners)):
         owner, row = owners[index], rows[index]
         count = min(counts[row], SAMPLED_POINTS)
@@ -123,8 +132,8 @@ def _renew(kept_points, kept_counts, balls, frames, owners, points, counts, rows
             balls[owner, 3] = max(balls[owner, 3], radius)
 
 
-@njit(cache=True, nogil=True)
-def _in_camera(T, x, y, z):  # type: ignore[no-untyped-def]
+@kernel
+def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -132,13 +141,22 @@ def _in_camera(T, x, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
-def _beside_view(ball, T_camera_world, width_px, height_px, fx, fy, cx, cy):  # type: ignore[no-untyped-def]
+@kernel
+def _beside_view(
+    ball: Float64,
+    T_camera_world: Float64,
+    width_px: int,
+    height_px: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> bool:
     """Whether all of a ball is behind the camera, or beyond one side of the image."""
     x, y, z = _in_camera(T_camera_world, ball[0], ball[1], ball[2])
     radius = ball[3]
     right, below = cx - width_px, cy - height_px
-    return (
+    return bool(
         z < NEAR_M - radius
         or fx * x + cx * z < -radius * math.hypot(fx, cx)
         or fx * x + right * z > radius * math.hypot(fx, right)
@@ -147,22 +165,22 @@ def _beside_view(ball, T_camera_world, width_px, height_px, fx, fy, cx, cy):  # 
     )
 
 
-@njit(cache=True, nogil=True)
-def _look(  # type: ignore[no-untyped-def]
-    points,
-    counts,
-    balls,
-    frames,
-    enough_frames,
-    seen,
-    T_camera_world,
-    depth_mm,
-    stride,
-    fx,
-    fy,
-    cx,
-    cy,
-):
+@kernel
+def _look(
+    points: Float32,
+    counts: Int64,
+    balls: Float64,
+    frames: Int64,
+    enough_frames: int,
+    seen: Int64,
+    T_camera_world: Float64,
+    depth_mm: UInt16,
+    stride: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> tuple[Int64, Int64]:
     found = np.zeros(len(points), np.bool_)
     for owner in seen:
         if owner < len(points):

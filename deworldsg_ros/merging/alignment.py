@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import transform
@@ -179,8 +179,8 @@ def _loss(distances: Float64, count: int) -> float:
     return float((met.sum() + (count - len(met)) * FAR_M**2) / count)
 
 
-@njit(cache=True, nogil=True)
-def _planes(points, most):  # type: ignore[no-untyped-def]
+@kernel
+def _planes(points: Float64, most: int) -> Float64:
     """Point and normal (k, 6) of the first points around which the surface is flat."""
     planes = np.empty((min(most, len(points)), 6))
     count = 0

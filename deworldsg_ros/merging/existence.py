@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.merging.absence import VIEWS, WHOLE
 from deworldsg_ros.scene.arrays import Float64, Int64
 
@@ -183,8 +184,8 @@ class Existence:
             self._nodes = np.concatenate((self._nodes, more))
 
 
-@njit(cache=True, nogil=True)
-def _doubtful(nodes, owner, by_view, min_rate):  # type: ignore[no-untyped-def]
+@kernel
+def _doubtful(nodes: NDArray[Any], owner: int, by_view: Float64, min_rate: float) -> bool:
     """Whether a node is more likely an error than an object."""
     node = nodes[owner]
     if min_rate == 0.0:
@@ -195,16 +196,18 @@ def _doubtful(nodes, owner, by_view, min_rate):  # type: ignore[no-untyped-def]
     chance = node.chance
     if node.last_ns < node.look_ns:
         chance *= _miss_chance(by_view, node.best_view)
-    return chance < ERROR_CHANCE and node.last_ns - node.first_ns < MOMENT_NS
+    return bool(chance < ERROR_CHANCE and node.last_ns - node.first_ns < MOMENT_NS)
 
 
-@njit(cache=True, nogil=True)
-def _miss_chance(by_view, view):  # type: ignore[no-untyped-def]
+@kernel
+def _miss_chance(by_view: Float64, view: int) -> float:
     return 1.0 - by_view[view, 1] / by_view[view, 0] if view > 0 else 1.0
 
 
-@njit(cache=True, nogil=True)
-def _look(node, by_view, mean, camera, stamp_ns, baseline_rad):  # type: ignore[no-untyped-def]
+@kernel
+def _look(
+    node: Any, by_view: Float64, mean: Float64, camera: Float64, stamp_ns: int, baseline_rad: float
+) -> float:
     """Begin another look where the camera has moved on; returns its distance from the node."""
     # A clock that is behind that of an earlier run: what was known then was known before.
     behind_ns = max(0, max(node.last_ns, node.look_ns) - stamp_ns)
@@ -239,8 +242,17 @@ def _look(node, by_view, mean, camera, stamp_ns, baseline_rad):  # type: ignore[
     return distance
 
 
-@njit(cache=True, nogil=True)
-def _detected(nodes, by_view, owners, means, scores, camera, stamp_ns, baseline_rad):  # type: ignore[no-untyped-def]
+@kernel
+def _detected(
+    nodes: NDArray[Any],
+    by_view: Float64,
+    owners: Int64,
+    means: Float64,
+    scores: Float64,
+    camera: Float64,
+    stamp_ns: int,
+    baseline_rad: float,
+) -> None:
     for index in range(len(owners)):
         node = nodes[owners[index]]
         if node.detections == 0:
@@ -260,8 +272,18 @@ def _detected(nodes, by_view, owners, means, scores, camera, stamp_ns, baseline_
         node.best_score = max(node.best_score, scores[index])
 
 
-@njit(cache=True, nogil=True)
-def _missed(nodes, by_view, owners, views, means, camera, stamp_ns, baseline_rad, min_rate):  # type: ignore[no-untyped-def]
+@kernel
+def _missed(
+    nodes: NDArray[Any],
+    by_view: Float64,
+    owners: Int64,
+    views: Int64,
+    means: Float64,
+    camera: Float64,
+    stamp_ns: int,
+    baseline_rad: float,
+    min_rate: float,
+) -> Int64:
     doubted = np.empty(len(owners), np.int64)
     count = 0
     for index in range(len(owners)):

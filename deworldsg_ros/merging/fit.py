@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
@@ -78,8 +78,8 @@ def warm_up() -> None:
     _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 0.5, 1.0, 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _solve(covariance, d0, d1, d2):  # type: ignore[no-untyped-def]
+@kernel
+def _solve(covariance: Float64, d0: float, d1: float, d2: float) -> tuple[float, float]:
     """|Σ| and dᵀΣ⁻¹d by the LDLᵀ pivots of a covariance."""
     c00 = covariance[0, 0]
     l10 = covariance[1, 0] / c00
@@ -93,21 +93,21 @@ def _solve(covariance, d0, d1, d2):  # type: ignore[no-untyped-def]
     return c00 * pivot_1 * pivot_2, squared
 
 
-@njit(cache=True, nogil=True)
-def _fit(  # type: ignore[no-untyped-def]
-    means,
-    covariances,
-    classes,
-    node_means,
-    node_covariances,
-    node_classes,
-    rows,
-    shares,
-    threshold,
-    threshold_other_class,
-    variance_ratio_other_class,
-    blur_m2,
-):
+@kernel
+def _fit(
+    means: Float64,
+    covariances: Float64,
+    classes: Float64,
+    node_means: Float64,
+    node_covariances: Float64,
+    node_classes: Float64,
+    rows: Int64,
+    shares: Float64,
+    threshold: float,
+    threshold_other_class: float,
+    variance_ratio_other_class: float,
+    blur_m2: float,
+) -> tuple[Float64, Bool]:
     values = np.zeros(shares.shape)
     touching = np.zeros(shares.shape, np.bool_)
     blur = blur_m2 * np.eye(3)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.nodes import NodeTable
 
@@ -24,7 +24,7 @@ from deworldsg_ros.scene.nodes import NodeTable
 _SLACK = 1.0 + 1e-9
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest(  # pragma: no cover - compiled
     mean: Float64,
     covariance: Float64,

@@ -12,8 +12,8 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int32, Int64, UInt64
 
 # An owner of fewer cells than this says too little by lying within a set.
@@ -204,39 +204,39 @@ class VoxelMap:
         self._used = _rehash(keys, masks, owners, self._keys, self._masks, self._owners)
 
 
-@njit(cache=True, nogil=True)
-def _place(keys, block):  # type: ignore[no-untyped-def]
+@kernel
+def _place(keys: Int64, block: np.int64) -> int:
     """Slot where a block belongs; it is in this or one of the next before an empty one."""
     mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
-    return np.int64(mixed >> np.uint64(32)) & (len(keys) - 1)
+    return int(np.int64(mixed >> np.uint64(32)) & (len(keys) - 1))
 
 
-@njit(cache=True, nogil=True)
-def _count(mask):  # type: ignore[no-untyped-def]
+@kernel
+def _count(mask: np.uint64) -> int:
     """Number of bits that are set."""
     mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
     pairs = np.uint64(0x3333333333333333)
     mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
     mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56))
+    return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
 
 
-@njit(cache=True, nogil=True)
-def _turned(mask, by):  # type: ignore[no-untyped-def]
+@kernel
+def _turned(mask: np.uint64, by: np.uint64) -> np.uint64:
     return (mask >> by) | (mask << (np.uint64(64) - by))
 
 
-@njit(cache=True, nogil=True)
-def _grown(mask):  # type: ignore[no-untyped-def]
+@kernel
+def _grown(mask: np.uint64) -> np.uint64:
     """Cells of a block with those of the same block that share a face with them."""
     z, y, x = np.uint64(1), np.uint64(4), np.uint64(16)
     grown = mask | (mask << x) | (mask >> x)
     grown |= ((mask & ~_FACES[0]) << z) | ((mask & ~_FACES[1]) >> z)
-    return grown | ((mask & ~_FACES[2]) << y) | ((mask & ~_FACES[3]) >> y)
+    return np.uint64(grown | ((mask & ~_FACES[2]) << y) | ((mask & ~_FACES[3]) >> y))
 
 
-@njit(cache=True, nogil=True)
-def _cell_of(point, cells_per_m):  # type: ignore[no-untyped-def]
+@kernel
+def _cell_of(point: Float32, cells_per_m: float) -> tuple[np.int64, np.uint64]:
     """Block and bit of the cell of a point; block -1 where it is too far away."""
     block = np.int64(0)
     bit = np.int64(0)
@@ -249,8 +249,10 @@ def _cell_of(point, cells_per_m):  # type: ignore[no-untyped-def]
     return (block if inside else np.int64(-1)), np.uint64(1) << np.uint64(bit)
 
 
-@njit(cache=True, nogil=True)
-def _holds(keys, masks, owners, owner, points, cell_m):  # type: ignore[no-untyped-def]
+@kernel
+def _holds(
+    keys: Int64, masks: UInt64, owners: Int32, owner: int, points: Float32, cell_m: float
+) -> Bool:
     held = np.zeros(len(points), np.bool_)
     for index in range(len(points)):
         block, bit = _cell_of(points[index], 1.0 / cell_m)
@@ -262,8 +264,8 @@ def _holds(keys, masks, owners, owner, points, cell_m):  # type: ignore[no-untyp
     return held
 
 
-@njit(cache=True, nogil=True)
-def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
+@kernel
+def _cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt64, Int64]:
     blocks = np.empty(len(points), np.int64)
     masks = np.zeros(len(points), np.uint64)
     new_starts = np.zeros(len(starts), np.int64)
@@ -291,8 +293,19 @@ def _cells_of(points, starts, cell_m):  # type: ignore[no-untyped-def]
     return blocks[:kept].copy(), masks[:kept].copy(), new_starts
 
 
-@njit(cache=True, nogil=True)
-def _add(keys, masks, owners, counts, limit, used, who, blocks, set_masks, starts):  # type: ignore[no-untyped-def]
+@kernel
+def _add(
+    keys: Int64,
+    masks: UInt64,
+    owners: Int32,
+    counts: Int64,
+    limit: int,
+    used: int,
+    who: Int64,
+    blocks: Int64,
+    set_masks: UInt64,
+    starts: Int64,
+) -> tuple[Int64, Int64, int]:
     new = np.empty(len(blocks), np.int64)
     new_starts = np.zeros(len(starts), np.int64)
     new_count = 0
@@ -335,8 +348,18 @@ def _add(keys, masks, owners, counts, limit, used, who, blocks, set_masks, start
     return new[:new_count].copy(), new_starts, used
 
 
-@njit(cache=True, nogil=True)
-def _shares(keys, masks, owners, marks, counts, used, blocks, set_masks, starts):  # type: ignore[no-untyped-def]
+@kernel
+def _shares(
+    keys: Int64,
+    masks: UInt64,
+    owners: Int32,
+    marks: UInt64,
+    counts: Int64,
+    used: int,
+    blocks: Int64,
+    set_masks: UInt64,
+    starts: Int64,
+) -> tuple[Int64, Float64]:
     set_count = len(starts) - 1
     on_owner = np.zeros((set_count, len(counts)), np.int64)
     of_owner = np.zeros((set_count, len(counts)), np.int64)
@@ -400,8 +423,8 @@ def _shares(keys, masks, owners, marks, counts, used, blocks, set_masks, starts)
     return columns, shares
 
 
-@njit(cache=True, nogil=True)
-def _near(block, blocks, set_masks, start, stop):  # type: ignore[no-untyped-def]
+@kernel
+def _near(block: np.int64, blocks: Int64, set_masks: UInt64, start: int, stop: int) -> np.uint64:
     """Cells of a block that are in a set, or have a face next to one that is."""
     near = np.uint64(0)
     for at in range(start, stop):
@@ -413,10 +436,20 @@ def _near(block, blocks, set_masks, start, stop):  # type: ignore[no-untyped-def
     return near
 
 
-@njit(cache=True, nogil=True)
-def _contest(  # type: ignore[no-untyped-def]
-    keys, masks, owners, marks, counts, used, who, blocks, set_masks, starts, least_share
-):
+@kernel
+def _contest(
+    keys: Int64,
+    masks: UInt64,
+    owners: Int32,
+    marks: UInt64,
+    counts: Int64,
+    used: int,
+    who: Int64,
+    blocks: Int64,
+    set_masks: UInt64,
+    starts: Int64,
+    least_share: float,
+) -> Int64:
     set_of = np.full(len(counts), -1, np.int64)
     for index in range(len(who)):
         if who[index] >= 0:
@@ -457,8 +490,8 @@ def _contest(  # type: ignore[no-untyped-def]
     return lost
 
 
-@njit(cache=True, nogil=True)
-def _slots_of(keys, owners, owner, blocks):  # type: ignore[no-untyped-def]
+@kernel
+def _slots_of(keys: Int64, owners: Int32, owner: int, blocks: Int64) -> Int64:
     slots = np.empty(len(blocks), np.int64)
     for index in range(len(blocks)):
         slot = _place(keys, blocks[index])
@@ -468,8 +501,10 @@ def _slots_of(keys, owners, owner, blocks):  # type: ignore[no-untyped-def]
     return slots
 
 
-@njit(cache=True, nogil=True)
-def _rehash(keys, masks, owners, new_keys, new_masks, new_owners):  # type: ignore[no-untyped-def]
+@kernel
+def _rehash(
+    keys: Int64, masks: UInt64, owners: Int32, new_keys: Int64, new_masks: UInt64, new_owners: Int32
+) -> int:
     used = 0
     for slot in range(len(keys)):
         if owners[slot] < 0:

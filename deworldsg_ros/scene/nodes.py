@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt64
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
 from deworldsg_ros.scene.surface import add_points
@@ -197,22 +197,22 @@ class NodeTable:
             setattr(self, name, column[:count])
 
 
-@njit(cache=True, nogil=True)
-def _fuse(  # type: ignore[no-untyped-def]
-    rows,
-    means,
-    covariances,
-    classes,
-    weights,
-    observations,
-    log_determinants,
-    eigenvalue_bounds,
-    new_means,
-    new_covariances,
-    new_classes,
-    new_weights,
-    new_observations,
-):
+@kernel
+def _fuse(
+    rows: Int64,
+    means: Float64,
+    covariances: Float64,
+    classes: Float64,
+    weights: Float64,
+    observations: Int64,
+    log_determinants: Float64,
+    eigenvalue_bounds: Float64,
+    new_means: Float64,
+    new_covariances: Float64,
+    new_classes: Float64,
+    new_weights: Float64,
+    new_observations: Int64,
+) -> int:
     """`scene.gaussian.fuse` with what is cached of the result; place that was refused, -1 = none.
 
     The operations are those of `fuse`, `log_determinant` and `eigenvalue_bound`, one by one.

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from itertools import accumulate
 
 import numpy as np
-from numba import njit
 
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt64
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt32, UInt64
 
 # Within this distance points of a surface are of one part of it: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015
@@ -57,8 +57,8 @@ def add_points(
     )
 
 
-@njit(cache=True, nogil=True)
-def _hash(bits):  # type: ignore[no-untyped-def]
+@kernel
+def _hash(bits: UInt32) -> np.uint64:
     """64-bit hash of a point, a function of its three float32 values alone."""
     state = np.uint64(0)
     for axis in range(3):
@@ -71,8 +71,10 @@ def _hash(bits):  # type: ignore[no-untyped-def]
     return state
 
 
-@njit(cache=True, nogil=True)
-def _add(hashes, bits, counts, rows, new_bits, starts):  # type: ignore[no-untyped-def]
+@kernel
+def _add(
+    hashes: UInt64, bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int64
+) -> None:
     capacity = hashes.shape[1]
     all_hashes = np.empty(capacity, np.uint64)
     all_bits = np.empty((capacity, 3), np.uint32)
@@ -128,8 +130,8 @@ def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
     return mean, (covariance + covariance.T) / 2
 
 
-@njit(cache=True, nogil=True)
-def _neighbours(points, radius):  # type: ignore[no-untyped-def]
+@kernel
+def _neighbours(points: Float32, radius: float) -> Float64:
     """Number of points within a radius of each point, itself included."""
     counts = np.ones(len(points))
     for a in range(len(points)):

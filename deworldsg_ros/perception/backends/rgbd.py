@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.perception.arrays import read_only
+from deworldsg_ros.kernels import read_only
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
 from deworldsg_ros.perception.superpixels.region_cut import cut_boxes

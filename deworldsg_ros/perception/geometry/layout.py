@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
-from deworldsg_ros.perception.arrays import read_only
+from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 
@@ -124,10 +123,8 @@ def upright_axes(up_camera: Float64) -> Float64:
     return np.stack([np.cross(forward, up), forward, up])
 
 
-@numba.njit(cache=True, nogil=True)
-def _sample(  # type: ignore[no-untyped-def]
-    depth_m, instances, count, most
-) -> tuple[Int64, Int64]:
+@kernel
+def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple[Int64, Int64]:
     """Pixels (k, 2) as row, column, and the row of their object, in the order of the objects.
 
     Of an object with many pixels, `most` that are evenly spread in scan order.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Int32
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Float32, Int32, UInt8
 
 # Differences that count 1: of colour (RGB, 8 bit), of depth relative to depth, of a cell's width.
 COLOUR_STEP = 12.0
@@ -15,9 +15,9 @@ PLACE_WEIGHT = 0.5
 DEPTH_LIMIT = 9.0
 
 
-@numba.njit(cache=True, nogil=True)
-def upsample_labels(  # type: ignore[no-untyped-def]
-    labels, cell_rgb, cell_depth, rgb, depth_m, stride
+@kernel
+def upsample_labels(
+    labels: Int32, cell_rgb: UInt8, cell_depth: Float32, rgb: UInt8, depth_m: Float32, stride: int
 ) -> Int32:
     """Each pixel takes the label of the most similar of its own cell and the four beside it.
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.perception.superpixels.superpixels import Regions
-from deworldsg_ros.scene.arrays import Int32, Int64
+from deworldsg_ros.scene.arrays import Float64, Int32, Int64
 
 
 class CutSettings(NamedTuple):
@@ -89,10 +89,22 @@ def cut_boxes(regions: Regions, boxes_cells: Int64, settings: CutSettings = SETT
     return owner
 
 
-@numba.njit(cache=True, nogil=True)
-def _cut_box(  # type: ignore[no-untyped-def]
-    labels, area, lab, valid, point, normal, flatness, pairs, strength, box, owner, row, settings
-):
+@kernel
+def _cut_box(
+    labels: Int32,
+    area: Float64,
+    lab: Float64,
+    valid: Float64,
+    point: Float64,
+    normal: Float64,
+    flatness: Float64,
+    pairs: Int32,
+    strength: Float64,
+    box: Int64,
+    owner: Int32,
+    row: int,
+    settings: CutSettings,
+) -> None:
     x1, y1, x2, y2 = box
     count = len(area)
     inside, loosely, bounds = _count_inside(labels, count, box, settings)
@@ -122,8 +134,10 @@ def _cut_box(  # type: ignore[no-untyped-def]
         owner[order[i]] = row
 
 
-@numba.njit(cache=True, nogil=True)
-def _count_inside(labels, count, box, settings):  # type: ignore[no-untyped-def]
+@kernel
+def _count_inside(
+    labels: Int32, count: int, box: Int64, settings: CutSettings
+) -> tuple[Int32, Int32, Int32]:
     x1, y1, x2, y2 = box
     rows, columns = labels.shape
     inside = np.zeros(count, np.int32)
@@ -147,10 +161,19 @@ def _count_inside(labels, count, box, settings):  # type: ignore[no-untyped-def]
     return inside, loosely, bounds
 
 
-@numba.njit(cache=True, nogil=True)
-def _reach_by_planes(  # type: ignore[no-untyped-def]
-    members, distance, owner, area, lab, valid, point, normal, flatness, settings
-):
+@kernel
+def _reach_by_planes(
+    members: Int64,
+    distance: Float64,
+    owner: Int32,
+    area: Float64,
+    lab: Float64,
+    valid: Float64,
+    point: Float64,
+    normal: Float64,
+    flatness: Float64,
+    settings: CutSettings,
+) -> None:
     for q in range(len(area)):
         if distance[q] > 0.0 or owner[q] >= 0 or valid[q] < settings.plane_min_cells:
             continue
@@ -175,8 +198,8 @@ def _reach_by_planes(  # type: ignore[no-untyped-def]
             distance[r] = min(distance[r], settings.plane_price + price)
 
 
-@numba.njit(cache=True, nogil=True)
-def _reach_by_borders(distance, owner, pairs, strength):  # type: ignore[no-untyped-def]
+@kernel
+def _reach_by_borders(distance: Float64, owner: Int32, pairs: Int32, strength: Float64) -> None:
     # Borders between two regions of the background cannot matter.
     relevant = np.empty(len(pairs), np.int32)
     found = 0
@@ -200,10 +223,16 @@ def _reach_by_borders(distance, owner, pairs, strength):  # type: ignore[no-unty
                 changed = True
 
 
-@numba.njit(cache=True, nogil=True)
-def _best_prefix(  # type: ignore[no-untyped-def]
-    order, distance, area, bounds, free, box_area, settings
-):
+@kernel
+def _best_prefix(
+    order: Int64,
+    distance: Float64,
+    area: Float64,
+    bounds: Int32,
+    free: float,
+    box_area: int,
+    settings: CutSettings,
+) -> int:
     total, total_square = 0.0, 0.0
     for r in order:
         total += area[r] * distance[r]

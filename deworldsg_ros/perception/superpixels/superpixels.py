@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
@@ -86,12 +86,11 @@ def reduce_frame(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics, stride: i
     lab = cv2.cvtColor(mean, cv2.COLOR_RGB2Lab).astype(np.float32)
     sampled = depth_m[middle, middle][:height, :width]
     valid = (sampled > 0) & (sampled < MAX_DEPTH_M)
-    z = cv2.medianBlur(np.where(valid, sampled, np.float32(0)), 3)
+    z = np.asarray(cv2.medianBlur(np.where(valid, sampled, np.float32(0)), 3), np.float32)
     columns = (np.arange(width) * stride + stride // 2 - intrinsics.cx) / intrinsics.fx
     rows = (np.arange(height) * stride + stride // 2 - intrinsics.cy) / intrinsics.fy
-    points, normals = _geometry(
-        z, cv2.blur(z, (5, 5)), columns.astype(np.float32), rows.astype(np.float32)
-    )
+    blurred = np.asarray(cv2.blur(z, (5, 5)), np.float32)
+    points, normals = _geometry(z, blurred, columns.astype(np.float32), rows.astype(np.float32))
     return Cells(stride, mean, lab, points, normals)
 
 
@@ -116,8 +115,10 @@ def cut_regions(cells: Cells) -> Regions:
     )
 
 
-@numba.njit(cache=True, nogil=True)
-def _geometry(z, smooth, columns, rows):  # type: ignore[no-untyped-def]
+@kernel
+def _geometry(
+    z: Float32, smooth: Float32, columns: Float32, rows: Float32
+) -> tuple[Float32, Float32]:
     height, width = z.shape
     points = np.zeros((height, width, 3), np.float32)
     normals = np.zeros((height, width, 3), np.float32)
@@ -146,8 +147,8 @@ def _geometry(z, smooth, columns, rows):  # type: ignore[no-untyped-def]
     return points, normals
 
 
-@numba.njit(cache=True, nogil=True)
-def _edge_weights(lab, points, normals):  # type: ignore[no-untyped-def]
+@kernel
+def _edge_weights(lab: Float32, points: Float32, normals: Float32) -> Float32:
     height, width = lab.shape[:2]
     weights = np.full((2, height, width), np.float32(np.inf))
     for y in range(height):
@@ -175,16 +176,16 @@ def _edge_weights(lab, points, normals):  # type: ignore[no-untyped-def]
     return weights
 
 
-@numba.njit(cache=True, nogil=True)
-def _root(parent, node):  # type: ignore[no-untyped-def]
+@kernel
+def _root(parent: Int32, node: int) -> int:
     while parent[node] != node:
         parent[node] = parent[parent[node]]
         node = parent[node]
     return node
 
 
-@numba.njit(cache=True, nogil=True)
-def _merge(weights, coarseness, min_cells):  # type: ignore[no-untyped-def]
+@kernel
+def _merge(weights: Float32, coarseness: float, min_cells: int) -> tuple[Int32, int]:
     _, height, width = weights.shape
     cells = height * width
     flat = weights.reshape(2 * cells)
@@ -248,8 +249,10 @@ def _merge(weights, coarseness, min_cells):  # type: ignore[no-untyped-def]
     return labels.reshape(height, width), count
 
 
-@numba.njit(cache=True, nogil=True)
-def _region_sums(labels, count, lab, points, normals):  # type: ignore[no-untyped-def]
+@kernel
+def _region_sums(
+    labels: Int32, count: int, lab: Float32, points: Float32, normals: Float32
+) -> Float64:
     sums = np.zeros((count, 11))
     height, width = labels.shape
     for y in range(height):
@@ -266,8 +269,8 @@ def _region_sums(labels, count, lab, points, normals):  # type: ignore[no-untype
     return sums
 
 
-@numba.njit(cache=True, nogil=True)
-def _adjacency(labels, count, weights):  # type: ignore[no-untyped-def]
+@kernel
+def _adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
     height, width = labels.shape
     keys = np.empty(2 * height * width, np.int64)
     values = np.empty(2 * height * width, np.float32)
