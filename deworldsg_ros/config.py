@@ -1,11 +1,11 @@
 """One typed configuration for the nodes and the command line.
 
-The defaults are the paper's values, plus what goes beyond the paper because measurement shows it to
-be better. config/paper.yaml turns the latter off.
+The defaults are the paper's values, plus extensions that measured better. config/paper_rules.yaml
+turns the extensions off.
 
-A section is a stage. Each field states its description and range once: here. The ROS parameters
-`section.field` are declared from this, and a YAML file is a ROS parameter file that also works
-with `deworldsg run --config`.
+Each section configures one stage. Description and range of a field are stated here only: the nodes
+declare their ROS parameters `section.field` from this module. A ROS parameter file also works with
+`deworldsg run --config`.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 
 def option(description: str, **limits: Any) -> Any:
-    """What a field is, and its limits (`ge`, `gt`, `le`, `lt`, …), for `Annotated`."""
+    """Description and limits (`ge`, `gt`, `le`, `lt`) of a field, for `Annotated`."""
     return msgspec.Meta(description=description, **limits)
 
 
@@ -281,44 +281,77 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What comes in, and what is refused."""
+    """Input topics, poses and depth."""
 
     transport: Annotated[
         Literal["auto", "raw", "compressed"],
-        option("Image or CompressedImage topics; auto = whichever is published"),
+        option(
+            "type of the image topics: raw = Image, compressed = CompressedImage, auto = the type "
+            "that is published"
+        ),
     ] = "auto"
     reliability: Annotated[
         Literal["auto", "reliable", "best_effort"],
-        option("QoS of the image topics; auto = reliable where every publisher offers it"),
+        option(
+            "QoS reliability of the camera and pose topics; auto = reliable if every publisher "
+            "offers it, else best_effort"
+        ),
     ] = "auto"
     pose_source: Annotated[
         Literal["auto", "pose", "odometry", "tf"],
-        option("PoseStamped, Odometry or TF; auto = what there is, an Odometry of a robot with TF"),
+        option(
+            "source of the camera poses: PoseStamped, Odometry or TF; auto = the pose topic if it "
+            "is published, else TF; TF also transforms an Odometry of another frame to the camera"
+        ),
     ] = "auto"
     world_frame: Annotated[
-        str, option("world frame that poses must have; empty = that of the first pose")
+        str,
+        option(
+            "frame_id of the world frame; poses in another frame are refused; empty = the frame "
+            "of the first pose"
+        ),
     ] = ""
     world_up: Annotated[
         Literal["auto", "z", "y", "-y"],
-        option("axis of the world frame that points up; auto = z if the poses agree, else theirs"),
+        option(
+            "axis of the world frame that points up; auto = z (the ROS convention) if the camera "
+            "poses agree with it, else the axis that they suggest"
+        ),
     ] = "auto"
     slop_s: Annotated[
-        float, option("most difference of the stamps of RGB and depth, seconds", ge=0, le=1)
+        float,
+        option(
+            "maximum difference between the stamps of an RGB image and its depth image, seconds; "
+            "the default is below half a frame period at 20 Hz",
+            ge=0,
+            le=1,
+        ),
     ] = 0.02
     pose_slop_s: Annotated[
-        float, option("most time between an image and the nearest pose, seconds", ge=0, le=10)
+        float,
+        option(
+            "maximum time between an image and the poses that are interpolated for it, seconds; "
+            "the default is one period of a 10 Hz localisation",
+            ge=0,
+            le=10,
+        ),
     ] = 0.1
-    max_step_m: Annotated[
-        float, option("camera movement between frames above which it is a jump, metres", gt=0)
-    ] = 1.0
-    # Hands and heads turn at 300 degrees a second at the most, and an image is blurred far below.
-    max_turn_deg_s: Annotated[
-        float, option("camera rotation above which it is a jump, degrees a second", gt=0)
-    ] = 360.0
     depth_scale: Annotated[
-        float, option("metres of one unit of a 16UC1 depth image", gt=0, le=1)
+        float,
+        option(
+            "metres per unit of a 16UC1 depth image; the default is millimetres (REP 118)",
+            gt=0,
+            le=1,
+        ),
     ] = 0.001
-    max_depth_m: Annotated[float, option("depth beyond which is invalid, metres", gt=0)] = 10.0
+    max_depth_m: Annotated[
+        float,
+        option(
+            "maximum valid depth, metres; larger values count as invalid; the default is the "
+            "range of common RGB-D cameras",
+            gt=0,
+        ),
+    ] = 10.0
 
 
 class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -381,10 +414,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def load_config(path: Union[str, Path]) -> Config:
-    """Read a ROS parameter file, or the bare sections.
+    """Read a ROS parameter file, or a file of bare sections.
 
     Raises:
-        ConfigurationError: with the file, the field, what was seen and what was wanted.
+        ConfigurationError: names the file, the field, the value seen and the value expected.
     """
     try:
         content = msgspec.yaml.decode(Path(path).read_bytes())
@@ -402,7 +435,7 @@ def load_config(path: Union[str, Path]) -> Config:
 
 
 def from_mapping(content: Any, source: str = "configuration") -> Config:
-    """Validate nested plain values into a Config; raises ConfigurationError."""
+    """Check nested plain values and convert them to a Config; raises ConfigurationError."""
     try:
         return msgspec.convert(content, Config)
     except msgspec.ValidationError as error:
@@ -410,12 +443,12 @@ def from_mapping(content: Any, source: str = "configuration") -> Config:
 
 
 def to_mapping(config: Config) -> dict[str, Any]:
-    """Nested plain values of a configuration, as they stand in a file."""
+    """Nested plain values of a configuration: sections of fields."""
     mapping: dict[str, Any] = msgspec.to_builtins(config)
     return mapping
 
 
 def to_yaml(config: Config) -> str:
-    """ROS parameter file of a configuration."""
+    """Text of a ROS parameter file with the whole configuration."""
     content = {"/**": {"ros__parameters": to_mapping(config)}}
     return msgspec.yaml.encode(content).decode()

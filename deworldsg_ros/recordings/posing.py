@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deworldsg_ros.config import Config, InputsConfig
+from deworldsg_ros.config import Config
 from deworldsg_ros.poses.frames import OnRefusal, track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
 from deworldsg_ros.poses.trajectory import Trajectory, read_trajectory
@@ -94,15 +94,13 @@ def posed_frames(
         frames = _tracked(frames, recording.source, config, on_refusal)
     if choice.noise != PoseNoise():
         frames = perturb_poses(frames, choice.noise)
-        frames = gate_jumps(frames, config.inputs, on_refusal)
+        frames = gate_jumps(frames, on_refusal)
     return frames
 
 
-def gate_jumps(
-    frames: Iterable[RgbdFrame], inputs: InputsConfig, on_refusal: OnRefusal
-) -> Iterator[RgbdFrame]:
-    """The frames without those whose camera jumped (`JumpGate`)."""
-    gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
+def gate_jumps(frames: Iterable[RgbdFrame], on_refusal: OnRefusal) -> Iterator[RgbdFrame]:
+    """The frames whose camera did not jump (`JumpGate`)."""
+    gate = JumpGate()
     for frame in frames:
         try:
             gate.check(frame.T_world_camera, frame.stamp_ns)

@@ -16,8 +16,8 @@ REASONS: dict[str, str] = {
     "invalid_pose": "a pose holds NaN, infinity, or a quaternion that is not of length 1",
     "wrong_frame": "a pose is in another world frame than the first one, or than "
     "`inputs.world_frame`; or a local graph in another than the graph",
-    "pose_jump": "the camera moved further than `inputs.max_step_m` between two frames, or turned "
-    "faster than `inputs.max_turn_deg_s`; believed after five frames at the new place",
+    "pose_jump": "the camera moved more than 1 m between two frames, or rotated faster than 360 "
+    "degrees a second; accepted after five consistent frames at the new position",
     "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
     "no_transform": "the odometry is of another frame than the camera's, and TF does not connect "
     "the two; publish that transform, or set `inputs.pose_source` to odometry if the poses are the "

@@ -72,7 +72,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         on_drop: OnDrop | None = None,
     ) -> None:
         super().__init__("rgb", (), inputs, topics, capacity, patience_s, on_drop)
-        self._gate = JumpGate(inputs.max_step_m, inputs.max_turn_deg_s)
+        self._gate = JumpGate()
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""
@@ -80,7 +80,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
 
     def _restart(self, stamp_ns: int) -> None:
         super()._restart(stamp_ns)
-        self._gate = JumpGate(self._inputs.max_step_m, self._inputs.max_turn_deg_s)
+        self._gate = JumpGate()
 
     def _settled(self, stamp_ns: int, value: Any) -> bool:
         return self._posed(stamp_ns)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.corner_room import corner_frame, walk
 
-from deworldsg_ros.config import InputsConfig, OdometryConfig
+from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.poses.perturbation import (
@@ -100,7 +100,7 @@ def test_jumps_last_a_frame_and_none_gets_through_the_gate() -> None:
     assert all(off_m[index] == pytest.approx(3.0) for index in jumped)
     assert 0 not in jumped
     refusals: list[RefusedInput] = []
-    kept = list(gate_jumps(worse, InputsConfig(), refusals.append))
+    kept = list(gate_jumps(worse, refusals.append))
     assert {frame.stamp_ns for frame in kept} == set(range(40)) - jumped
     assert {refusal.reason for refusal in refusals} == {"pose_jump"}
     assert len(refusals) == len(jumped)

@@ -76,7 +76,7 @@ def test_a_whole_number_is_a_number() -> None:
         ({"queuesize": 1}, "did you mean queue_size?"),
         ({"xyzzy": 1}, "there is no parameter xyzzy"),
         ({"lifting.tau": 7.0}, "parameter lifting.tau is 7.0, wanted float >= 0 and <= 1"),
-        ({"inputs.max_step_m": 0.0}, "wanted float > 0"),
+        ({"inputs.max_depth_m": 0.0}, "wanted float > 0"),
         ({"lifting.tau": "much"}, "is 'much', wanted float"),
         ({"lifting.min_pixels": 1}, "wanted int >= 2 and <= 100000"),
         ({"lifting.min_pixels": 10.5}, "wanted int"),
@@ -93,8 +93,8 @@ def test_a_bad_override_is_told_in_one_line(overrides: dict, says: str) -> None:
 
 
 def test_unbounded_sides_have_the_type_s_limits() -> None:
-    (bounds,) = descriptor(FIELDS["inputs.max_step_m"]).floating_point_range
+    (bounds,) = descriptor(FIELDS["inputs.max_depth_m"]).floating_point_range
     assert (bounds.from_value, bounds.to_value) == (0.0, sys.float_info.max)
-    assert descriptor(FIELDS["inputs.max_step_m"]).additional_constraints == "> 0"
+    assert descriptor(FIELDS["inputs.max_depth_m"]).additional_constraints == "> 0"
     (bounds,) = descriptor(FIELDS["relations.seed"]).integer_range
     assert bounds.to_value == 2**63 - 1
