@@ -1,4 +1,4 @@
-"""The `deworldsg` program: its commands and options, and how errors end it."""
+"""The `deworldsg` program: its commands, their options, and the exit codes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import DeWorldSGError
 
-# Bad usage, a bad configuration, a recording that cannot be used.
+# Bad usage, a bad configuration, or a recording that cannot be used.
 EXIT_USAGE = 2
 
 app = typer.Typer(
@@ -30,95 +30,120 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-# typer reads these while the program runs: no `X | None` before Python 3.10's own rules allow it.
+# Options that several commands share. typer evaluates these annotations at run time.
 RecordingPath = Annotated[
     Path,
     typer.Argument(
         metavar="RECORDING",
-        help="rosbag2 folder, .mcap or .db3 file, or folder of 7-Scenes, TUM RGB-D, 3RScan, "
+        help="rosbag2 folder, .mcap or .db3 file, or folder of 7-Scenes, TUM RGB-D, 3RScan or "
         "ReplicaSSG",
     ),
 ]
-OutFolder = Annotated[Path, typer.Option("--out", help="folder for the results; made if need be")]
+OutFolder = Annotated[
+    Path, typer.Option("--out", help="folder for the results; created if missing")
+]
 ConfigFile = Annotated[
     Optional[Path],
-    typer.Option("--config", help="ROS parameter file; the defaults without one"),
+    typer.Option("--config", help="ROS parameter file; default: the built-in values"),
 ]
 Settings = Annotated[
     Optional[list[str]],
-    typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="one value of it; may be repeated"),
+    typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="set one option; may be repeated"),
 ]
 MaxFrames = Annotated[
-    int, typer.Option("--max-frames", min=0, help="stop after so many frames; 0 = take all")
+    int, typer.Option("--max-frames", min=0, help="stop after this many frames; 0 = all frames")
 ]
-RgbTopic = Annotated[str, typer.Option("--rgb", metavar="TOPIC", help="RGB images in a bag")]
-DepthTopic = Annotated[str, typer.Option("--depth", metavar="TOPIC", help="depth images in a bag")]
+RgbTopic = Annotated[
+    str, typer.Option("--rgb", metavar="TOPIC", help="topic of the RGB images in a bag")
+]
+DepthTopic = Annotated[
+    str, typer.Option("--depth", metavar="TOPIC", help="topic of the depth images in a bag")
+]
 InfoTopic = Annotated[
-    str, typer.Option("--camera-info", metavar="TOPIC", help="calibration in a bag")
+    str, typer.Option("--camera-info", metavar="TOPIC", help="topic of the CameraInfo in a bag")
 ]
 PoseTopic = Annotated[
-    str, typer.Option("--pose", metavar="TOPIC", help="poses in a bag: also an odometry or /tf")
+    str,
+    typer.Option(
+        "--pose", metavar="TOPIC", help="topic of the poses in a bag: PoseStamped, Odometry or /tf"
+    ),
 ]
 FrameRate = Annotated[
     float,
-    typer.Option("--rate", min=0, help="frames a second of a folder without stamps; 0 = its own"),
+    typer.Option(
+        "--rate",
+        min=0,
+        help="frames per second of a folder without stamps; 0 = the data set's rate",
+    ),
 ]
 CameraIntrinsics = Annotated[
     str,
-    typer.Option("--intrinsics", metavar="FX,FY,CX,CY", help="of a folder that does not tell"),
+    typer.Option(
+        "--intrinsics", metavar="FX,FY,CX,CY", help="intrinsics of a folder without calibration"
+    ),
 ]
 DepthSource = Annotated[
     str,
-    typer.Option("--depth-source", help="3rscan: rendered or sensor; auto = rendered if there"),
+    typer.Option(
+        "--depth-source",
+        help="depth of a 3RScan folder: rendered or sensor; auto = rendered if available",
+    ),
 ]
 Poses = Annotated[
     Optional[Path],
     typer.Option(
         "--poses",
         metavar="FILE",
-        help="poses of this trajectory rather than the recording's: TUM or KITTI file, or folder "
-        "of frame-NNNNNN.pose.txt or .slam.pose.txt",
+        help="use the poses of this trajectory: TUM or KITTI file, or folder of "
+        "frame-NNNNNN.pose.txt or .slam.pose.txt",
     ),
 ]
 PoseFormat = Annotated[
-    str, typer.Option("--pose-format", help="tum, kitti, 3rscan or slam; auto = by looking")
+    str,
+    typer.Option(
+        "--pose-format", help="format of --poses: tum, kitti, 3rscan or slam; auto = detect"
+    ),
 ]
 OdometryPoses = Annotated[
-    bool, typer.Option("--odometry", help="poses out of the images, by RGB-D odometry")
+    bool, typer.Option("--odometry", help="estimate the poses from the images, by RGB-D odometry")
 ]
 PoseNoiseText = Annotated[
     str,
     typer.Option(
         "--pose-noise",
         metavar="NAME=NUMBER,…",
-        help="make poses worse: jitter_m, jitter_deg, drift_m_per_m, drift_deg_per_m, "
+        help="perturb the poses: jitter_m, jitter_deg, drift_m_per_m, drift_deg_per_m, "
         "jump_probability, jump_m, seed",
     ),
 ]
 SaveTrajectory = Annotated[
     Optional[Path],
-    typer.Option("--save-trajectory", metavar="FILE", help="write the poses used, as TUM"),
+    typer.Option(
+        "--save-trajectory",
+        metavar="FILE",
+        help="write the poses of the processed frames, as a TUM file",
+    ),
 ]
 MapFile = Annotated[
     Optional[Path],
     typer.Option(
         "--map",
         metavar="FILE",
-        help="go on with the graph of this map where the file is there, and write it at the end; "
-        "the poses have to be in the same world frame",
+        help="load this map if the file exists, and save the map there at the end; the poses must "
+        "be in the map's world frame",
     ),
 ]
 Temporal = Annotated[
     bool,
-    typer.Option("--temporal", help="measure how steady the graph was, into run.json"),
+    typer.Option("--temporal", help="write the temporal stability of the graph to run.json"),
 ]
 
-Timings = Annotated[bool, typer.Option("--timings", help="print how long each stage takes")]
+Timings = Annotated[bool, typer.Option("--timings", help="print the time of each stage")]
 
 
 @contextmanager
-def _telling_errors() -> Iterator[None]:
-    """Errors of the user end the program with a sentence; no traceback for them or Ctrl-C."""
+def _reporting_errors() -> Iterator[None]:
+    """Print an error of the user as one sentence and exit; no traceback, not for Ctrl-C either."""
     try:
         yield
     except DeWorldSGError as error:
@@ -130,8 +155,8 @@ def _telling_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_INTERRUPTED) from interrupt
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         typer.echo(f"deworldsg {__version__}")
         raise typer.Exit
 
@@ -168,26 +193,28 @@ def run(
     temporal: Temporal = False,
     timings: Timings = False,
 ) -> None:
-    """Make a recording's scene graph in one process."""
-    with _telling_errors():
-        from deworldsg_ros.cli.run import run_recording
+    """Build the scene graph of a recording in one process."""
+    with _reporting_errors():
+        from deworldsg_ros.cli.run import RunOptions, run_recording
         from deworldsg_ros.poses.perturbation import parse_noise
         from deworldsg_ros.recordings.posing import PoseChoice
 
         run_recording(
-            recording,
-            out,
-            config,
-            settings or [],
-            max_frames=max_frames,
-            topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=DatasetOptions(rate, parse_intrinsics(intrinsics), depth_source),
-            poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
-            temporal=temporal,
-            trajectory_out=save_trajectory,
-            map_path=map_path,
-            timings=timings,
-            console=Console(),
+            RunOptions(
+                recording=recording,
+                out=out,
+                config_path=config,
+                settings=tuple(settings or ()),
+                max_frames=max_frames,
+                topics=TopicChoice(rgb, depth, camera_info, pose),
+                dataset=DatasetOptions(rate, parse_intrinsics(intrinsics), depth_source),
+                poses=PoseChoice(poses, pose_format, odometry, parse_noise(pose_noise)),
+                trajectory_out=save_trajectory,
+                map_path=map_path,
+                temporal=temporal,
+                timings=timings,
+            ),
+            Console(),
         )
 
 
@@ -197,7 +224,7 @@ def demo(
         Optional[Path],
         typer.Argument(
             metavar="RECORDING",
-            help="as for run; without one the recording that ships with the package",
+            help="as for run; default: the recording that ships with the package",
         ),
     ] = None,
     out: OutFolder = Path("demo_out"),
@@ -205,7 +232,9 @@ def demo(
     settings: Settings = None,
     rate: Annotated[
         float,
-        typer.Option("--rate", min=0, help="pace: 1 = real time, 0 = as fast as the nodes keep up"),
+        typer.Option(
+            "--rate", min=0, help="replay speed: 1 = real time, 0 = as fast as the nodes keep up"
+        ),
     ] = 1.0,
     rgb: RgbTopic = "",
     depth: DepthTopic = "",
@@ -214,8 +243,8 @@ def demo(
     intrinsics: CameraIntrinsics = "",
     odometry: OdometryPoses = False,
 ) -> None:
-    """Make it with the four ROS 2 nodes, from a replay."""
-    with _telling_errors():
+    """Build it with the four ROS 2 nodes, from a replay."""
+    with _reporting_errors():
         from deworldsg_ros.cli.demo import run_demo
 
         run_demo(
@@ -237,7 +266,7 @@ def convert(
         str,
         typer.Argument(
             metavar="FORMAT",
-            help="name of a data set (7scenes, tum, …), rosbag2, or auto = by looking",
+            help="name of a data set (7scenes, tum, …) or rosbag2; auto = detect",
         ),
     ],
     source: Annotated[Path, typer.Argument(metavar="SRC", help="folder or bag")],
@@ -250,8 +279,8 @@ def convert(
     camera_info: InfoTopic = "",
     pose: PoseTopic = "",
 ) -> None:
-    """Turn a folder or bag into one MCAP file."""
-    with _telling_errors():
+    """Convert a folder or bag to one MCAP file."""
+    with _reporting_errors():
         from deworldsg_ros.cli.convert import convert_recording
 
         convert_recording(
@@ -266,8 +295,8 @@ def convert(
 
 @app.command()
 def info(recording: RecordingPath) -> None:
-    """Tell what a recording holds and what is used."""
-    with _telling_errors():
+    """Show the topics of a recording and their use."""
+    with _reporting_errors():
         from deworldsg_ros.cli.info import show_recording
 
         show_recording(recording, Console())
@@ -275,18 +304,18 @@ def info(recording: RecordingPath) -> None:
 
 @app.command("config")
 def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
-    """Print the effective configuration, described."""
-    with _telling_errors():
+    """Print all options: description, range, value."""
+    with _reporting_errors():
         from deworldsg_ros.cli.configuration import described_yaml, effective_config
 
         typer.echo(described_yaml(effective_config(config, settings)), nl=False)
 
 
-# A command's own first sentence would be cut to one line of the list.
+# Short help: the list of commands cuts a longer first sentence.
 for function, summary in (
     (evaluate, "Measure scene graphs against annotations."),
     (probe.train_probe, "Train the probe of a world model."),
     (probe.import_probe, "Make the published probe ready for use."),
 ):
-    app.command(short_help=summary)(_telling_errors()(function))
+    app.command(short_help=summary)(_reporting_errors()(function))
 app.add_typer(models.app)

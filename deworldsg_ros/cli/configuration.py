@@ -1,8 +1,9 @@
-"""The configuration that a command runs with: the defaults, a file, single values."""
+"""The configuration of a command: the defaults, a file, single options on top."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,42 +12,51 @@ import msgspec
 from deworldsg_ros.config import Config, from_mapping, load_config, to_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 
+HEADER = """\
+# Configuration of deworldsg_ros: each option with its description, its range in brackets, and its
+# value. The sections follow the data: inputs, odometry, the four stages, output.
+# This is a ROS 2 parameter file: pass it to the nodes (--params-file) or to deworldsg (--config).
+# A file may contain a part of the options; the others keep their defaults.
+# No option can be changed while a node runs: nodes read their parameters once, at start-up.
+"""
+NO_BREAK = "\N{NO-BREAK SPACE}"
 
-def effective_config(path: Path | None, settings: list[str] | None = None) -> Config:
-    """Configuration of a file (or the defaults) with single values put in.
+
+def effective_config(path: Path | None, settings: Sequence[str] | None = None) -> Config:
+    """Configuration of a file (or the defaults) with single options set on top.
 
     Args:
         path: ROS parameter file; None = the defaults.
         settings: ``section.field=value`` each.
 
     Raises:
-        ConfigurationError: names the file or setting, what was seen and what was wanted.
+        ConfigurationError: names the file or setting, the value seen and the value expected.
     """
     config = Config() if path is None else load_config(path)
     for setting in settings or []:
-        config = _put(config, setting)
+        config = _set(config, setting)
     return config
 
 
-def _put(config: Config, setting: str) -> Config:
+def _set(config: Config, setting: str) -> Config:
     name, equals, text = setting.partition("=")
     section, dot, field = name.strip().partition(".")
     mapping = to_mapping(config)
     if not equals or not dot:
-        raise ConfigurationError(f"--set {setting}: wanted section.field=value")
+        raise ConfigurationError(f"--set {setting}: expected section.field=value")
     if field not in mapping.get(section, {}):
         known = ", ".join(mapping.get(section, mapping))
-        raise ConfigurationError(f"--set {setting}: there is no {name}; known are {known}")
+        raise ConfigurationError(f"--set {setting}: there is no {name}; expected one of {known}")
     mapping[section][field] = _value(text, mapping[section][field])
     try:
         return from_mapping(mapping)
     except ConfigurationError as error:
         described = next(line for path, line in _described_fields() if path == (section, field))
-        raise ConfigurationError(f"--set {setting}: no value of {name}, {described}") from error
+        raise ConfigurationError(f"--set {setting}: expected for {name}: {described}") from error
 
 
 def _value(text: str, current: Any) -> Any:
-    """The value as YAML reads it; what is a string stays one (a bare y is no truth value)."""
+    """The value as YAML reads it; a string field keeps the text (YAML reads a bare y as true)."""
     if isinstance(current, str):
         return text
     try:
@@ -58,21 +68,30 @@ def _value(text: str, current: Any) -> Any:
 
 
 def described_yaml(config: Config) -> str:
-    """ROS parameter file of a configuration, each field under its description and range."""
-    lines = ["/**:", "  ros__parameters:"]
+    """ROS parameter file of a configuration; description and range precede each field."""
+    lines = [*HEADER.splitlines(), "/**:", "  ros__parameters:"]
     mapping = to_mapping(config)
     for (section, field), description in _described_fields():
         if f"    {section}:" not in lines:
             kind = type(getattr(config, section))
-            lines += [f"    # {(kind.__doc__ or '').strip()}", f"    {section}:"]
+            lines += ["", f"    # {(kind.__doc__ or '').strip()}", f"    {section}:"]
         value = msgspec.yaml.encode(mapping[section][field]).decode()
-        # A document that is one plain value ends with a line of three dots.
-        lines += [f"      # {description}", f"      {field}: {value.splitlines()[0]}"]
+        # msgspec ends a document that is one plain value with a line of three dots.
+        lines += [*_comment(description), f"      {field}: {value.splitlines()[0]}"]
     return "\n".join(lines) + "\n"
 
 
+def _comment(description: str) -> list[str]:
+    """Comment lines of a description, at most 100 characters each; the range stays in one."""
+    text, bracket, limits = description.partition(" [")
+    unbroken = text + bracket + limits.replace(" ", NO_BREAK)
+    indent = "      # "
+    lines = textwrap.wrap(unbroken, 100, initial_indent=indent, subsequent_indent=indent)
+    return [line.replace(NO_BREAK, " ") for line in lines]
+
+
 def _described_fields() -> Iterator[tuple[tuple[str, str], str]]:
-    """Section, field and description of everything that can be configured."""
+    """Section, field, and description with range, of every option."""
     sections: Any = msgspec.inspect.type_info(Config)
     for section in sections.fields:
         for field in section.type.fields:

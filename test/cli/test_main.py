@@ -1,4 +1,4 @@
-"""Commands, options, and how errors of the user are told."""
+"""Commands, options, and the messages for errors of the user."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_version_and_help(tmp_path):
         (["convert", "auto", ".", "x.bag"], ".mcap"),
         (["convert", "auto", ".", "x.mcap", "--depth-source", "laser"], "auto, rendered, sensor"),
         (["config", "--set", "lifting.tauu=1"], "lifting.tauu"),
-        (["config", "--set", "lifting.tau=2"], "no value of lifting.tau, relative tolerance"),
+        (["config", "--set", "lifting.tau=2"], "expected for lifting.tau: relative tolerance"),
         (["config", "--set", "lifting.tau=wide"], "[>= 0, <= 1]"),
         (["config", "--set", "tau"], "section.field=value"),
         (["config", "--config", "nowhere.yaml"], "nowhere.yaml"),
