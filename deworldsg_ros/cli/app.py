@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from deworldsg_ros import __version__
 from deworldsg_ros.cli import EXIT_INTERRUPTED, models, probe
-from deworldsg_ros.cli.evaluate import evaluate
+from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import DeWorldSGError
@@ -311,11 +311,17 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
         typer.echo(described_yaml(effective_config(config, settings)), nl=False)
 
 
+evaluation = typer.Typer(
+    name="evaluate", help="Measure scene graphs against annotations.", no_args_is_help=True
+)
 # Short help: the list of commands cuts a longer first sentence.
-for function, summary in (
-    (evaluate, "Measure scene graphs against annotations."),
-    (probe.train_probe, "Train the probe of a world model."),
-    (probe.import_probe, "Make the published probe ready for use."),
+for parent, function, summary in (
+    (evaluation, evaluate.score, "Score predictions or scene graphs of earlier runs."),
+    (evaluation, evaluate.run, "Run the pipeline on every scan and score its graphs."),
+    (evaluation, evaluate.table, "Compare methods or configurations in a table."),
+    (app, probe.train_probe, "Train the probe of a world model."),
+    (app, probe.import_probe, "Make the published probe ready for use."),
 ):
-    app.command(short_help=summary)(_reporting_errors()(function))
+    parent.command(short_help=summary)(_reporting_errors()(function))
+app.add_typer(evaluation)
 app.add_typer(models.app)

@@ -18,14 +18,14 @@ from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 
-Kind = Literal["ground-truth", "slam", "odometry", "worse"]
-KINDS: tuple[Kind, ...] = ("ground-truth", "slam", "odometry", "worse")
+Kind = Literal["ground-truth", "slam", "odometry", "perturbed"]
+KINDS: tuple[Kind, ...] = ("ground-truth", "slam", "odometry", "perturbed")
 # A drift of 2 % and 1 degree a metre with the tremble of a hand: worse than good SLAM.
-WORSE = PoseNoise(jitter_m=0.005, jitter_deg=0.2, drift_m_per_m=0.02, drift_deg_per_m=1.0)
+PERTURBATION = PoseNoise(jitter_m=0.005, jitter_deg=0.2, drift_m_per_m=0.02, drift_deg_per_m=1.0)
 
 
 @dataclass(frozen=True)
-class PoseChoice:
+class PoseSource:
     """Poses of the data set, estimated ones, or the data set's made worse.
 
     Attributes:
@@ -35,7 +35,7 @@ class PoseChoice:
     """
 
     kind: Kind = "ground-truth"
-    noise: PoseNoise = WORSE
+    noise: PoseNoise = PERTURBATION
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -44,7 +44,7 @@ class PoseChoice:
 
 def repose(
     frames: Iterator[RgbdFrame],
-    choice: PoseChoice,
+    choice: PoseSource,
     source: Source,
     odometry: OdometryConfig,
     drops: Counter[str],
@@ -56,7 +56,7 @@ def repose(
     """
     if choice.kind == "ground-truth":
         return frames
-    if choice.kind == "worse":
+    if choice.kind == "perturbed":
         return perturb_poses(frames, choice.noise)
     first = next(frames, None)
     if first is None:

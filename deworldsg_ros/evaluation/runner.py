@@ -24,7 +24,7 @@ from deworldsg_ros.evaluation.measures.graph_measures import (
     measure,
     read_reference,
 )
-from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
+from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
 from deworldsg_ros.evaluation.protocol.labels import translate
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, ScanResult, score_scan
@@ -74,7 +74,7 @@ class ScanTask:
     max_frames: int = 0
     checkpoints: int = 0
     method: str = PIPELINE
-    poses: PoseChoice = PoseChoice()
+    poses: PoseSource = PoseSource()
 
 
 @dataclass(frozen=True)

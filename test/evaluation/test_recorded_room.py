@@ -22,7 +22,8 @@ RECORDING = Path(__file__).resolve().parents[2] / "bags" / "demo_room"
 
 
 def evaluate(*arguments: object) -> Result:
-    words = ["evaluate", "--layout", "recording", RECORDING, "--checkpoints", 0, *arguments]
+    inputs = ["--layout", "recording", RECORDING, "--checkpoints", 0]
+    words = ["evaluate", "run", *inputs, *arguments]
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
@@ -79,11 +80,11 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
         (("--front-end", "backend", "--faults", "cut=0.1"), "backend with cut 0.1: wanted"),
         (
             ("--front-end", "ground-truth", "--poses", "odometry", "--pose-noise", "jitter_m=1"),
-            "wanted worse",
+            "only --poses perturbed has noise",
         ),
         (
-            ("--front-end", "ground-truth", "--poses", "odometry", "--poses", "worse"),
-            "takes one --poses",
+            ("--front-end", "ground-truth", "--poses", "odometry", "--poses", "perturbed"),
+            "has 2 --poses: give one",
         ),
     ],
 )

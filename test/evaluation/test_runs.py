@@ -20,7 +20,7 @@ from deworldsg_ros.evaluation.protocol.labels import translate, translation
 from deworldsg_ros.evaluation.protocol.predictions import read_predictions, write_predictions
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
-from deworldsg_ros.evaluation.reports.files import latex_rows, latex_text
+from deworldsg_ros.evaluation.reports.csv_latex import latex_rows, latex_text
 from deworldsg_ros.evaluation.runner import (
     ScanOutcome,
     ScanTask,
@@ -127,8 +127,8 @@ def test_a_scan_of_3rscan_is_turned_and_found(tmp_path: Path) -> None:
     assert outcome.result.relationship_ranks == [0, 0]
 
 
-def invoke(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
+def invoke(command: str, *arguments: object) -> tuple[int, str]:
+    result = CliRunner().invoke(app, ["evaluate", command, *map(str, arguments)])
     return result.exit_code, result.output
 
 
@@ -136,7 +136,7 @@ def test_command_on_a_data_set(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     out, json_file = tmp_path / "out", tmp_path / "new" / "numbers.json"
     code, text = invoke(
-        "--layout", "replica", root, "--front-end", "recorded", "--flip", 0,
+        "run", "--layout", "replica", root, "--front-end", "recorded", "--flip", 0,
         "--out", out, "--json", json_file,
     )  # fmt: skip
     assert code == 0, text
@@ -161,13 +161,13 @@ def test_command_on_graphs(tmp_path: Path) -> None:
     outcome = evaluate_scan(task(root, tmp_path / "out"))
     json_file = tmp_path / "numbers.json"
     arguments = ("--layout", "replica", root, "--graphs", tmp_path / "out", "--json", json_file)
-    code, text = invoke(*arguments)
+    code, text = invoke("score", *arguments)
     assert code == 0, text
     values = json.loads(json_file.read_text())
     assert values["object_recall"] == 1.0
     assert values["measures"]["nodes"] == outcome.nodes
     (tmp_path / "out" / "room_0" / "scene_graph.json").unlink()
-    code, text = invoke(*arguments)
+    code, text = invoke("score", *arguments)
     assert code == 2
     assert "cannot be read" in text
 
@@ -179,7 +179,7 @@ def test_command_on_predictions(tmp_path: Path) -> None:
     write_json(path, {"num_classes": 3, "num_predicates": 3, "scans": {"room_0": graph}})
     json_file = tmp_path / "numbers.json"
     code, text = invoke(
-        "--layout", "replica", root, "--predictions", path, "--skip-no-rel-objects",
+        "score", "--layout", "replica", root, "--predictions", path, "--skip-no-rel-objects",
         "--json", json_file, "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0, text
@@ -191,18 +191,26 @@ def test_command_on_predictions(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "confusion.png").exists()
 
 
-def test_command_says_what_was_wanted(tmp_path: Path) -> None:
+def test_command_states_what_was_expected(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
-    for arguments, wanted in (
-        (["--layout", "replica", root], "give one of"),
-        (["--layout", "scannet", root, "--front-end", "recorded"], "wanted replica, 3rscan"),
-        (["--layout", "3rscan", root, "--front-end", "recorded"], "is missing"),
-        (["--layout", "replica", root, "--front-end", "video"], "wanted backend, recorded"),
-        (["--layout", "replica", root, "--predictions", root / "none.json"], "cannot be read"),
+    run = ("run", root, "--out", tmp_path / "out")
+    score = ("score", root, "--layout", "replica")
+    for arguments, expected in (
+        (score, "none of --predictions FILE and --graphs DIR: give one of them"),
+        ((*score, "--predictions", "p.json", "--graphs", "out"), "both of --predictions FILE"),
+        ((*score, "--predictions", root / "none.json"), "cannot be read"),
+        ((*run, "--layout", "scannet", "--front-end", "recorded"), "replica, 3rscan"),
+        ((*run, "--layout", "3rscan", "--front-end", "recorded"), "is missing"),
+        ((*run, "--layout", "replica", "--front-end", "video"), "backend, recorded"),
+        ((*run, "--layout", "replica", "--split", "train"), "has no scan"),
+        (
+            (*run, "--layout", "replica", "--poses", "slam", "--poses", "odometry"),
+            "has 2 --poses: give one",
+        ),
     ):
         code, text = invoke(*arguments)
         assert code == 2
-        assert wanted in " ".join(text.split())
+        assert expected in " ".join(text.split())
 
 
 def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(tmp_path: Path) -> None:
@@ -211,7 +219,7 @@ def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(tmp_path: Path) ->
     split.write_text("absent\nroom_0\n")
     json_file = tmp_path / "numbers.json"
     code, text = invoke(
-        "--layout", "replica", root, "--front-end", "ground-truth", "--json", json_file,
+        "run", "--layout", "replica", root, "--front-end", "ground-truth", "--json", json_file,
         "--out", tmp_path / "out", "--checkpoints", 0,
     )  # fmt: skip
     assert code == 0
@@ -220,7 +228,8 @@ def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(tmp_path: Path) ->
     assert list(values["failed"]) == ["absent"]
     assert [scan["scan"] for scan in values["scans"]] == ["room_0"]
     split.write_text("absent\n")
-    assert invoke("--layout", "replica", root, "--front-end", "recorded")[0] == 1
+    arguments = ("--layout", "replica", root, "--front-end", "recorded", "--out", tmp_path / "out")
+    assert invoke("run", *arguments)[0] == 1
 
 
 def test_latex() -> None:

@@ -16,20 +16,19 @@ from support.sequences import write_room
 from typer.testing import CliRunner, Result
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.cli.tables import pose_choices
 from deworldsg_ros.config import Config, MergingConfig, OdometryConfig
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
-from deworldsg_ros.evaluation.pose_sources import PoseChoice, repose
+from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
 from deworldsg_ros.evaluation.protocol.predictions import write_predictions
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
 from deworldsg_ros.evaluation.runner import ScanTask, read_graph
-from deworldsg_ros.evaluation.tables import mapping
+from deworldsg_ros.evaluation.tables import parallel
 from deworldsg_ros.evaluation.tables.jobs import Job, fingerprint, run_job
-from deworldsg_ros.evaluation.tables.mapping import run_jobs
-from deworldsg_ros.evaluation.tables.printed import RUNTIME_MS, printed_rows
-from deworldsg_ros.evaluation.tables.results import total_ms
+from deworldsg_ros.evaluation.tables.paper_numbers import RUNTIME_MS, printed_rows
+from deworldsg_ros.evaluation.tables.parallel import run_jobs
+from deworldsg_ros.evaluation.tables.row_results import total_ms
 from deworldsg_ros.evaluation.tables.rows import SWITCHES, TABLES, table_rows
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -53,8 +52,9 @@ def job(root: Path, out: Path, scan: str = "room_0", **changes: object) -> Job:
     return Job("row", replace(task, **changes))
 
 
-def evaluate(root: Path, *arguments: object) -> Result:
-    words = ["evaluate", "--layout", "replica", root, "--front-end", "recorded", *arguments]
+def evaluate(root: Path, kind: str, *arguments: object) -> Result:
+    inputs = ["--layout", "replica", root, "--front-end", "recorded"]
+    words = ["evaluate", "table", kind, *inputs, *arguments]
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
@@ -88,7 +88,7 @@ def test_the_fingerprint_is_of_the_task_and_not_of_its_folder(root: Path, tmp_pa
     for changes in (
         {"method": "kim"},
         {"max_frames": 2},
-        {"poses": PoseChoice("worse")},
+        {"poses": PoseSource("perturbed")},
         {"front_end": FrontEndChoice("recorded", flip=0.1)},
         {"options": ProtocolOptions(skip_no_rel_objects=True)},
         {"layout": "3rscan"},
@@ -124,7 +124,7 @@ def test_processes_give_the_same_results_and_may_die(
     deadly = job(root, tmp_path / "deadly", scan="deadly", config=Deadly())
     jobs = [job(root, tmp_path / "fross", method="fross"), deadly, job(root, tmp_path / "kim")]
     results = {result.scan: result for result in run_jobs(jobs, workers=2)}
-    assert results["deadly"].failure == mapping.DIED
+    assert results["deadly"].failure == parallel.DIED
     wanted = run_job(job(root, tmp_path / "here"))
     assert results["room_0"].outcome is not None
     assert wanted.outcome is not None
@@ -164,7 +164,7 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
     vocabulary = Vocabulary(("book", "chair", "table"), ("near", "on", "under"))
     write_predictions(tmp_path / "p.json", {"room_0": to_prediction(graph, vocabulary)}, 3, 3)
     arguments = (
-        *("--table", "main", "--workers", 1, "--checkpoints", 0),
+        *("main", "--workers", 1, "--checkpoints", 0),
         *("--out", out, "--json", tmp_path / "t.json"),
         *("--predictions", f"SGFN={tmp_path / 'p.json'}"),
     )
@@ -197,7 +197,7 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
 
 def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Path) -> None:
     told = evaluate(
-        *(root, "--table", "ablation", "--workers", 1, "--checkpoints", 0),
+        *(root, "ablation", "--workers", 1, "--checkpoints", 0),
         *("--out", tmp_path, "--json", tmp_path / "t.json", "--set", "a:lifting.min_pixels=20"),
     )
     assert told.exit_code == 0, told.output
@@ -216,8 +216,8 @@ def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Pat
 
 def test_the_pose_table(root: Path, tmp_path: Path) -> None:
     told = evaluate(
-        *(root, "--table", "pose", "--workers", 1, "--checkpoints", 0, "--poses", "slam"),
-        *("--poses", "worse", "--pose-noise", "jitter_m=0.001"),
+        *(root, "pose", "--workers", 1, "--checkpoints", 0, "--poses", "slam"),
+        *("--poses", "perturbed", "--pose-noise", "jitter_m=0.001"),
         # Jitter is movement, and these few frames are too short to be sure of what is seen in it.
         *("--set", "merging.baseline_deg=0"),
         *("--out", tmp_path, "--json", tmp_path / "t.json"),
@@ -225,14 +225,14 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
     assert told.exit_code == 0, told.output
     values = json.loads((tmp_path / "t.json").read_text())
     rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
-    assert rows["default-worse"]["object_recall"] == 1.0
+    assert rows["default-perturbed"]["object_recall"] == 1.0
     assert "slam.pose.txt" in rows["default-slam"]["failed"]["room_0"]
 
 
 def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
     for table, name in (("hard", "default-jitter"), ("switches", "cell5-label")):
         told = evaluate(
-            *(root, "--table", table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
+            *(root, table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
         )
         assert told.exit_code == 0, told.output
@@ -248,7 +248,7 @@ def test_each_condition_is_given_to_its_rows() -> None:
         return Config()
 
     front_end = FrontEndChoice("recorded", flip=0.1, miss=0.2)
-    poses = [PoseChoice("odometry")]
+    poses = [PoseSource("odometry")]
     hard = {row.name: row for row in table_rows("hard", poses, front_end, configure)}
     assert hard["fross-plain"].front_end == front_end
     assert hard["fross-plain"].poses == poses[0]
@@ -262,7 +262,7 @@ def test_each_condition_is_given_to_its_rows() -> None:
 
 def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
     told = evaluate(
-        *(root, "--table", "runtime", "--checkpoints", 0),
+        *(root, "runtime", "--checkpoints", 0),
         *("--out", tmp_path, "--json", tmp_path / "t.json"),
     )
     assert told.exit_code == 0, told.output
@@ -275,13 +275,13 @@ def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--table", "first"), "wanted main, hard, pose, ablation, switches, runtime"),
-        (("--table", "main", "--predictions", "p.json"), "wanted NAME=FILE"),
-        (("--table", "main", "--predictions", "IMP=none.json"), "there is no file none.json"),
-        (("--table", "main", "--poses", "guessed"), "--poses guessed"),
-        (("--table", "main", "--poses", "slam", "--poses", "worse"), "takes one --poses"),
-        (("--table", "main", "--set", "best:lifting.tau=0.1"), "no row best"),
-        (("--table", "main", "--set", "paper:lifting.tao=0.1"), "there is no lifting.tao"),
+        (("first",), "expected main, hard, pose, ablation, switches, runtime"),
+        (("main", "--predictions", "p.json"), "expected NAME=FILE"),
+        (("main", "--predictions", "IMP=none.json"), "none.json is not a file"),
+        (("main", "--poses", "guessed"), "--poses guessed"),
+        (("main", "--poses", "slam", "--poses", "perturbed"), "takes one --poses"),
+        (("main", "--set", "best:lifting.tau=0.1"), "no row best"),
+        (("main", "--set", "paper:lifting.tao=0.1"), "there is no lifting.tao"),
     ],
 )
 def test_what_a_table_refuses(
@@ -293,9 +293,7 @@ def test_what_a_table_refuses(
 
 
 def test_nothing_done_is_an_error(root: Path, tmp_path: Path) -> None:
-    told = evaluate(
-        *(root, "--table", "main", "--scan", "room_9", "--workers", 1, "--out", tmp_path)
-    )
+    told = evaluate(*(root, "main", "--scan", "room_9", "--workers", 1, "--out", tmp_path))
     assert told.exit_code == 1
     assert "failed:" in told.output
 
@@ -305,7 +303,7 @@ def test_rows_of_every_table_have_names_of_their_own() -> None:
         return Config()
 
     for table in TABLES:
-        poses = pose_choices(table, [], "")
+        poses = [PoseSource(kind) for kind in KINDS]
         rows = table_rows(table, poses, FrontEndChoice("recorded"), configure)
         assert len({row.name for row in rows}) == len(rows)
         assert len({row.title for row in rows}) == len(rows)
@@ -337,7 +335,7 @@ def test_slam_poses_begin_where_the_camera_truly_was(tmp_path: Path) -> None:
         np.savetxt(path, moved)
     drops: Counter[str] = Counter()
     frames = Recording(source, Config().inputs).frames()
-    posed = list(repose(frames, PoseChoice("slam"), source, OdometryConfig(), drops))
+    posed = list(repose(frames, PoseSource("slam"), source, OdometryConfig(), drops))
     assert drops == {"no_slam_pose": 1}
     np.testing.assert_allclose(posed[0].T_world_camera, true[0], atol=1e-9)
     offset = np.linalg.inv(true[0]) @ posed[2].T_world_camera

@@ -119,8 +119,9 @@ def evaluate_predictions(
     annotations: Annotations,
     predictions: Mapping[str, ScanPrediction],
     options: ProtocolOptions | None = None,
+    scans: Sequence[str] | None = None,
 ) -> ProtocolResult:
-    """Hold the predictions of a split against its annotations.
+    """Score predictions by scan against the annotations of `scans`; None = of the split.
 
     Raises:
         RecordingError: where a file of the data set is absent or unreadable.
@@ -128,7 +129,7 @@ def evaluate_predictions(
     options = options or ProtocolOptions()
     vocabulary = annotations.vocabulary
     results = []
-    for scan in annotations.scans(options.split):
+    for scan in scans or annotations.scans(options.split):
         prediction = predictions.get(scan)
         notes = (
             [] if prediction is not None else [f"{scan} has no prediction: nothing of it is found"]

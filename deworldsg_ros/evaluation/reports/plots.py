@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from deworldsg_ros.evaluation.protocol.scoring import Count
-from deworldsg_ros.evaluation.reports.files import class_items
+from deworldsg_ros.evaluation.reports.csv_latex import class_items
 from deworldsg_ros.evaluation.runner import Checkpoint
 
 DPI = 130

@@ -10,11 +10,18 @@ from rich.table import Table
 
 from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
+from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 
 
 def percent(fraction: float) -> str:
     """A fraction in percent with one decimal; a dash where it is undefined."""
     return "–" if math.isnan(fraction) else f"{100 * fraction:.1f}"
+
+
+def print_evaluation(console: Console, evaluation: Evaluation) -> None:
+    """Print the official scores and the further measures."""
+    print_protocol(console, evaluation.result, f"{evaluation.method} on {evaluation.dataset}")
+    print_measures(console, {**evaluation.measures, "all": evaluation.pooled})
 
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:

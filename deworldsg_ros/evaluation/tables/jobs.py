@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import msgspec
 
 from deworldsg_ros import __version__
 from deworldsg_ros.evaluation.runner import GRAPH_FILE, ScanOutcome, ScanTask, evaluate_scan
+from deworldsg_ros.evaluation.tables.rows import Row
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 OUTCOME_FILE = "outcome.json"
@@ -44,6 +46,26 @@ class _Kept:
 
     fingerprint: str
     outcome: ScanOutcome
+
+
+def jobs_of(rows: Sequence[Row], tasks: Sequence[ScanTask], *, fresh: bool) -> list[Job]:
+    """Every scan of every row; results of a row are below ``out/ROW``."""
+    return [
+        Job(
+            row.name,
+            replace(
+                task,
+                out=task.out / row.name,
+                method=row.method,
+                config=row.config,
+                poses=row.poses,
+                front_end=row.front_end,
+            ),
+            fresh,
+        )
+        for task in tasks
+        for row in rows
+    ]
 
 
 def run_job(job: Job) -> JobResult:

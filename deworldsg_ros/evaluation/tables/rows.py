@@ -9,7 +9,7 @@ from typing import Literal
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
-from deworldsg_ros.evaluation.pose_sources import PoseChoice
+from deworldsg_ros.evaluation.pose_sources import PoseSource
 from deworldsg_ros.evaluation.runner import PIPELINE
 from deworldsg_ros.poses.perturbation import PoseNoise
 
@@ -19,7 +19,7 @@ POSE_WORDS = {
     "ground-truth": "true poses",
     "slam": "SLAM's poses",
     "odometry": "odometry",
-    "worse": "poses made worse",
+    "perturbed": "perturbed poses",
 }
 # Configures a row: shipped file, settings of its own.
 Configure = Callable[[str, Sequence[str], str], Config]
@@ -43,7 +43,7 @@ class Row:
     method: str
     config: Config
     front_end: FrontEndChoice
-    poses: PoseChoice = PoseChoice()
+    poses: PoseSource = PoseSource()
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Condition:
     name: str
     title: str = ""
     faults: Faults | None = None
-    poses: PoseChoice | None = None
+    poses: PoseSource | None = None
     flip: float | None = None
 
     def apply(self, front_end: FrontEndChoice) -> FrontEndChoice:
@@ -85,7 +85,7 @@ ABLATION = (
 
 
 # A hand that trembles, or a tracker that does: 2 cm and 1 degree about each axis.
-TREMBLING = PoseChoice("worse", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
+TREMBLING = PoseSource("perturbed", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
 LABELS = Condition("label", "persistent wrong labels", Faults(label=0.1))
 FALSE = Condition("false", "false boxes", Faults(false=1.0))
 TREMBLES = Condition("jitter", "poses ±2 cm, ±1°", poses=TREMBLING)
@@ -143,7 +143,7 @@ SWITCH_CONDITIONS = (
 
 
 def table_rows(
-    table: str, poses: Sequence[PoseChoice], front_end: FrontEndChoice, configure: Configure
+    table: str, poses: Sequence[PoseSource], front_end: FrontEndChoice, configure: Configure
 ) -> list[Row]:
     """The rows of a table.
 
@@ -159,7 +159,7 @@ def table_rows(
         ConfigurationError: for a setting that does not fit.
     """
     if table not in TABLES:
-        raise EvaluationError(f"--table {table}: wanted {', '.join(TABLES)}")
+        raise EvaluationError(f"table {table}: expected {', '.join(TABLES)}")
     if table == "ablation":
         return [
             Row(name, title, PIPELINE, configure("paper", settings, name), front_end, poses[0])

@@ -9,7 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult, ScanResult
+from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 from deworldsg_ros.evaluation.runner import ScanOutcome
 
 
@@ -59,11 +61,19 @@ def outcome_values(outcome: ScanOutcome) -> dict[str, Any]:
     }
 
 
+def evaluation_values(evaluation: Evaluation) -> dict[str, Any]:
+    """Plain values of a whole evaluation."""
+    return {**protocol_values(evaluation.result), "measures": evaluation.pooled.numbers()}
+
+
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write values as JSON; NaN and infinity become null."""
+    """Write values as JSON, NaN and infinity as null; raises EvaluationError."""
     text = json.dumps(finite_or_none(values), indent=2, ensure_ascii=False, allow_nan=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text + "\n", encoding="utf-8")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise EvaluationError(f"--json {path} cannot be written ({error.strerror})") from error
 
 
 def finite_or_none(value: Any) -> Any:

@@ -13,9 +13,10 @@ from deworldsg_ros.evaluation.measures import graph_measures as measures
 from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol import scoring as protocol
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolResult
-from deworldsg_ros.evaluation.reports import files, report
+from deworldsg_ros.evaluation.reports import csv_latex, json_values
+from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 from deworldsg_ros.evaluation.tables.jobs import JobResult
-from deworldsg_ros.evaluation.tables.printed import (
+from deworldsg_ros.evaluation.tables.paper_numbers import (
     RUNTIME_DEVICE,
     RUNTIME_MS,
     printed_rows,
@@ -94,15 +95,15 @@ def run_row(
         "; ".join(dict.fromkeys(outcome.device for outcome in outcomes)),
         len(outcomes),
         failures,
-        {"frames": frames, "scans": [report.outcome_values(outcome) for outcome in outcomes]},
+        {"frames": frames, "scans": [json_values.outcome_values(outcome) for outcome in outcomes]},
     )
 
 
-def predicted_row(title: str, dataset: str, result: ProtocolResult, together: Measures) -> TableRow:
-    """A row out of somebody's predictions."""
-    return TableRow(
-        title, title, dataset, False, all_numbers(result, together), scans=len(result.scans)
-    )
+def predicted_row(title: str, evaluation: Evaluation) -> TableRow:
+    """The row of a method of which only the predictions are known."""
+    result = evaluation.result
+    numbers = all_numbers(result, evaluation.pooled)
+    return TableRow(title, title, evaluation.dataset, False, numbers, scans=len(result.scans))
 
 
 def paper_rows(table: str, layout: str) -> list[TableRow]:
@@ -145,8 +146,8 @@ def write_table(out: Path, rows: Sequence[TableRow]) -> list[Path]:
             }
             for row in rows
         }
-        files.write_rows(out / CSV_FILE, lines, "method")
-        (out / LATEX_FILE).write_text(files.latex_rows(lines), encoding="utf-8")
+        csv_latex.write_rows(out / CSV_FILE, lines, "method")
+        (out / LATEX_FILE).write_text(csv_latex.latex_rows(lines), encoding="utf-8")
     except OSError as error:
         raise EvaluationError(f"--out {out}: cannot be written ({error.strerror})") from error
     return [out / CSV_FILE, out / LATEX_FILE]

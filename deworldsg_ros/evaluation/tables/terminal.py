@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from deworldsg_ros.evaluation.tables.results import TableRow, total_ms
+from deworldsg_ros.evaluation.tables.row_results import TableRow, total_ms
 from deworldsg_ros.timing import STAGES
 
 # Heading, number, factor, decimals.

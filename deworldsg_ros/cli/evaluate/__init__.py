@@ -1,0 +1,1 @@
+"""`deworldsg evaluate`: scene graphs measured against annotations."""

@@ -1,0 +1,47 @@
+"""The files of an evaluation in one folder: CSV, LaTeX and plots."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.protocol.scoring import pool
+from deworldsg_ros.evaluation.reports import csv_latex, plots
+from deworldsg_ros.evaluation.reports.evaluation import Evaluation
+
+CSV_FILE, CLASSES_FILE, LATEX_FILE = "results.csv", "classes.csv", "results.tex"
+OBJECTS_PLOT, PREDICATES_PLOT = "objects_by_class.png", "predicates.png"
+CONFUSION_PLOT, TIME_PLOT = "confusion.png", "recall_over_time.png"
+
+
+def write_folder(out: Path, evaluation: Evaluation) -> list[Path]:
+    """Write CSV, LaTeX and plots to the folder `out`; returns the paths.
+
+    Raises:
+        EvaluationError: the folder cannot be written.
+    """
+    result, measures, method = evaluation.result, evaluation.measures, evaluation.method
+    rows = {
+        scan.scan: pool([scan], evaluation.vocabulary).numbers()
+        | (measures[scan.scan].numbers() if scan.scan in measures else {})
+        for scan in result.scans
+    }
+    rows["all"] = result.numbers() | evaluation.pooled.numbers()
+    over_time = {scan: points for scan, points in evaluation.over_time.items() if points}
+    names = [CSV_FILE, CLASSES_FILE, LATEX_FILE, OBJECTS_PLOT, PREDICATES_PLOT, CONFUSION_PLOT]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        csv_latex.write_rows(out / CSV_FILE, rows, "scan")
+        csv_latex.write_classes(out / CLASSES_FILE, result)
+        latex = csv_latex.latex_rows({method: result.numbers()})
+        (out / LATEX_FILE).write_text(latex, encoding="utf-8")
+        plots.plot_classes(out / OBJECTS_PLOT, result.object_classes, f"objects: {method}")
+        plots.plot_classes(out / PREDICATES_PLOT, result.predicate_classes, f"predicates: {method}")
+        confusion = evaluation.pooled.confusion
+        plots.plot_confusion(out / CONFUSION_PLOT, confusion, f"classes of nodes: {method}")
+        if over_time:
+            plots.plot_over_time(out / TIME_PLOT, over_time, f"recall over time: {method}")
+            names.append(TIME_PLOT)
+    except OSError as error:
+        raise EvaluationError(f"--out {out}: cannot be written ({error.strerror})") from error
+    return [out / name for name in names]
