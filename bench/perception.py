@@ -1,9 +1,9 @@
-"""Stage a by its parts on one 640x480 frame, and the segmenter paired against cv2.grabCut.
+"""Times of the parts of perception on one 640x480 frame, the segmenter beside cv2.grabCut.
 
     python bench/perception.py [IMAGE DEPTH_PNG_MM] [--rounds 15]
 
-Without an image, a drawn table scene with twelve boxes. Times are wall-clock times and, in
-brackets, processor times of all threads, so that other work on the machine can be told apart.
+Without an image, it draws a table with twelve objects. It prints wall-clock times and, in brackets,
+processor times of all threads, which other work on the machine does not change.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
 
@@ -36,7 +37,7 @@ UP_CAMERA = np.array([0.0, -0.9, -0.436])
 
 
 def drawn_scene() -> Frame:
-    """Twelve things of 50 to 130 pixels on a slanted, grained table."""
+    """Twelve objects of 50 to 130 pixels on a slanted, grained table."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     depth = 2.6 - 1.4 * v / HEIGHT
@@ -90,14 +91,13 @@ def main() -> None:
 
     masks = segment()  # compiles
     instances = label_image(masks, classes, scores, (HEIGHT, WIDTH))
+    objects = SegmentedObjects(names, scores, None, instances, frame.depth_m, INTRINSICS, UP_CAMERA)
     parts: dict[str, Callable[[], object]] = {
         "detector, 2 threads": lambda: detector.detect(frame.rgb, 0.4),
         "segmenter, 1 thread": segment,
         "grabCut, 1 thread": lambda: grab_cut(frame),
         "label image": lambda: label_image(masks, classes, scores, (HEIGHT, WIDTH)),
-        "relation head": lambda: head.relate(
-            frame.depth_m, INTRINSICS, frame.boxes_xyxy, names, scores, instances, UP_CAMERA, 10
-        ),
+        "relation head": lambda: head.relate(objects, max_relations=10),
     }
     wall: dict[str, list[float]] = {name: [] for name in parts}
     processor: dict[str, list[float]] = {name: [] for name in parts}

@@ -1,5 +1,6 @@
-"""What the paper's detector, relation head and segmenters cost a frame: published sizes, random
-weights, through the package's own backends, on a CPU or on CUDA.
+"""Time per frame of the paper's detector, relation head and segmenters, on a CPU or on CUDA.
+
+The networks have published sizes and random weights. They run in the backends of the package.
 
     python bench/perception_models.py [--device auto|cpu|cuda] [--only NAME …] [--repeat N]
 """
@@ -26,6 +27,7 @@ from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.perception.backends.sam import SamSegmenter
 from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
+from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
 
@@ -42,7 +44,7 @@ Frame = Callable[[], Any]
 
 
 def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
-    """A detector of Visual Genome's classes, with a relation head beside it."""
+    """A detector of Visual Genome's classes, with a relation head in the same folder."""
     backbone = changes.pop("backbone", {})
     config = transformers.RTDetrConfig(
         backbone_config=transformers.RTDetrResNetConfig(
@@ -74,37 +76,37 @@ def relating(folder: Path, device: str) -> Frame:
     detector = rtdetr(folder, device)
     head = EgtrRelationHead(PerceptionConfig(), detector)
     kept = detector.detect(RGB, 0.0).take(slice(OBJECTS))
-    names = [VISUAL_GENOME_CLASSES[0]] * OBJECTS
-    none = np.zeros((HEIGHT, WIDTH), np.uint16)
-    return lambda: head.relate(
-        DEPTH_M, INTRINSICS, kept.boxes_xyxy, names, kept.scores, none, None, 10, kept.features
+    objects = SegmentedObjects(
+        class_names=[VISUAL_GENOME_CLASSES[0]] * OBJECTS,
+        scores=kept.scores,
+        features=kept.features,
+        instances=np.zeros((HEIGHT, WIDTH), np.uint16),
+        depth_m=DEPTH_M,
+        intrinsics=INTRINSICS,
+        up_camera=np.array([0.0, -1.0, 0.0]),
     )
+    return lambda: head.relate(objects, max_relations=10)
 
 
-def segmenting(
-    make: Callable[[], Any], backend: Any, image_size: int = 0
-) -> Callable[[Path, str], Frame]:
+def segmenting(make: Callable[[], Any], backend: Any) -> Callable[[Path, str], Frame]:
     """One image and the masks of 12 boxes."""
 
     def build(folder: Path, device: str) -> Frame:
         make().save_pretrained(folder)
-        segmenter = backend(
-            PerceptionConfig(
-                segmenter_path=str(folder), device=device, sam_image_size=image_size, threads=0
-            )
-        )
+        config = PerceptionConfig(segmenter_path=str(folder), device=device, threads=0)
+        segmenter = backend(config)
         return lambda: segmenter.segment(RGB, DEPTH_M, INTRINSICS, BOXES)
 
     return build
 
 
 def sam2_tiny() -> Any:
-    """SAM 2.1 tiny, as transformers' defaults have it."""
+    """SAM 2.1 tiny: the defaults of transformers."""
     return transformers.Sam2Model(transformers.Sam2Config())
 
 
 def sam_base() -> Any:
-    """SAM with ViT-B, as transformers' defaults have it."""
+    """SAM with ViT-B: the defaults of transformers."""
     return transformers.SamModel(transformers.SamConfig())
 
 
@@ -114,20 +116,19 @@ R18_DETECTOR = {
     "hidden_expansion": 0.5,
     "decoder_layers": 3,
 }
-# Each makes, in an empty folder, a checkpoint, and from it what is timed: one frame.
+# Each function saves a checkpoint in an empty folder and returns the call that is timed.
 BUILDERS: dict[str, Callable[[Path, str], Frame]] = {
     "RT-DETR r18, 640": detecting(**R18_DETECTOR),
     "RT-DETR r50, 640": detecting(),
     "RT-DETR r50m, 3 of 6 layers, 640": detecting(hidden_expansion=0.5, decoder_layers=3),
     "EGTR head, 12 objects": relating,
     "SAM 2.1 tiny, 1024, 12 boxes": segmenting(sam2_tiny, Sam2Segmenter),
-    "SAM 2.1 tiny, 512, 12 boxes": segmenting(sam2_tiny, Sam2Segmenter, 512),
     "SAM ViT-B, 1024, 12 boxes": segmenting(sam_base, SamSegmenter),
 }
 
 
 def time_ms(frame: Frame, repeat: int) -> tuple[float, float]:
-    """Medians of wall and processor time; what the backends return is back on the CPU."""
+    """Medians of wall and processor time. Backends return arrays on the CPU, so both are whole."""
     wall, processor = [], []
     for _ in range(repeat):
         started, used = time.perf_counter(), time.process_time()
@@ -140,12 +141,12 @@ def time_ms(frame: Frame, repeat: int) -> tuple[float, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
-    parser.add_argument("--only", nargs="*", default=[], help="models whose names hold this")
+    parser.add_argument("--only", nargs="*", default=[], help="models whose name contains this")
     parser.add_argument("--repeat", type=int, default=5)
     arguments = parser.parse_args()
     transformers.utils.logging.disable_progress_bar()
     torch.manual_seed(0)
-    # Random weights lead to numbers so small that a CPU slows down; trained ones do not.
+    # Random weights produce subnormal numbers, which slow a CPU down. Trained weights do not.
     torch.set_flush_denormal(True)
     on_cuda = torch.cuda.is_available() and arguments.device != "cpu"
     device = torch.cuda.get_device_name() if on_cuda else f"CPU, {torch.get_num_threads()} threads"

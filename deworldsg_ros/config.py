@@ -22,11 +22,17 @@ def option(description: str, **limits: Any) -> Any:
 
 
 class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stage a: image → 2D scene graph and instance labels."""
+    """Stage a: image → 2D scene graph and instance image."""
 
-    detector: Annotated[str, option("detector backend")] = "nanodet"
-    segmenter: Annotated[str, option("box-conditioned segmenter backend")] = "rgbd"
-    relation_head: Annotated[str, option("relation head backend")] = "geometric"
+    detector: Annotated[
+        str, option("detector: nanodet (shipped weights, COCO classes) or rtdetr (the paper's)")
+    ] = "nanodet"
+    segmenter: Annotated[
+        str, option("segmenter of the boxes: rgbd (no weights), sam2 (the paper's) or sam")
+    ] = "rgbd"
+    relation_head: Annotated[
+        str, option("relation head: geometric (no weights) or egtr (the paper's, needs rtdetr)")
+    ] = "geometric"
     predicate_set: Annotated[
         Literal["replica_ssg", "3dssg", "checkpoint"],
         option(
@@ -37,62 +43,33 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     score_threshold: Annotated[
         float,
         option(
-            "least detection score (the paper: 0.7); -1 = the backend's own default", ge=-1, le=1
-        ),
-    ] = -1.0
-    unsure_share: Annotated[
-        float,
-        option(
-            "share of the score threshold from which a box within a larger object keeps its pixels "
-            "from that one, though it is no object itself; 1 = none",
-            ge=0,
+            "minimum detection score (the paper: 0.7); -1 = the default of the detector",
+            ge=-1,
             le=1,
         ),
-    ] = 0.5
-    max_objects: Annotated[int, option("most objects kept a frame, best first", ge=1, le=300)] = 50
-    top_relations: Annotated[int, option("relations kept a frame", ge=0, le=1000)] = 10
-    join_nested: Annotated[
-        bool, option("one thing that is detected whole and in part in a frame is one object")
+    ] = -1.0
+    max_relations: Annotated[
+        int, option("maximum number of relations per frame, best first", ge=0, le=1000)
+    ] = 10
+    refine_detections: Annotated[
+        bool,
+        option(
+            "beyond the paper: nested detections of one object are joined, boxes that fill the "
+            "image are dropped, and weak boxes inside a larger object keep their pixels"
+        ),
     ] = True
-    drop_views: Annotated[
-        bool, option("a box that reaches all four borders of the image is no object")
-    ] = True
-    threads: Annotated[int, option("threads of the networks; 0 = all cores", ge=0, le=64)] = 2
     detector_path: Annotated[
-        str, option("checkpoint of the detector rtdetr: a folder, or a hub id")
+        str,
+        option("checkpoint of rtdetr, and of egtr beside it: a folder, or a hub id in the cache"),
     ] = ""
     segmenter_path: Annotated[
-        str, option("checkpoint of the segmenter sam2 or sam: a folder, or a hub id")
+        str, option("checkpoint of sam2 or sam: a folder, or a hub id in the cache")
     ] = ""
-    relation_head_path: Annotated[
-        str, option("checkpoint of the relation head egtr; empty = the detector's")
-    ] = ""
-    local_files_only: Annotated[
-        bool, option("take a hub id from the local cache only, never from the network")
-    ] = True
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        option("where rtdetr, egtr, sam2 and sam run; auto = CUDA where there is one"),
+        option("device of rtdetr, egtr, sam2 and sam; auto = CUDA if available"),
     ] = "auto"
-    class_scores: Annotated[
-        Literal["auto", "softmax", "sigmoid"],
-        option("how rtdetr's class logits are read; auto = as the checkpoint's card says"),
-    ] = "auto"
-    class_temperature: Annotated[
-        float,
-        option("temperature of rtdetr's class distribution; 0 = the checkpoint's", ge=0, le=100),
-    ] = 0.0
-    decoder_layers: Annotated[
-        int,
-        option("layers of rtdetr's decoder that are run; 0 = the checkpoint's", ge=0, le=64),
-    ] = 0
-    sam_image_size: Annotated[
-        int,
-        option("edge of sam2's square input, pixels, by 32; 0 = the checkpoint's", ge=0, le=4096),
-    ] = 0
-    sam_box_batch: Annotated[
-        int, option("boxes that sam2 and sam decode at once", ge=1, le=1024)
-    ] = 16
+    threads: Annotated[int, option("CPU threads of the networks; 0 = all cores", ge=0, le=64)] = 2
 
 
 class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -193,9 +193,7 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
         for field, value in default[section].items()
         if paper[section][field] != value
     } == {
-        ("perception", "join_nested"),
-        ("perception", "drop_views"),
-        ("perception", "unsure_share"),
+        ("perception", "refine_detections"),
         ("merging", "association"),
         ("relations", "encode"),
         ("relations", "clips_per_s"),

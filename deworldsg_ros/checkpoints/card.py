@@ -67,7 +67,7 @@ def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
     """
     if config.predicate_set != "checkpoint":
         return PREDICATE_SETS[config.predicate_set]
-    folder = Path(config.relation_head_path or config.detector_path).expanduser()
+    folder = Path(config.detector_path).expanduser()
     path = folder / CARD_FILE
     if not path.is_file():
         return None

@@ -126,13 +126,13 @@ class CheckpointSource:
 
     def _cannot_load(self, error: Exception) -> str:
         first_line = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-        hint = "wanted a folder with config.json and model.safetensors of transformers' format"
-        if not Path(self.name).is_dir():
-            hint = "download it to a folder and name that"
-            if self.local_files_only:
-                section = self.parameter.split(".")[0]
-                hint += f", or set {section}.local_files_only to false"
-        return f"{self.parameter} '{self.name}' cannot be loaded ({first_line}): {hint}"
+        reason = f"{self.parameter} '{self.name}' cannot be loaded ({first_line})"
+        folder = "a folder with config.json and model.safetensors of transformers' format"
+        if Path(self.name).is_dir():
+            return f"{reason}, expected {folder}: download the checkpoint again"
+        if self.local_files_only:
+            return f"{reason}: run `hf download {self.name}`, or name {folder}"
+        return f"{reason}: check the id and the network, or name {folder}"
 
 
 def choose_device(parameter: str, wanted: str) -> torch.device:

@@ -199,7 +199,7 @@ def _load_backbone(config: RelationsConfig) -> Any:
         return load(config)
     except ConfigurationError as error:
         # Who types options is told of options.
-        told = str(error).replace("set relations.local_files_only to false", "give --download")
+        told = str(error).replace(": run `hf", ": give --download, run `hf")
         for name, option in OPTION_OF.items():
             told = told.replace(f"relations.{name}", option)
         raise ConfigurationError(told) from error

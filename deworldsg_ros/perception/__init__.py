@@ -1,10 +1,16 @@
-"""Stage a: image → 2D scene graph and instance labels."""
+"""Stage a: image → 2D scene graph and instance image.
+
+`stage` runs a detector, a segmenter and a relation head (`backends`) on each frame. `protocols`
+defines them and `registry` builds them by name. `nested` handles boxes inside boxes,
+`label_image` combines masks.
+"""
 
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
     MaskPatch,
     RelationHead,
+    SegmentedObjects,
     Segmenter,
 )
 from deworldsg_ros.perception.registry import build_perception
@@ -17,6 +23,7 @@ __all__ = [
     "Perceived",
     "Perception",
     "RelationHead",
+    "SegmentedObjects",
     "Segmenter",
     "build_perception",
 ]

@@ -1,4 +1,4 @@
-"""What a backend has to do: one small protocol each for detector, segmenter and relation head."""
+"""Protocols of the backends: detector, segmenter, relation head; and the data between them."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Detections:
         boxes_xyxy: (n, 4) float64 pixels, corners x1, y1, x2, y2; pixel centres at integers.
         class_probabilities: (n, C) float64, calibrated, rows sum to one.
         scores: (n,) float64 in [0, 1], the detector's own score.
-        features: (n, …) float32, what the detector knows of each object besides, for a relation
-            head that was made for it; None = nothing.
+        features: (n, …) float32 features of the detector for a relation head that was trained on
+            them; None = none.
     """
 
     boxes_xyxy: Float64
@@ -34,16 +34,16 @@ class Detections:
         if self.boxes_xyxy.shape != (count, 4) or len(self.class_probabilities) != count:
             raise ValueError(
                 f"{count} scores, boxes of shape {self.boxes_xyxy.shape}, class probabilities of "
-                f"shape {self.class_probabilities.shape}: wanted one row an object"
+                f"shape {self.class_probabilities.shape}; expected one row per object"
             )
         if self.features is not None and len(self.features) != count:
-            raise ValueError(f"{count} scores, {len(self.features)} features: wanted one a score")
+            raise ValueError(f"{count} scores, {len(self.features)} features; expected as many")
 
     def __len__(self) -> int:
         return len(self.scores)
 
     def take(self, rows: Int64 | Bool | slice) -> Detections:
-        """The objects of `rows`, in that order."""
+        """The objects of `rows` (indices, mask or slice), in that order."""
         return Detections(
             self.boxes_xyxy[rows],
             self.class_probabilities[rows],
@@ -54,11 +54,11 @@ class Detections:
 
 @dataclass(frozen=True)
 class MaskPatch:
-    """Mask of one object, kept as the part of the image around it.
+    """Mask of one object, stored as the part of the image around it.
 
     Attributes:
         top, left: image row and column of the patch's first pixel.
-        pixels: (h, w) bool; h or w may be 0 where the object has no pixel.
+        pixels: (h, w) bool; h or w is 0 if the object has no pixel.
     """
 
     top: int
@@ -87,9 +87,9 @@ class Detector(Protocol):
 
     @property
     def default_score_threshold(self) -> float:
-        """The least score that means "probably an object" for this backend.
+        """Minimum score of an object for this backend, in [0, 1].
 
-        The paper's 0.7 is one for softmax scores; sigmoid scores of a small network are lower.
+        The paper's 0.7 suits softmax scores. Sigmoid scores of a small network are lower.
         """
 
     def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
@@ -105,7 +105,6 @@ class Segmenter(Protocol):
         depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
-        class_names: list[str] | None = None,
     ) -> list[MaskPatch]:
         """The visible surface of the object in each box.
 
@@ -114,11 +113,36 @@ class Segmenter(Protocol):
             depth_m: (H, W) float32, metres along the optical axis; 0 = invalid.
             intrinsics: of both images.
             boxes_xyxy: (n, 4) pixels; may reach beyond the image.
-            class_names: the likeliest class of each box; a hint that may be ignored.
 
         Returns:
             n masks, in the order of the boxes.
         """
+
+
+@dataclass(frozen=True)
+class SegmentedObjects:
+    """The n objects of one frame, input of a relation head.
+
+    Attributes:
+        class_names: n most likely classes.
+        scores: (n,) float64 in [0, 1], best first.
+        features: (n, …) float32, the `Detections.features`; None = none.
+        instances: (H, W) uint16 instance image; k + 1 on the pixels of row k, else 0.
+        depth_m: (H, W) float32, metres; 0 = invalid.
+        intrinsics: of the depth.
+        up_camera: (3,) float64 unit vector against gravity, camera frame.
+    """
+
+    class_names: list[str]
+    scores: Float64
+    features: Float32 | None
+    instances: UInt16
+    depth_m: Float32
+    intrinsics: Intrinsics
+    up_camera: Float64
+
+    def __len__(self) -> int:
+        return len(self.scores)
 
 
 class RelationHead(Protocol):
@@ -128,28 +152,5 @@ class RelationHead(Protocol):
     def predicates(self) -> tuple[str, ...]:
         """Names of the R predicates, in the order of the logits."""
 
-    def relate(
-        self,
-        depth_m: Float32,
-        intrinsics: Intrinsics,
-        boxes_xyxy: Float64,
-        class_names: list[str],
-        scores: Float64,
-        instances: UInt16,
-        up_camera: Float64 | None,
-        top_relations: int,
-        features: Float32 | None = None,
-    ) -> Relations:
-        """The `top_relations` best ordered pairs of the frame, best first.
-
-        Args:
-            depth_m: (H, W) float32, metres; 0 = invalid.
-            intrinsics: of the depth.
-            boxes_xyxy: (n, 4) pixels.
-            class_names: likeliest class of each object.
-            scores: (n,) in [0, 1].
-            instances: (H, W) uint16; k + 1 on the pixels of row k, 0 on nothing.
-            up_camera: (3,) unit vector against gravity in the camera frame; None = unknown.
-            top_relations: most pairs returned.
-            features: (n, …) the `Detections.features` of the objects.
-        """
+    def relate(self, objects: SegmentedObjects, max_relations: int) -> Relations:
+        """The `max_relations` best ordered pairs of the objects, best first."""

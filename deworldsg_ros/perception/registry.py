@@ -1,6 +1,7 @@
-"""Backends by the name the configuration uses; a new one is a file and a line here.
+"""Backends by their name in the configuration. A new backend is a file and a line here.
 
-A backend's module is imported only when it is chosen, so that nobody pays for what is not used.
+The module of a backend is imported only if the configuration names it, because torch is optional
+and slow to import.
 """
 
 from __future__ import annotations
@@ -56,8 +57,8 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
     if config.predicate_set == "checkpoint":
         raise ConfigurationError(
-            "perception.predicate_set is 'checkpoint' and the relation head 'geometric' has none: "
-            f"wanted one of {', '.join(PREDICATE_SETS)}"
+            "perception.predicate_set is 'checkpoint', but the relation head 'geometric' has none: "
+            f"set it to one of {', '.join(PREDICATE_SETS)}"
         )
     return GeometricRelationHead(PREDICATE_SETS[config.predicate_set])
 
@@ -78,7 +79,7 @@ SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "sam2": _sam2,
     "sam": _sam,
 }
-# A head may read what the detector knows of its objects.
+# A relation head may read features of its detector.
 RELATION_HEADS: dict[str, Callable[[PerceptionConfig, Detector], RelationHead]] = {
     "geometric": _geometric,
     "egtr": _egtr,
@@ -86,17 +87,16 @@ RELATION_HEADS: dict[str, Callable[[PerceptionConfig, Detector], RelationHead]] 
 
 
 def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Perception:
-    """The stage with the backends that `config` names.
+    """Perception with the backends that `config` names.
 
     Args:
         config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y.
 
     Raises:
-        ConfigurationError: a backend or an axis that does not exist, with those that do; a
-            checkpoint that cannot be used.
+        ConfigurationError: an unknown backend or axis, or a checkpoint that cannot be used.
     """
-    # All names before the first checkpoint is loaded.
+    # Check all names before loading the first checkpoint.
     make_detector = _choose("perception.detector", config.detector, DETECTORS)
     make_segmenter = _choose("perception.segmenter", config.segmenter, SEGMENTERS)
     make_head = _choose("perception.relation_head", config.relation_head, RELATION_HEADS)
@@ -107,7 +107,7 @@ def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Per
 
 @contextmanager
 def _torch(parameter: str, name: str, config: PerceptionConfig) -> Iterator[None]:
-    """Import a backend on torch, which need not be installed; then give it its threads."""
+    """Import a backend that needs torch, an optional dependency, and set torch's threads."""
     try:
         yield
     except ImportError as error:
@@ -123,5 +123,5 @@ def _torch(parameter: str, name: str, config: PerceptionConfig) -> Iterator[None
 
 def _choose(parameter: str, name: str, known: Mapping[str, Made]) -> Made:
     if name not in known:
-        raise ConfigurationError(f"{parameter} is {name!r}: wanted one of {', '.join(known)}")
+        raise ConfigurationError(f"{parameter} is {name!r}, expected one of {', '.join(known)}")
     return known[name]

@@ -1,4 +1,4 @@
-"""Stage a: one RGB-D frame → its 2D scene graph and its instance labels."""
+"""Stage a: one RGB-D frame → its 2D scene graph and its instance image."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from deworldsg_ros.perception.protocols import (
     Detector,
     MaskPatch,
     RelationHead,
+    SegmentedObjects,
     Segmenter,
 )
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
@@ -26,24 +27,30 @@ from deworldsg_ros.scene.up import UpEstimator
 
 logger = logging.getLogger(__name__)
 
-# Below this a box has no inside to segment.
+# A smaller box has no interior to segment.
 MIN_BOX_SIDE_PX = 2.0
-# A box reaches a border of the image from so near, as a share of the image's side.
-BORDER_SHARE = 0.04
+# Masks and pairs of objects cost time and memory. A frame of an indoor scene has about 12 objects.
+MAX_OBJECTS = 50
+# A weak box inside a larger object keeps its pixels from this fraction of the score threshold on.
+# docs/evaluation.md compares 0.5, 0.75 and 1.
+WEAK_SCORE_FRACTION = 0.5
+# A box reaches a border of the image if it is nearer than this fraction of the image's side.
+# Detectors end their boxes a few pixels before the border.
+BORDER_FRACTION = 0.04
 
 
 @dataclass(frozen=True)
 class Perceived:
-    """What one frame showed.
+    """The result of one frame.
 
     Attributes:
         frame_graph: objects, best score first, and the relations between them.
-        instances: (H, W) uint16; k + 1 on the pixels of the k-th object, 0 on nothing.
-        drops: number of detections not passed on, by reason: ``box_too_small`` (or outside the
-            image), ``box_is_the_view``, ``over_max_objects``, ``detected_twice`` (whole and in
-            part), ``segmenter_error`` (all of the frame); and ``relation_head_error`` for those
-            that went on without relations.
-        failures: what a backend said when it failed on this frame, by those reasons.
+        instances: (H, W) uint16 instance image; k + 1 on the pixels of the k-th object, else 0.
+        drops: number of dropped detections by reason: ``box_too_small`` (or outside the image),
+            ``box_is_the_view`` (fills the image), ``over_max_objects``, ``detected_twice``
+            (nested), ``segmenter_error`` (all of the frame). ``relation_head_error`` counts the
+            objects that are passed on without relations.
+        failures: error message of each backend that failed on this frame, by reason.
     """
 
     frame_graph: FrameGraph
@@ -57,8 +64,12 @@ class Perception:
 
     Args:
         detector, segmenter, relation_head: the backends.
-        config: thresholds and limits.
+        config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y (`UpEstimator`).
+
+    Attributes:
+        vocabulary: classes of the detector and predicates of the relation head.
+        score_threshold: minimum score of an object, in [0, 1].
     """
 
     def __init__(
@@ -73,7 +84,8 @@ class Perception:
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
-        self._config = config
+        self._refine = config.refine_detections
+        self._max_relations = config.max_relations
         self._up = UpEstimator(world_up)
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
@@ -85,39 +97,40 @@ class Perception:
         )
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
-        """The 2D scene graph and the instance labels of `frame`.
+        """The 2D scene graph and the instance image of `frame`.
 
-        A backend that fails costs what it would have given, not the frame: see `drops`.
+        A segmenter or relation head that fails does not stop the run: `drops` counts the lost
+        objects.
 
         Raises:
             RefusedInput: ``detector_error``.
         """
         intrinsics = frame.intrinsics
-        shape = (intrinsics.height, intrinsics.width)
-        up_camera = self._up_camera(frame.T_world_camera)
+        self._up.observe(frame.T_world_camera)
         self._failures = {}
-        found = self.detect(frame)
-        sure = found.scores >= self.score_threshold
-        objects, drops = self._select(found.take(sure), intrinsics.width, intrinsics.height)
-        unsure, _ = self._select(found.take(~sure), intrinsics.width, intrinsics.height)
-        masks = self.segment(frame, objects, in_front_of(objects, unsure))
+        found = self._detect(frame)
+        strong = found.scores >= self.score_threshold
+        objects, drops = self._select(found.take(strong), intrinsics.width, intrinsics.height)
+        weak, _ = self._select(found.take(~strong), intrinsics.width, intrinsics.height)
+        masks = self._segment(frame, objects, in_front_of(objects, weak))
         if masks is None:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
-        found_count = len(objects)
-        if self._config.join_nested:
+        if self._refine:
+            count = len(objects)
             objects, masks = join_nested(objects, masks, frame.depth_m)
-        if len(objects) < found_count:
-            drops["detected_twice"] = found_count - len(objects)
-        classes = objects.class_probabilities.argmax(axis=1)
-        instances = label_image(masks, classes.astype(np.int64), objects.scores, shape)
-        relations = Relations.none(len(self.vocabulary.predicates))
-        if len(objects) > 1 and self._config.top_relations:
-            related = self.relate(frame, objects, instances, up_camera)
-            if related is None:
-                drops["relation_head_error"] = len(objects)
-            else:
-                relations = related
+            if len(objects) < count:
+                drops["detected_twice"] = count - len(objects)
+        instances = label_image(
+            masks,
+            objects.class_probabilities.argmax(axis=1),
+            objects.scores,
+            (intrinsics.height, intrinsics.width),
+        )
+        relations = self._relate(frame, objects, instances)
+        if relations is None:
+            drops["relation_head_error"] = len(objects)
+            relations = Relations.none(len(self.vocabulary.predicates))
         frame_graph = FrameGraph(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
@@ -131,68 +144,55 @@ class Perception:
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
-    def detect(self, frame: RgbdFrame) -> Detections:
-        """What may be an object in the image; raises RefusedInput ``detector_error``."""
+    def _detect(self, frame: RgbdFrame) -> Detections:
+        """Objects and, if detections are refined, weak boxes; raises ``detector_error``."""
+        fraction = WEAK_SCORE_FRACTION if self._refine else 1.0
         try:
-            return self._detector.detect(
-                frame.rgb, self._config.unsure_share * self.score_threshold
-            )
+            return self._detector.detect(frame.rgb, fraction * self.score_threshold)
         except Exception as error:  # a model can fail in more ways than can be listed
             message = self._note_failure("detector", "detector_error", error)
             raise RefusedInput("detector_error", message) from error
 
-    def segment(
-        self, frame: RgbdFrame, objects: Detections, others: Detections
+    def _segment(
+        self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
-        """A mask for each object, beside others; None where the segmenter failed."""
+        """A mask of each object, without the pixels of `weak`; None if the segmenter failed."""
+        boxes_xyxy = np.concatenate([objects.boxes_xyxy, weak.boxes_xyxy])
         try:
-            masks = self._segmenter.segment(
-                frame.rgb,
-                frame.depth_m,
-                frame.intrinsics,
-                np.concatenate([objects.boxes_xyxy, others.boxes_xyxy]),
-                self._likeliest_names(objects) + self._likeliest_names(others),
-            )
+            masks = self._segmenter.segment(frame.rgb, frame.depth_m, frame.intrinsics, boxes_xyxy)
             return masks[: len(objects)]
-        except Exception as error:  # see detect
+        except Exception as error:  # see _detect
             self._note_failure("segmenter", "segmenter_error", error)
             return None
 
-    def relate(
-        self,
-        frame: RgbdFrame,
-        objects: Detections,
-        instances: UInt16,
-        up_camera: Float64,
-    ) -> Relations | None:
-        """The best relations between the objects; None where the relation head failed."""
+    def _relate(self, frame: RgbdFrame, objects: Detections, instances: UInt16) -> Relations | None:
+        """The best relations between the objects; None if the relation head failed."""
+        if len(objects) < 2 or not self._max_relations:
+            return Relations.none(len(self.vocabulary.predicates))
+        segmented = SegmentedObjects(
+            class_names=[
+                self.vocabulary.classes[c] for c in objects.class_probabilities.argmax(axis=1)
+            ],
+            scores=objects.scores,
+            features=objects.features,
+            instances=instances,
+            depth_m=frame.depth_m,
+            intrinsics=frame.intrinsics,
+            up_camera=np.asarray(frame.T_world_camera[:3, :3].T @ self._up.up_world()),
+        )
         try:
-            return self._relation_head.relate(
-                frame.depth_m,
-                frame.intrinsics,
-                objects.boxes_xyxy,
-                self._likeliest_names(objects),
-                objects.scores,
-                instances,
-                up_camera,
-                self._config.top_relations,
-                objects.features,
-            )
-        except Exception as error:  # see detect
+            return self._relation_head.relate(segmented, self._max_relations)
+        except Exception as error:  # see _detect
             self._note_failure("relation head", "relation_head_error", error)
             return None
 
-    def _likeliest_names(self, objects: Detections) -> list[str]:
-        return [self.vocabulary.classes[c] for c in objects.class_probabilities.argmax(axis=1)]
-
     def _note_failure(self, backend: str, reason: str, error: Exception) -> str:
-        """Log a backend's first failure with its traceback; the others are only counted."""
+        """Log the first failure of a backend with its traceback; later ones are only counted."""
         message = self._failures[reason] = f"the {backend} failed: {error}"
         if reason not in self._logged:
             self._logged.add(reason)
             logger.error(
-                "%s; the run goes on without what it would have found, and further failures are "
-                "counted",
+                "%s; the run continues without its result, and further failures are counted",
                 message,
                 exc_info=error,
             )
@@ -201,14 +201,14 @@ class Perception:
     def _select(
         self, found: Detections, width: int, height: int
     ) -> tuple[Detections, Counter[str]]:
-        """Boxes cut to the image, best score first, at most `max_objects`."""
+        """Boxes clipped to the image, best score first, at most `MAX_OBJECTS`; and the drops."""
         boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
         large = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
-        view = is_the_view(boxes, width, height) & self._config.drop_views
+        view = fills_image(boxes, width, height) & self._refine
         usable = large & ~view
         order = np.argsort(-found.scores, kind="stable")
         order = order[usable[order]]
-        kept = order[: self._config.max_objects]
+        kept = order[:MAX_OBJECTS]
         drops: Counter[str] = Counter()
         if not large.all():
             drops["box_too_small"] = int((~large).sum())
@@ -218,16 +218,12 @@ class Perception:
             drops["over_max_objects"] = len(order) - len(kept)
         return replace(found, boxes_xyxy=boxes).take(kept), drops
 
-    def _up_camera(self, T_world_camera: Float64) -> Float64:
-        """Direction against gravity in the camera frame, (3,) unit vector."""
-        self._up.observe(T_world_camera)
-        return np.asarray(T_world_camera[:3, :3].T @ self._up.up_world())
 
+def fills_image(boxes_xyxy: Float64, width: int, height: int) -> Bool:
+    """(n,) bool: which boxes (n, 4), in pixels, reach all four borders of the image.
 
-def is_the_view(boxes_xyxy: Float64, width: int, height: int) -> Bool:
-    """Which boxes (n, 4) reach all four borders of the image.
-
-    Nothing tells where such a thing ends: it is named after the scene, and holds what is in it.
+    The image does not show where such an object ends. Its class is that of the whole scene, and
+    its mask contains other objects.
     """
     margins = boxes_xyxy * [1.0, 1.0, -1.0, -1.0] + [0.0, 0.0, width - 1.0, height - 1.0]
-    return np.asarray((margins <= BORDER_SHARE * np.array([width, height] * 2)).all(axis=1))
+    return np.asarray((margins <= BORDER_FRACTION * np.array([width, height] * 2)).all(axis=1))

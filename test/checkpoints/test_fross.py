@@ -6,7 +6,15 @@ import json
 
 import numpy as np
 import pytest
-from support.torch_models import PREDICATES, WIDTH, image, settings, torch, transformers
+from support.torch_models import (
+    PREDICATES,
+    WIDTH,
+    image,
+    segmented,
+    settings,
+    torch,
+    transformers,
+)
 from typer.testing import CliRunner
 
 from deworldsg_ros.checkpoints.card import read_card
@@ -243,9 +251,7 @@ def test_what_was_imported_finds_objects_and_relations(imported):
     assert len(detector.model.model.decoder.layers) == 3
     found = detector.detect(image(), 0.0)
     names = [SCANNET_CLASSES[row.argmax()] for row in found.class_probabilities]
-    related = head.relate(
-        None, None, found.boxes_xyxy, names, found.scores, None, None, 10, found.features
-    )
+    related = head.relate(segmented(names, found.scores, found.features), 10)
     assert related.logits.shape == (10, 7)
 
 

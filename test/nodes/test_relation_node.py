@@ -172,7 +172,6 @@ def test_predicates_of_an_imported_checkpoint_are_known(
         write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
         if predicates == ("on", "under"):
             start(**chosen, perception__detector_path=str(tmp_path))
-            start(**chosen, perception__relation_head_path=str(tmp_path))
             continue
         told = "trained on others" if predicates else "names no predicates"
         with pytest.raises(ConfigurationError, match=told):

@@ -89,5 +89,5 @@ def test_features_are_one_row_an_object():
 
 
 def test_the_geometric_head_has_no_predicates_of_its_own():
-    with pytest.raises(ConfigurationError, match="'checkpoint' and the relation head 'geometric'"):
+    with pytest.raises(ConfigurationError, match="'checkpoint', but the relation head 'geometric'"):
         build_perception(PerceptionConfig(predicate_set="checkpoint", threads=1))

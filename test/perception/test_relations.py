@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from support.perception import (
     CUP_ON_TABLE,
-    INTRINSICS,
     SHAPE,
     TABLE_LEG,
     TABLE_TOP,
-    UP_CAMERA,
     Slab,
-    box_of,
     render,
+    segmented,
 )
 
 from deworldsg_ros.perception.backends.geometric import (
@@ -22,29 +20,25 @@ from deworldsg_ros.perception.backends.geometric import (
     GeometricRelationHead,
 )
 from deworldsg_ros.perception.geometry.layout import upright_axes
-from deworldsg_ros.perception.geometry.up_direction import estimate_up
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, SCANNET_PREDICATES
 
 SHELF = Slab((-0.5, 2.6, 0.75), (0.5, 2.95, 1.05), (90, 90, 100))
 CHEST = Slab((-0.5, 2.5, 0.0), (0.5, 2.98, 0.4), (100, 60, 60))
 
 
-def see(named, predicates=REPLICA_SSG_PREDICATES, up=UP_CAMERA, top=100):
+def see(named, predicates=REPLICA_SSG_PREDICATES, top=100):
     """Relations of named objects, each a list of slabs, as {(subject, object): predicate}."""
     slabs = [slab for _, parts in named for slab in parts]
     _, depth_m, owner = render(slabs, 0.001)
     instances = np.zeros(SHAPE, np.uint16)
-    boxes, first = [], 1
+    first = 1
     for row, (_, parts) in enumerate(named):
         mask = (owner >= first) & (owner < first + len(parts))
         instances[mask] = row + 1
-        boxes.append(box_of(mask))
         first += len(parts)
     head = GeometricRelationHead(predicates)
     names = [name for name, _ in named]
-    found = head.relate(
-        depth_m, INTRINSICS, np.array(boxes), names, np.full(len(named), 0.8), instances, up, top
-    )
+    found = head.relate(segmented(names, instances, depth_m), top)
     assert found.logits.shape == (len(found.pairs), len(predicates))
     assert (found.logits >= FLOOR_LOGIT).all() and (found.logits <= CEILING_LOGIT).all()
     assert (np.diff(found.scores) <= 0).all()
@@ -62,10 +56,6 @@ def test_a_cup_on_a_table():
     told = see([TABLE, CUP])
     assert told["cup", "table"] == "on"
     assert told.get(("table", "cup")) not in {"on", "in", "under"}
-
-
-def test_the_same_without_knowing_up():
-    assert see([TABLE, CUP], up=None)["cup", "table"] == "on"
 
 
 def test_the_same_in_the_words_of_3dssg():
@@ -128,60 +118,24 @@ def test_as_many_as_asked_for(top):
 
 def test_objects_without_pixels_or_depth_are_not_related():
     _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
-    boxes = np.array([[0.0, 0, 9, 9], [20, 20, 40, 40]])
     head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
-    for instances, depth in (
-        (np.zeros(SHAPE, np.uint16), depth_m),
-        (owner.astype(np.uint16), np.zeros_like(depth_m)),
-    ):
-        found = head.relate(
-            depth, INTRINSICS, boxes, ["table", "cup"], np.ones(2), instances, UP_CAMERA, 10
-        )
+    for instances, depth in ((np.zeros(SHAPE), depth_m), (owner, np.zeros_like(depth_m))):
+        found = head.relate(segmented(["table", "cup"], instances, depth), 10)
         assert len(found.pairs) == 0
 
 
 def test_one_object_has_no_relation():
     head = GeometricRelationHead(SCANNET_PREDICATES)
-    found = head.relate(
-        np.ones(SHAPE, np.float32),
-        INTRINSICS,
-        np.zeros((1, 4)),
-        ["cup"],
-        np.ones(1),
-        np.ones(SHAPE, np.uint16),
-        UP_CAMERA,
-        10,
-    )
+    found = head.relate(segmented(["cup"], np.ones(SHAPE), np.ones(SHAPE, np.float32)), 10)
     assert found.pairs.shape == (0, 2) and found.logits.shape == (0, 7)
 
 
 def test_predicates_that_geometry_cannot_judge_weigh_nothing():
     _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
     head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
-    boxes = np.stack([box_of(owner == k) for k in (1, 2)])
-    found = head.relate(
-        depth_m,
-        INTRINSICS,
-        boxes,
-        ["table", "cup"],
-        np.ones(2),
-        owner.astype(np.uint16),
-        UP_CAMERA,
-        1,
-    )
+    found = head.relate(segmented(["table", "cup"], owner, depth_m), 1)
     weights = np.exp(found.logits[0]) / np.exp(found.logits[0]).sum()
     assert weights[REPLICA_SSG_PREDICATES.index("on")] > 0.9
-
-
-@pytest.mark.parametrize("slabs", [[], [TABLE_TOP, CUP_ON_TABLE], [CHEST, SHELF]])
-def test_up_is_found_in_the_depth(slabs):
-    _, depth_m, _ = render(slabs, 0.003)
-    angle = np.degrees(np.arccos(np.clip(estimate_up(depth_m, INTRINSICS) @ UP_CAMERA, -1, 1)))
-    assert angle < 4
-
-
-def test_up_without_depth_is_the_images():
-    assert estimate_up(np.zeros(SHAPE, np.float32), INTRINSICS).tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, -0.8, 0], [1, 0, 0]])

@@ -33,7 +33,7 @@ from deworldsg_ros.scene.vocabularies import (
 
 
 class ListedDetector:
-    """Says what it was given."""
+    """Returns the detections that it was made with."""
 
     classes = ("table", "cup", "person")
     default_score_threshold = 0.45
@@ -43,10 +43,10 @@ class ListedDetector:
         self.probabilities = np.full((len(scores), 3), 0.1)
         self.probabilities[np.arange(len(scores)), classes] = 0.8
         self.scores = np.array(scores, dtype=float)
-        self.asked = []
+        self.thresholds = []
 
     def detect(self, rgb, score_threshold):
-        self.asked.append(score_threshold)
+        self.thresholds.append(score_threshold)
         keep = self.scores >= score_threshold
         return Detections(self.boxes[keep], self.probabilities[keep], self.scores[keep])
 
@@ -99,13 +99,22 @@ def test_nothing_detected():
     assert found.frame_graph.relations.logits.shape == (0, 50)
 
 
-def test_what_is_dropped_is_counted():
+def test_dropped_detections_are_counted():
     frame, table, cup, _ = table_and_cup()
     boxes = [table, cup, [400, 10, 500, 60], [10, 10, 10.5, 80]]
-    found = stage(ListedDetector(boxes, [0, 1, 2, 2], [0.6, 0.9, 0.95, 0.5]), max_objects=1)
-    perceived = found.perceive(frame)
-    assert perceived.drops == {"box_too_small": 2, "over_max_objects": 1}
-    assert perceived.frame_graph.scores.tolist() == [0.9]
+    perceived = stage(ListedDetector(boxes, [0, 1, 2, 2], [0.6, 0.9, 0.95, 0.5])).perceive(frame)
+    assert perceived.drops == {"box_too_small": 2}
+    assert perceived.frame_graph.scores.tolist() == [0.9, 0.6]
+
+
+def test_the_best_50_objects_are_kept():
+    frame, *_ = table_and_cup()
+    corners = [(30 * (k % 10), 30 * (k // 10)) for k in range(52)]
+    boxes = [[x, y, x + 20, y + 20] for x, y in corners]
+    scores = np.linspace(0.5, 0.9, 52)
+    perceived = stage(ListedDetector(boxes, [2] * 52, scores)).perceive(frame)
+    assert perceived.drops == {"over_max_objects": 2}
+    assert perceived.frame_graph.scores.tolist() == scores[:1:-1].tolist()
 
 
 def test_boxes_are_cut_to_the_image():
@@ -114,7 +123,7 @@ def test_boxes_are_cut_to_the_image():
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
 
 
-def test_what_reaches_all_four_borders_is_the_view_and_no_object():
+def test_a_box_that_fills_the_image_is_no_object():
     frame, *_ = table_and_cup()
     near = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
     far = [*near[:3], 0.9 * HEIGHT]
@@ -122,31 +131,31 @@ def test_what_reaches_all_four_borders_is_the_view_and_no_object():
     perceived = stage(detector).perceive(frame)
     assert perceived.drops == {"box_is_the_view": 1}
     assert perceived.frame_graph.scores.tolist() == [0.8]
-    perceived = stage(detector, drop_views=False, join_nested=False).perceive(frame)
+    perceived = stage(detector, refine_detections=False).perceive(frame)
     assert perceived.frame_graph.scores.tolist() == [0.9, 0.8]
 
 
 def test_relations_can_be_off():
     frame, table, cup, _ = table_and_cup()
-    found = stage(ListedDetector([table, cup], [0, 1], [0.6, 0.9]), top_relations=0)
+    found = stage(ListedDetector([table, cup], [0, 1], [0.6, 0.9]), max_relations=0)
     assert len(found.perceive(frame).frame_graph.relations.pairs) == 0
 
 
 @pytest.mark.parametrize(("configured", "used"), [(-1.0, 0.45), (0.7, 0.7), (0.0, 0.0)])
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_threshold_is_the_backends_unless_configured(configured, used, share):
+@pytest.mark.parametrize(("refine", "fraction"), [(True, 0.5), (False, 1.0)])
+def test_threshold_is_that_of_the_detector_unless_configured(configured, used, refine, fraction):
     frame, *_ = table_and_cup()
     detector = ListedDetector([], [], [])
-    perception = stage(detector, score_threshold=configured, unsure_share=share)
+    perception = stage(detector, score_threshold=configured, refine_detections=refine)
     perception.perceive(frame)
-    assert detector.asked == [used * share] and perception.score_threshold == used
+    assert detector.thresholds == [used * fraction] and perception.score_threshold == used
 
 
-@pytest.mark.parametrize(("share", "taken"), [(0.5, 0.0), (1.0, 1.0)])
-def test_a_cup_that_is_not_sure_is_no_object_and_no_part_of_the_table(share, taken):
+@pytest.mark.parametrize(("refine", "taken"), [(True, 0.0), (False, 1.0)])
+def test_a_weakly_detected_cup_is_no_object_and_no_part_of_the_table(refine, taken):
     frame, table, cup, owner = table_and_cup()
     detector = ListedDetector([table, cup], [0, 1], [0.6, 0.3])
-    perceived = stage(detector, unsure_share=share).perceive(frame)
+    perceived = stage(detector, refine_detections=refine).perceive(frame)
     assert perceived.frame_graph.scores.tolist() == [0.6] and perceived.drops == {}
     assert (perceived.instances[owner == 2] > 0).mean() == pytest.approx(taken, abs=0.1)
 
@@ -168,9 +177,9 @@ def test_the_configured_stage_runs():
 
 
 @pytest.mark.parametrize("field", ["detector", "segmenter", "relation_head"])
-def test_an_unknown_backend_is_named_with_those_that_exist(field):
+def test_an_unknown_backend_is_refused(field):
     config = msgspec.structs.replace(PerceptionConfig(), **{field: "magic"})
-    with pytest.raises(ConfigurationError, match=f"perception.{field} is 'magic': wanted one of"):
+    with pytest.raises(ConfigurationError, match=f"perception.{field} is 'magic', expected one of"):
         build_perception(config)
 
 

@@ -1,4 +1,4 @@
-"""A backend of perception that fails on demand."""
+"""A detector, segmenter and relation head that fails on demand."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SHAPE = (40, 50)
 
 
 class Backend:
-    """All three backends in one; fails where told."""
+    """All three backends in one; `failing` names the one that raises."""
 
     classes = ("table", "cup")
     predicates = ("on", "near")
@@ -32,11 +32,11 @@ class Backend:
         features = np.arange(6, dtype=np.float32).reshape(3, 2)
         return Detections(boxes, probabilities, np.array([0.6, 0.9, 0.8]), features)
 
-    def segment(self, rgb, depth_m, intrinsics, boxes_xyxy, class_names=None):
+    def segment(self, rgb, depth_m, intrinsics, boxes_xyxy):
         self._work("segmenter")
         return [MaskPatch(3 * row, 2, np.ones((3, 4), bool)) for row in range(len(boxes_xyxy))]
 
-    def relate(self, *arguments):
+    def relate(self, objects, max_relations):
         self._work("relation head")
-        self.features = arguments[-1]
+        self.features = objects.features
         return Relations(np.array([[0, 1]]), np.zeros((1, 2)), np.ones(1))

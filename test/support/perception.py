@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception.protocols import MaskPatch, SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
 
 WIDTH, HEIGHT = 320, 240
@@ -73,6 +73,13 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
     rgb = np.clip(rgb + rng.normal(0, 2, rgb.shape), 0, 255).astype(np.uint8)
     depth += rng.normal(0, 1, SHAPE) * noise_m
     return rgb, depth.astype(np.float32), owner
+
+
+def segmented(names, instances, depth_m, up_camera=UP_CAMERA):
+    """Objects of equal scores for a relation head."""
+    scores = np.full(len(names), 0.8)
+    instances = instances.astype(np.uint16)
+    return SegmentedObjects(names, scores, None, instances, depth_m, INTRINSICS, up_camera)
 
 
 def box_of(mask: np.ndarray) -> np.ndarray:

@@ -19,6 +19,8 @@ from deworldsg_ros.checkpoints.card import (  # noqa: E402
 )
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork  # noqa: E402
 from deworldsg_ros.config import PerceptionConfig  # noqa: E402
+from deworldsg_ros.perception import SegmentedObjects  # noqa: E402
+from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
 
 WIDTH = 32
 LAYERS = 4
@@ -188,6 +190,14 @@ def _stir(model):
         for name, value in model.mask_decoder.named_parameters():
             if "norm" not in name:
                 value.normal_(0, 0.3)
+
+
+def segmented(class_names, scores, features=None):
+    """Objects for a relation head that reads no image."""
+    instances, depth_m = np.zeros((4, 4), np.uint16), np.zeros((4, 4), np.float32)
+    camera = Intrinsics(4.0, 4.0, 1.5, 1.5, 4, 4)
+    up_camera = np.array([0.0, -1.0, 0.0])
+    return SegmentedObjects(class_names, scores, features, instances, depth_m, camera, up_camera)
 
 
 def settings(**changes):

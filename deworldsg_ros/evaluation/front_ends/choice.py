@@ -103,7 +103,7 @@ def build_front_end(
         choice.faults,
         choice.seed,
     )
-    top_relations = config.perception.top_relations
+    top_relations = config.perception.max_relations
     if isinstance(annotations, RecordedRoom):
         frame_numbers = annotations.frame_numbers
     elif isinstance(source, SequenceDataset):

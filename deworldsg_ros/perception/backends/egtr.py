@@ -1,4 +1,4 @@
-"""The EGTR relation head as a backend: it reads the queries of the detector `rtdetr`."""
+"""The EGTR relation head on torch: it reads the queries of the detector `rtdetr`."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ import torch
 from safetensors.torch import load_file
 
 from deworldsg_ros.checkpoints.architectures import HEAD_FILE
-from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, read_card
+from deworldsg_ros.checkpoints.card import CARD_FILE
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.checkpoints.loading import CheckpointSource, enough_memory
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
-from deworldsg_ros.perception.protocols import Detector
-from deworldsg_ros.scene.arrays import Float32, Float64, UInt16
-from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.perception.protocols import Detector, SegmentedObjects
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
@@ -28,12 +27,13 @@ class EgtrRelationHead:
     max_r sigmoid(relation) sigmoid(connectivity) s_i s_j.
 
     Args:
-        config: the section `perception`: `relation_head_path` (empty = the detector's checkpoint).
-        detector: the one that finds the objects; told to record its queries.
+        config: the section `perception`: `predicate_set`.
+        detector: an `RtDetrDetector` whose checkpoint folder also contains the head. From now on
+            it records its queries.
 
     Raises:
-        ConfigurationError: another detector, no head, a head for other queries, or for another
-            label set.
+        ConfigurationError: another detector, no head in its folder, or a head that was trained
+            on other queries, classes or predicates.
 
     Attributes:
         predicates: names, in the order of the logits.
@@ -42,69 +42,54 @@ class EgtrRelationHead:
     def __init__(self, config: PerceptionConfig, detector: Detector) -> None:
         if not isinstance(detector, RtDetrDetector):
             raise ConfigurationError(
-                "perception.relation_head 'egtr' reads the queries of the detector 'rtdetr', and "
-                f"perception.detector is '{config.detector}': set it to 'rtdetr', or the head to "
-                "'geometric'"
+                f"perception.detector is '{config.detector}', but perception.relation_head 'egtr' "
+                "reads the queries of the detector 'rtdetr': set perception.detector to 'rtdetr', "
+                "or perception.relation_head to 'geometric'"
             )
-        source, card = detector.source, detector.card
-        if config.relation_head_path:
-            source = CheckpointSource.find(
-                "perception.relation_head_path",
-                config.relation_head_path,
-                local_files_only=config.local_files_only,
-            )
-            card = read_card(source.file(CARD_FILE))
-        self._network = _load(source)
+        self._network = _load(detector.source)
         self._device = detector.device
         self._index = {name: index for index, name in enumerate(detector.classes)}
-        self._frequency_bias = card.frequency_bias
-        self.predicates = _checked_predicates(self._network, card, config.predicate_set, source)
-        _check_detector(self._network, card, detector, source)
+        self._frequency_bias = detector.card.frequency_bias
+        self.predicates = _checked_predicates(self._network, config.predicate_set, detector)
+        _check_detector(self._network, detector)
         detector.record_queries()
         with enough_memory("loading the relation head"):
             self._network.to(self._device)
 
-    def relate(
-        self,
-        depth_m: Float32,
-        intrinsics: Intrinsics,
-        boxes_xyxy: Float64,
-        class_names: list[str],
-        scores: Float64,
-        instances: UInt16,
-        up_camera: Float64 | None,
-        top_relations: int,
-        features: Float32 | None = None,
-    ) -> Relations:
-        """The best ordered pairs, best first; see `RelationHead`. Needs nothing but `features`."""
-        if len(scores) < 2 or top_relations < 1:
+    def relate(self, objects: SegmentedObjects, max_relations: int) -> Relations:
+        """The best ordered pairs, best first; see `RelationHead`.
+
+        Raises:
+            ValueError: the objects have no query features.
+        """
+        if len(objects) < 2 or max_relations < 1:
             return Relations.none(len(self.predicates))
-        if features is None:
-            raise ValueError("objects without features of their queries: wanted those of rtdetr")
+        if objects.features is None:
+            raise ValueError("objects without query features, expected those of rtdetr")
         classes = None
         with torch.inference_mode():
             if self._frequency_bias:
-                indices = [self._index[name] for name in class_names]
+                indices = [self._index[name] for name in objects.class_names]
                 classes = torch.tensor(indices, device=self._device)
-            found = self._network(torch.from_numpy(features).to(self._device), classes)
+            found = self._network(torch.from_numpy(objects.features).to(self._device), classes)
             relations, connectivity = (part.cpu().double() for part in found)
             ranks = torch.sigmoid(relations).amax(dim=2) * torch.sigmoid(connectivity)
-        return best_pairs(relations.numpy(), ranks.numpy(), scores, top_relations)
+        return best_pairs(relations.numpy(), ranks.numpy(), objects.scores, max_relations)
 
 
 def best_pairs(logits: Float64, ranks: Float64, scores: Float64, top: int) -> Relations:
-    """The `top` ordered pairs by rank times both scores, without those of one object.
+    """The `top` ordered pairs of two objects by rank s_i s_j, best first.
 
     Args:
         logits: (n, n, R) pre-sigmoid, subject first.
         ranks: (n, n) in [0, 1].
         scores: (n,) of the objects, in [0, 1].
-        top: most pairs.
+        top: maximum number of pairs.
     """
     count = len(scores)
     pair_scores = ranks * np.outer(scores, scores)
     np.fill_diagonal(pair_scores, -1.0)
-    # The pairs of an object with itself come last.
+    # Pairs of an object with itself come last, and are cut off.
     order = np.argsort(-pair_scores, axis=None, kind="stable")[: min(top, count * (count - 1))]
     pairs = np.stack(np.unravel_index(order, pair_scores.shape), axis=1).astype(np.int64)
     subjects, objects = pairs.T
@@ -127,53 +112,46 @@ def _load(source: CheckpointSource) -> EgtrNetwork:
 
 
 def _checked_predicates(
-    network: EgtrNetwork, card: CheckpointCard, predicate_set: str, source: CheckpointSource
+    network: EgtrNetwork, predicate_set: str, detector: RtDetrDetector
 ) -> tuple[str, ...]:
-    there = network.predicates
-    names = card.predicates
-    if len(names) != there:
+    """Names of the head's predicates, if they are those of the predicate set."""
+    name, names = detector.source.name, detector.card.predicates
+    if len(names) != network.predicates:
         raise ConfigurationError(
-            f"relation head of '{source.name}' has {there} predicates and its {CARD_FILE} names "
-            f"{len(names)}: name each in `predicates` there"
+            f"{CARD_FILE} of '{name}' names {len(names)} predicates, expected one for each of the "
+            f"{network.predicates} of its relation head: name each in `predicates`"
         )
     if predicate_set != "checkpoint" and names != PREDICATE_SETS[predicate_set]:
-        fitting = [name for name, known in PREDICATE_SETS.items() if known == names]
+        matching = [key for key, known in PREDICATE_SETS.items() if known == names]
         raise ConfigurationError(
-            f"perception.predicate_set is '{predicate_set}' and the relation head of "
-            f"'{source.name}' was trained on {there} others ({', '.join(names[:3])}, …): set it to "
-            f"'{fitting[0] if fitting else 'checkpoint'}'"
+            f"perception.predicate_set is '{predicate_set}', but the relation head of '{name}' "
+            f"was trained on {len(names)} other predicates ({', '.join(names[:3])}, …): set it to "
+            f"'{matching[0] if matching else 'checkpoint'}'"
         )
     return names
 
 
-def _check_detector(
-    network: EgtrNetwork, card: CheckpointCard, detector: RtDetrDetector, source: CheckpointSource
-) -> None:
-    """Refuse a detector whose queries, layers or classes are not what the head was trained on."""
-    width, layers = network.final_sub_proj.in_features, len(network.proj_q)
+def _check_detector(network: EgtrNetwork, detector: RtDetrDetector) -> None:
+    """Refuse a detector with other queries, layers or classes than those of the head's training."""
+    name = detector.source.name
+    expected = network.final_sub_proj.in_features, len(network.proj_q)
     found = detector.model.config.d_model, len(detector.model.model.decoder.layers)
-    if found[0] != width or found[1] > layers:
+    if found[0] != expected[0] or found[1] > expected[1]:
         raise ConfigurationError(
-            f"relation head of '{source.name}' reads {layers} layers of {width} features and the "
-            f"detector '{detector.source.name}' has {found[1]} of {found[0]}: take both from one "
-            "checkpoint"
+            f"detector of '{name}' has {found[1]} layers of {found[0]} features, but its relation "
+            f"head reads {expected[1]} layers of {expected[0]}: take both from one checkpoint"
         )
-    classes = len(detector.classes)
-    if card.classes and card.classes != detector.classes:
-        raise ConfigurationError(
-            f"relation head of '{source.name}' was trained on other classes than the detector "
-            f"'{detector.source.name}' has: take both from one checkpoint"
-        )
-    if not card.frequency_bias:
+    if not detector.card.frequency_bias:
         return
     if not hasattr(network, "triplet_dist"):
         raise ConfigurationError(
-            f"relation head of '{source.name}' has no class-pair statistics (triplet_dist): set "
+            f"relation head of '{name}' has no class-pair statistics (triplet_dist): set "
             f"`frequency_bias` in its {CARD_FILE} to false"
         )
+    classes = len(detector.classes)
+    # Published heads count "no class", too.
     if network.triplet_dist.shape[0] not in (classes, classes + 1):
         raise ConfigurationError(
-            f"relation head of '{source.name}' was trained on {network.triplet_dist.shape[0]} "
-            f"classes and the detector '{detector.source.name}' has {classes}: take both from one "
-            "checkpoint"
+            f"detector of '{name}' has {classes} classes, but its relation head was trained on "
+            f"{network.triplet_dist.shape[0]}: take both from one checkpoint"
         )

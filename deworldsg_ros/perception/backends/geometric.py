@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.perception.geometry.layout import Layout, measure_layout
-from deworldsg_ros.perception.geometry.up_direction import estimate_up
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt16
+from deworldsg_ros.perception.protocols import SegmentedObjects
+from deworldsg_ros.scene.arrays import Bool, Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import Relations
 
@@ -99,30 +99,21 @@ class GeometricRelationHead:
             np.array([0.0, -1.0, 0.0]),
         )
 
-    def relate(
-        self,
-        depth_m: Float32,
-        intrinsics: Intrinsics,
-        boxes_xyxy: Float64,
-        class_names: list[str],
-        scores: Float64,
-        instances: UInt16,
-        up_camera: Float64 | None,
-        top_relations: int,
-        features: Float32 | None = None,
-    ) -> Relations:
-        """The best ordered pairs; see `RelationHead`."""
-        count = len(boxes_xyxy)
-        if count < 2 or top_relations <= 0:
+    def relate(self, objects: SegmentedObjects, max_relations: int) -> Relations:
+        """The best ordered pairs, best first; see `RelationHead`."""
+        count = len(objects)
+        if count < 2 or max_relations <= 0:
             return Relations.none(len(self.predicates))
-        up = estimate_up(depth_m, intrinsics) if up_camera is None else up_camera
-        layout = measure_layout(depth_m, intrinsics, instances, count, up)
-        logits = self.logits(layout, class_names)
+        layout = measure_layout(
+            objects.depth_m, objects.intrinsics, objects.instances, count, objects.up_camera
+        )
+        logits = self.logits(layout, objects.class_names)
+        scores = objects.scores
         # EGTR's pair score, with the layout's own confidence for its connectivity.
         best = logits.max(axis=2)
         pair_scores = scores[:, None] * scores[None, :] / (1.0 + np.exp(-best))
         candidates = np.flatnonzero((best > MIN_LOGIT).ravel())
-        order = np.argsort(-pair_scores.ravel()[candidates], kind="stable")[:top_relations]
+        order = np.argsort(-pair_scores.ravel()[candidates], kind="stable")[:max_relations]
         kept = candidates[order]
         pairs = np.stack([kept // count, kept % count], axis=1).astype(np.int64)
         return Relations(

@@ -35,10 +35,8 @@ class RgbdSegmenter:
         depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
-        class_names: list[str] | None = None,
     ) -> list[MaskPatch]:
-        """One mask a box; see `Segmenter`. The masks are disjoint."""
-        del class_names  # The geometry decides.
+        """One mask for each box; see `Segmenter`. Masks do not overlap."""
         if len(boxes_xyxy) == 0:
             return []
         rgb, depth_m = read_only(rgb), read_only(depth_m)

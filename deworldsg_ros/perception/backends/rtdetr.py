@@ -1,6 +1,6 @@
 """RT-DETR and RT-DETRv2 on torch: the paper's detector.
 
-An object is one query of the decoder: there is no suppression of overlapping boxes.
+Each object is one query of the decoder. Overlapping boxes are not suppressed.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 
-# The public checkpoints': no mean, no standard deviation.
+# The public checkpoints take 640 x 640 images, scaled to [0, 1] and not normalised.
 PUBLIC_PREPROCESSING = Preprocessing(640, 640)
 
 
@@ -37,17 +37,17 @@ class RtDetrDetector:
     """Detector on an RT-DETR checkpoint.
 
     Args:
-        config: the section `perception`: `detector_path`, `device`, `decoder_layers`,
-            `class_scores`.
+        config: the section `perception`: `detector_path` and `device`.
 
     Raises:
         ConfigurationError: no checkpoint, another architecture, no CUDA, no memory.
 
     Attributes:
         classes: names, in the order of the distributions.
-        card: how the checkpoint is read, with the configuration's changes.
-        source: where it came from.
-        device: where it runs.
+        default_score_threshold: minimum score of an object, of the card or of its kind of scores.
+        card: settings of the checkpoint.
+        source: folder or hub id of the checkpoint.
+        device: device of the network.
         model: the network.
     """
 
@@ -55,13 +55,11 @@ class RtDetrDetector:
         self.source = CheckpointSource.find(
             "perception.detector_path",
             config.detector_path,
-            local_files_only=config.local_files_only,
         )
         self.device = choose_device("perception.device", config.device)
-        # Half precision: of the two kinds the one that still tells neighbouring pixels apart.
         self.dtype = choose_dtype(self.device)
         network = self.source.config(DETECTORS)
-        self.card = _effective_card(read_card(self.source.file(CARD_FILE)), config)
+        self.card = read_card(self.source.file(CARD_FILE))
         self.classes = _class_names(network, self.card, self.source)
         self.default_score_threshold = (
             DEFAULT_SCORE_THRESHOLD[self.card.class_scores]
@@ -70,15 +68,15 @@ class RtDetrDetector:
         )
         self._preprocess = Preprocessing.of_checkpoint(self.source, PUBLIC_PREPROCESSING)
         model = self.source.load(DETECTORS[network.model_type], network)
-        _use_layers(model, self.card.decoder_layers, network.decoder_layers)
+        _use_layers(model, self.card.decoder_layers, self.source)
         self._recorder: QueryRecorder | None = None
         with enough_memory("loading the detector", "choose a smaller perception.detector_path"):
             self.model = model.to(self.device, self.dtype, memory_format=torch.channels_last)
-            # What is allocated and tuned at the first image is so now.
+            # The first pass allocates memory and tunes kernels; do it at start-up.
             self._forward(np.zeros((self._preprocess.height, self._preprocess.width, 3), np.uint8))
 
     def record_queries(self) -> None:
-        """Give each object the features of its query, from now on; a relation head reads them."""
+        """From now on, `detect` also returns the query features of each object."""
         if self._recorder is None:
             self._recorder = QueryRecorder(self.model)
 
@@ -106,7 +104,7 @@ class RtDetrDetector:
 
 
 class QueryRecorder:
-    """Keeps what the decoder's self-attention made of the queries (EGTR reads it).
+    """Keeps the queries and keys that the decoder's self-attention projects; EGTR reads them.
 
     Args:
         model: an RT-DETR.
@@ -125,8 +123,8 @@ class QueryRecorder:
         """(n, 2 L + 1, d) float32: projected queries, projected keys, last hidden state.
 
         Args:
-            output: of the pass that was the last one.
-            rows: (n,) the queries that are wanted.
+            output: of the last pass.
+            rows: (n,) indices of the queries.
         """
         slots = [*self._queries, *self._keys, output.last_hidden_state]
         return torch.stack([slot[0, rows] for slot in slots], dim=1).float()
@@ -144,35 +142,23 @@ def class_distributions(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Class distributions (n, C) and scores (n,) of class logits (n, C).
 
-    Softmax checkpoints: the score is the distribution's greatest value, as FROSS and the paper
-    have it. Sigmoid checkpoints: the score is the greatest sigmoid, and the distribution the
-    softmax of the logits over a temperature, as in `calibration.SoftmaxCalibration`: merely
-    normalised, the many small sigmoids would outweigh the one that is right (Eq. 5).
+    The distribution is softmax(logits / temperature). Normalised sigmoids are no alternative:
+    many small ones would outweigh the correct one (Eq. 5). The score of a softmax checkpoint is
+    the maximum of the distribution, as in FROSS and the paper. The score of a sigmoid checkpoint
+    is its largest sigmoid.
     """
     probabilities = torch.softmax(logits / card.temperature, dim=-1)
     scores = probabilities if card.class_scores == "softmax" else torch.sigmoid(logits)
     return probabilities, scores.amax(dim=-1)
 
 
-def _effective_card(card: CheckpointCard, config: PerceptionConfig) -> CheckpointCard:
-    changes: dict[str, Any] = {}
-    if config.class_scores != "auto" and config.class_scores != card.class_scores:
-        # The checkpoint's threshold is one for the scores that it was made for.
-        changes = {"class_scores": config.class_scores, "score_threshold": None}
-    if config.class_temperature > 0:
-        changes["temperature"] = config.class_temperature
-    if config.decoder_layers > 0:
-        changes["decoder_layers"] = config.decoder_layers
-    return CheckpointCard(**{**{f: getattr(card, f) for f in card.__struct_fields__}, **changes})
-
-
 def _class_names(network: Any, card: CheckpointCard, source: CheckpointSource) -> tuple[str, ...]:
     names = card.classes or tuple(name for _, name in sorted(network.id2label.items()))
     if len(names) != network.num_labels or len(set(names)) != len(names):
         raise ConfigurationError(
-            f"{source.parameter} '{source.name}' names {len(set(names))} classes for "
-            f"{network.num_labels} outputs: name each once, in `classes` of {CARD_FILE} or in "
-            "`id2label` of config.json"
+            f"{source.parameter} '{source.name}' names {len(set(names))} classes, expected one for "
+            f"each of its {network.num_labels} outputs: name each once, in `classes` of "
+            f"{CARD_FILE} or in `id2label` of config.json"
         )
     if all(name == f"LABEL_{index}" for index, name in enumerate(names)):
         raise ConfigurationError(
@@ -182,16 +168,17 @@ def _class_names(network: Any, card: CheckpointCard, source: CheckpointSource) -
     return names
 
 
-def _use_layers(model: Any, wanted: int, there: int) -> None:
-    """Leave out the decoder's later layers: each has class and box heads of its own."""
-    if wanted > there:
-        raise ConfigurationError(
-            f"perception.decoder_layers is {wanted} and the checkpoint has {there}: wanted at most "
-            "that, or 0 for what it was made for"
-        )
+def _use_layers(model: Any, used: int, source: CheckpointSource) -> None:
+    """Drop the later layers of the decoder; each layer has class and box heads of its own."""
     decoder = model.model.decoder
+    count = len(decoder.layers)
+    if used > count:
+        raise ConfigurationError(
+            f"{source.parameter} '{source.name}': decoder_layers in {CARD_FILE} is {used}, "
+            f"expected at most the {count} of the network: lower it, or set it to 0 for all"
+        )
     for part in ("layers", "class_embed", "bbox_embed"):
-        setattr(decoder, part, getattr(decoder, part)[: wanted or there])
+        setattr(decoder, part, getattr(decoder, part)[: used or count])
 
 
 def _pixel_boxes(boxes_cxcywh: Float64, width: int, height: int) -> Any:

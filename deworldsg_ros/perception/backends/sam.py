@@ -1,4 +1,4 @@
-"""SAM (the first) on torch, by the same protocol as SAM 2."""
+"""SAM (version 1) on torch."""
 
 from __future__ import annotations
 
@@ -7,30 +7,25 @@ from typing import Any
 import torch
 from transformers import SamModel
 
+from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD
 from deworldsg_ros.checkpoints.loading import CheckpointSource
 from deworldsg_ros.perception.networks.box_prompts import BoxPromptedSegmenter
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing, resize
 from deworldsg_ros.scene.arrays import UInt8
-from deworldsg_ros.scene.errors import ConfigurationError
 
 
 class SamSegmenter(BoxPromptedSegmenter):
-    """Boxes to masks; the image keeps its shape, at the top left of the square input."""
+    """Boxes to masks. The image keeps its aspect ratio, at the top left of the square input."""
 
-    def _load(self, source: CheckpointSource, image_size: int) -> tuple[Any, int]:
+    def _load(self, source: CheckpointSource) -> tuple[Any, int]:
         config = source.config(("sam",))
-        edge = int(config.vision_config.image_size)
-        if image_size not in (0, edge):
-            raise ConfigurationError(
-                f"perception.sam_image_size is {image_size} and SAM was trained for {edge} alone: "
-                "set it to 0, or take a SAM 2"
-            )
-        return source.load(SamModel, config), edge
+        return source.load(SamModel, config), int(config.vision_config.image_size)
 
     def _input(self, rgb: UInt8) -> torch.Tensor:
         height, width = self._used(*rgb.shape[:2])
-        pixels = Preprocessing(height, width, self.mean, self.std)(rgb, self.device, self.dtype)
+        preprocess = Preprocessing(height, width, IMAGENET_MEAN, IMAGENET_STD)
         right, bottom = self.image_size - width, self.image_size - height
+        pixels = preprocess(rgb, self.device, self.dtype)
         return torch.nn.functional.pad(pixels, (0, right, 0, bottom))
 
     def _scale(self, height: int, width: int) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""What SAM and SAM 2 share as segmenters: boxes decoded in chunks, logits made into masks."""
+"""Common part of SAM and SAM 2: boxes are decoded in batches, logits become masks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD
 from deworldsg_ros.checkpoints.loading import (
     CheckpointSource,
     choose_device,
@@ -20,60 +19,52 @@ from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
-TOO_LITTLE_MEMORY = (
-    "lower perception.sam_box_batch, choose a smaller perception.sam_image_size (SAM 2) or "
-    "perception.segmenter_path, or free the device"
-)
+# Boxes decoded at once. A frame has about 12 objects, and so needs one pass; the limit bounds the
+# memory of crowded frames.
+BOX_BATCH = 16
 
 
 class BoxPromptedSegmenter(ABC):
     """Segmenter on a network that takes boxes as prompts.
 
-    An image is encoded once; its boxes are decoded `perception.sam_box_batch` at a time. Depth and
-    class names are not used.
+    An image is encoded once, and its boxes are decoded in batches. Depth is not used.
 
     Args:
-        config: the section `perception`: `segmenter_path`, `device`, `sam_image_size`,
-            `sam_box_batch`.
+        config: the section `perception`: `segmenter_path` and `device`.
+        box_batch: boxes decoded at once.
 
     Raises:
         ConfigurationError: no checkpoint, another architecture, no CUDA, no memory.
     """
 
-    mean, std = IMAGENET_MEAN, IMAGENET_STD
-
-    def __init__(self, config: PerceptionConfig) -> None:
-        source = CheckpointSource.find(
-            "perception.segmenter_path",
-            config.segmenter_path,
-            local_files_only=config.local_files_only,
-        )
+    def __init__(self, config: PerceptionConfig, *, box_batch: int = BOX_BATCH) -> None:
+        source = CheckpointSource.find("perception.segmenter_path", config.segmenter_path)
         self.device = choose_device("perception.device", config.device)
         self.dtype = choose_dtype(self.device)
-        self._chunk = config.sam_box_batch
-        model, self.image_size = self._load(source, config.sam_image_size)
-        with enough_memory("loading the segmenter", TOO_LITTLE_MEMORY):
+        self._box_batch = box_batch
+        model, self.image_size = self._load(source)
+        with enough_memory("loading the segmenter", "choose a smaller perception.segmenter_path"):
             self.model = model.to(self.device, self.dtype)
-            # What is allocated and tuned at the first image is so now.
+            # The first pass allocates memory and tunes kernels; do it at start-up.
             side = self.image_size
-            boxes = np.tile([0.0, 0.0, side - 1.0, side - 1.0], (self._chunk, 1))
+            boxes = np.tile([0.0, 0.0, side - 1.0, side - 1.0], (box_batch, 1))
             self._masks(np.zeros((side, side, 3), np.uint8), boxes)
 
     @abstractmethod
-    def _load(self, source: CheckpointSource, image_size: int) -> tuple[Any, int]:
-        """The network and the edge of its input; `image_size` 0 = the checkpoint's."""
+    def _load(self, source: CheckpointSource) -> tuple[Any, int]:
+        """The network, and the side of its square input in pixels."""
 
     @abstractmethod
     def _input(self, rgb: UInt8) -> torch.Tensor:
-        """(1, 3, S, S) of an image."""
+        """(1, 3, S, S) input of the network for an image (H, W, 3)."""
 
     @abstractmethod
     def _scale(self, height: int, width: int) -> tuple[float, float]:
-        """Input pixels an image pixel, along x and y."""
+        """Input pixels per image pixel, along x and y."""
 
     @abstractmethod
     def _at_image_size(self, logits: torch.Tensor, height: int, width: int) -> torch.Tensor:
-        """Logits (n, 1, s, s) of the input as (n, 1, height, width) of the image."""
+        """Mask logits (n, 1, s, s) of the input, resampled to (n, 1, height, width)."""
 
     def segment(
         self,
@@ -81,35 +72,33 @@ class BoxPromptedSegmenter(ABC):
         depth_m: Float32,
         intrinsics: Intrinsics,
         boxes_xyxy: Float64,
-        class_names: list[str] | None = None,
     ) -> list[MaskPatch]:
-        """The object in each box; see `Segmenter`."""
+        """One mask for each box; see `Segmenter`. Masks may overlap."""
         return [as_patch(mask) for mask in self._masks(rgb, boxes_xyxy)] if len(boxes_xyxy) else []
 
     @torch.inference_mode()
     def _masks(self, rgb: UInt8, boxes_xyxy: Float64) -> Bool:
-        """(n, H, W) masks of n >= 1 boxes."""
+        """(n, H, W) bool masks of n >= 1 boxes (n, 4), pixels."""
         height, width = rgb.shape[:2]
         scale = np.tile(self._scale(height, width), 2)
-        boxes = torch.from_numpy((boxes_xyxy * scale).astype(np.float32))
-        # Half precision would round coordinates to half a pixel.
-        boxes = boxes.to(self.device)
+        # float32 on every device: half precision would round coordinates to half a pixel.
+        boxes = torch.from_numpy((boxes_xyxy * scale).astype(np.float32)).to(self.device)
         embeddings = self.model.get_image_embeddings(self._input(rgb))
         masks = []
-        for start in range(0, len(boxes), self._chunk):
+        for start in range(0, len(boxes), self._box_batch):
             output = self.model(
                 image_embeddings=embeddings,
-                input_boxes=boxes[None, start : start + self._chunk],
+                input_boxes=boxes[None, start : start + self._box_batch],
                 multimask_output=False,
             )
-            # (1, boxes, 1, s, s): a box is one prompt, and gets one mask.
+            # (1, boxes, 1, s, s): one mask for each box.
             logits = output.pred_masks[0].float()
             masks.append((self._at_image_size(logits, height, width)[:, 0] > 0).cpu().numpy())
         return np.concatenate(masks)
 
 
 def as_patch(mask: Bool) -> MaskPatch:
-    """The part of a mask (H, W) that holds all its pixels."""
+    """The smallest patch that contains all pixels of a mask (H, W) bool."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return MaskPatch(0, 0, np.zeros((0, 0), bool))

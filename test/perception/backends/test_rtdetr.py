@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +21,7 @@ from support.torch_models import (
     torch,
 )
 
-from deworldsg_ros.checkpoints.card import CheckpointCard, read_card
+from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, read_card, write_card
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -40,6 +42,13 @@ def folders(tmp_path_factory):
 
 def detector(folder, **changes):
     return RtDetrDetector(settings(detector_path=str(folder), **changes))
+
+
+def with_card(folder, tmp_path, **fields):
+    """A copy of a checkpoint with another card."""
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    write_card(copy / CARD_FILE, CheckpointCard(**fields))
+    return copy
 
 
 def reference(folder, rgb, *, normalise=False, version=1):
@@ -83,8 +92,10 @@ def test_softmax_scores_are_the_distributions_maxima(folders):
     assert np.allclose(found.scores, found.class_probabilities.max(axis=1), atol=1e-6)
 
 
-def test_sigmoid_scores_become_distributions_that_eq_5_can_use(folders):
-    sharp = detector(folders["v1"], class_temperature=0.25).detect(image(), 0.0)
+def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scores(
+    folders, tmp_path
+):
+    sharp = detector(with_card(folders["v1"], tmp_path, temperature=0.25)).detect(image(), 0.0)
     plain = detector(folders["v1"]).detect(image(), 0.0)
     for found in (sharp, plain):
         assert np.allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-12)
@@ -106,24 +117,28 @@ def test_threshold_keeps_the_best_in_order(folders):
 
 
 @pytest.mark.parametrize("layers", [1, 3])
-def test_fewer_layers_are_the_intermediate_output_of_all(folders, layers):
+def test_fewer_decoder_layers_give_the_intermediate_output(folders, tmp_path, layers):
     rgb = image()
-    found = detector(folders["v1"], decoder_layers=layers).detect(rgb, 0.0)
+    folder = with_card(folders["v1"], tmp_path, decoder_layers=layers)
+    found = detector(folder).detect(rgb, 0.0)
     inner = reference(folders, rgb).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
     assert np.allclose(found.scores, inner.sort(descending=True).values, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("folder", "changes", "threshold"),
+    ("card", "threshold"),
     [
-        ("v1", {}, 0.5),
-        ("softmax", {}, 0.7),
-        ("v1", {"class_scores": "softmax"}, 0.7),
-        ("softmax", {"class_scores": "sigmoid"}, 0.5),
+        ({}, 0.5),
+        ({"class_scores": "sigmoid"}, 0.5),
+        ({"class_scores": "softmax"}, 0.7),
+        ({"class_scores": "softmax", "score_threshold": 0.3}, 0.3),
     ],
 )
-def test_default_threshold_is_that_of_the_scores(folders, folder, changes, threshold):
-    assert detector(folders[folder], **changes).default_score_threshold == threshold
+def test_default_threshold_is_that_of_the_card_or_the_kind_of_scores(
+    folders, tmp_path, card, threshold
+):
+    folder = with_card(folders["v1"], tmp_path, **card)
+    assert detector(folder).default_score_threshold == threshold
 
 
 def test_queries_are_recorded_only_on_request(folders):
@@ -171,7 +186,7 @@ def test_a_folder_of_another_architecture_is_named(tmp_path):
     [
         ("", "detector_path is empty: set it to the folder or hub id"),
         ("/no/such/folder", "there is no such folder; wanted one with config.json"),
-        ("nobody/nothing-of-that-name", "download it to a folder .* or set perception.local_files"),
+        ("nobody/nothing-of-that-name", "run `hf download nobody/nothing-of-that-name`, or name a"),
     ],
 )
 def test_no_checkpoint(path, message):
@@ -216,9 +231,10 @@ def test_out_of_memory_at_start_says_what_to_do(folders, monkeypatch):
         detector(folders["v1"])
 
 
-def test_too_many_layers(folders):
-    with pytest.raises(ConfigurationError, match="decoder_layers is 9 and the checkpoint has 4"):
-        detector(folders["v1"], decoder_layers=9)
+def test_more_decoder_layers_than_the_network_has_are_refused(folders, tmp_path):
+    message = "decoder_layers in deworldsg.json is 9, expected at most the 4 of the network"
+    with pytest.raises(ConfigurationError, match=message):
+        detector(with_card(folders["v1"], tmp_path, decoder_layers=9))
 
 
 def test_unnamed_and_miscounted_classes(tmp_path):
@@ -226,7 +242,7 @@ def test_unnamed_and_miscounted_classes(tmp_path):
     with pytest.raises(ConfigurationError, match="does not name its 3 classes"):
         detector(nameless)
     short = save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
-    with pytest.raises(ConfigurationError, match="names 1 classes for 6 outputs"):
+    with pytest.raises(ConfigurationError, match="names 1 classes, expected one for each of its 6"):
         detector(short)
 
 

@@ -1,4 +1,4 @@
-"""SAM 2 and SAM: box prompts, chunks, sizes, and what start-up refuses."""
+"""SAM 2 and SAM: box prompts, batches of boxes, and checkpoints that are refused."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def folders(tmp_path_factory):
 
 
 def segmenter(folders, name, **changes):
-    return BACKENDS[name](settings(segmenter_path=str(folders[name]), **changes))
+    return BACKENDS[name](settings(segmenter_path=str(folders[name])), **changes)
 
 
 def masks(backend, rgb, boxes=BOXES):
@@ -61,17 +61,17 @@ def test_one_mask_a_box_in_image_pixels(folders, name):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_the_size_of_the_chunks_does_not_matter(folders, name):
+def test_the_box_batch_does_not_change_the_masks(folders, name):
     rgb = image(HEIGHT, WIDTH)
-    whole = masks(segmenter(folders, name, sam_box_batch=16), rgb)
-    for chunk in (1, 2):
-        parts = masks(segmenter(folders, name, sam_box_batch=chunk), rgb)
+    whole = masks(segmenter(folders, name, box_batch=16), rgb)
+    for box_batch in (1, 2):
+        parts = masks(segmenter(folders, name, box_batch=box_batch), rgb)
         assert (parts != whole).mean() < 1e-3
 
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_an_image_is_encoded_once(folders, name, monkeypatch):
-    backend = segmenter(folders, name, sam_box_batch=2)
+    backend = segmenter(folders, name, box_batch=2)
     encode, calls = backend.model.get_image_embeddings, []
     monkeypatch.setattr(
         backend.model, "get_image_embeddings", lambda pixels: calls.append(1) or encode(pixels)
@@ -115,15 +115,6 @@ def test_sam_keeps_the_shape_of_the_image(folders):
     assert pixels[0, :, 95].abs().max() > 0
 
 
-@pytest.mark.parametrize("size", [64, 256])
-@pytest.mark.parametrize("name", ["sam2", "sam2_video"])
-def test_sam2_at_another_size(folders, name, size):
-    backend = segmenter(folders, name, sam_image_size=size)
-    assert backend.image_size == size
-    found = masks(backend, image(HEIGHT, WIDTH))
-    assert found.shape == (len(BOXES), HEIGHT, WIDTH) and found.any()
-
-
 @pytest.mark.parametrize("name", BACKENDS)
 def test_half_precision_runs_through(folders, name):
     rgb = image(HEIGHT, WIDTH)
@@ -152,17 +143,6 @@ def test_a_patch_holds_all_of_a_mask(pixels):
     assert patch.pixels.size <= mask.size
 
 
-@pytest.mark.parametrize("size", [100, 16])
-def test_sam2_refuses_sizes_that_its_strides_do_not_divide(folders, size):
-    with pytest.raises(ConfigurationError, match=f"sam_image_size is {size}: wanted a multiple"):
-        segmenter(folders, "sam2", sam_image_size=size)
-
-
-def test_sam_refuses_another_size(folders):
-    with pytest.raises(ConfigurationError, match="is 512 and SAM was trained for 128 alone"):
-        segmenter(folders, "sam", sam_image_size=512)
-
-
 def test_the_other_architecture_is_named(folders, tmp_path):
     with pytest.raises(ConfigurationError, match="of sam: wanted sam2 or sam2_video"):
         Sam2Segmenter(settings(segmenter_path=str(folders["sam"])))
@@ -175,7 +155,7 @@ def test_nothing_configured_and_no_cuda(folders, monkeypatch):
         Sam2Segmenter(settings())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigurationError, match="perception.device is 'cuda'"):
-        segmenter(folders, "sam", device="cuda")
+        SamSegmenter(settings(segmenter_path=str(folders["sam"]), device="cuda"))
 
 
 def test_out_of_memory_at_start_says_what_to_do(folders, monkeypatch):
@@ -183,5 +163,5 @@ def test_out_of_memory_at_start_says_what_to_do(folders, monkeypatch):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1")
 
     monkeypatch.setattr(Sam2Segmenter, "_masks", full)
-    with pytest.raises(ConfigurationError, match="out of memory .* lower perception.sam_box_batch"):
+    with pytest.raises(ConfigurationError, match="out of memory .* smaller perception.segmenter_"):
         segmenter(folders, "sam2")

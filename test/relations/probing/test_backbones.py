@@ -162,7 +162,7 @@ def test_the_stage_encodes_in_batches_and_gives_the_same(checkpoints, tmp_path):
     [
         ("", "relations.model_path is empty"),
         ("/no/such/folder", "there is no such folder"),
-        ("nobody/no-such-model", "local_files_only"),
+        ("nobody/no-such-model", "run `hf download nobody/no-such-model`"),
     ],
 )
 def test_missing_checkpoint_is_one_sentence(path, told):
