@@ -1,15 +1,15 @@
-"""What choosing clips costs in edges: the configured choice against every pair of every frame.
+"""Compares the edges from chosen clips with the edges from all clips of every frame.
 
     python bench/clip_budget.py                                  the shipped recording
     python bench/clip_budget.py --rooms FOLDER                   both rooms, recorded detections
-    python bench/clip_budget.py --set relations.clips_per_s=0    another choice
-    python bench/clip_budget.py --lead 0                         a world model that is undecided
+    python bench/clip_budget.py --set relations.max_clips_per_s=2  another budget
+    python bench/clip_budget.py --lead 0                         uncertain predictions
 
-Both sides are given the same local graphs and images. An edge is the same where the same directed
-pair has the same most probable predicate. The world model is `fake` unless --set says otherwise:
-the class pair decides which predicate leads in every clip. With --lead 0 the clip has a say too,
-and no predicate of 50 has a lead worth the name: what that leaves of the agreement says how much
-an average of few clips differs from one of all.
+Both sides get the same local graphs and images. Two edges are equal if the same directed pair has
+the same most probable predicate. The world model is `fake` unless --set changes it: the class pair
+decides the most probable predicate of every clip. With --lead 0 the clips of a class pair differ,
+and the predicates have nearly equal probabilities. The agreement then shows how much the mean of a
+few clips differs from the mean of all.
 """
 
 from __future__ import annotations
@@ -34,29 +34,36 @@ from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.relations import LiveGraph, RelationReasoner, build_world_model
+from deworldsg_ros.relations.stage import QUEUE_SIZE
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import LocalGraph
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
-# An edge whose lead over the runner-up is greater is one whose predicate means something.
+# The predicate of an edge is decided if its probability exceeds the second one by this.
 LEAD = 0.05
+
+
+# Clips that may wait on the side that encodes all clips of a frame at once.
+EVERY_CLIP_QUEUE_SIZE = 4096
 
 
 class Side:
     """Merging and relations with one choice of clips."""
 
-    def __init__(self, config: Config, first: LocalGraph, lead: float | None) -> None:
+    def __init__(
+        self, config: Config, first: LocalGraph, lead: float | None, queue_size: int
+    ) -> None:
         model = build_world_model(config.relations)
         if lead is not None:
-            model = FakeWorldModel(config.relations.clip_length, config.relations.seed, lead)
+            model = FakeWorldModel(config.relations.clip_length, lead_logit=lead)
         self.builder = GraphBuilder(config, first.vocabulary, first.frame_id)
-        self.reasoner = RelationReasoner(config.relations, model)
+        self.reasoner = RelationReasoner(config.relations, model, queue_size=queue_size)
         self.reasoner.watch(LiveGraph(self.builder.graph))
         self.seconds = 0.0
 
     def take(self, local: LocalGraph, rgb: np.ndarray) -> None:
-        """Take in a frame."""
+        """Process a frame."""
         self.builder.integrate(local)
         started_s = time.perf_counter()
         evidence = [self.reasoner.observe(local, rgb), *self.reasoner.drain()]
@@ -70,7 +77,7 @@ class Side:
 
 
 def recordings(rooms: Path | None, config: Config) -> Iterator[tuple[str, Recording, Pipeline]]:
-    """Each recording, and a pipeline without a world model that makes its local graphs."""
+    """Each recording, and a pipeline without a world model for its local graphs."""
     blind = msgspec.structs.replace(
         config, relations=msgspec.structs.replace(config.relations, world_model="none")
     )
@@ -87,7 +94,7 @@ def recordings(rooms: Path | None, config: Config) -> Iterator[tuple[str, Record
 
 
 def compare(name: str, every: Side, chosen: Side, frames: int) -> None:
-    """Print one table row of numbers, and what became of the clips."""
+    """Print one table row of numbers, and the numbers of clips."""
     reference, edges = every.edges(), chosen.edges()
     counters = chosen.reasoner.counters()
     all_clips, clips = every.reasoner.counters().encoded, counters.encoded
@@ -103,11 +110,11 @@ def compare(name: str, every: Side, chosen: Side, frames: int) -> None:
     print(f" (same pairs {len(shared) / len(reference):.1%}, more {len(edges) - len(shared)})")
     if decided:
         share = sum(pair in agreed for pair in decided) / len(decided)
-        print(f"  of the {len(decided)} with a lead of more than {LEAD}: {share:.1%}")
+        print(f"  of the {len(decided)} decided by more than {LEAD}: {share:.1%}")
     print(f"  probability differs  mean {np.mean(differences):.4f}, most {max(differences):.4f}")
     print(f"  a frame of relations {1e3 * chosen.seconds / frames:.1f} ms", end="")
     print(f" (all: {1e3 * every.seconds / frames:.1f} ms)")
-    print(f"  not encoded: {counters.dropped}, {counters.pending} wait at the end", flush=True)
+    print(f"  not encoded: {counters.dropped}, {counters.pending} pending at the end", flush=True)
 
 
 def _lead(edge: wire.EdgeState) -> float:
@@ -120,15 +127,12 @@ def main() -> None:
     parser.add_argument("--rooms", type=Path, help="data set in ReplicaSSG's layout")
     parser.add_argument("--config", type=Path, help="parameter file")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.FIELD=VALUE")
-    parser.add_argument("--lead", type=float, help="of the fake's leading predicate, in logits")
-    parser.add_argument("--every", type=int, default=1, help="take every n-th frame only")
+    parser.add_argument("--lead", type=float, help="extra logit of the fake's leading predicate")
+    parser.add_argument("--every", type=int, default=1, help="process every N-th frame")
     options = parser.parse_args()
     config = effective_config(options.config, ["relations.world_model=fake", *options.set])
-    everything = msgspec.structs.replace(
-        config,
-        relations=msgspec.structs.replace(
-            config.relations, encode="all", clips_per_s=0.0, queue_size=4096
-        ),
+    every_clip = msgspec.structs.replace(
+        config, relations=msgspec.structs.replace(config.relations, max_clips_per_s=0.0)
     )
     for name, recording, pipeline in recordings(options.rooms, config):
         sides: list[Side] = []
@@ -138,7 +142,10 @@ def main() -> None:
                 continue
             local = pipeline.process(frame).local
             if not sides:
-                sides = [Side(each, local, options.lead) for each in (everything, config)]
+                sides = [
+                    Side(every_clip, local, options.lead, EVERY_CLIP_QUEUE_SIZE),
+                    Side(config, local, options.lead, QUEUE_SIZE),
+                ]
             for side in sides:
                 side.take(local, frame.rgb)
             frames += 1

@@ -1,9 +1,9 @@
-"""Times the paper's models, of their published sizes and with random weights, on this device.
+"""Times the paper's models at their published sizes, with random weights, on this device.
 
-    python bench/models.py [--device auto|cpu|cuda] [--only NAME] [--turns 5] [--quantise]
+    python bench/models.py [--device auto|cpu|cuda] [--only NAME] [--turns 5]
 
-A line a model: median and least time. Weights do not matter to the time. To add a model, write a
-builder and put it into BUILDERS.
+Prints the median and the least time of each model. The time does not depend on the weights. To add
+a model, write a builder and add it to BUILDERS.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,17 +27,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.probing.backbone import FrozenBackbone, quantise
+from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.errors import ConfigurationError
 
 CLIP_LENGTH = RelationsConfig().clip_length
-CROP = (300, 400)  # of a pair, before it is resized
+CROP = (300, 400)  # height and width of a crop before resizing, pixels
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is timed: a call, its unit, and how many units one call is."""
+    """A timed call: its unit, and the number of units per call."""
 
     call: Callable[[], object]
     unit: str
@@ -46,12 +46,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Choice:
-    """What the command line chose."""
+    """Options of the command line."""
 
     device: torch.device
     dtype: torch.dtype
     batch_size: int
-    quantise: bool
 
 
 def vjepa2_of(layers: int, width: int, heads: int, mlp_ratio: float, size: int):
@@ -157,21 +156,16 @@ BUILDERS: dict[str, Callable[[Choice], Run]] = {
 
 
 def _placed(model, choice: Choice):
-    model = model.eval().requires_grad_(False)
-    return (
-        quantise(model, choice.device) if choice.quantise else model.to(choice.device, choice.dtype)
-    )
+    return model.eval().requires_grad_(False).to(choice.device, choice.dtype)
 
 
 def _clips(choice: Choice, family, width, size, geometry, features) -> Run:
     identity = BackboneIdentity(family, width, size, CLIP_LENGTH)
-    backbone = FrozenBackbone(
-        identity, geometry, choice.device, choice.dtype, features, choice.quantise
-    )
+    backbone = FrozenBackbone(identity, geometry, choice.device, choice.dtype, features)
     generator = np.random.default_rng(0)
     shape = (CLIP_LENGTH, *CROP, 3)
     clips = [generator.integers(0, 256, shape).astype(np.uint8) for _ in range(choice.batch_size)]
-    # The features come back to the CPU: the call ends when the device has ended.
+    # The features are copied to the CPU: the call ends when the device has finished.
     return Run(lambda: backbone.encode(clips), f"clip of {CLIP_LENGTH} frames", len(clips))
 
 
@@ -184,45 +178,37 @@ def device_name(device: torch.device) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--only", default="", help="models whose name holds this")
+    parser.add_argument("--only", default="", help="models whose name contains this")
     parser.add_argument("--turns", type=int, default=5)
     parser.add_argument("--warm-up", type=int, default=1)
     parser.add_argument("--batch-size", type=int, default=1)
-    parser.add_argument("--quantise", action="store_true", help="8-bit linear layers, CPU")
-    parser.add_argument("--compare-int8", action="store_true", help="both, in turns")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     try:
         device = choose_device("--device", options.device)
     except ConfigurationError as error:
         sys.exit(f"error: {error}")
-    choice = Choice(device, choose_dtype(device), options.batch_size, options.quantise)
-    number = "int8" if options.quantise else str(choice.dtype).removeprefix("torch.")
-    print(f"{device_name(device)}, torch {torch.__version__}, {number}")
-    print(f"{'model':18} {'median ms':>10} {'least ms':>10}   of one")
+    choice = Choice(device, choose_dtype(device), options.batch_size)
+    dtype = str(choice.dtype).removeprefix("torch.")
+    print(f"{device_name(device)}, torch {torch.__version__}, {dtype}")
+    print(f"{'model':18} {'median ms':>10} {'least ms':>10}   per")
     for name, build in BUILDERS.items():
         if options.only not in name:
             continue
         run = build(choice)
-        other = build(replace(choice, quantise=True)) if options.compare_int8 else None
         for _ in range(options.warm_up):
             run.call()
-        times = np.array([[timed(run), timed(other)] for _ in range(options.turns)])
-        line = f"{name:18} {np.median(times[:, 0]):10.1f} {times[:, 0].min():10.1f}   {run.unit}"
-        if other is not None:
-            ratio = np.median(times[:, 0] / times[:, 1])
-            line += f"; int8 {np.median(times[:, 1]):.1f}, {ratio:.2f} times as fast"
-        print(line, flush=True)
-        del run, other
+        times_ms = np.array([timed(run) for _ in range(options.turns)])
+        median_ms, least_ms = np.median(times_ms), times_ms.min()
+        print(f"{name:18} {median_ms:10.1f} {least_ms:10.1f}   {run.unit}", flush=True)
+        del run
         gc.collect()
         if device.type == "cuda":
             torch.cuda.empty_cache()
 
 
-def timed(run: Run | None) -> float:
-    """Milliseconds of one unit."""
-    if run is None:
-        return 0.0
+def timed(run: Run) -> float:
+    """Milliseconds per unit."""
     start = time.perf_counter()
     with torch.inference_mode():
         run.call()

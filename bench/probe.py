@@ -1,9 +1,9 @@
-"""Does a probe learn, and do its priors help ambiguous edges? On drawn rooms, held out by room.
+"""Measures probes on drawn rooms, held out by room: accuracy, and their effect on edges.
 
     python bench/probe.py [--rooms 16] [--pairs 30] [--out FOLDER]
 
-The backbones are tiny and randomly initialised, so that anyone can run this: random features. The
-rooms are those of `test/support/pair_rooms.py`. Nothing here says how good published models are.
+The backbones are tiny and randomly initialised, so it needs no checkpoint. The rooms are those of
+`test/support/pair_rooms.py`. The numbers say nothing about published models.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.special import entr, softmax
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
@@ -40,7 +42,7 @@ DEFAULTS = RelationsConfig()
 
 
 def request_of(pair: PairClip) -> ClipRequest:
-    """The pair as the stage asks for it: union crop, both directions."""
+    """The request that the stage would make for a pair: union crop, both directions."""
     height, width = pair.frames.shape[1:3]
     x1, y1, x2, y2 = union_box(*pair.boxes_xyxy, width, height)
     boxes = [box - np.array([x1, y1, x1, y1]) for box in pair.boxes_xyxy]
@@ -62,14 +64,13 @@ def labelled(pair: PairClip, number: int) -> LabelledClip:
 
 
 def ambiguous_logits(truth: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Logits whose softmax is uncertain (> 1 nat), with a slight lean to the truth."""
+    """Logits whose softmax is uncertain (> 1 nat) and slightly favours the true predicate."""
     rows = []
     for true in truth:
         while True:
             logits = generator.normal(0, 0.7, len(PREDICATES))
             logits[true] += 0.5
-            shares = np.exp(logits) / np.exp(logits).sum()
-            if -(shares * np.log(shares)).sum() > DEFAULTS.entropy_threshold_nats:
+            if entr(softmax(logits)).sum() > DEFAULTS.entropy_threshold_nats:
                 rows.append(logits)
                 break
     return np.array(rows)
@@ -82,7 +83,7 @@ def on_and_off(model, pairs: list[PairClip], seed: int) -> dict[str, float]:
     classes = []
     for pair in pairs:
         request = request_of(pair)
-        (answer,) = model.predict_batch([request])
+        answer = model.predict(request)
         rows = [(context.subject_class, context.object_class) for context in request.pairs]
         prior.update(np.array(rows), answer)
         classes.append(rows[0])
@@ -109,7 +110,7 @@ def on_and_off(model, pairs: list[PairClip], seed: int) -> dict[str, float]:
 
 
 def blind(backbone: FrozenBackbone) -> FrozenBackbone:
-    """A backbone that sees nothing: what the boxes alone are worth."""
+    """A backbone without features, to measure the value of the boxes alone."""
     identity = BackboneIdentity("blind", 1, backbone.identity.image_size, DEFAULTS.clip_length)
     return replace(
         backbone, identity=identity, features=lambda videos: videos.new_zeros((len(videos), 1))
@@ -132,16 +133,16 @@ def main() -> None:
     print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of held-out rooms")
     loaders = {
         "vjepa2": (vjepa2.load_backbone, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
-        "dinov2": (dinov2.load_backbone, save_dinov2, {"image_size": 56, "hidden_size": 96}),
+        "dinov2": (
+            partial(dinov2.load_backbone, image_size=56),
+            save_dinov2,
+            {"image_size": 56, "hidden_size": 96},
+        ),
     }
     backbones = {}
     for family, (load, save, sizes) in loaders.items():
-        config = RelationsConfig(
-            world_model=family,
-            model_path=str(save(out / family, **sizes)),
-            image_size=sizes.get("image_size", 0),
-            device="cpu",
-        )
+        folder = str(save(out / family, **sizes))
+        config = RelationsConfig(world_model=family, world_model_path=folder, device="cpu")
         backbones[family] = load(config)
     backbones["boxes alone"] = blind(backbones["dinov2"])
     for family, backbone in backbones.items():

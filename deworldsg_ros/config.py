@@ -201,15 +201,19 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stage d: pairing, world-model evidence and fusion (Eq. 8-10)."""
+    """Stage d: pairing, world model, prior and fusion (Eq. 8-10)."""
 
-    world_model: Annotated[str, option("world model backend; none = visual evidence only")] = "none"
+    world_model: Annotated[
+        str, option("world model: none (visual evidence only), vjepa2, dinov2, or fake for tests")
+    ] = "none"
     geo_cost_threshold: Annotated[
-        float, option("geometric cost below which a pair is a neighbour, Eq. 8", gt=0, le=100)
+        float,
+        option("geometric cost below which two objects are neighbours, Eq. 8", gt=0, le=100),
     ] = 0.45
-    clip_length: Annotated[int, option("frames of a clip", ge=1, le=256)] = 16
+    clip_length: Annotated[int, option("frames per clip", ge=1, le=256)] = 16
     entropy_threshold_nats: Annotated[
-        float, option("visual entropy above which the prior enters, nats", ge=0, le=10)
+        float,
+        option("entropy of the visual distribution above which the prior is used", ge=0, le=10),
     ] = 1.0
     fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
     outlier_rate: Annotated[
@@ -219,42 +223,23 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     consistent_directions: Annotated[
         bool, option("predicates of a pair's two directions do not contradict each other")
     ] = True
-    encode: Annotated[
-        Literal["uncertain", "all"],
-        option(
-            "clips that the world model looks at: of pairs whose edges are uncertain, or all of "
-            "every frame"
-        ),
-    ] = "uncertain"
-    clips_per_s: Annotated[
+    max_clips_per_s: Annotated[
         float,
-        option("most clips encoded a second, by the images' stamps; 0 = unlimited", ge=0, le=1000),
+        option(
+            "clips encoded per second, by image stamps, the most uncertain pairs first; 0 = every "
+            "clip of every frame, as in the paper",
+            ge=0,
+            le=1000,
+        ),
     ] = 10.0
-    queue_size: Annotated[int, option("clips that may wait for the world model", ge=1, le=4096)] = (
-        256
-    )
-    seed: Annotated[int, option("seed of the deterministic world model", ge=0)] = 0
-    model_path: Annotated[
-        str, option("checkpoint of the world model's backbone: a folder, or a hub id")
+    world_model_path: Annotated[
+        str, option("checkpoint of the world model: a folder, or a hub id in the local cache")
     ] = ""
     probe_path: Annotated[str, option("folder of the trained probe")] = ""
-    local_files_only: Annotated[
-        bool, option("take a hub id from the local cache only, never from the network")
-    ] = True
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        option("where the world model runs; auto = CUDA where there is one"),
+        option("device of the world model; auto = CUDA if available, else the CPU"),
     ] = "auto"
-    image_size: Annotated[
-        int,
-        option("edge of the backbone's square input, pixels; 0 = the checkpoint's", ge=0, le=1024),
-    ] = 0
-    quantise: Annotated[
-        bool, option("linear layers of the backbone in 8-bit integers, on the CPU only")
-    ] = False
-    batch_size: Annotated[
-        int, option("clips encoded at once; more than 1 pays on CUDA only", ge=1, le=256)
-    ] = 1
 
 
 class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -157,7 +157,7 @@ def test_a_frame_that_is_not_newer_is_refused_and_changes_nothing(index: int) ->
 
 def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
     builder = GraphBuilder(PAPER, VOCABULARY, "map")
-    evidence = RelationReasoner(PAPER.relations, None).observe(local_graph(0))
+    evidence = RelationReasoner(PAPER.relations, None).observe(local_graph(0), frame(0).rgb)
     with pytest.raises(RefusedInput) as refused:
         builder.add_evidence(evidence)
     assert refused.value.reason == "unknown_frame"
@@ -195,8 +195,7 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
     } == {
         ("perception", "refine_detections"),
         ("merging", "association"),
-        ("relations", "encode"),
-        ("relations", "clips_per_s"),
+        ("relations", "max_clips_per_s"),
         ("relations", "outlier_rate"),
         ("relations", "consistent_directions"),
     }

@@ -16,10 +16,8 @@ from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 OPTION_OF = {
-    "model_path": "--model",
+    "world_model_path": "--model",
     "clip_length": "--clip-length",
-    "image_size": "--image-size",
-    "batch_size": "--batch-size",
     "device": "--device",
 }
 
@@ -67,9 +65,6 @@ def train_probe(
         int, typer.Option("--clips-per-pair", min=1, help="clips cut of each related pair")
     ] = 4,
     clip_length: Annotated[int, typer.Option("--clip-length", min=1, help="frames")] = 16,
-    image_size: Annotated[
-        int, typer.Option("--image-size", min=0, help="pixels; 0 = the checkpoint's")
-    ] = 0,
     device: Annotated[str, typer.Option("--device", help="auto, cpu or cuda")] = "auto",
     batch_size: Annotated[
         int, typer.Option("--batch-size", min=1, help="clips encoded at once")
@@ -93,12 +88,9 @@ def train_probe(
 
     choice = {
         "world_model": world_model,
-        "model_path": model,
+        "world_model_path": model,
         "clip_length": clip_length,
-        "image_size": image_size,
         "device": device,
-        "batch_size": batch_size,
-        "local_files_only": not download,
     }
     config = from_mapping({"relations": choice}, "train-probe").relations
     names = read_predicates(predicates)
@@ -118,7 +110,7 @@ def train_probe(
             batch_size=batch_size,
             fit=FitOptions(epochs, patience, learning_rate=learning_rate, seed=seed),
         )
-        backbone = _load_backbone(config)
+        backbone = _load_backbone(config, download)
         with frame_progress(console) as bar:
             encoding = bar.add_task("features", total=len(clips), note="")
             fitting = bar.add_task("epochs", total=epochs, note="")
@@ -145,8 +137,8 @@ def train_probe(
         markup=False,
     )
     console.print(
-        f"use it: --set relations.world_model={world_model} --set relations.model_path={model} "
-        f"--set relations.probe_path={out}",
+        f"use it: --set relations.world_model={world_model} "
+        f"--set relations.world_model_path={model} --set relations.probe_path={out}",
         markup=False,
     )
 
@@ -190,15 +182,15 @@ def read_predicates(choice: str) -> tuple[str, ...]:
     return names
 
 
-def _load_backbone(config: RelationsConfig) -> Any:
+def _load_backbone(config: RelationsConfig, download: bool) -> Any:
     from deworldsg_ros.relations.world_models import dinov2, vjepa2
 
     loaders = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
     load = loaders[_one_of("world-model", config.world_model, tuple(loaders))]
     try:
-        return load(config)
+        return load(config, download=download)
     except ConfigurationError as error:
-        # Who types options is told of options.
+        # The user typed options of the command, not configuration fields.
         told = str(error).replace(": run `hf", ": give --download, run `hf")
         for name, option in OPTION_OF.items():
             told = told.replace(f"relations.{name}", option)

@@ -44,7 +44,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._world_model.start()
         self._graph = PublishedGraph()
         self._snapshot_text = ""
-        if world_model is not None and config.encode == "uncertain":
+        if world_model is not None and config.max_clips_per_s:
             self._watch_graph()
         frames = self._frames = RelationAssembler(**self.assembler_options())
         self.join(frames, self._relate)

@@ -1,7 +1,7 @@
-"""Clips of object pairs: the last frames, cropped to the pair's union box.
+"""Clips of object pairs: the last frames, cropped to the union box of the pair.
 
-Frames are kept by reference and cropped only when a clip is encoded, so that a pair that is never
-encoded costs nothing.
+Frames are kept by reference and cropped when a clip is encoded. A pair that is never encoded costs
+no copy.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ class QueuedClip:
     """A neighbour pair of one frame whose clip may be encoded.
 
     Attributes:
-        stamp_ns: frame in which both objects were last seen.
-        frame_stamps_ns: the clip's frames, oldest first, ending with that one.
-        crop_xyxy: union box of that frame.
+        stamp_ns: last frame in which both objects were seen.
+        frame_stamps_ns: the clip's frames, oldest first; the last is `stamp_ns`.
+        crop_xyxy: union box of the two objects in that last frame, whole pixels.
         vocabulary: of the frame's local graph.
         rows: rows of the two objects in that local graph, the smaller first.
-        classes: their classes.
+        classes: indices of their classes.
         boxes_xyxy: their boxes, each (4,) float64 pixels of the image.
-        geo_cost: the cost of Eq. 8.
-        pixels: the clip itself, (T, h, w, 3) uint8, where it was cut before its frames left the
-            frame buffer; None while they are there.
+        geo_cost: the geometric cost of Eq. 8.
+        pixels: (T, h, w, 3) uint8, the cropped clip; None while its frames are in the frame
+            buffer.
     """
 
     stamp_ns: int
@@ -49,15 +49,15 @@ class QueuedClip:
 
 
 class FrameBuffer:
-    """The last frames of the RGB stream, ordered by stamp; bounded, by reference.
+    """The last frames of the RGB stream, ordered by stamp, kept by reference.
 
-    Images that are added must not be changed afterwards. Images of another size than the stored
-    ones replace them: the camera has changed, and a clip cannot mix the two.
+    Do not change an image after adding it. An image of another size than the stored ones replaces
+    them all: the camera has changed, and a clip cannot mix two sizes.
     """
 
     def __init__(self, capacity: int) -> None:
         if capacity < 1:
-            raise ValueError(f"frame buffer of {capacity} frames: wanted at least 1")
+            raise ValueError(f"frame buffer of {capacity} frames: expected at least 1")
         self.capacity = capacity
         self._stamps_ns: list[int] = []
         self._images: dict[int, Rgb] = {}
@@ -66,9 +66,10 @@ class FrameBuffer:
         return len(self._stamps_ns)
 
     def add(self, stamp_ns: int, rgb: Rgb) -> None:
-        """Keep one image, (H, W, 3) uint8; the oldest leaves where there is no room.
+        """Keep one image, (H, W, 3) uint8; a full buffer drops its oldest image.
 
-        An image whose stamp is already here, or is older than all of a full buffer, is ignored.
+        A full buffer ignores an image older than all of its own. An image whose stamp is already
+        here is ignored, too.
         """
         if stamp_ns in self._images:
             return
@@ -80,14 +81,14 @@ class FrameBuffer:
             del self._images[self._stamps_ns.pop(0)]
 
     def leaving(self, stamp_ns: int) -> int | None:
-        """Stamp of the frame that would have to go for one with this stamp; None if none would."""
+        """Stamp of the frame that an image with this stamp would replace; None if none."""
         full = len(self) == self.capacity and stamp_ns not in self._images
         return self._stamps_ns[0] if full and stamp_ns > self._stamps_ns[0] else None
 
     def window(self, stamp_ns: int, length: int) -> tuple[int, ...]:
-        """Stamps of the at most `length` consecutive frames that end with this one.
+        """Stamps of the last `length` frames up to this stamp, or of fewer if there are fewer.
 
-        Empty where the frame with this stamp is not here.
+        Empty if the frame with this stamp is not in the buffer.
         """
         if stamp_ns not in self._images:
             return ()
@@ -95,19 +96,19 @@ class FrameBuffer:
         return tuple(self._stamps_ns[max(0, end - length) : end])
 
     def images(self, stamps_ns: Sequence[int]) -> list[Rgb] | None:
-        """The images with these stamps; None where one of them has left the buffer."""
+        """The images with these stamps; None if one of them has left the buffer."""
         if not all(stamp_ns in self._images for stamp_ns in stamps_ns):
             return None
         return [self._images[stamp_ns] for stamp_ns in stamps_ns]
 
     def clear(self) -> None:
-        """Forget every frame."""
+        """Drop all frames."""
         self._stamps_ns.clear()
         self._images.clear()
 
 
 def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int) -> CropBox:
-    """The pixels that two boxes and what lies between them touch, clipped to the image.
+    """The smallest rectangle of whole pixels that contains two boxes, clipped to the image.
 
     Pixel centres are at integers: pixel k reaches from k - 1/2 to k + 1/2.
 
@@ -118,8 +119,8 @@ def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int)
         height: image height in pixels.
 
     Returns:
-        x1, y1, x2, y2 with the far edges exclusive; at least one pixel wide and high, even where
-        the boxes lie outside of the image.
+        x1, y1, x2, y2, the far edges exclusive; at least one pixel wide and high, even if the boxes
+        lie outside of the image.
     """
     left, top = np.minimum(box_a_xyxy[:2], box_b_xyxy[:2]).tolist()
     right, bottom = np.maximum(box_a_xyxy[2:], box_b_xyxy[2:]).tolist()
@@ -131,20 +132,22 @@ def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int)
 
 
 def crop_clip(images: Sequence[Rgb], crop_xyxy: CropBox, length: int) -> Rgb:
-    """Clip of fixed length out of the frames up to the last reliable one.
+    """A clip of fixed length, cropped out of frames.
 
     Args:
         images: 1 to `length` images (H, W, 3) uint8, oldest first; the last is the most recent
             frame in which both objects were seen.
         crop_xyxy: box of whole pixels in those images, far edges exclusive.
-        length: T, frames of the clip; where there are fewer images the last is repeated at the
-            end.
+        length: T, frames of the clip; the last image is repeated at the end to fill it.
 
     Returns:
         (T, h, w, 3) uint8, a copy.
+
+    Raises:
+        ValueError: no image, or more than `length`.
     """
     if not 1 <= len(images) <= length:
-        raise ValueError(f"clip of {len(images)} frames: wanted 1 to {length}")
+        raise ValueError(f"clip of {len(images)} frames: expected 1 to {length}")
     x1, y1, x2, y2 = crop_xyxy
     clip = np.empty((length, y2 - y1, x2 - x1, 3), np.uint8)
     for row, image in enumerate(images):

@@ -1,4 +1,4 @@
-"""The global graph, as far as the choice of clips asks of it: in process, and as published."""
+"""The state of the global graph that the choice of clips needs, from memory or from messages."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.replica import GraphReplica
 
-# Frames and removed nodes that a published graph is remembered by; clips wait for far fewer.
+# Frames whose nodes are remembered: 34 s at 30 frames/s. Clips wait for a few seconds.
 REMEMBERED_FRAMES = 1024
+# Removed nodes whose successors are remembered, to bound memory.
 REMEMBERED_REMOVALS = 65536
 
 
@@ -22,8 +23,8 @@ class NodeView(NamedTuple):
     """A confirmed node.
 
     Attributes:
-        label: its most probable class.
-        observations: frames in which it was seen.
+        label: name of its most probable class.
+        observations: number of frames in which it was detected.
     """
 
     label: str
@@ -31,40 +32,40 @@ class NodeView(NamedTuple):
 
 
 class GraphView(Protocol):
-    """What is asked of the graph."""
+    """The queries that the choice of clips makes on the graph."""
 
     @property
     def generation(self) -> int:
-        """Another number means another graph, whose node ids mean something else."""
+        """A counter that changes when a new graph, with new node ids, replaces the old one."""
         ...
 
     @property
     def newest_ns(self) -> int | None:
-        """Stamp up to which is known what became of frames; None = no graph is known."""
+        """Stamp of the newest frame that the graph has processed; None = no graph is known."""
         ...
 
     def nodes_of_frame(self, stamp_ns: int) -> Sequence[int] | None:
-        """The node that each row of a local graph is today, 0 = gone; None = not known."""
+        """The current node id of each row of a frame, 0 = removed; None = frame not known."""
         ...
 
     def node(self, node_id: int) -> NodeView | None:
-        """A live node; None while it is tentative."""
+        """A confirmed node; None if it is tentative."""
         ...
 
     def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
-        """Entropy of P_vis (Eq. 9) of the pair; infinite where neither direction was seen.
+        """Entropy of P_vis (Eq. 9) of a pair: the greater one of its two directions.
 
-        The greater one of the directions of which something was seen.
+        Directions without visual evidence are ignored; infinite if both have none.
         """
         ...
 
 
 class LiveGraph:
-    """The graph of this process."""
+    """The graph of the same process."""
 
     def __init__(self, graph: SceneGraph) -> None:
         self.generation = 0
-        # Frames are merged before they come here: what is not known now will never be.
+        # In one process a frame is merged before its clips are ranked: no frame is still to come.
         self.newest_ns = sys.maxsize
         self._graph = graph
 
@@ -95,13 +96,14 @@ class LiveGraph:
 
 
 class PublishedGraph:
-    """The graph of another process, from `/scene_graph/updates`.
+    """A copy of another process's graph, kept up to date from `/scene_graph/updates`.
 
-    Where it joins late, and after lost updates, it wants a snapshot, and goes on with what it has
-    meanwhile. A graph that starts anew, which its sequence numbers tell, replaces the one before.
+    It needs a snapshot when it starts late and after lost updates, and keeps its last state until
+    the snapshot arrives. Sequence numbers that start again mean a new graph, which replaces the
+    old one.
 
     Attributes:
-        wants_snapshot: whether `reset` would help.
+        wants_snapshot: whether it needs a snapshot, by `reset`.
     """
 
     def __init__(self) -> None:
@@ -111,11 +113,11 @@ class PublishedGraph:
         self._replica = GraphReplica()
         self._last_sequence = 0
         self._frames: dict[int, list[int]] = {}
-        # Where each id that is gone went; 0 = nowhere.
+        # The node that each removed node was merged into; 0 = none.
         self._successors: dict[int, int] = {}
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
-        """Take in an update, in the order of publication."""
+        """Apply an update; call it in the order of publication."""
         if update.sequence <= self._last_sequence:
             self.generation += 1
             self._replica = GraphReplica()
@@ -124,7 +126,7 @@ class PublishedGraph:
         self._last_sequence = update.sequence
         for removed in update.removed_nodes:
             self._successors[removed.id] = removed.merged_into or 0
-        # A node that was hidden for a while is told as removed, and comes back under its id.
+        # A node that becomes tentative is published as removed. It may return under the same id.
         for node in update.nodes:
             self._successors.pop(node.id, None)
         for association in update.associations:
@@ -139,7 +141,7 @@ class PublishedGraph:
             self.wants_snapshot = True
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
-        """Take the nodes and edges of a snapshot, unless it is older than the last update."""
+        """Take the nodes and edges of a snapshot; ignore one older than the last update."""
         if snapshot.sequence < self._last_sequence:
             return
         self._replica.reset(snapshot)
@@ -160,7 +162,7 @@ class PublishedGraph:
         return NodeView(state.label, state.observations)
 
     def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
-        """See `GraphView`; an edge that was seen is always published."""
+        """See `GraphView`. Every edge with visual evidence is published."""
         edges = [self._replica.edges.get(pair) for pair in ((a_id, b_id), (b_id, a_id))]
         seen = [edge.entropy_nats for edge in edges if edge is not None and edge.observations]
         return max(seen, default=math.inf)

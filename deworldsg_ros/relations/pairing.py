@@ -1,4 +1,4 @@
-"""Which objects of a frame are geometric neighbours (Eq. 8)."""
+"""Geometric neighbours among the objects of a frame (Eq. 8)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from deworldsg_ros.scene.arrays import Float64, Int64
 def geometric_costs(boxes_xyxy: Float64, depths_m: Float64, width: int, height: int) -> Float64:
     """Geometric cost of every pair of a frame's objects (Eq. 8).
 
-    Half the distance of the box centres over the image diagonal, plus the difference of the mean
-    depths in metres. The paper adds a ratio to a length: the scale between them is the paper's.
+    cost = |c_i - c_j| / (2 D) + |z_i - z_j|, with box centres c in pixels, the image diagonal D in
+    pixels, and mean depths z in metres. Like the paper, it adds a ratio to a length in metres.
 
     Args:
         boxes_xyxy: (n, 4) float64 pixels.
@@ -35,14 +35,14 @@ def geometric_costs(boxes_xyxy: Float64, depths_m: Float64, width: int, height: 
 def neighbour_pairs(
     boxes_xyxy: Float64, depths_m: Float64, width: int, height: int, threshold: float
 ) -> tuple[Int64, Float64]:
-    """Ordered pairs whose geometric cost is below a threshold (Eq. 8, strictly).
+    """Ordered pairs whose geometric cost is strictly below a threshold (Eq. 8).
 
     Args:
         boxes_xyxy: (n, 4) float64 pixels.
         depths_m: (n,) float64, as in `geometric_costs`.
         width: image width in pixels.
         height: image height in pixels.
-        threshold: the paper's 0.45.
+        threshold: of the cost; 0.45 in the paper.
 
     Returns:
         pairs (m, 2) int64 of rows, both directions of each neighbour pair, in lexicographic

@@ -1,4 +1,4 @@
-"""A thread in which the world model works, in nobody's way."""
+"""A thread for the world model, so that frames never wait for it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 
 
 class EvidenceWorker:
-    """Runs a reasoner's `work` in a thread of its own.
+    """Runs `work` of a reasoner in a separate thread.
 
-    `observe` returns the neighbour pairs at once, whatever the world model does; predictions come
-    through `deliver`, in the worker's thread. To run in one thread instead, call the reasoner's
-    `observe` and `drain`.
+    `observe` returns the neighbour pairs at once. Predictions come later, through `deliver`, in the
+    worker's thread. To run in one thread, call `observe` and `drain` of the reasoner instead.
 
     Args:
-        reasoner: whose clips are encoded; its counters tell what was dropped.
-        deliver: called with each prediction; an exception in it is reported and the worker goes
+        reasoner: queues the clips; its counters report dropped clips.
+        deliver: called with each prediction. An exception in it is reported, and the worker goes
             on.
-        report: told what went wrong; default: the log.
+        report: called with one sentence on each error; default: the log.
     """
 
     def __init__(
@@ -37,39 +36,39 @@ class EvidenceWorker:
         self._changed = threading.Condition()
         self._stopping = False
         self._busy = False
-        # Something came since the last look, so that a clip may be worth its time now.
+        # A frame or a change of the graph came since the worker last ran out of ready clips.
         self._news = False
-        # A daemon, so that a model that never returns cannot keep the process alive.
+        # A daemon: a world model that never returns cannot keep the process alive.
         self._thread = threading.Thread(target=self._run, name="world-model", daemon=True)
 
     def start(self) -> None:
         """Start the thread; once."""
         self._thread.start()
 
-    def observe(self, local: LocalGraph, rgb: Rgb | None = None) -> RelationEvidence:
-        """Neighbour pairs of a frame, at once; see `RelationReasoner.observe`."""
+    def observe(self, local: LocalGraph, rgb: Rgb) -> RelationEvidence:
+        """Find the neighbour pairs of a frame; see `RelationReasoner.observe`."""
         evidence = self.reasoner.observe(local, rgb)
         self._wake()
         return evidence
 
     def learn(self, change: Callable[[], None]) -> None:
-        """Change the graph that clips are chosen by; see `RelationReasoner.learn`."""
+        """Change the graph by which clips are chosen; see `RelationReasoner.learn`."""
         self.reasoner.learn(change)
         self._wake()
 
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until all clips that may be are encoded and delivered; False where time ran out."""
+        """Wait until all ready clips are encoded and delivered; False after the timeout."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self._stopping or not (self._busy or self._news), timeout_s
             )
 
     def stop(self, timeout_s: float = 5.0) -> bool:
-        """Drop what is queued and end the thread.
+        """Drop all queued clips and end the thread.
 
         Returns:
-            False where the world model was still at its last clip when time ran out; the thread
-            then ends, without delivering, when the model comes back.
+            False if the world model still encodes its last clip after the timeout. The thread then
+            ends as soon as the model returns, and delivers nothing.
         """
         with self._changed:
             self._stopping = True
@@ -92,16 +91,15 @@ class EvidenceWorker:
                 self._changed.wait_for(lambda: self._stopping or self._news)
                 self._news = False
                 self._busy = True
-            while not self._stopping and (batch := self.reasoner.work_batch()):
-                self._deliver_all(batch)
+            while not self._stopping and (evidence := self.reasoner.work()) is not None:
+                self._deliver_safely(evidence)
             if self._stopping:
                 return
 
-    def _deliver_all(self, batch: list[RelationEvidence]) -> None:
-        for evidence in batch:
-            if self._stopping:
-                return
-            try:
-                self._deliver(evidence)
-            except Exception as error:  # the receiver's fault must not end the world model
-                self._report(f"evidence was not delivered: {type(error).__name__}: {error}")
+    def _deliver_safely(self, evidence: RelationEvidence) -> None:
+        if self._stopping:
+            return
+        try:
+            self._deliver(evidence)
+        except Exception as error:  # an error in the receiver must not end this thread
+            self._report(f"evidence was not delivered: {type(error).__name__}: {error}")

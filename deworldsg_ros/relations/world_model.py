@@ -1,14 +1,13 @@
-"""What a world model is to this stage, and how one is chosen by name.
+"""The interface of world models, and their choice by name.
 
-A world model is a file of its own in `world_models/` with a function
-`build(config: RelationsConfig) -> WorldModel | None`; its name is the file's.
+Each world model is a file in `world_models/` with a function
+`build(config: RelationsConfig) -> WorldModel | None`. The file name is the world model's name.
 """
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,19 +17,19 @@ from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
-# What the optional world models are made with; the package's own extra installs them.
+# Libraries of the optional world models; the extra `models` of this package installs them.
 MODEL_LIBRARIES = ("torch", "transformers", "safetensors")
 
 
 @dataclass(frozen=True)
 class PairContext:
-    """One direction of a pair, as it lies in the clip.
+    """One direction of a pair in a clip.
 
     Attributes:
-        subject_box_xyxy, object_box_xyxy: (4,) float64 pixels of the crop, in the last frame in
-            which both were seen.
+        subject_box_xyxy, object_box_xyxy: (4,) float64 pixels of the crop, in the clip's last
+            frame.
         subject_class, object_class: indices into the vocabulary's classes.
-        subject_name, object_name: their names.
+        subject_name, object_name: names of these classes.
     """
 
     subject_box_xyxy: Float64
@@ -43,12 +42,12 @@ class PairContext:
 
 @dataclass(frozen=True)
 class ClipRequest:
-    """One clip, and the ordered pairs that are asked of it.
+    """One clip, and the ordered pairs to predict from it.
 
     Attributes:
         clip: (T, h, w, 3) uint8 RGB, oldest frame first.
-        pairs: the directions asked for, usually both of one pair; the clip is encoded once.
-        vocabulary: whose predicates the answer is over.
+        pairs: directions to predict, usually both of one pair; the clip is encoded once.
+        vocabulary: its predicates are the columns of the prediction.
     """
 
     clip: UInt8
@@ -57,36 +56,36 @@ class ClipRequest:
 
 
 class WorldModel(Protocol):
-    """A frozen video model with its probe: clips in, predicate distributions out."""
+    """A frozen video model with its probe: maps a clip to predicate distributions."""
 
     @property
     def name(self) -> str:
-        """The source that its evidence is published under."""
+        """The `source` of its published evidence."""
         ...
 
     @property
     def clip_length(self) -> int:
-        """T, frames that it wants in a clip."""
+        """T, frames of its clips."""
         ...
 
-    def predict_batch(self, requests: Sequence[ClipRequest]) -> list[Float64]:
-        """Predicate distributions of each request's pairs.
+    def predict(self, request: ClipRequest) -> Float64:
+        """Predicate distributions of the pairs of a request.
 
-        Clips differ in height and width: resizing is the model's own preprocessing.
+        Clips differ in height and width. The world model resizes them.
 
         Returns:
-            for each request (pairs, R), rows >= 0 that sum to one.
+            (pairs, R), rows >= 0 that sum to one.
         """
         ...
 
 
 def require_predicates(model: WorldModel | None, predicates: tuple[str, ...]) -> None:
-    """Refuse at the start a world model that answers over other predicates than the graph's.
+    """Refuse a world model whose predicates differ from the graph's, before the first frame.
 
-    A world model that is bound to its predicates says so by a method `require_predicates`.
+    A world model with fixed predicates has a method `require_predicates`.
 
     Raises:
-        ConfigurationError: where it does not fit.
+        ConfigurationError: the predicates differ.
     """
     check = getattr(model, "require_predicates", None)
     if check is not None:
@@ -94,22 +93,23 @@ def require_predicates(model: WorldModel | None, predicates: tuple[str, ...]) ->
 
 
 def world_model_names() -> tuple[str, ...]:
-    """Names of the world models that can be chosen."""
+    """Names of all world models."""
     return tuple(sorted(module.name for module in pkgutil.iter_modules(world_models.__path__)))
 
 
 def build_world_model(config: RelationsConfig) -> WorldModel | None:
     """The configured world model; None for ``none``.
 
-    Its module, and with it whatever the model needs, is imported here and not before.
+    Its module, and the libraries of the module, are imported only here.
 
     Raises:
-        ConfigurationError: for an unknown name, or a model that cannot be used as configured.
+        ConfigurationError: unknown name, missing library, or a checkpoint or probe that cannot be
+            used.
     """
     if config.world_model not in world_model_names():
         raise ConfigurationError(
             f"relations.world_model is '{config.world_model}': "
-            f"wanted one of {', '.join(world_model_names())}"
+            f"expected one of {', '.join(world_model_names())}"
         )
     try:
         module = importlib.import_module(f"{world_models.__name__}.{config.world_model}")

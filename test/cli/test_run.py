@@ -61,14 +61,14 @@ def test_a_recording_without_a_usable_frame_is_an_error_that_says_why(tmp_path):
 class Broken(FakeWorldModel):
     """A world model that fails on every clip."""
 
-    def predict_batch(self, requests):
+    def predict(self, request):
         raise RuntimeError("no memory left")
 
 
 @pytest.mark.timeout(400)
 def test_a_world_model_that_fails_is_in_the_report_and_the_run_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "build_world_model", lambda config: Broken(16, 0))
-    options = ["--max-frames", "6", "--set", "relations.encode=all"]
+    monkeypatch.setattr(pipeline, "build_world_model", lambda config: Broken(16))
+    options = ["--max-frames", "6", "--set", "relations.max_clips_per_s=0"]
     told = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
     assert told.exit_code == 0, told.output
     clips = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["clips"]

@@ -103,7 +103,7 @@ def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
         publish(2, stamp_ns, 4)
         clips(encoded=2, waiting=0)
         publish(3, send_two_objects(at), 5)
-        clips(encoded=2, dropped__looked_at=1)
+        clips(encoded=2, dropped__already_encoded=1)
         publish(7, send_two_objects(at), 8)  # updates are lost, and twice as often seen
         clips(encoded=3, waiting=0)
         publish(1, send_two_objects(at), 3)  # another graph
@@ -166,7 +166,7 @@ def test_predicates_of_an_imported_checkpoint_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The relation node runs no perception, and may run where its checkpoint is not."""
-    monkeypatch.setattr(relation_node, "build_world_model", lambda config: Bound(4, 0))
+    monkeypatch.setattr(relation_node, "build_world_model", lambda config: Bound(4))
     chosen = {"perception__predicate_set": "checkpoint"}
     for predicates in (("on", "under"), ("on", "near"), ()):
         write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))

@@ -1,4 +1,4 @@
-"""The choice of clips: what is uncertain, each pair once, within the budget; nothing is lost."""
+"""The choice of clips: uncertain pairs, each once, within the budget; every lost clip counted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.relations import VOCABULARY, RecordingModel, config, crowd_graph, pair_graph, picture
+from support.relations import (
+    VOCABULARY,
+    RecordingModel,
+    config,
+    crowd_graph,
+    empty_graph,
+    pair_graph,
+    picture,
+)
 
 from deworldsg_ros.relations import NodeView, RelationReasoner
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -16,7 +24,7 @@ SECOND_NS = 10**9
 
 
 class Graph:
-    """A graph as a test wants it; row r of every frame is node r + 1."""
+    """A graph with a given state; row r of every frame is node r + 1."""
 
     def __init__(self, count=2, newest_ns=10**12):
         self.generation = 0
@@ -40,8 +48,13 @@ class Graph:
         return self.entropies.get((a_id, b_id), math.inf)
 
 
-def watching(graph, model=None, **changes):
-    stage = RelationReasoner(config(**changes), model or RecordingModel(), report=lambda _: None)
+def watching(graph, model=None, queue_size=100, **changes):
+    stage = RelationReasoner(
+        config(**changes),
+        model or RecordingModel(),
+        report=lambda _: None,
+        queue_size=queue_size,
+    )
     stage.watch(graph)
     return stage
 
@@ -53,7 +66,7 @@ def of_pair():
     return graph
 
 
-def looks(stage, *stamps):
+def encoded_clips(stage, *stamps):
     """Number of clips encoded at each of these frames of the pair."""
     counts = []
     for stamp in stamps:
@@ -67,11 +80,11 @@ def test_only_pairs_above_the_entropy_threshold_are_encoded(entropy_nats, encode
     graph = of_pair()
     graph.entropies[1, 2] = entropy_nats
     stage = watching(graph)
-    assert looks(stage, 1) == [encoded]
+    assert encoded_clips(stage, 1) == [encoded]
     assert stage.counters().dropped == ({} if encoded else {"certain": 1})
 
 
-def test_over_two_predicates_the_prior_never_enters_and_nothing_is_encoded():
+def test_with_two_predicates_the_prior_never_enters_and_no_clip_is_encoded():
     graph = of_pair()
     stage = watching(graph)
     local = pair_graph(1)
@@ -81,36 +94,36 @@ def test_over_two_predicates_the_prior_never_enters_and_nothing_is_encoded():
     assert stage.drain() == [] and stage.counters().dropped == {"certain": 1}
 
 
-def test_a_pair_is_looked_at_once_and_again_when_seen_twice_as_often():
+def test_a_pair_is_encoded_once_and_again_after_twice_as_many_observations():
     graph, counts = of_pair(), []
     stage = watching(graph)
     for frame in range(3, 100):
         graph.observations = {1: frame, 2: 2 * frame}
-        counts += looks(stage, frame)
+        counts += encoded_clips(stage, frame)
     assert [frame for frame, count in enumerate(counts, 3) if count] == [3, 6, 12, 24, 48, 96]
-    assert stage.counters().dropped == {"looked_at": 97 - 6}
+    assert stage.counters().dropped == {"already_encoded": 97 - 6}
 
 
-def test_a_frame_that_names_an_object_otherwise_is_passed_over():
+def test_a_clip_is_dropped_if_frame_and_graph_disagree_on_a_class():
     graph = of_pair()
     graph.labels[1] = "chair"
     stage = watching(graph)
-    assert looks(stage, 1) == [0] and stage.counters().dropped == {"other_class": 1}
-    graph.labels[1] = "table"  # the graph has come to believe otherwise: another class pair
-    assert looks(stage, 2, 3) == [1, 0]
+    assert encoded_clips(stage, 1) == [0] and stage.counters().dropped == {"other_class": 1}
+    graph.labels[1] = "table"  # the graph has changed its class: another class pair
+    assert encoded_clips(stage, 2, 3) == [1, 0]
 
 
 @pytest.mark.parametrize("frames", [1, 40])
-def test_a_tentative_pair_waits_and_its_clip_is_not_lost(frames):
+def test_the_clip_of_a_tentative_pair_waits(frames):
     """40 frames are more than the buffer holds: the clip is cut before they leave."""
     early, late = RecordingModel(), RecordingModel()
-    assert looks(watching(of_pair(), early), 1) == [1]
+    assert encoded_clips(watching(of_pair(), early), 1) == [1]
     graph = of_pair()
     graph.tentative = {2}
     stage = watching(graph, late)
-    assert looks(stage, 1) == [0]
+    assert encoded_clips(stage, 1) == [0]
     for stamp in range(2, frames):
-        stage.add_frame(stamp, picture(stamp))
+        stage.observe(empty_graph(stamp), picture(stamp))
     assert stage.drain() == [] and stage.counters().ready == 0
     graph.tentative.clear()
     (evidence,) = stage.drain()
@@ -118,76 +131,76 @@ def test_a_tentative_pair_waits_and_its_clip_is_not_lost(frames):
     assert (late.requests[0].clip == early.requests[0].clip).all()
 
 
-def test_a_clip_waits_for_the_graph_to_know_its_frame():
+def test_a_clip_waits_until_the_graph_has_merged_its_frame():
     graph = of_pair()
     graph.newest_ns, graph.unknown = 5, {6}
     stage = watching(graph)
-    assert looks(stage, 6) == [0] and stage.counters().pending == 1
+    assert encoded_clips(stage, 6) == [0] and stage.counters().pending == 1
     graph.unknown.clear()
     assert len(stage.drain()) == 1
 
 
-def test_a_frame_that_the_graph_passed_over_is_passed_over():
+def test_clips_of_a_frame_that_the_graph_refused_are_dropped():
     graph = of_pair()
     graph.newest_ns, graph.unknown = 7, {6}
     stage = watching(graph)
-    assert looks(stage, 6) == [0] and stage.counters().dropped == {"node_gone": 1}
+    assert encoded_clips(stage, 6) == [0] and stage.counters().dropped == {"node_removed": 1}
 
 
 @pytest.mark.parametrize("rows", [[0, 1], [1, 1], [1]])
-def test_clips_of_nodes_that_are_gone_or_one_are_passed_over(rows):
+def test_clips_of_removed_or_merged_nodes_are_dropped(rows):
     graph = of_pair()
     graph.rows = rows
     stage = watching(graph)
-    assert looks(stage, 1) == [0] and stage.counters().dropped == {"node_gone": 1}
+    assert encoded_clips(stage, 1) == [0] and stage.counters().dropped == {"node_removed": 1}
 
 
-def test_nodes_are_those_of_today():
-    """What was one pair when it was queued may be another, already looked at, when it is judged."""
+def test_clips_are_ranked_by_the_current_nodes():
+    """A merge may turn a queued pair into one that was encoded already."""
     graph = of_pair()
     stage = watching(graph)
-    assert looks(stage, 1) == [1]
+    assert encoded_clips(stage, 1) == [1]
     graph.labels.update({3: "cup"})
     graph.observations[3] = 3
     graph.rows, graph.tentative = [1, 3], {3}
-    assert looks(stage, 2) == [0]
+    assert encoded_clips(stage, 2) == [0]
     graph.rows = [1, 2]  # merged
-    assert stage.drain() == [] and stage.counters().dropped == {"looked_at": 1}
+    assert stage.drain() == [] and stage.counters().dropped == {"already_encoded": 1}
 
 
-def test_without_a_graph_and_where_all_is_asked_for_the_newest_is_first():
+def test_every_clip_is_encoded_without_a_graph_and_without_a_budget():
     graph = of_pair()
     graph.newest_ns = None
-    assert looks(watching(graph), 1, 2, 3) == [1, 1, 1]
+    assert encoded_clips(watching(graph), 1, 2, 3) == [1, 1, 1]
     certain = of_pair()
     certain.entropies[1, 2] = 0.0
-    assert looks(watching(certain, encode="all"), 1, 2, 3) == [1, 1, 1]
+    assert encoded_clips(watching(certain, max_clips_per_s=0.0), 1, 2, 3) == [1, 1, 1]
 
 
-def test_another_graph_is_a_new_beginning():
+def test_a_new_graph_resets_the_encodings():
     graph = of_pair()
     stage = watching(graph)
-    assert looks(stage, 1, 2) == [1, 0]
+    assert encoded_clips(stage, 1, 2) == [1, 0]
     graph.generation += 1
-    assert looks(stage, 3, 4) == [1, 0]
+    assert encoded_clips(stage, 3, 4) == [1, 0]
 
 
 def test_order_class_pairs_without_a_prior_then_uncertainty_then_observations():
     graph = Graph(6)
     graph.entropies = {(1, 2): 1.1, (4, 5): 1.3, (1, 3): 1.2, (2, 3): 1.2, (5, 6): 1.35}
     graph.observations.update({1: 9, 3: 9})
-    asked = set(graph.entropies)
+    uncertain = set(graph.entropies)
     graph.entropies.update(
-        {(a, b): 0.0 for a in range(1, 7) for b in range(a + 1, 7) if (a, b) not in asked}
+        {(a, b): 0.0 for a in range(1, 7) for b in range(a + 1, 7) if (a, b) not in uncertain}
     )
-    stage = watching(graph, queue_size=100)
+    stage = watching(graph)
     stage.observe(crowd_graph(1, 6), picture(1))
     order = [tuple(row + 1 for row in item.pairs[0].tolist()) for item in stage.drain()]
-    # (2, 3) and (5, 6) are of one class pair, and so are (1, 2) and (4, 5).
+    # (2, 3) and (5, 6) have one class pair, and so do (1, 2) and (4, 5).
     assert order == [(5, 6), (4, 5), (1, 3), (2, 3), (1, 2)]
 
 
-def test_of_two_equally_uncertain_pairs_the_one_seen_more_often_is_first():
+def test_of_two_equally_uncertain_pairs_the_more_observed_one_is_first():
     graph = Graph(4)
     graph.entropies = {(1, 2): 0.0, (2, 3): 0.0, (2, 4): 0.0, (3, 4): 0.0, (1, 4): 1.2, (1, 3): 1.2}
     graph.observations.update({1: 9, 3: 8})
@@ -202,7 +215,9 @@ def test_of_two_equally_uncertain_pairs_the_one_seen_more_often_is_first():
     st.sampled_from([0.3, 1.0, 2.5, 10.0]),
 )
 def test_no_more_is_encoded_than_the_budget_allows(frames, clips_per_s):
-    stage = watching(Graph(6), clips_per_s=clips_per_s, queue_size=100, encode="all")
+    graph = Graph(6)
+    graph.newest_ns = None  # no graph is known: every clip may be encoded
+    stage = watching(graph, max_clips_per_s=clips_per_s)
     stamp_ns, encoded = SECOND_NS, 0
     for step_ns, count in frames:
         stamp_ns += step_ns
@@ -215,11 +230,11 @@ def test_no_more_is_encoded_than_the_budget_allows(frames, clips_per_s):
     assert counters.queued == encoded + counters.pending + sum(counters.dropped.values())
 
 
-def test_what_has_to_wait_for_the_budget_is_encoded_when_it_has_grown():
-    stage = watching(Graph(6), clips_per_s=2.0, queue_size=100)
+def test_clips_that_wait_for_the_budget_are_encoded_when_it_has_grown():
+    stage = watching(Graph(6), max_clips_per_s=2.0)
     stage.observe(crowd_graph(1, 6), picture(1))
     assert len(stage.drain()) == 2 and stage.counters().pending == 13
     stage.observe(crowd_graph(1 + SECOND_NS // 2, 0), picture(1))
     assert len(stage.drain()) == 1
     stage.observe(crowd_graph(1 + 60 * SECOND_NS, 0), picture(1))
-    assert len(stage.drain()) == 2  # a pause is not saved up
+    assert len(stage.drain()) == 2  # a long pause saves up one second of budget

@@ -1,4 +1,4 @@
-"""The queue: bounded, ordered by a policy and by nothing else."""
+"""The queue: bounded, and ordered only by the policy."""
 
 from __future__ import annotations
 
@@ -32,8 +32,13 @@ def queue_of(size, policy=None):
     return ClipQueue(size, policy or ClipPolicy(config()), drop), dropped
 
 
+def taken(queue):
+    """Every clip that the queue gives, in order."""
+    return list(iter(queue.take, None))
+
+
 class ByPair(ClipPolicy):
-    """Every clip is of the pair that its rows name."""
+    """Every clip belongs to the pair of its rows."""
 
     def judge(self, clips):
         return [Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes)) for clip in clips]
@@ -46,7 +51,7 @@ clips = st.lists(
 
 def test_empty_queue_gives_nothing():
     queue, _ = queue_of(3)
-    assert len(queue) == 0 and queue.take(5) == [] and queue.ready() == 0 and queue.clear() == 0
+    assert len(queue) == 0 and queue.take() is None and queue.ready() == 0 and queue.clear() == 0
 
 
 @given(clips, st.integers(1, 5))
@@ -55,7 +60,7 @@ def test_keeps_the_best_in_order_and_counts_the_rest(items, size):
     for item in items:
         queue.put([item])
     assert len(queue) == queue.ready() == min(size, len(items))
-    kept = [(item.stamp_ns, -item.geo_cost) for item in queue.take(len(items))]
+    kept = [(item.stamp_ns, -item.geo_cost) for item in taken(queue)]
     best = sorted(((item.stamp_ns, -item.geo_cost) for item in items), reverse=True)
     assert kept == best[:size] and len(queue) == 0
     assert dropped["queue_full"] == len(best[size:]) == dropped.total()
@@ -66,18 +71,18 @@ def test_order_does_not_depend_on_the_order_of_arrival():
     for arrival in (items, items[::-1]):
         queue, _ = queue_of(10)
         queue.put(arrival)
-        assert [item.rows for item in queue.take(10)] == [item.rows for item in items]
+        assert [item.rows for item in taken(queue)] == [item.rows for item in items]
 
 
-def test_of_two_clips_of_a_pair_the_newer_waits():
+def test_only_the_newest_clip_of_a_pair_waits():
     queue, dropped = queue_of(10, ByPair(config()))
     queue.put([clip(1), clip(2), clip(1, rows=(0, 2))])
     queue.put([clip(3, rows=(0, 2))])
-    assert [(item.stamp_ns, item.rows) for item in queue.take(9)] == [(3, (0, 2)), (2, (0, 1))]
+    assert [(item.stamp_ns, item.rows) for item in taken(queue)] == [(3, (0, 2)), (2, (0, 1))]
     assert dropped == {"superseded": 2}
 
 
-def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_go():
+def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_become_stale():
     frames = FrameBuffer(2)
     image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
     frames.add(1, image)
@@ -86,25 +91,25 @@ def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_go():
     for queue in (known, unknown):
         queue.put([clip(1)])
         queue.cut(1, frames, 4)
-    (item,) = known.take(1)
+    item = known.take()
     assert item.pixels.shape == (4, 10, 10, 3) and (item.pixels == image).all() and not lost
     assert len(unknown) == 0 and stale == {"stale": 1}
 
 
-def test_cut_clips_have_so_much_room_and_the_worst_go(monkeypatch):
-    monkeypatch.setattr(clip_queue, "CUT_BYTES", 2 * 4 * 300)
+def test_cut_clips_have_bounded_memory_and_the_lowest_ranks_are_dropped(monkeypatch):
+    monkeypatch.setattr(clip_queue, "MAX_CUT_BYTES", 2 * 4 * 300)
     frames = FrameBuffer(3)
     queue, dropped = queue_of(10, ByPair(config()))
     for stamp in (1, 2, 3):
         frames.add(stamp, np.zeros((10, 10, 3), np.uint8))
         queue.put([clip(stamp, rows=(0, stamp))])
     queue.cut(3, frames, 4)
-    assert [item.stamp_ns for item in queue.take(9)] == [3, 2] and dropped == {"stale": 1}
+    assert [item.stamp_ns for item in taken(queue)] == [3, 2] and dropped == {"stale": 1}
 
 
 @pytest.mark.parametrize("size", [0, -1])
-def test_room_for_nothing_is_refused(size):
-    with pytest.raises(ValueError, match=f"of {size} clips: wanted at least 1"):
+def test_a_size_below_one_is_refused(size):
+    with pytest.raises(ValueError, match=f"of size {size}: expected at least 1"):
         queue_of(size)
-    with pytest.raises(ValueError, match=f"of {size} frames: wanted at least 1"):
+    with pytest.raises(ValueError, match=f"of {size} frames: expected at least 1"):
         FrameBuffer(size)

@@ -63,7 +63,7 @@ def test_images_are_kept_by_reference():
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "wanted"),
+    ("a", "b", "expected"),
     [
         ([1, 2, 3, 4], [1, 2, 3, 4], (1, 2, 4, 5)),  # pixel centres are at integers
         ([1.4, 2.6, 3.1, 4.0], [10, 11, 12.6, 13.4], (1, 3, 14, 14)),  # every pixel touched
@@ -73,9 +73,9 @@ def test_images_are_kept_by_reference():
         ([-9, -9, -3, -3], [-9, -9, -3, -3], (0, 0, 1, 1)),
     ],
 )
-def test_union_box(a, b, wanted):
-    assert union_box(np.array(a, float), np.array(b, float), WIDTH, HEIGHT) == wanted
-    assert union_box(np.array(b, float), np.array(a, float), WIDTH, HEIGHT) == wanted
+def test_union_box(a, b, expected):
+    assert union_box(np.array(a, float), np.array(b, float), WIDTH, HEIGHT) == expected
+    assert union_box(np.array(b, float), np.array(a, float), WIDTH, HEIGHT) == expected
 
 
 @settings(max_examples=30, deadline=None)
@@ -86,8 +86,8 @@ def test_union_box_is_every_pixel_between_the_outer_edges(seed):
     left, top, right, bottom = min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
     columns = [k for k in range(WIDTH) if left < k + 0.5 and k - 0.5 < right]
     rows = [k for k in range(HEIGHT) if top < k + 0.5 and k - 0.5 < bottom]
-    wanted = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-    assert union_box(a, b, WIDTH, HEIGHT) == wanted
+    expected = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
+    assert union_box(a, b, WIDTH, HEIGHT) == expected
 
 
 def test_clip_is_the_crop_of_each_frame():
@@ -114,5 +114,5 @@ def test_clip_is_a_copy():
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_clip_refuses_no_frames_and_too_many(count):
-    with pytest.raises(ValueError, match=f"clip of {count} frames: wanted 1 to 2"):
+    with pytest.raises(ValueError, match=f"clip of {count} frames: expected 1 to 2"):
         crop_clip([picture(0)] * count, (0, 0, 9, 9), 2)

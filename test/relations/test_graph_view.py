@@ -1,4 +1,4 @@
-"""What is asked of the graph has one answer, in process and from what is published."""
+"""The graph in memory and its published copy give the same answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SURE, UNSURE = (3.0, -3.0, -3.0), (0.001, 0.0, 0.0)
 
 
 def answers(view, stamps_ns):
-    """Everything that can be asked of a graph of three nodes."""
+    """All queries on a graph of three nodes."""
     told = {stamp_ns: view.nodes_of_frame(stamp_ns) for stamp_ns in stamps_ns}
     live = {node_id for node_ids in told.values() for node_id in node_ids or () if node_id}
     nodes = {node_id: view.node(node_id) for node_id in live}
@@ -32,7 +32,7 @@ def answers(view, stamps_ns):
 
 
 def sent(message):
-    """A message as it comes out of DDS."""
+    """A message after encoding and decoding, as through DDS."""
     return wire.decode(wire.encode(message), type(message))
 
 
@@ -46,7 +46,7 @@ def running(logits=UNSURE):
 
 
 @pytest.mark.parametrize("logits", [SURE, UNSURE])
-def test_published_graph_answers_as_the_live_one(logits):
+def test_the_published_graph_answers_like_the_live_one(logits):
     published, stamps_ns = PublishedGraph(), []
     for builder, update, _, stamp_ns in running(logits):
         stamps_ns.append(stamp_ns)
@@ -60,7 +60,7 @@ def test_published_graph_answers_as_the_live_one(logits):
     assert (entropies[1, 2] > 1.0) == (logits is UNSURE)
 
 
-def test_a_tentative_node_is_known_by_its_frame_and_has_no_name():
+def test_a_tentative_node_has_an_id_and_no_view():
     (builder, update, _, stamp_ns), *_ = running()
     published = PublishedGraph()
     published.apply(msgspec.structs.replace(update, nodes=update.nodes[:2]))
@@ -71,7 +71,7 @@ def test_a_tentative_node_is_known_by_its_frame_and_has_no_name():
 
 
 @pytest.mark.parametrize("lost", [{1}, {3}, {2, 3, 4}])
-def test_after_lost_updates_a_snapshot_puts_it_right(lost):
+def test_after_lost_updates_a_snapshot_restores_the_graph(lost):
     published, stamps_ns = PublishedGraph(), []
     for builder, update, snapshot, stamp_ns in running():
         if update.sequence in lost:
@@ -85,7 +85,7 @@ def test_after_lost_updates_a_snapshot_puts_it_right(lost):
     assert len(stamps_ns) == 8 - len(lost)
 
 
-def test_an_older_snapshot_than_the_last_update_is_of_no_use():
+def test_a_snapshot_older_than_the_last_update_is_ignored():
     published, snapshots = PublishedGraph(), []
     for _, update, snapshot, _ in running():
         snapshots.append(snapshot)
@@ -97,7 +97,7 @@ def test_an_older_snapshot_than_the_last_update_is_of_no_use():
                 break
 
 
-def test_a_graph_that_starts_anew_replaces_the_one_before():
+def test_a_graph_that_starts_again_replaces_the_old_one():
     published = PublishedGraph()
     for logits in (SURE, UNSURE):
         run = list(running(logits))
@@ -108,7 +108,7 @@ def test_a_graph_that_starts_anew_replaces_the_one_before():
     assert answers(published, [stamp_ns]) == answers(LiveGraph(builder.graph), [stamp_ns])
 
 
-def test_removed_and_merged_nodes_are_followed_and_hidden_ones_come_back():
+def test_merged_nodes_are_followed_and_removed_ones_may_return():
     _, update, snapshot, stamp_ns = next(running())
     published = PublishedGraph()
     published.apply(update)
@@ -127,7 +127,7 @@ def test_removed_and_merged_nodes_are_followed_and_hidden_ones_come_back():
     assert published.nodes_of_frame(stamp_ns) == [1, 2, 2]
 
 
-def test_what_is_remembered_is_bounded(monkeypatch):
+def test_the_number_of_remembered_frames_is_bounded(monkeypatch):
     monkeypatch.setattr("deworldsg_ros.relations.graph_view.REMEMBERED_FRAMES", 3)
     published = PublishedGraph()
     stamps_ns = []
@@ -138,7 +138,7 @@ def test_what_is_remembered_is_bounded(monkeypatch):
     assert known == [False] * 5 + [True] * 3
 
 
-def test_chosen_clips_end_in_the_edges_of_all_clips():
+def test_the_chosen_clips_give_the_edges_of_all_clips():
     def final(**changes):
         relations = RelationsConfig(world_model="fake", clip_length=4, **changes)
         config = msgspec.structs.replace(PAPER, relations=relations)
@@ -148,7 +148,7 @@ def test_chosen_clips_end_in_the_edges_of_all_clips():
         return pipeline.graph().edges, pipeline.relations.counters()
 
     chosen, few = final()
-    every, many = final(encode="all", clips_per_s=0.0)
+    every, many = final(max_clips_per_s=0.0)
     assert many.encoded == 30 and few.encoded == 5  # seen 1, 2, 4, 8 and 16 times
     assert [(edge.subject, edge.object, edge.predicate, edge.provenance) for edge in chosen] == [
         (edge.subject, edge.object, edge.predicate, edge.provenance) for edge in every
@@ -156,9 +156,9 @@ def test_chosen_clips_end_in_the_edges_of_all_clips():
     assert len(chosen) == 1 and chosen[0].provenance == "fused"
 
 
-def test_updates_that_come_late_and_in_lumps_choose_the_same_pairs():
-    """The graph node publishes a few times a second: clips wait, and are judged by then."""
-    relations = RelationsConfig(world_model="fake", clip_length=4, clips_per_s=0.0)
+def test_clips_wait_for_updates_that_come_late_and_in_groups():
+    """The graph node publishes a few times a second: clips wait for its next update."""
+    relations = RelationsConfig(world_model="fake", clip_length=4, max_clips_per_s=1000.0)
     config = msgspec.structs.replace(PAPER, relations=relations)
     builder = GraphBuilder(config, VOCABULARY, "map")
     pipeline = Pipeline(PAPER, Scripted(UNSURE))
@@ -173,6 +173,6 @@ def test_updates_that_come_late_and_in_lumps_choose_the_same_pairs():
         if index % 5 == 4:
             published.apply(sent(builder.update()))
         encoded += [evidence.stamp_ns for evidence in stage.drain()]
-    # Before the first update nothing is known of a graph, and all are encoded; then 5, 10, 20 times
-    # seen are as often as updates tell.
+    # Before the first update no graph is known, and all clips are encoded. The updates then show 5,
+    # 10 and 20 observations.
     assert encoded == [index * 10**8 for index in (0, 1, 2, 3, 4, 9, 19)]

@@ -1,4 +1,4 @@
-"""The worker's thread: never in the way, ends when told; order of events by locks, not by time."""
+"""The worker's thread: frames never wait for it, and it stops. Locks order the events, not time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LONG_S = 30.0
 
 
 class Receiver:
-    """What the worker delivers, and an event for each."""
+    """Collects what the worker delivers, and the threads in which it does."""
 
     def __init__(self):
         self.evidence = []
@@ -24,8 +24,9 @@ class Receiver:
         self.threads.add(threading.get_ident())
 
 
-def worker_of(model, receiver, report=lambda _: None, **changes):
-    return EvidenceWorker(RelationReasoner(config(**changes), model, report), receiver, report)
+def worker_of(model, receiver, report=lambda _: None, queue_size=8):
+    reasoner = RelationReasoner(config(), model, report, queue_size=queue_size)
+    return EvidenceWorker(reasoner, receiver, report)
 
 
 def test_delivers_every_prediction_in_its_own_thread():
@@ -42,7 +43,7 @@ def test_delivers_every_prediction_in_its_own_thread():
     assert threading.get_ident() not in receiver.threads
 
 
-def test_slow_model_blocks_nothing_and_what_is_lost_is_counted():
+def test_a_slow_world_model_delays_no_frame_and_lost_clips_are_counted():
     model, receiver = GatedModel(), Receiver()
     worker = worker_of(model, receiver, queue_size=2)
     worker.start()
@@ -63,7 +64,7 @@ def test_slow_model_blocks_nothing_and_what_is_lost_is_counted():
     assert [evidence.stamp_ns for evidence in receiver.evidence] == [0, 5, 4]
 
 
-def test_stop_gives_up_on_a_model_that_hangs_and_nothing_comes_after_it():
+def test_stop_returns_though_the_world_model_hangs_and_nothing_is_delivered_after_it():
     model, receiver = GatedModel(), Receiver()
     worker = worker_of(model, receiver)
     worker.start()
@@ -84,7 +85,7 @@ def test_stop_of_an_idle_worker_and_of_one_never_started():
     assert unused.stop(LONG_S)
 
 
-def test_without_a_world_model_it_is_idle():
+def test_a_worker_without_a_world_model_is_idle():
     worker = EvidenceWorker(RelationReasoner(config(world_model="none"), None), Receiver())
     worker.start()
     try:
@@ -97,22 +98,22 @@ def test_without_a_world_model_it_is_idle():
 class FailsAtFirst(RecordingModel):
     """A model that fails on its first clip."""
 
-    def predict_batch(self, requests):
+    def predict(self, request):
         if not self.requests:
-            self.requests.extend(requests)
+            self.requests.append(request)
             raise RuntimeError("not loaded yet")
-        return super().predict_batch(requests)
+        return super().predict(request)
 
 
-def test_lives_on_after_failures_of_model_and_receiver():
-    told, delivered = [], []
+def test_the_worker_survives_failures_of_world_model_and_receiver():
+    reports, delivered = [], []
 
     def deliver(evidence):
         if evidence.stamp_ns == 1:
             raise RuntimeError("publisher is gone")
         delivered.append(evidence)
 
-    worker = worker_of(FailsAtFirst(), deliver, told.append)
+    worker = worker_of(FailsAtFirst(), deliver, reports.append)
     worker.start()
     try:
         for stamp in range(3):
@@ -121,7 +122,7 @@ def test_lives_on_after_failures_of_model_and_receiver():
     finally:
         assert worker.stop(LONG_S)
     assert [evidence.stamp_ns for evidence in delivered] == [2]
-    assert told == [
+    assert reports == [
         "world model 'fake' failed: RuntimeError: not loaded yet",
         "evidence was not delivered: RuntimeError: publisher is gone",
     ]

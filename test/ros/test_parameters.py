@@ -11,7 +11,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from deworldsg_ros import config as configuration
 from deworldsg_ros.ros import parameters as ros_parameters
 from deworldsg_ros.ros.options import NodeOptions, Parameters
-from deworldsg_ros.ros.parameters import descriptor, fields
+from deworldsg_ros.ros.parameters import Field, descriptor, fields
 from deworldsg_ros.scene.errors import ConfigurationError
 
 FIELDS = {field.name: field for field in fields()}
@@ -96,5 +96,6 @@ def test_unbounded_sides_have_the_type_s_limits() -> None:
     (bounds,) = descriptor(FIELDS["inputs.max_depth_m"]).floating_point_range
     assert (bounds.from_value, bounds.to_value) == (0.0, sys.float_info.max)
     assert descriptor(FIELDS["inputs.max_depth_m"]).additional_constraints == "> 0"
-    (bounds,) = descriptor(FIELDS["relations.seed"]).integer_range
+    count = Field("section.count", ("section", "count"), int, 0, "a number without limit", lowest=0)
+    (bounds,) = descriptor(count).integer_range
     assert bounds.to_value == 2**63 - 1

@@ -44,45 +44,50 @@ def pair_graph(stamp_ns: int) -> LocalGraph:
 
 
 def crowd_graph(stamp_ns: int, count: int) -> LocalGraph:
-    """Objects in a row, all neighbours of each other."""
+    """Objects in a row; all are neighbours of each other."""
     left = np.linspace(0, 40, count)
     boxes = np.stack([left, np.full(count, 10.0), left + 8, np.full(count, 20.0)], axis=1)
     return local_graph(stamp_ns, boxes, np.full(count, 2.0), np.arange(count) % 3)
 
 
+def empty_graph(stamp_ns: int) -> LocalGraph:
+    """A frame without objects."""
+    return crowd_graph(stamp_ns, 0)
+
+
 def picture(stamp_ns: int) -> np.ndarray:
-    """An image whose content tells its stamp."""
+    """An image with random pixels, seeded by the stamp."""
     generator = np.random.default_rng(stamp_ns)
     return generator.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
 
 
 def config(**changes) -> RelationsConfig:
-    return RelationsConfig(
-        **{"world_model": "fake", "clip_length": 4, "queue_size": 8, "clips_per_s": 0.0, **changes}
-    )
+    """The fake world model with clips of 4 frames, and a budget that no test uses up."""
+    settings = {"world_model": "fake", "clip_length": 4, "max_clips_per_s": 1000.0}
+    return RelationsConfig(**{**settings, **changes})
 
 
 class RecordingModel(FakeWorldModel):
-    """The fake, remembering what it was asked."""
+    """The fake world model; it records its requests."""
 
     def __init__(self, clip_length: int = 4) -> None:
-        super().__init__(clip_length, seed=0)
+        super().__init__(clip_length)
         self.requests = []
 
-    def predict_batch(self, requests):
-        self.requests.extend(requests)
-        return super().predict_batch(requests)
+    def predict(self, request):
+        self.requests.append(request)
+        return super().predict(request)
 
 
 class GatedModel(RecordingModel):
-    """Begins a clip and does not return before it is allowed to."""
+    """A world model that returns from a clip only when the test allows it."""
 
     def __init__(self) -> None:
         super().__init__()
         self.begun = threading.Semaphore(0)
         self.allowed = threading.Semaphore(0)
 
-    def predict_batch(self, requests):
+    def predict(self, request):
         self.begun.release()
         assert self.allowed.acquire(timeout=30)
-        return super().predict_batch(requests)
+        return super().predict(request)

@@ -1,12 +1,10 @@
-"""Frozen backbones on torch: clips in, features out."""
+"""Frozen torch backbones that turn clips into features."""
 
 from __future__ import annotations
 
 import hashlib
-import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,27 +20,22 @@ from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry, normalise, resize_and_crop
 from deworldsg_ros.scene.arrays import Float32, UInt8
-from deworldsg_ros.scene.errors import ConfigurationError
 
-# Values of each tensor that its fingerprint is made of.
+# Values per tensor that enter its fingerprint. All values of a ViT-g would take seconds to hash.
 FINGERPRINT_SAMPLES = 64
-REMEDY = (
-    "lower relations.batch_size or relations.image_size, choose a smaller checkpoint, or free the "
-    "device"
-)
+REMEDY = "choose a smaller checkpoint, encode fewer clips at once, or free memory of the device"
 
 
 @dataclass(frozen=True)
 class FrozenBackbone:
-    """A pretrained network that is only read.
+    """A pretrained network without training.
 
     Attributes:
-        identity: what a probe is bound to.
+        identity: family, sizes and weights; a probe is bound to it.
         geometry: how frames are resized.
-        device: where it runs.
-        dtype: of its activations.
-        features: (B, T, 3, S, S) normalised to (B, d), the network itself.
-        quantised: whether its linear layers are in 8-bit integers.
+        device: device of the network.
+        dtype: data type of its activations.
+        features: the network itself, (B, T, 3, S, S) normalised images to (B, d).
     """
 
     identity: BackboneIdentity
@@ -50,16 +43,14 @@ class FrozenBackbone:
     device: torch.device
     dtype: torch.dtype
     features: Callable[[torch.Tensor], torch.Tensor]
-    quantised: bool = False
 
     @property
     def description(self) -> str:
-        """Everything that a feature depends on besides the clip, but for the device."""
-        number = "int8" if self.quantised else str(self.dtype).removeprefix("torch.")
-        return f"{self.identity}; {self.geometry}; {number}"
+        """Everything besides the clip and the device that changes a feature."""
+        return f"{self.identity}; {self.geometry}; {str(self.dtype).removeprefix('torch.')}"
 
     def encode(self, clips: Sequence[UInt8]) -> Float32:
-        """Features of clips, all of them in one batch.
+        """Features of clips, encoded in one batch.
 
         Args:
             clips: each (T, h, w, 3) uint8 RGB; sizes may differ.
@@ -68,19 +59,18 @@ class FrozenBackbone:
             (n, d) float32.
 
         Raises:
-            ConfigurationError: where the device has too little memory for the batch.
-            ValueError: for a clip of another length.
+            ConfigurationError: the device has too little memory for the batch.
+            ValueError: a clip has another length than T.
         """
-        wanted = self.identity.clip_length
+        expected = self.identity.clip_length
         for clip in clips:
-            if len(clip) != wanted:
-                raise ValueError(f"clip of {len(clip)} frames: wanted {wanted}")
+            if len(clip) != expected:
+                raise ValueError(f"clip of {len(clip)} frames: expected {expected}")
         if not clips:
             return np.zeros((0, self.identity.feature_dim), np.float32)
-        on_cuda = self.device.type == "cuda"
-        with enough_memory(f"encoding {len(clips)} clips", REMEDY), torch.inference_mode():
+        with enough_memory(f"encoding {len(clips)} clip(s)", REMEDY), torch.inference_mode():
             images = torch.stack([resize_and_crop(clip, self.geometry) for clip in clips])
-            if on_cuda:
+            if self.device.type == "cuda":
                 images = images.pin_memory().to(self.device, non_blocking=True)
             features = self.features(normalise(images, self.dtype))
             return np.asarray(features.to("cpu", torch.float32).numpy(), np.float32)
@@ -88,69 +78,45 @@ class FrozenBackbone:
 
 def load_checkpoint(
     config: RelationsConfig,
-    family: str,
     model_class: Any,
-    changes: Mapping[str, int] = MappingProxyType({}),
     unused: Sequence[str] = (),
+    *,
+    download: bool = False,
 ) -> torch.nn.Module:
-    """A pretrained model of `transformers`, whole and frozen, on the CPU in float32.
+    """A pretrained model of `transformers`, complete and frozen, on the CPU in float32.
 
     Args:
-        config: section ``relations``.
-        family: model type that the checkpoint must have.
-        model_class: class that it is loaded into.
-        changes: fields of its configuration to set.
-        unused: prefixes of parameters that need not be there.
+        config: section ``relations``; `world_model` is the model type of the checkpoint.
+        model_class: class of `transformers` to load it into.
+        unused: prefixes of parameters that the checkpoint may lack.
+        download: whether a hub id may be downloaded; otherwise it is taken from the local cache.
 
     Raises:
-        ConfigurationError: where there is no checkpoint, or it is another model's, or not whole.
+        ConfigurationError: no checkpoint, a checkpoint of another model, or an incomplete one.
     """
     source = CheckpointSource.find(
-        "relations.model_path", config.model_path, local_files_only=config.local_files_only
+        "relations.world_model_path", config.world_model_path, local_files_only=not download
     )
-    settings = source.config([family])
-    settings.update(dict(changes))
-    model: torch.nn.Module = source.load(model_class, settings, unused)
+    model: torch.nn.Module = source.load(model_class, source.config([config.world_model]), unused)
     return model
 
 
 def place(
     config: RelationsConfig, model: torch.nn.Module
 ) -> tuple[torch.nn.Module, torch.device, torch.dtype]:
-    """The model on its device, in its precision, quantised where that is configured.
+    """Move a model to the configured device, in the precision of that device.
 
     Raises:
-        ConfigurationError: no CUDA, no memory, or quantisation that is not to be had.
+        ConfigurationError: no CUDA device, or too little memory.
     """
     device = choose_device("relations.device", config.device)
     dtype = choose_dtype(device)
-    if config.quantise:
-        return quantise(model, device), device, dtype
     with enough_memory(f"moving the backbone to {device}", REMEDY):
         return model.to(device, dtype), device, dtype
 
 
-def quantise(model: torch.nn.Module, device: torch.device) -> torch.nn.Module:
-    """Linear layers in 8-bit integers, activations quantised as they come."""
-    if device.type != "cpu":
-        raise ConfigurationError(
-            "relations.quantise is for the CPU: set relations.device to 'cpu', or quantise to false"
-        )
-    try:
-        quantization: Any = importlib.import_module("torch.ao.quantization")
-    except ImportError as error:
-        raise ConfigurationError(
-            f"torch {torch.__version__} has no dynamic quantisation: set relations.quantise to "
-            "false, or install torch 2.13 or older"
-        ) from error
-    quantised: torch.nn.Module = quantization.quantize_dynamic(
-        model, {torch.nn.Linear}, dtype=torch.qint8
-    )
-    return quantised
-
-
 def fingerprint(model: torch.nn.Module) -> str:
-    """16 hexadecimal digits that depend on names, shapes and a sample of all parameters."""
+    """16 hexadecimal digits of a hash of all parameters: names, shapes and sampled values."""
     digest = hashlib.sha256()
     for name, value in sorted(model.state_dict().items()):
         flat = value.detach().flatten()

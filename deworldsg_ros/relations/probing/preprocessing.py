@@ -1,7 +1,7 @@
-"""Clips as a backbone wants them: short edge resized, middle cut out, ImageNet's statistics.
+"""Preprocessing of clips: resize the short edge, crop the centre, normalise as for ImageNet.
 
-The steps are those of the backbones' published processors. Pixels stay uint8 until they are on
-the device: a quarter of the bytes is copied.
+The steps are those of the backbones' published processors. Pixels are copied to the device as
+uint8, a quarter of the bytes of float32.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ import torch
 from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD
 from deworldsg_ros.scene.arrays import UInt8
 
-# Only the middle square is looked at; of a longer image no more than this is ever resized.
+# Longer images are shortened to this ratio before resizing. Only the central square is used, and
+# the resizing of the rest would be wasted.
 MAX_ASPECT_RATIO = 4
 
 
 @dataclass(frozen=True)
 class ClipGeometry:
-    """Sizes in pixels, and how an image is resized.
+    """How an image is resized; sizes in pixels.
 
     Attributes:
         short_edge: length of the short edge after resizing.
-        crop: edge of the square that is cut out of the middle.
+        crop: edge of the central square that is cropped then.
         interpolation: ``bilinear`` or ``bicubic``, both with antialiasing.
     """
 
@@ -40,7 +41,7 @@ def resize_and_crop(clip: UInt8, geometry: ClipGeometry) -> torch.Tensor:
     """(T, h, w, 3) uint8 to (T, 3, crop, crop) uint8."""
     height, width = clip.shape[1:3]
     limit = MAX_ASPECT_RATIO * min(height, width)
-    # Taken off in equal parts, so that the middle stays the middle.
+    # Equal parts are removed on both sides: the centre stays the centre.
     top, left = max(0, (height - limit + 1) // 2), max(0, (width - limit + 1) // 2)
     middle = clip[:, top : height - top, left : width - left]
     height, width = middle.shape[1:3]
@@ -62,7 +63,7 @@ def resize_and_crop(clip: UInt8, geometry: ClipGeometry) -> torch.Tensor:
 
 
 def normalise(images: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """(…, 3, h, w) uint8 to ImageNet's zero mean and unit deviation, on the tensor's device."""
+    """(…, 3, h, w) uint8 minus ImageNet's mean, over its deviation; same device."""
     shape = (3, 1, 1)
     mean = torch.tensor(IMAGENET_MEAN, device=images.device).reshape(shape)
     std = torch.tensor(IMAGENET_STD, device=images.device).reshape(shape)

@@ -1,8 +1,8 @@
-"""A frozen backbone and a trained probe are a world model."""
+"""A world model made of a frozen backbone and a trained probe."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +17,15 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 
 class ProbedWorldModel:
-    """Clips in, the probe's predicate distributions out.
+    """Maps clips to the probe's predicate distributions.
 
     Attributes:
-        name: the backbone's family.
-        clip_length: T, frames that it wants in a clip.
-        predicates: names that the probe answers over.
+        name: family of the backbone.
+        clip_length: T, frames of a clip.
+        predicates: names of the probe's outputs.
 
     Raises:
-        ConfigurationError: where the probe was trained on another backbone.
+        ConfigurationError: the probe was trained on another backbone.
     """
 
     def __init__(self, backbone: FrozenBackbone, probe: Probe) -> None:
@@ -37,28 +37,24 @@ class ProbedWorldModel:
         self._probe = probe
 
     def require_predicates(self, predicates: tuple[str, ...]) -> None:
-        """Raise ConfigurationError unless the probe answers over just these predicates."""
+        """Raise ConfigurationError unless the probe has exactly these predicates, in this order."""
         self._probe.card.require_predicates(predicates)
 
-    def predict_batch(self, requests: Sequence[ClipRequest]) -> list[Float64]:
-        """(pairs, R) float64 for each request; all clips are encoded at once.
+    def predict(self, request: ClipRequest) -> Float64:
+        """(pairs, R) float64, rows sum to one.
 
         Raises:
-            ConfigurationError: where a vocabulary has other predicates than the probe.
+            ConfigurationError: the vocabulary has other predicates than the probe, or the device
+                has too little memory.
         """
-        for request in requests:
-            self.require_predicates(request.vocabulary.predicates)
-        features = self._backbone.encode([request.clip for request in requests])
-        answers = []
-        for feature, request in zip(features, requests):
-            boxes = relative_boxes(request)
-            rows = np.repeat(feature[None], len(boxes), axis=0)
-            answers.append(self._probe.predict(rows, boxes))
-        return answers
+        self.require_predicates(request.vocabulary.predicates)
+        boxes = relative_boxes(request)
+        features = np.repeat(self._backbone.encode([request.clip]), len(boxes), axis=0)
+        return self._probe.predict(features, boxes)
 
 
 def relative_boxes(request: ClipRequest) -> Float32:
-    """(pairs, 8) float32: corners of subject and object as shares of the crop."""
+    """(pairs, 8) float32: corners of subject and object as fractions of the crop's size."""
     height, width = request.clip.shape[1:3]
     rows = [
         relative_box_pair(pair.subject_box_xyxy, pair.object_box_xyxy, width, height)
@@ -73,18 +69,18 @@ def build_probed(
     """The configured backbone and probe.
 
     Raises:
-        ConfigurationError: in one sentence, where one is missing, or they do not fit.
+        ConfigurationError: one of them is missing, or they do not fit each other.
     """
     if not config.probe_path:
         raise ConfigurationError(
-            f"relations.probe_path is empty: world model '{config.world_model}' wants the folder "
+            f"relations.probe_path is empty: world model '{config.world_model}' needs the folder "
             "of a probe; train one with `deworldsg train-probe`"
         )
-    # The probe first: it is small, and what is wrong with it is told before the wait.
+    # The probe is small: an error in it is reported before the long load of the backbone.
     probe = load_probe(Path(config.probe_path).expanduser())
     if probe.card.backbone.family != config.world_model:
         raise ConfigurationError(
-            f"the probe in '{config.probe_path}' was trained on {probe.card.backbone}: "
-            f"relations.world_model '{config.world_model}' wants another"
+            f"relations.probe_path '{config.probe_path}' was trained on {probe.card.backbone}: "
+            f"relations.world_model '{config.world_model}' needs another probe"
         )
     return ProbedWorldModel(load_backbone(config), probe)

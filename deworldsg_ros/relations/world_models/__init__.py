@@ -1,1 +1,1 @@
-"""World models, one a file; each has `build(config: RelationsConfig) -> WorldModel | None`."""
+"""World models, one per file, each with `build(config: RelationsConfig) -> WorldModel | None`."""

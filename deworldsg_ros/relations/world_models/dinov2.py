@@ -1,6 +1,7 @@
-"""DINOv2, the paper's ablation (d): the same clips and probe, frames looked at one by one.
+"""DINOv2, the paper's ablation (d): the clips and the probe of V-JEPA 2, single frames.
 
-A frame's feature is its class token after the last normalisation; a clip's is their mean.
+A frame's feature is its class token after the last normalisation. A clip's feature is the mean of
+its frames' features.
 """
 
 from __future__ import annotations
@@ -20,31 +21,31 @@ from deworldsg_ros.relations.probing.backbone import (
 )
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
 from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
-from deworldsg_ros.scene.errors import ConfigurationError
 
-FAMILY = "dinov2"
-
-# Of the published processor; the checkpoints' own 518 pixels are those of their last training.
-IMAGE_SIZE = 224
+# Edge of the square input, pixels: that of the published processor, 16 patches of 14 pixels. The
+# checkpoints' own 518 pixels are the size of their last training.
+IMAGE_SIZE_PX = 224
 
 
-def load_backbone(config: RelationsConfig) -> FrozenBackbone:
+def load_backbone(
+    config: RelationsConfig, *, download: bool = False, image_size: int = IMAGE_SIZE_PX
+) -> FrozenBackbone:
     """The configured checkpoint.
 
+    Args:
+        config: section ``relations``.
+        download: whether a hub id may be downloaded.
+        image_size: edge of the square input, pixels, a multiple of the patch size.
+
     Raises:
-        ConfigurationError: in one sentence, where it cannot be used as configured.
+        ConfigurationError: the checkpoint cannot be used as configured.
     """
-    image_size = config.image_size or IMAGE_SIZE
-    # The mask token is for training.
-    model: Any = load_checkpoint(config, FAMILY, Dinov2Model, unused=("embeddings.mask_token",))
-    settings = model.config
-    if image_size % settings.patch_size:
-        raise ConfigurationError(
-            f"relations.image_size is {image_size}: DINOv2 wants a multiple of its patch size "
-            f"{settings.patch_size}"
-        )
+    # The mask token is only for training.
+    model: Any = load_checkpoint(
+        config, Dinov2Model, unused=("embeddings.mask_token",), download=download
+    )
     identity = BackboneIdentity(
-        FAMILY, settings.hidden_size, image_size, config.clip_length, fingerprint(model)
+        "dinov2", model.config.hidden_size, image_size, config.clip_length, fingerprint(model)
     )
     placed, device, dtype = place(config, model)
 
@@ -53,16 +54,14 @@ def load_backbone(config: RelationsConfig) -> FrozenBackbone:
         tokens: torch.Tensor = placed(videos.flatten(0, 1)).last_hidden_state
         return tokens[:, 0].to(torch.float32).reshape(clips, frames, -1).mean(dim=1)
 
-    return FrozenBackbone(
-        identity, clip_geometry(image_size), device, dtype, features, config.quantise
-    )
+    return FrozenBackbone(identity, clip_geometry(image_size), device, dtype, features)
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
-    """Resizing of the published processor: 256 for 224."""
+    """Resizing of the published processor: short edge 256 for 224 pixels."""
     return ClipGeometry(image_size * 256 // 224, image_size, "bicubic")
 
 
 def build(config: RelationsConfig) -> ProbedWorldModel:
-    """The backbone with its probe; raises ConfigurationError where one does not fit."""
+    """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
     return build_probed(config, load_backbone)

@@ -1,4 +1,4 @@
-"""No world model: neighbour pairs are found, no clip is queued, edges are visual only."""
+"""No world model: neighbour pairs without clips; edges have visual evidence only."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ from deworldsg_ros.config import RelationsConfig
 
 
 def build(config: RelationsConfig) -> None:
-    """There is none."""
+    """No world model."""
     del config

@@ -1,7 +1,7 @@
-"""V-JEPA 2, the paper's world model: its encoder, frozen, with a trained probe.
+"""V-JEPA 2, the paper's world model: its frozen encoder and a trained probe.
 
-All tokens of the encoder's last layer are averaged; the predictor is not used. Any published
-size: ViT-L, ViT-H, ViT-g at 256, ViT-g at 384 pixels.
+A clip's feature is the mean of all tokens of the encoder's last layer. The predictor is not used.
+All published sizes work: ViT-L, ViT-H and ViT-g at 256 pixels, ViT-g at 384 pixels.
 """
 
 from __future__ import annotations
@@ -23,54 +23,43 @@ from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
 from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
 from deworldsg_ros.scene.errors import ConfigurationError
 
-FAMILY = "vjepa2"
 
+def load_backbone(config: RelationsConfig, *, download: bool = False) -> FrozenBackbone:
+    """The encoder of the configured checkpoint.
 
-def load_backbone(config: RelationsConfig) -> FrozenBackbone:
-    """The configured checkpoint's encoder.
+    Args:
+        config: section ``relations``.
+        download: whether a hub id may be downloaded.
 
     Raises:
-        ConfigurationError: in one sentence, where it cannot be used as configured.
+        ConfigurationError: the checkpoint cannot be used as configured.
     """
-    # The rotary positions follow the configured size of the image: it is set, not the checkpoint's.
-    changes = {"crop_size": config.image_size} if config.image_size else {}
-    model: Any = load_checkpoint(config, FAMILY, VJEPA2Model, changes, unused=("predictor.",))
+    model: Any = load_checkpoint(config, VJEPA2Model, unused=("predictor.",), download=download)
     settings = model.config
-    _check(settings, config)
+    if config.clip_length % settings.tubelet_size:
+        raise ConfigurationError(
+            f"relations.clip_length is {config.clip_length}: V-JEPA 2 expects a multiple of its "
+            f"tubelet size {settings.tubelet_size}"
+        )
     model.predictor = torch.nn.Identity()
     identity = BackboneIdentity(
-        FAMILY, settings.hidden_size, settings.crop_size, config.clip_length, fingerprint(model)
+        "vjepa2", settings.hidden_size, settings.crop_size, config.clip_length, fingerprint(model)
     )
     placed, device, dtype = place(config, model)
 
     def features(videos: torch.Tensor) -> torch.Tensor:
         hidden: torch.Tensor = placed(videos, skip_predictor=True).last_hidden_state
-        # The average of thousands of tokens wants more than half precision.
+        # Half precision is too coarse for the mean of thousands of tokens.
         return hidden.mean(dim=1, dtype=torch.float32)
 
-    return FrozenBackbone(
-        identity, clip_geometry(settings.crop_size), device, dtype, features, config.quantise
-    )
+    return FrozenBackbone(identity, clip_geometry(settings.crop_size), device, dtype, features)
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
-    """Resizing of the published processor: 292 for 256, 438 for 384."""
+    """Resizing of the published processor: short edge 292 for 256 pixels, 438 for 384."""
     return ClipGeometry(image_size * 256 // 224, image_size, "bilinear")
 
 
 def build(config: RelationsConfig) -> ProbedWorldModel:
-    """The backbone with its probe; raises ConfigurationError where one does not fit."""
+    """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
     return build_probed(config, load_backbone)
-
-
-def _check(settings: Any, config: RelationsConfig) -> None:
-    if settings.crop_size % settings.patch_size:
-        raise ConfigurationError(
-            f"relations.image_size is {settings.crop_size}: V-JEPA 2 wants a multiple of its "
-            f"patch size {settings.patch_size}"
-        )
-    if config.clip_length % settings.tubelet_size:
-        raise ConfigurationError(
-            f"relations.clip_length is {config.clip_length}: V-JEPA 2 wants a multiple of its "
-            f"tubelet size {settings.tubelet_size}"
-        )

@@ -31,6 +31,8 @@ from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 SAVERS = {"vjepa2": save_vjepa2, "dinov2": save_dinov2}
 LOADERS = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
+# The published 224 pixels of DINOv2 are the default; the tests use a smaller input.
+SMALL = {"vjepa2": {}, "dinov2": {"image_size": 56}}
 IMAGE_SIZES = {"vjepa2": 32, "dinov2": 56}
 
 
@@ -41,8 +43,7 @@ def checkpoints(tmp_path_factory):
 
 
 def load(family, folder, **changes):
-    size = {"image_size": 56} if family == "dinov2" else {}
-    return LOADERS[family](config_of(family, folder, **{**size, **changes}))
+    return LOADERS[family](config_of(family, folder, **changes), **SMALL[family])
 
 
 @pytest.mark.parametrize("family", SAVERS)
@@ -57,7 +58,7 @@ def test_a_clip_gives_one_feature_whatever_is_beside_it(checkpoints, family):
     for row, alone in zip(features, clips):
         np.testing.assert_allclose(row, backbone.encode([alone])[0], atol=1e-5)
     assert not np.allclose(features[0], features[1], atol=1e-3)
-    with pytest.raises(ValueError, match="clip of 3 frames: wanted 4"):
+    with pytest.raises(ValueError, match="clip of 3 frames: expected 4"):
         backbone.encode([clip(length=3)])
 
 
@@ -90,17 +91,6 @@ def test_vjepa2_sees_the_order_of_frames(checkpoints):
     assert not np.allclose(backbone.encode([clip()]), backbone.encode([clip()[::-1]]), atol=1e-3)
 
 
-def test_another_image_size_gives_vjepa2_the_positions_of_that_size(checkpoints, tmp_path):
-    """The rotary positions come from the configured size: as if trained at it."""
-    weights = load_file(checkpoints["vjepa2"] / "model.safetensors")
-    save_vjepa2(tmp_path, crop_size=64)
-    save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    set_size = load("vjepa2", checkpoints["vjepa2"], image_size=64)
-    own_size = load("vjepa2", tmp_path)
-    assert set_size.identity == own_size.identity and set_size.identity.image_size == 64
-    np.testing.assert_allclose(set_size.encode([clip()]), own_size.encode([clip()]), atol=1e-6)
-
-
 @pytest.mark.parametrize("family", SAVERS)
 def test_the_fingerprint_is_of_the_weights_and_not_of_the_folder(checkpoints, family, tmp_path):
     here = load(family, checkpoints[family]).identity
@@ -110,57 +100,36 @@ def test_the_fingerprint_is_of_the_weights_and_not_of_the_folder(checkpoints, fa
 
 
 @pytest.mark.parametrize("family", SAVERS)
-@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning")
-def test_int8_gives_nearly_the_same_features(checkpoints, family):
-    whole = load(family, checkpoints[family])
-    small = load(family, checkpoints[family], quantise=True)
-    assert small.identity == whole.identity and small.description != whole.description
-    expected = whole.encode([clip()])
-    error = np.linalg.norm(small.encode([clip()]) - expected) / np.linalg.norm(expected)
-    assert 0 < error < 0.1
-
-
-@pytest.mark.parametrize("family", SAVERS)
 @pytest.mark.parametrize("inputs", ["clip", "clip_and_boxes"])
 def test_backbone_and_probe_are_a_world_model(checkpoints, family, inputs, tmp_path):
-    identity = load(family, checkpoints[family]).identity
-    save_random_probe(tmp_path, identity, inputs=inputs)
-    size = {"image_size": 56} if family == "dinov2" else {}
-    model = build_world_model(
-        config_of(family, checkpoints[family], probe_path=str(tmp_path), **size)
-    )
+    config = config_of(family, checkpoints[family], probe_path=str(tmp_path))
+    save_random_probe(tmp_path, LOADERS[family](config).identity, inputs=inputs)
+    model = build_world_model(config)
     assert model.name == family and model.predicates == VOCABULARY.predicates
-    answers = model.predict_batch([request(0), request(1, height=20)])
-    assert [answer.shape for answer in answers] == [(2, 4), (2, 4)]
-    for answer in answers:
-        np.testing.assert_allclose(answer.sum(axis=1), 1)
-        # Without the boxes a probe cannot tell one direction from the other.
-        assert np.allclose(answer[0], answer[1]) == (inputs == "clip")
-    assert model.predict_batch([]) == []
+    for asked in (request(0), request(1, height=20)):
+        predicted = model.predict(asked)
+        assert predicted.shape == (2, 4)
+        np.testing.assert_allclose(predicted.sum(axis=1), 1)
+        # Without the boxes a probe cannot distinguish the two directions.
+        assert np.allclose(predicted[0], predicted[1]) == (inputs == "clip")
 
 
-def test_the_stage_encodes_in_batches_and_gives_the_same(checkpoints, tmp_path):
-    identity = load("vjepa2", checkpoints["vjepa2"]).identity
-    save_random_probe(tmp_path, identity)
-    told = []
-    for batch_size in (1, 3):
-        config = config_of(
-            "vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path), batch_size=batch_size
-        )
-        stage = RelationReasoner(config, build_world_model(config))
-        for stamp in range(1, 6):
-            stage.observe(pair_graph(stamp), picture(stamp))
-        told.append(stage.drain())
-        assert stage.counters().encoded == 5
-    for single, batched in zip(*told):
-        assert single.stamp_ns == batched.stamp_ns and single.source == "vjepa2"
-        np.testing.assert_allclose(single.predictions, batched.predictions, atol=1e-5)
+def test_the_stage_publishes_the_predictions_of_backbone_and_probe(checkpoints, tmp_path):
+    config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path))
+    save_random_probe(tmp_path, vjepa2.load_backbone(config).identity)
+    stage = RelationReasoner(config, build_world_model(config))
+    for stamp in range(1, 4):
+        stage.observe(pair_graph(stamp), picture(stamp))
+    evidence = stage.drain()
+    assert [item.stamp_ns for item in evidence] == [3, 2, 1] and stage.counters().encoded == 3
+    for item in evidence:
+        assert item.source == "vjepa2" and item.predicted.all()
 
 
 @pytest.mark.parametrize(
     "path, told",
     [
-        ("", "relations.model_path is empty"),
+        ("", "relations.world_model_path is empty"),
         ("/no/such/folder", "there is no such folder"),
         ("nobody/no-such-model", "run `hf download nobody/no-such-model`"),
     ],
@@ -210,17 +179,9 @@ def test_the_unused_predictor_need_not_be_there(checkpoints, tmp_path):
     assert vjepa2.load_backbone(config_of("vjepa2", tmp_path)).identity == identity
 
 
-@pytest.mark.parametrize(
-    "family, changes, told",
-    [
-        ("vjepa2", {"image_size": 40}, "multiple of its patch size 16"),
-        ("vjepa2", {"clip_length": 5}, "multiple of its tubelet size 2"),
-        ("dinov2", {"image_size": 60}, "multiple of its patch size 14"),
-    ],
-)
-def test_sizes_that_do_not_fit_are_refused(checkpoints, family, changes, told):
-    with pytest.raises(ConfigurationError, match=told):
-        load(family, checkpoints[family], **changes)
+def test_a_clip_length_that_the_encoder_cannot_split_is_refused(checkpoints):
+    with pytest.raises(ConfigurationError, match="a multiple of its tubelet size 2"):
+        load("vjepa2", checkpoints["vjepa2"], clip_length=5)
 
 
 def test_cuda_asked_for_and_absent(checkpoints, monkeypatch):
@@ -244,7 +205,7 @@ def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
 ):
     identity = load("vjepa2", checkpoints["vjepa2"]).identity
     save_random_probe(tmp_path, identity)
-    config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path), batch_size=2)
+    config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path))
     told = []
     stage = RelationReasoner(config, build_world_model(config), told.append)
 
@@ -257,4 +218,4 @@ def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
         assert len(evidence.pairs) == 2
     assert stage.drain() == []
     assert stage.counters().dropped == {"world_model_error": 2}
-    assert "out of memory while encoding 2 clips: lower relations.batch_size" in told[0]
+    assert "out of memory while encoding 1 clip(s): choose a smaller checkpoint" in told[0]

@@ -200,7 +200,7 @@ def test_a_world_model_refuses_what_does_not_fit(tmp_path):
     config = config_of("vjepa2", folder, probe_path=str(probe_folder))
     with pytest.raises(ConfigurationError, match="weights 0123456789abcdef, and the backbone is"):
         build_world_model(config)
-    with pytest.raises(ConfigurationError, match="world_model 'dinov2' wants another"):
+    with pytest.raises(ConfigurationError, match="world_model 'dinov2' needs another"):
         build_world_model(config_of("dinov2", folder, probe_path=str(probe_folder)))
 
 
@@ -216,4 +216,4 @@ def test_other_predicates_are_refused_at_the_start_and_in_the_middle_of_a_run(tm
     asked = request()
     other = type(VOCABULARY)(VOCABULARY.classes, ("on", "near"))
     with pytest.raises(ConfigurationError, match="trained for 4 predicates and the graph has 2"):
-        model.predict_batch([type(asked)(asked.clip, asked.pairs, other)])
+        model.predict(type(asked)(asked.clip, asked.pairs, other))
