@@ -1,6 +1,6 @@
 """FROSS (Hou et al., ICCV 2025): boxes lifted at their centre, merged by class and distance.
 
-Written from the description in words (docs/evaluation.md tells it, and where it leaves a choice).
+Written from the published description, with its open choices (docs/evaluation/protocol.md).
 """
 
 from __future__ import annotations

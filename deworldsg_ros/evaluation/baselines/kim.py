@@ -1,6 +1,6 @@
 """Kim et al. (3-D Scene Graph, 2019), as it is compared with: box windows, three similarities.
 
-Written from the description in words (docs/evaluation.md tells it, and where it leaves a choice).
+Written from the published description, with its open choices (docs/evaluation/protocol.md).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COLOUR_BINS = 8
 CLASS_WEIGHT, POSITION_WEIGHT, COLOUR_WEIGHT = 0.5, 0.4, 0.1
 CLASS_SIMILARITIES = (0.0, 0.8, 0.9, 1.0)
 POSITION_SCALE_M, POSITION_REACH = 5.0, 0.112
-# The description does not give it; see docs/evaluation.md.
+# The description does not give it; see docs/evaluation/protocol.md.
 SIMILARITY_THRESHOLD = 0.9
 
 

@@ -1,6 +1,6 @@
 """Recorded detections and relations: frontend.json beside each frame.
 
-The file is described in docs/evaluation.md. A class or predicate of which nothing is stated gets
+docs/evaluation/protocol.md describes the file. A class or predicate without a stated value gets
 an even share of what the stated probabilities leave; relation probabilities become logits.
 """
 

@@ -1,6 +1,6 @@
 """What recall leaves out: precision, duplicates, position, extent, edges, calibration.
 
-docs/evaluation.md defines every measure. Counts are kept, so that scans can be pooled.
+docs/evaluation/protocol.md defines every measure. Counts are kept, so that scans can be pooled.
 """
 
 from __future__ import annotations

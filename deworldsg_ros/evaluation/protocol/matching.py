@@ -47,7 +47,7 @@ def match(
     segments: Sequence[NDArray[np.floating[Any]]],
     threshold_m: float = OVERLAP_THRESHOLD_M,
 ) -> Matching:
-    """Match predictions to objects (docs/evaluation.md, "Matching").
+    """Match predictions to objects (docs/evaluation/protocol.md, "Matching").
 
     Args:
         object_ids: the annotated objects; points of no other id are looked at.

@@ -1,6 +1,6 @@
 """Predicted scene graphs as the protocol takes them: two formats in, one format out.
 
-The open format (JSON) and the official pickle are described in docs/evaluation.md.
+The open format (JSON) and the official pickle are described in docs/evaluation/protocol.md.
 """
 
 from __future__ import annotations

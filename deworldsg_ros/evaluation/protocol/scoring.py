@@ -1,7 +1,7 @@
 """The official protocol: recall of objects, predicates and relationships.
 
 Every decision is that of the program by which the field reports its numbers (FROSS,
-``Merging/evaluate.py``); docs/evaluation.md states the rules.
+``Merging/evaluate.py``); docs/evaluation/protocol.md states the rules.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Ground truth of a data set in one of the two official layouts: objects, relations, points.
 
-Rules of reading, as the official evaluation program has them, are in docs/evaluation.md.
+Rules of reading, as the official evaluation program has them, are in docs/evaluation/protocol.md.
 """
 
 from __future__ import annotations
