@@ -245,17 +245,19 @@ def demo(
 ) -> None:
     """Build it with the four ROS 2 nodes, from a replay."""
     with _reporting_errors():
-        from deworldsg_ros.cli.demo import run_demo
+        from deworldsg_ros.cli.demo import DemoOptions, run_demo
 
         run_demo(
             recording,
             out,
             config,
             settings or [],
-            rate=rate,
-            topics=TopicChoice(rgb, depth, camera_info, pose),
-            options=DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
-            odometry=odometry,
+            DemoOptions(
+                rate=rate,
+                topics=TopicChoice(rgb, depth, camera_info, pose),
+                intrinsics=parse_intrinsics(intrinsics),
+                odometry=odometry,
+            ),
             console=Console(),
         )
 

@@ -1,4 +1,4 @@
-"""Processes of the demo: started apart, with a log each, and ended one by one in good order."""
+"""Processes of the demo: each in its own session with its own log, ended one after the other."""
 
 from __future__ import annotations
 
@@ -7,33 +7,26 @@ import ctypes
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
-PR_SET_PDEATHSIG = 1
-# How long a process may take to end after each signal.
+from rich.console import Console
+
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
+# Time to end after each signal. graph_node writes its map after SIGINT.
 GRACE_S = ((signal.SIGINT, 8.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
 
-def _end_with_parent() -> Callable[[], None] | None:
-    """What a child does first on Linux: it asks for SIGINT should its parent be killed."""
-    try:
-        prctl = ctypes.CDLL(None, use_errno=True).prctl
-    except (OSError, AttributeError):
-        return None
-    return lambda: prctl(PR_SET_PDEATHSIG, signal.SIGINT)
-
-
 class LoggedProcess:
-    """A process in a session of its own: Ctrl-C in the terminal is left to its parent.
+    """A process in its own session, which Ctrl-C in the terminal does not reach.
 
     Args:
-        name: what to call it.
+        name: name in messages.
         command: program and arguments.
-        environment: the whole environment.
-        log: file for its standard error, and for its standard output unless that is read.
-        read_output: whether `output` is to be read.
+        environment: the complete environment.
+        log: file of its standard error, and of its standard output unless `read_output`.
+        read_output: whether the parent reads `output`.
     """
 
     def __init__(
@@ -59,6 +52,11 @@ class LoggedProcess:
             )
 
     @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
     def output(self) -> IO[bytes]:
         """Standard output."""
         assert self._process.stdout is not None
@@ -78,18 +76,27 @@ class LoggedProcess:
         """Send a signal, if it still runs."""
         if self.exit_code is None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self._process.pid, number)
+                os.kill(self.pid, number)
 
     def wait(self, timeout_s: float) -> int | None:
-        """Exit code; None where it runs on."""
+        """Exit code; None on timeout."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
 
 
+def _end_with_parent() -> Callable[[], None] | None:
+    """On Linux, the first call of a child: request SIGINT for the death of its parent."""
+    try:
+        prctl = ctypes.CDLL(None, use_errno=True).prctl
+    except (OSError, AttributeError):
+        return None
+    return lambda: prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+
 def end_all(processes: Sequence[LoggedProcess]) -> dict[str, int | None]:
-    """End all: SIGINT, then SIGTERM, then SIGKILL; gives the exit codes by name."""
+    """End all by SIGINT, then SIGTERM, then SIGKILL; return the exit codes by name."""
     for number, grace_s in GRACE_S:
         running = [process for process in processes if process.exit_code is None]
         for process in running:
@@ -97,3 +104,37 @@ def end_all(processes: Sequence[LoggedProcess]) -> dict[str, int | None]:
         for process in running:
             process.wait(grace_s)
     return {process.name: process.exit_code for process in processes}
+
+
+@contextlib.contextmanager
+def ending(console: Console) -> Iterator[list[LoggedProcess]]:
+    """A list of processes, the source of messages last; all are ended on the way out."""
+    processes: list[LoggedProcess] = []
+    try:
+        yield processes
+    finally:
+        with console.status("ending the nodes …"):
+            # The last one first, so that no new message arrives.
+            codes = end_all(processes[-1:]) | end_all(processes[:-1])
+        for name, code in codes.items():
+            # A node that is still loading has no handler: SIGINT itself ends it.
+            if code not in (0, -signal.SIGINT):
+                console.print(f"[yellow]{name} ended with exit code {code}[/]", highlight=False)
+
+
+@contextlib.contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Only the first SIGINT or SIGTERM interrupts: a second one must not stop the clean-up."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def interrupt(*_: Any) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -1,1 +1,1 @@
-"""The ROS 2 nodes: a thin shell around one stage each."""
+"""The ROS 2 nodes: each is a thin shell around one stage."""

@@ -24,24 +24,29 @@ from deworldsg_ros.streams.pending import PendingEvidence
 from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
 from deworldsg_ros.view.markers import markers
 
+# /diagnostics warns after this time without a local graph.
 SILENCE_S = 2.0
 CORRECTION_TOPIC = "deworldsg/pose_correction"
 
 
 class GraphNode(StageNode):
-    """Stage c, and the fusion of stage d, as a node."""
+    """Stage c, and the fusion of stage d, as a node.
+
+    Raises:
+        ConfigurationError: for a map file that cannot be read or written.
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
         build_merging(self.parameters.merging).warm_up()
-        # The map, or the first local graph, tells the world frame and the vocabulary.
+        # None until a map or the first local graph gives the world frame and the vocabulary.
         self._builder: GraphBuilder | None = None
         map_path = self.parameters.node.map_path
         self._map_path = Path(map_path).absolute() if map_path else None
         self._pending = PendingEvidence()
         self._newest_ns = 0
         self._changed_s: float | None = None
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._publish_graph = self.json_publisher("/scene_graph", 1, latched=True)
         self._publish_update = self.json_publisher("/scene_graph/updates", 50)
         self._markers = self.create_publisher(
@@ -60,19 +65,19 @@ class GraphNode(StageNode):
         if self._map_path is not None:
             check_map_writable(self._map_path)
             if self._map_path.exists():
-                self._go_on_with(self._map_path)
+                self._continue_map(self._map_path)
 
-    def _go_on_with(self, path: Path) -> None:
-        """Begin with the graph of a map; raises ConfigurationError where there is none in it."""
+    def _continue_map(self, path: Path) -> None:
+        """Start with the graph of a map file; raises ConfigurationError if it contains none."""
         self._builder = GraphBuilder.from_map(self.parameters, path)
         graph = self._builder.graph
         self.get_logger().info(
-            f"map {path}: {len(graph)} nodes in frame '{graph.frame_id}'; going on with it"
+            f"continuing map {path}: {len(graph)} nodes in frame '{graph.frame_id}'"
         )
         self._note_change()
 
     def close(self) -> None:
-        """Write the map."""
+        """Write the map file."""
         if self._map_path is not None:
             written, message = self._save_map(self._map_path)
             if written:
@@ -82,7 +87,7 @@ class GraphNode(StageNode):
         super().close()
 
     def _integrate(self, message: wire.LocalGraphMessage) -> None:
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         local = local_graph_from_message(message)
         if self._builder is None:
             self._builder = GraphBuilder(self.parameters, local.vocabulary, local.frame_id)
@@ -102,11 +107,13 @@ class GraphNode(StageNode):
         self._note_change()
 
     def _correct(self, message: Any) -> None:
-        """Move what was first seen since the stamp by the pose, a correction in the world frame."""
+        """Move the nodes first observed at the stamp or later; the pose is the rigid transform."""
         self.health.received(CORRECTION_TOPIC)
         T_correction, frame_id = pose_from_message(message)
         if self._builder is None:
-            raise RefusedInput("no_graph", "pose correction: no local graph has come yet")
+            raise RefusedInput(
+                "no_graph", "pose correction before the first local graph: no node to correct"
+            )
         if frame_id != self._builder.graph.frame_id:
             raise RefusedInput(
                 "wrong_frame",
@@ -137,7 +144,7 @@ class GraphNode(StageNode):
         self.health.published(time.monotonic() - changed_s)
 
     def _save(self, request: Any, response: Any) -> Any:
-        """Write the whole graph, with surface points, to `save_path`; and the map."""
+        """Write the whole graph, with surface points, to `save_path`; and the map file."""
         response.message = "refused: see /diagnostics"
         with self.refusing():
             response.success, response.message = self._save_to(
@@ -150,7 +157,7 @@ class GraphNode(StageNode):
 
     def _save_map(self, path: Path) -> tuple[bool, str]:
         if self._builder is None:
-            return False, "no map was written: no local graph has come"
+            return False, "no map written: no local graph has arrived"
         try:
             self._builder.save_map(path)
         except ConfigurationError as error:
@@ -159,7 +166,7 @@ class GraphNode(StageNode):
 
     def _save_to(self, path: Path) -> tuple[bool, str]:
         if self._builder is None:
-            return False, "there is no graph yet: no local graph has come"
+            return False, "no graph yet: no local graph has arrived"
         message = self._builder.full()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -171,8 +178,8 @@ class GraphNode(StageNode):
         return True, f"{path}: {len(message.nodes)} nodes, {len(message.edges)} edges"
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """Whether local graphs have stopped coming."""
-        silence_s = now_ns / 1e9 - self._heard_s
+        """The topic of the local graphs, if it is silent."""
+        silence_s = now_ns / 1e9 - self._received_s
         topic = self.resolve_topic_name("deworldsg/local_graph")
         return [f"no local_graph on {topic} for {silence_s:.0f} s"] if silence_s > SILENCE_S else []
 
@@ -187,7 +194,7 @@ class GraphNode(StageNode):
             "sequence": str(snapshot.sequence),
             "evidence waiting": str(len(self._pending)),
             "pose corrections": str(self._corrections),
-            "nodes moved by them": str(self._corrected_nodes),
+            "nodes moved by corrections": str(self._corrected_nodes),
         }
 
 

@@ -1,4 +1,4 @@
-"""lifting_node: frame graphs, instances, depth and poses → deworldsg/local_graph."""
+"""lifting_node: frame graphs, instance images, depth and poses → deworldsg/local_graph."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from deworldsg_ros.streams.unposed import UnposedAssembler, UnposedFrame
 
 
 class OdometryNode(JoiningNode[UnposedFrame]):
-    """Poses out of the images; a frame that is lost gets none."""
+    """Poses from RGB-D images; a lost frame gets none."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("odometry_node", "poses", **options)
@@ -47,7 +47,7 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         listen_rgb(self, self.taking(frames.add_rgb))
 
     def _track(self, frame: UnposedFrame) -> None:
-        if frame.stamp_ns < self._newest_ns:  # a recording was started again
+        if frame.stamp_ns < self._newest_ns:  # a recording was restarted
             self._odometry = RgbdOdometry(self.parameters.odometry)
         self._newest_ns = frame.stamp_ns
         T_world_camera = self._odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)
@@ -68,11 +68,11 @@ class OdometryNode(JoiningNode[UnposedFrame]):
             )
 
     def more_values(self) -> dict[str, str]:
-        """What became of the frames."""
+        """Numbers of tracked and lost frames, and of restarts."""
         odometry = self._odometry
         counts = {"tracked": odometry.tracked, "lost": odometry.lost, "restarts": odometry.restarts}
-        told = {f"odometry {name}": str(count) for name, count in counts.items()}
-        return {**super().more_values(), **told}
+        values = {f"odometry {name}": str(count) for name, count in counts.items()}
+        return {**super().more_values(), **values}
 
 
 def main(args: list[str] | None = None) -> int:

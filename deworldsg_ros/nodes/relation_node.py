@@ -1,6 +1,7 @@
-"""relation_node: local graphs and RGB → deworldsg/relation_evidence, predictions when they come.
+"""relation_node: local graphs and RGB → deworldsg/relation_evidence.
 
-What the graph node publishes tells which pairs are worth a prediction.
+The evidence of a frame is published at once, the predictions of the world model when they are
+ready. The published graph selects the pairs for the world model.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from deworldsg_ros.streams.sync import PairingFrame, RelationAssembler
 
 
 class RelationNode(JoiningNode[PairingFrame]):
-    """Stage d as a node; the world model has a thread of its own and is in nobody's way."""
+    """Stage d as a node; the world model runs in its own thread, so that frames do not wait."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__("relation_node", "evidence messages", **options)
@@ -34,7 +35,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         report = self.get_logger().warning
         world_model = build_world_model(config)
         predicates = graph_predicates(self.parameters.perception)
-        if predicates is not None:  # else the first local graph tells
+        if predicates is not None:  # else the first local graph contains them
             require_predicates(world_model, predicates)
         self._reasoner = RelationReasoner(config, world_model, report)
         self._world_frame = ""
@@ -66,11 +67,11 @@ class RelationNode(JoiningNode[PairingFrame]):
         generation = self._graph.generation
         self._world_model.learn(lambda: self._graph.apply(update))
         if self._graph.generation != generation:
-            self._snapshot_text = ""  # of the graph before
+            self._snapshot_text = ""  # a snapshot of the previous graph
         self._catch_up()
 
     def _keep_snapshot(self, message: Any) -> None:
-        # The whole graph comes with every change: it is read only where updates were lost.
+        # Each change publishes the whole graph. It is decoded only after a lost update.
         self._snapshot_text = message.data
         self._catch_up()
 
@@ -83,7 +84,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._frames.add_local_graph(local_graph_from_message(message))
 
     def _relate(self, frame: PairingFrame) -> None:
-        if frame.local.stamp_ns < self._newest_ns:  # a recording was started again
+        if frame.local.stamp_ns < self._newest_ns:  # a recording was restarted
             self._reasoner.clear()
         self._newest_ns = frame.local.stamp_ns
         self._world_frame = frame.local.frame_id
@@ -93,14 +94,14 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._publish(evidence_to_message(evidence, self._world_frame))
 
     def more_values(self) -> dict[str, str]:
-        """What became of the clips."""
+        """Numbers of clips by their state."""
         counters = self._reasoner.counters()
         clips = {"queued": counters.queued, "encoded": counters.encoded}
         clips["pending"] = counters.ready
         clips["waiting"] = counters.pending - counters.ready
         clips.update((f"dropped {reason}", n) for reason, n in sorted(counters.dropped.items()))
-        told = {f"clips {name}": str(count) for name, count in clips.items()}
-        return {**super().more_values(), **told}
+        values = {f"clips {name}": str(count) for name, count in clips.items()}
+        return {**super().more_values(), **values}
 
     def close(self) -> None:
         """End the threads."""

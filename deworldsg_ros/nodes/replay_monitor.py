@@ -1,12 +1,11 @@
-"""What a replay knows of the pipeline behind it: who is connected, who is done, what was dropped.
+"""The state of the pipeline behind a replay: connections, processed frames, drops.
 
-All of it is read from topics that are there anyway: discovery, the local graphs and evidence that
-go to the graph node, and /diagnostics.
+It is read from existing topics: DDS discovery, the local graphs and evidence that graph_node
+receives, and /diagnostics.
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +17,7 @@ from std_srvs.srv import Trigger
 
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.pacing import Window
+from deworldsg_ros.ros.health import DROPPED, UNMATCHED_PREFIX, counts_in, received_in
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 
@@ -34,7 +34,7 @@ LISTENERS = {
     Role.CAMERA_INFO: {SEGMENTATION, LIFTING},
     Role.POSE: {SEGMENTATION, LIFTING},
 }
-# Topic: who publishes it, and who listens.
+# Topic: its publishers, its subscribers.
 BETWEEN = {
     "deworldsg/frame_graph": ({SEGMENTATION}, {LIFTING}),
     "deworldsg/instances": ({SEGMENTATION}, {LIFTING}),
@@ -43,17 +43,20 @@ BETWEEN = {
 }
 ODOMETRY_LISTENS_TO = (Role.RGB, Role.DEPTH, Role.CAMERA_INFO)
 POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
-# Each participant tells of its endpoints on its own: what is seen here is soon seen everywhere.
+# Enough for one frame in each of the three processing nodes and one between them; fewer than a
+# node's queue holds, so that no frame is dropped.
+WINDOW_FRAMES = 4
+# DDS announces each endpoint to each participant separately: endpoints that are seen here may be
+# unknown elsewhere for a moment.
 SETTLE_S = 1.0
-# How long evidence may lag behind the last local graph before it is taken to be all.
+# Longest delay of evidence after the last local graph.
 EVIDENCE_QUIET_S = 3.0
-# How long the first answer of all may take.
-FIRST_ANSWER_S = 300.0
-RECEIVED = re.compile(r"(\d+) in all")
+# Compiling the kernels for the first frame takes minutes on a small machine.
+FIRST_RESULT_S = 300.0
 
 
 class _LocalGraph(msgspec.Struct):
-    """The parts of a local graph that are read here."""
+    """The fields of a local graph that are read here."""
 
     stamp: wire.Stamp
     T_world_camera: wire.Matrix4
@@ -71,19 +74,19 @@ class PipelineMonitor:
     """Watches the nodes.
 
     Args:
-        node: of the replay.
-        window: most frames in flight.
-        odometry: whether odometry_node makes the poses.
+        node: node of the replay.
+        odometry: whether odometry_node publishes the poses.
 
     Attributes:
-        window: frames published and answered.
-        diagnostics: what each node told last, by its name.
-        poses: T_world_camera of the local graphs, 16 values each.
+        window: frames in flight.
+        diagnostics: newest values of each node, by its name.
+        poses: T_world_camera of the local graphs, 16 values each, row by row.
     """
 
-    def __init__(self, node: Node, window: int, *, odometry: bool) -> None:
+    def __init__(self, node: Node, *, odometry: bool) -> None:
         self._node = node
-        self.window = Window(window, (Role.DEPTH,) if odometry else (Role.DEPTH, Role.POSE))
+        needs = (Role.DEPTH,) if odometry else (Role.DEPTH, Role.POSE)
+        self.window = Window(WINDOW_FRAMES, needs)
         self._listening = {
             role: names | ({ODOMETRY} if odometry and role in ODOMETRY_LISTENS_TO else set())
             for role, names in LISTENERS.items()
@@ -94,7 +97,7 @@ class PipelineMonitor:
         self._local_graphs = self._evidence = 0
         self._refused_frames = 0
         self._complete_since_s: float | None = None
-        self._heard_s: float | None = None
+        self._progress_s: float | None = None
         node.create_subscription(String, "deworldsg/local_graph", self._on_local, reliable(50))
         node.create_subscription(
             String, "deworldsg/relation_evidence", self._on_evidence, reliable(50)
@@ -104,28 +107,12 @@ class PipelineMonitor:
 
     @property
     def nodes(self) -> int:
-        """Nodes in the graph, as the graph node told last."""
+        """Number of nodes in the graph, by the newest diagnostics of graph_node."""
         return int(self.diagnostics.get(GRAPH, {}).get("nodes", 0))
 
     def missing(self, endpoints: dict[Role, Endpoint], now_s: float) -> list[str]:
-        """Connections that are not there yet, in words; empty once all are, for a while."""
-        missing: list[str] = []
-        for role, endpoint in endpoints.items():
-            listeners = self._listeners(endpoint.topic)
-            missing += [
-                f"{name} to listen to {endpoint.topic}"
-                for name in sorted(self._listening[role] - listeners)
-            ]
-            wanted = len(self._listening[role])
-            if not missing and endpoint.publisher.get_subscription_count() < wanted:
-                missing.append(f"a connection on {endpoint.topic}")
-        for topic, (publishers, listeners) in self._between.items():
-            full_name = self._node.resolve_topic_name(topic)
-            infos = self._node.get_publishers_info_by_topic(full_name)
-            absent = publishers - {info.node_name for info in infos}
-            missing += [f"{name} to publish {full_name}" for name in sorted(absent)]
-            absent = listeners - self._listeners(full_name)
-            missing += [f"{name} to listen to {full_name}" for name in sorted(absent)]
+        """Missing connections, in words; empty once all have existed for SETTLE_S."""
+        missing = self._missing_listeners(endpoints) + self._missing_between()
         if missing:
             self._complete_since_s = None
             return missing
@@ -134,25 +121,25 @@ class PipelineMonitor:
         return [] if now_s - self._complete_since_s >= SETTLE_S else ["discovery to settle"]
 
     def give_up_after(self, stall_s: float, now_s: float) -> None:
-        """Stop waiting for frames in flight where nobody has answered for so long."""
+        """Stop waiting for the frames in flight after `stall_s` without a result."""
         if not self.window.answered:
-            # Kernels may still be compiled for the first frame.
-            stall_s = max(stall_s, FIRST_ANSWER_S)
+            stall_s = max(stall_s, FIRST_RESULT_S)
         if self.silent_for(now_s) > stall_s:
             self._node.get_logger().warning(
-                f"no local graph for {stall_s:g} s: {self.window.in_flight} frames are given up"
+                f"no local graph for {stall_s:g} s: stopped waiting for {self.window.in_flight} "
+                "frames; the log of each node has the cause"
             )
             self.window.give_up()
-            self._heard_s = now_s
+            self._progress_s = now_s
 
     def silent_for(self, now_s: float) -> float:
-        """Seconds since the last sign of progress, or since this was first asked."""
-        if self._heard_s is None:
-            self._heard_s = now_s
-        return now_s - self._heard_s
+        """Seconds since the last progress, or since the first call after it."""
+        if self._progress_s is None:
+            self._progress_s = now_s
+        return now_s - self._progress_s
 
     def drained(self, now_s: float) -> bool:
-        """Whether the graph node has taken in everything that will come."""
+        """Whether graph_node has received all local graphs and all evidence."""
         silent_s = self.silent_for(now_s)
         if self.window.in_flight:
             return False
@@ -162,13 +149,34 @@ class PipelineMonitor:
         if int(self.diagnostics.get(RELATION, {}).get("clips pending", 0)):
             return False
         return (
-            self._received(GRAPH, "deworldsg/local_graph") >= self._local_graphs
-            and self._received(GRAPH, "deworldsg/relation_evidence") >= self._evidence
+            self._received("deworldsg/local_graph") >= self._local_graphs
+            and self._received("deworldsg/relation_evidence") >= self._evidence
         )
 
     def request_save(self) -> Any:
-        """A future of the answer of graph_node's service ~/save."""
+        """A future of the response of graph_node's service ~/save."""
         return self._save.call_async(Trigger.Request())
+
+    def _missing_listeners(self, endpoints: dict[Role, Endpoint]) -> list[str]:
+        missing: list[str] = []
+        for role, endpoint in endpoints.items():
+            absent = self._listening[role] - self._listeners(endpoint.topic)
+            missing += [f"{name} to listen to {endpoint.topic}" for name in sorted(absent)]
+            expected = len(self._listening[role])
+            if not missing and endpoint.publisher.get_subscription_count() < expected:
+                missing.append(f"a connection on {endpoint.topic}")
+        return missing
+
+    def _missing_between(self) -> list[str]:
+        missing: list[str] = []
+        for topic, (publishers, listeners) in self._between.items():
+            full_name = self._node.resolve_topic_name(topic)
+            infos = self._node.get_publishers_info_by_topic(full_name)
+            absent = publishers - {info.node_name for info in infos}
+            missing += [f"{name} to publish {full_name}" for name in sorted(absent)]
+            absent = listeners - self._listeners(full_name)
+            missing += [f"{name} to listen to {full_name}" for name in sorted(absent)]
+        return missing
 
     def _listeners(self, topic: str) -> set[str]:
         return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
@@ -177,12 +185,12 @@ class PipelineMonitor:
         local = msgspec.json.decode(message.data, type=_LocalGraph)
         self.poses.append(local.T_world_camera)
         self._local_graphs += 1
-        self._heard_s = None
+        self._progress_s = None
         self.window.answer(wire.ns_from_stamp(local.stamp))
 
     def _on_evidence(self, message: Any) -> None:
         self._evidence += 1
-        self._heard_s = None
+        self._progress_s = None
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:
@@ -193,16 +201,12 @@ class PipelineMonitor:
         if refused > self._refused_frames:
             self.window.excuse(refused - self._refused_frames)
             self._refused_frames = refused
-            self._heard_s = None
+            self._progress_s = None
 
     def _drops(self, name: str) -> int:
-        """Frames that a node has refused; messages that belonged to no frame do not count."""
-        return sum(
-            int(value)
-            for key, value in self.diagnostics.get(name, {}).items()
-            if key.startswith("dropped ") and not key.startswith("dropped unmatched_")
-        )
+        """Frames that a node has dropped; unmatched messages are not frames."""
+        drops = counts_in(self.diagnostics.get(name, {}), DROPPED)
+        return sum(n for reason, n in drops.items() if not reason.startswith(UNMATCHED_PREFIX))
 
-    def _received(self, name: str, topic: str) -> int:
-        match = RECEIVED.search(self.diagnostics.get(name, {}).get(f"received {topic}", ""))
-        return int(match[1]) if match else 0
+    def _received(self, topic: str) -> int:
+        return received_in(self.diagnostics.get(GRAPH, {}), topic)

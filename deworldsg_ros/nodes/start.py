@@ -1,4 +1,4 @@
-"""Start of a node's process: a signal ends it with 0 also while Python still imports."""
+"""Start of a node's process: a signal during the imports ends it with exit code 0."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import NoReturn
 
 
 def start(name: str) -> NoReturn:
-    """Run the node of a module of this package, and end the process with its exit code."""
+    """Run the node of a module of this package; end the process with its exit code."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        # Nothing is open yet. The node's own handlers take over when it begins.
+        # Nothing is open yet. The node installs its own handlers.
         signal.signal(number, lambda *_: os._exit(0))
     sys.exit(importlib.import_module(f"{__package__}.{name}").main())

@@ -1,6 +1,8 @@
-"""The only place where ROS messages and numpy meet.
+"""The border between ROS 2 and the rest of the package.
 
-What turns messages into frames (`images`, `camera_info`, `poses`, `transforms`, `streams`,
-`assembler`, `posed`, `sync`) knows them by their attributes alone and imports no rclpy, so that a
-bag read in one process takes the same path as the nodes.
+`node` is the base of every node (parameters, guarded callbacks, diagnostics, shutdown), `joining`
+adds a worker thread behind joined streams, and `process` runs one node as a process. `options` and
+`parameters` declare ROS parameters; `health` and `reasons` fill /diagnostics. `inputs` and `qos`
+subscribe to whatever the camera publishes; `markers` and `transform_output` write messages.
+Conversion of messages to numpy, which needs no rclpy, is in `deworldsg_ros.streams`.
 """

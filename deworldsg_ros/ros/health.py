@@ -1,7 +1,8 @@
-"""What a node tells about itself: rates, latencies, drops by reason, what it waits for."""
+"""The state of a node for /diagnostics: rates, latencies, drops by reason, missing inputs."""
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -11,20 +12,23 @@ import numpy as np
 
 OK, WARN, ERROR = 0, 1, 2
 
-# Counted under this, an exception was not foreseen.
+# The reason of an unexpected exception.
 INTERNAL_ERROR = "internal_error"
-# Counted, but no cause for alarm: one camera stream is faster than the other, or than the work.
-HARMLESS_PREFIX = "unmatched_"
+# Reasons with this prefix raise no warning: one camera stream is faster than the other, or than the
+# node.
+UNMATCHED_PREFIX = "unmatched_"
+DROPPED, LEFT_OUT, RECEIVED = "dropped ", "objects left out ", "received "
+TOTAL = re.compile(r"(\d+) in total")
 
 
 @dataclass(frozen=True)
 class Report:
-    """One line of /diagnostics.
+    """One status of /diagnostics.
 
     Attributes:
         level: OK, WARN or ERROR.
-        message: what matters most, in one sentence.
-        values: everything, by name.
+        message: one sentence.
+        values: all values, by name.
     """
 
     level: int
@@ -36,7 +40,7 @@ class Health:
     """Counts between two reports, and since the start; safe to use from several threads.
 
     Args:
-        product: what the node makes, for the message: "frame graphs".
+        product: output of the node in the message, e.g. "frame graphs".
     """
 
     def __init__(self, product: str) -> None:
@@ -59,21 +63,21 @@ class Health:
             self._received[topic] += 1
 
     def published(self, latency_s: float | None = None) -> None:
-        """Count a product, and how long it took from its inputs on."""
+        """Count a product, and the time since its inputs were complete."""
         with self._lock:
             self._published += 1
             if latency_s is not None:
                 self._latencies_ms.append(1e3 * latency_s)
 
     def dropped(self, reason: str, number: int = 1, example: str = "") -> None:
-        """Count a drop; the newest example of each reason is told."""
+        """Count a drop; the report contains the newest example of each reason."""
         with self._lock:
             self._drops[reason] += number
             if example:
                 self._examples[reason] = example.splitlines()[0]
 
     def left_out(self, reasons: Mapping[str, int]) -> None:
-        """Count objects that a frame went on without; every frame has some."""
+        """Count objects that a processed frame lacks; they raise no warning."""
         with self._lock:
             self._left_out.update(reasons)
 
@@ -83,56 +87,79 @@ class Health:
         with self._lock:
             return dict(self._drops)
 
+    @property
+    def products(self) -> int:
+        """Number of products since the start."""
+        with self._lock:
+            return self._published
+
     def report(
         self, now_s: float, waiting_for: Sequence[str] = (), values: Mapping[str, str] | None = None
     ) -> Report:
-        """Sum up the time since the last report.
+        """Summarise the time since the last report.
 
         Args:
-            now_s: a clock that only goes forward, seconds.
-            waiting_for: what is missing, in words.
-            values: more to tell, by name.
+            now_s: monotonic clock, seconds.
+            waiting_for: missing inputs, in words.
+            values: further values, by name.
         """
         with self._lock:
             elapsed_s = max(now_s - self._reported_s, 1e-9) if self._reported_s is not None else 0.0
             rate = _rate(self._published - self._published_before, elapsed_s)
-            new_drops = self._drops - self._drops_before
-            latencies_ms, self._latencies_ms = self._latencies_ms, []
-            told = {f"{self._product} a second": f"{rate:.1f}", "total": str(self._published)}
-            for topic, count in sorted(self._received.items()):
-                received = _rate(count - self._received_before[topic], elapsed_s)
-                told[f"received {topic}"] = f"{received:.1f} a second, {count} in all"
-            if latencies_ms:
-                told["latency mean ms"] = f"{np.mean(latencies_ms):.1f}"
-                told["latency p95 ms"] = f"{np.percentile(latencies_ms, 95):.1f}"
-            for reason, count in sorted(self._drops.items()):
-                told[f"dropped {reason}"] = str(count)
-                if reason in self._examples:
-                    told[f"why {reason}"] = self._examples[reason]
-            for reason, count in sorted(self._left_out.items()):
-                told[f"objects left out {reason}"] = str(count)
-            self._reported_s = now_s
-            self._received_before = self._received.copy()
-            self._published_before = self._published
-            self._drops_before = self._drops.copy()
-        for index, text in enumerate(waiting_for):
-            told[f"waiting for {index + 1}"] = text
-        told.update(values or {})
-        serious = {
-            reason: count
-            for reason, count in new_drops.items()
-            if not reason.startswith(HARMLESS_PREFIX)
-        }
-        message = f"{rate:.1f} {self._product} a second"
-        if waiting_for:
-            message = "; ".join(waiting_for)
-        if serious:
-            message += "".join(
-                f"; dropped {count} {reason}: {told.get(f'why {reason}', 'no example')}"
-                for reason, count in sorted(serious.items())
-            )
-        level = WARN if waiting_for or serious else OK
-        return Report(ERROR if INTERNAL_ERROR in serious else level, message, told)
+            drops = {
+                reason: count
+                for reason, count in sorted((self._drops - self._drops_before).items())
+                if not reason.startswith(UNMATCHED_PREFIX)
+            }
+            counted = self._counted(rate, elapsed_s)
+            message = "; ".join(waiting_for) or f"{rate:.1f} {self._product} per second"
+            for reason, count in drops.items():
+                example = self._examples.get(reason, "no example")
+                message += f"; dropped {count} {reason}: {example}"
+            self._begin_period(now_s)
+        missing = {f"waiting for {at}": text for at, text in enumerate(waiting_for, 1)}
+        level = WARN if waiting_for or drops else OK
+        return Report(
+            ERROR if INTERNAL_ERROR in drops else level,
+            message,
+            {**counted, **missing, **(values or {})},
+        )
+
+    def _counted(self, rate: float, elapsed_s: float) -> dict[str, str]:
+        values = {f"{self._product} per second": f"{rate:.1f}", "total": str(self._published)}
+        for topic, count in sorted(self._received.items()):
+            received = _rate(count - self._received_before[topic], elapsed_s)
+            values[f"{RECEIVED}{topic}"] = f"{received:.1f} per second, {count} in total"
+        if self._latencies_ms:
+            values["latency mean ms"] = f"{np.mean(self._latencies_ms):.1f}"
+            values["latency p95 ms"] = f"{np.percentile(self._latencies_ms, 95):.1f}"
+        for reason, count in sorted(self._drops.items()):
+            values[f"{DROPPED}{reason}"] = str(count)
+            if reason in self._examples:
+                values[f"example {reason}"] = self._examples[reason]
+        for reason, count in sorted(self._left_out.items()):
+            values[f"{LEFT_OUT}{reason}"] = str(count)
+        return values
+
+    def _begin_period(self, now_s: float) -> None:
+        self._reported_s = now_s
+        self._latencies_ms = []
+        self._received_before = self._received.copy()
+        self._published_before = self._published
+        self._drops_before = self._drops.copy()
+
+
+def counts_in(values: Mapping[str, str], prefix: str) -> dict[str, int]:
+    """Counts by reason in a report's values; `prefix` is DROPPED or LEFT_OUT."""
+    return {
+        key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)
+    }
+
+
+def received_in(values: Mapping[str, str], topic: str) -> int:
+    """Number of messages received on a topic since the start, in a report's values."""
+    match = TOTAL.search(values.get(f"{RECEIVED}{topic}", ""))
+    return int(match[1]) if match else 0
 
 
 def _rate(count: int, elapsed_s: float) -> float:

@@ -1,4 +1,4 @@
-"""Subscriptions to the camera: images, camera_info and poses, whatever form they come in."""
+"""Subscriptions to the camera: images, camera_info and poses in every supported type."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.streams.posed import PosedAssembler
 from deworldsg_ros.streams.poses import stamp_ns_of
 
-try:  # On a full installation of ROS, and not in its wheels.
-    from tf2_msgs.msg import TFMessage as TFMessage  # transform_output has it from here
+try:  # Part of ROS 2, but not of its wheels.
+    from tf2_msgs.msg import TFMessage as TFMessage  # for transform_output, too
 except ImportError:
     TFMessage = None
 
-# Called with a message and its stamp in nanoseconds.
+# Takes a message and its stamp in nanoseconds.
 Taker = Callable[[Any, int], None]
-# An image has to survive one look at a slow network; poses and transforms come faster.
+# Messages that DDS keeps: a third of a second of images at 30 Hz, half a second of poses at 200 Hz.
 IMAGE_DEPTH = 10
 POSE_DEPTH = 100
-# How long poses are waited for before TF stands in for them.
+# Without a publisher of poses for this time, poses come from TF.
 TF_AFTER_S = 3.0
 
 
 def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[Source]:
-    """Where images may come from, in order of preference.
+    """Topics and types of images, in order of preference.
 
     Args:
-        topic: of the raw images.
-        compressed_suffix: that image_transport appends, e.g. ``/compressed``.
+        topic: topic of the raw images.
+        compressed_suffix: suffix of image_transport, e.g. ``/compressed``.
         transport: auto, raw or compressed.
     """
     raw = [source(topic, Image)]
@@ -48,7 +48,7 @@ def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[So
 
 
 def listen_rgb(node: StageNode, take: Taker) -> None:
-    """Take RGB images."""
+    """Subscribe to RGB images."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("rgb/image_raw")
     sources = image_sources(topic, "/compressed", inputs.transport)
@@ -56,7 +56,7 @@ def listen_rgb(node: StageNode, take: Taker) -> None:
 
 
 def listen_depth(node: StageNode, take: Taker) -> None:
-    """Take depth images."""
+    """Subscribe to depth images."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("depth/image_raw")
     sources = image_sources(topic, "/compressedDepth", inputs.transport)
@@ -64,42 +64,42 @@ def listen_depth(node: StageNode, take: Taker) -> None:
 
 
 def listen_camera_info(node: StageNode, take: Taker) -> None:
-    """Take camera_info."""
+    """Subscribe to camera_info."""
     sources = [source("rgb/camera_info", CameraInfo)]
     reliability = node.parameters.inputs.reliability
     node.listen("camera_info", sources, _stamped(take), reliability, IMAGE_DEPTH)
 
 
 def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
-    """Take poses, and transforms where they are wanted or needed.
+    """Subscribe to poses, and to TF if `inputs.pose_source` or an odometry requires it.
 
     Raises:
-        ConfigurationError: where TF is wanted and its messages are not installed.
+        ConfigurationError: if TF is required and tf2_msgs is not installed.
     """
-    wanted = node.parameters.inputs.pose_source
+    pose_source = node.parameters.inputs.pose_source
     transforms = _Transforms(node, frames)
-    if wanted == "tf":
+    if pose_source == "tf":
         transforms.listen()
         return
     kinds = {"pose": [PoseStamped], "odometry": [Odometry], "auto": [PoseStamped, Odometry]}
-    carried = wanted == "auto" and TFMessage is not None
+    uses_tf = pose_source == "auto" and TFMessage is not None
     add = node.taking(frames.add_pose)
 
     def take(message: Any, stamp_ns: int) -> None:
         add(message, stamp_ns)
-        if carried and getattr(message, "child_frame_id", "") not in ("", frames.camera_frame):
+        if uses_tf and getattr(message, "child_frame_id", "") not in ("", frames.camera_frame):
             transforms.listen()
 
-    sources = [source("camera/pose", kind) for kind in kinds[wanted]]
+    sources = [source("camera/pose", kind) for kind in kinds[pose_source]]
     reliability = node.parameters.inputs.reliability
     poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
-    if carried:
+    if uses_tf:
         frames.expect_transforms()
         _fall_back_on_transforms(node, poses, transforms)
 
 
 class _Transforms:
-    """Subscriptions to /tf and /tf_static, made once."""
+    """Subscriptions to /tf and /tf_static, created once."""
 
     def __init__(self, node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
         self._node = node
@@ -107,11 +107,11 @@ class _Transforms:
         self._is_listening = False
 
     def listen(self) -> None:
-        """Subscribe, unless that is done; raises ConfigurationError without tf2_msgs."""
+        """Subscribe at the first call; raises ConfigurationError without tf2_msgs."""
         if TFMessage is None:
             raise ConfigurationError(
-                "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: wanted a "
-                "full ROS 2 installation, or poses on camera/pose"
+                "parameter inputs.pose_source is 'tf', but tf2_msgs is not installed: install all "
+                "of ROS 2, or publish poses on camera/pose"
             )
         if self._is_listening:
             return
@@ -130,17 +130,17 @@ class _Transforms:
 def _fall_back_on_transforms(
     node: StageNode, poses: AutoSubscription, transforms: _Transforms
 ) -> None:
-    """Listen to TF once nobody has offered poses for a while, and not before.
+    """Subscribe to TF after TF_AFTER_S without a publisher of poses.
 
-    The two may be in different world frames: a graph must not begin in one and go on in the other.
+    Not earlier: poses and TF may have different world frames, and a graph has one.
     """
     started_s = time.monotonic()
 
-    def look() -> None:
+    def check() -> None:
         if not poses.was_published and time.monotonic() - started_s > TF_AFTER_S:
             transforms.listen()
 
-    node.every(CHECK_PERIOD_S, look)
+    node.every(CHECK_PERIOD_S, check)
 
 
 def _stamped(take: Taker) -> Callable[[Any], None]:

@@ -1,4 +1,4 @@
-"""A node that joins streams and works on what is complete, in a thread of its own."""
+"""A node that joins streams by stamp and processes each complete frame in its own thread."""
 
 from __future__ import annotations
 
@@ -11,42 +11,68 @@ from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.streams.assembler import Assembler
 from deworldsg_ros.streams.posed import TOPICS
 
+# A third of a second of a 30 Hz camera: a longer queue of a slow node adds latency only. It has to
+# be longer than the window of a replay (4 frames), or a replay would lose frames.
+QUEUE_FRAMES = 10
+# Poses of a SLAM system come seconds after their image. The streams keep 256 images, which is 8 s
+# at 30 Hz.
+MAX_WAIT_S = 5.0
+
 Out = TypeVar("Out")
 
 
 class JoiningNode(StageNode, Generic[Out]):
-    """Callbacks feed an assembler; what it completes is worked on in order, in a thread."""
+    """Callbacks feed an assembler; a worker thread processes its complete frames in order.
 
-    def __init__(self, name: str, product: str, **options: Any) -> None:
+    Args:
+        name: node name.
+        product: name of the output in /diagnostics.
+        queue_frames: complete frames that may wait for the worker; more drop the oldest.
+        max_wait_s: maximum time a frame waits for depth, camera_info or pose.
+        options: arguments of rclpy's Node.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        product: str,
+        *,
+        queue_frames: int = QUEUE_FRAMES,
+        max_wait_s: float = MAX_WAIT_S,
+        **options: Any,
+    ) -> None:
         super().__init__(name, product, **options)
+        self._queue_frames = queue_frames
+        self._max_wait_s = max_wait_s
         self._assembler: Assembler[Any, Out] | None = None
         self._worker: Worker[tuple[Out, float]] | None = None
 
     def assembler_options(self) -> dict[str, Any]:
-        """Arguments that every assembler takes: names, patience, where drops are counted."""
+        """Arguments of every assembler: topic names, maximum wait, counter of drops."""
         return {
             "topics": {name: self.resolve_topic_name(topic) for name, topic in TOPICS.items()},
-            "patience_s": self.parameters.node.patience_s,
+            "patience_s": self._max_wait_s,
             "on_drop": self.drop,
         }
 
     def join(self, assembler: Assembler[Any, Out], work: Callable[[Out], None]) -> None:
-        """Work on what the assembler completes; `work` publishes one product a call."""
+        """Call `work` with each frame that the assembler completes; it publishes one product."""
         self._assembler = assembler
 
-        def do(item: tuple[Out, float]) -> None:
+        def process(item: tuple[Out, float]) -> None:
             joined, joined_s = item
             with self.refusing():
                 work(joined)
                 self.health.published(time.monotonic() - joined_s)
 
-        size = self.parameters.node.queue_size
-        self._worker = Worker(self.get_name(), do, size=size, on_overrun=self._overrun)
-        # What waits in vain is given up even when nothing comes any more.
+        self._worker = Worker(
+            self.get_name(), process, size=self._queue_frames, on_overrun=self._overrun
+        )
+        # The maximum wait also ends when no message arrives.
         self.every(CHECK_PERIOD_S, self.pump)
 
     def taking(self, add: Callable[..., None]) -> Callable[..., None]:
-        """A callback that adds to the assembler, then passes on what is complete."""
+        """A callback that adds a message to the assembler and passes on complete frames."""
 
         def take(*arguments: Any) -> None:
             add(*arguments)
@@ -55,21 +81,21 @@ class JoiningNode(StageNode, Generic[Out]):
         return take
 
     def pump(self) -> None:
-        """Pass on what is complete."""
+        """Pass complete frames to the worker."""
         assert self._assembler is not None and self._worker is not None
         for joined in self._assembler.pop_ready(time.monotonic_ns()):
             self._worker.submit((joined, time.monotonic()))
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """What the assembler lacks."""
+        """Missing inputs, in words."""
         return [] if self._assembler is None else self._assembler.waiting_for(now_ns)
 
     def more_values(self) -> dict[str, str]:
-        """How much work waits."""
+        """Number of frames in the queue."""
         return {} if self._worker is None else {"queue": str(self._worker.waiting)}
 
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until all work is done; False where time ran out."""
+        """Wait until all frames are processed; False on timeout."""
         return self._worker is None or self._worker.wait_idle(timeout_s)
 
     def close(self) -> None:
@@ -79,5 +105,8 @@ class JoiningNode(StageNode, Generic[Out]):
         super().close()
 
     def _overrun(self) -> None:
-        size = self.parameters.node.queue_size
-        self.drop("overrun", f"the work is slower than the frames: the oldest of {size} goes")
+        self.drop(
+            "overrun",
+            f"the node processes fewer frames than arrive: dropped the oldest of "
+            f"{self._queue_frames}",
+        )

@@ -1,4 +1,4 @@
-"""Markers of the view as ROS messages."""
+"""Markers of `view.markers` as ROS messages."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ KINDS = {"sphere": Marker.SPHERE, "text": Marker.TEXT_VIEW_FACING, "arrow": Mark
 
 
 def marker_array(markers: Iterable[Any], frame_id: str, stamp: Any) -> MarkerArray:
-    """The whole picture: everything there was goes, then all of `markers` come.
+    """All markers of the graph, after a marker that deletes the previous ones.
 
-    A viewer that missed arrays, or joins late, ends with the same picture as one that did not.
+    A viewer that joins late or loses messages thus shows the same as any other.
 
     Args:
-        markers: with namespace, id, kind, position, quat_xyzw, scale, rgba, text, points.
+        markers: as `view.markers.Marker`.
         frame_id: world frame.
         stamp: builtin_interfaces/Time.
     """

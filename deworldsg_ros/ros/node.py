@@ -1,4 +1,4 @@
-"""What the nodes share: start, parameters, guarded callbacks, diagnostics, a clean end."""
+"""The base of every node: parameters, guarded callbacks, subscriptions, diagnostics, shutdown."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from deworldsg_ros.ros.health import INTERNAL_ERROR, Health
+from deworldsg_ros.ros.health import INTERNAL_ERROR, UNMATCHED_PREFIX, Health
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import declare
 from deworldsg_ros.ros.process import run_process
@@ -24,60 +24,68 @@ from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 
+# Publishers that appear or change are noticed after this time.
 CHECK_PERIOD_S = 0.25
+# The usual rate of /diagnostics; diagnostic_aggregator calls a status stale after 5 s.
 DIAGNOSTICS_PERIOD_S = 1.0
-# A reason that repeats is logged this often at most.
+# Minimum time between two log lines with the same reason.
 LOG_PERIOD_S = 10.0
-# The longest that a signal waits to be noticed.
+# Longest delay until a signal is noticed.
 SPIN_PERIOD_S = 0.2
 
 
 class StageNode(Node):  # type: ignore[misc]
     """A node around one stage.
 
-    Callbacks made by `guarded` never raise: what is refused is counted by its reason, what was
-    not foreseen is counted as ``internal_error`` and logged with its traceback.
+    Callbacks made by `guarded` never raise. Refused input is counted under its reason; an
+    unexpected exception is counted as ``internal_error`` and logged with its traceback.
 
     Args:
-        name: of the node.
-        product: what it makes, for the diagnostics.
+        name: node name.
+        product: name of the output in /diagnostics.
+        options: arguments of rclpy's Node.
 
     Attributes:
-        parameters: the configuration it runs with.
-        health: its counts.
+        parameters: values of this start; nodes read parameters once.
+        health: counts for /diagnostics.
+
+    Raises:
+        ConfigurationError: for an unknown parameter or a value out of range.
     """
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.parameters = declare(self, Parameters)
-        self.get_logger().info("loading (a first start compiles kernels, up to a minute)")
+        self.get_logger().info(
+            "loading; the first start compiles kernels, which takes up to a minute"
+        )
         self.health = Health(product)
         self._logged_s: dict[str, float] = {}
         self._log_lock = threading.Lock()
         self._subscriptions_to_check: list[AutoSubscription] = []
-        # Timers of this node follow real time, also where /clock is not published.
+        # Real time: with use_sim_time, timers on the node's clock would stop without /clock.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.every(CHECK_PERIOD_S, self._check_publishers)
         self.every(DIAGNOSTICS_PERIOD_S, self._diagnose)
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """What is missing, in words; for subclasses to say."""
+        """Missing inputs, in words; for subclasses."""
         return []
 
     def more_values(self) -> dict[str, str]:
-        """More for the diagnostics, by name; for subclasses to say."""
+        """Further values of /diagnostics, by name; for subclasses."""
         return {}
 
     def close(self) -> None:
-        """End threads before the node goes; for subclasses to extend."""
+        """End threads before the node is destroyed; for subclasses to extend."""
 
     def every(self, period_s: float, function: Callable[[], None]) -> None:
         """Call a function periodically, in real time."""
         self.create_timer(period_s, self.guarded(function), clock=self._steady)
 
     def guarded(self, function: Callable[..., None]) -> Callable[..., None]:
-        """The function, unable to raise."""
+        """The function, with its exceptions counted and logged instead of raised."""
 
         def call(*arguments: Any) -> None:
             with self.refusing():
@@ -87,18 +95,18 @@ class StageNode(Node):  # type: ignore[misc]
 
     @contextlib.contextmanager
     def refusing(self) -> Iterator[None]:
-        """Count and log what goes wrong inside, and go on."""
+        """Count and log exceptions of the block."""
         try:
             yield
         except RefusedInput as refusal:
             self.drop(refusal.reason, str(refusal))
-        except Exception as error:  # the node has to outlive what nobody foresaw
-            # When the context is gone, publishing fails: that is the end, and no error.
+        except Exception as error:  # the node has to survive an unexpected message
+            # During shutdown the context is invalid and publishing fails: this is no error.
             if rclpy.ok(context=self.context):
                 self.drop(INTERNAL_ERROR, f"{error}\n{traceback.format_exc()}")
 
     def drop(self, reason: str, message: str, number: int = 1) -> None:
-        """Count a drop and log it, the same reason not too often."""
+        """Count a drop and log it, each reason at most once per LOG_PERIOD_S."""
         self.health.dropped(reason, number, message)
         now_s = time.monotonic()
         with self._log_lock:
@@ -108,7 +116,7 @@ class StageNode(Node):  # type: ignore[misc]
         log = self.get_logger()
         if reason == INTERNAL_ERROR:
             log.error(f"{reason}: {message}")
-        elif reason.startswith("unmatched_"):
+        elif reason.startswith(UNMATCHED_PREFIX):
             log.debug(f"{reason}: {message}")
         else:
             log.warning(f"{reason}: {message}")
@@ -121,7 +129,7 @@ class StageNode(Node):  # type: ignore[misc]
         reliability: str,
         depth: int = 10,
     ) -> AutoSubscription:
-        """Subscribe to whichever source is published, at the reliability that matches."""
+        """Subscribe to the first source that is published, with a matching reliability."""
 
         def received(message: Any) -> None:
             self.health.received(name)
@@ -136,7 +144,7 @@ class StageNode(Node):  # type: ignore[misc]
     def listen_json(
         self, topic: str, kind: type[wire.M], callback: Callable[[wire.M], None], depth: int
     ) -> None:
-        """Subscribe to JSON messages of one of the package's types."""
+        """Subscribe to JSON messages of one type."""
 
         def received(message: Any) -> None:
             self.health.received(topic)
@@ -184,7 +192,7 @@ class StageNode(Node):  # type: ignore[misc]
 
 
 def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; returns the exit code, see `run_process`."""
+    """Run a node until SIGINT or SIGTERM; return the exit code of `run_process`."""
 
     def body(stop: threading.Event) -> int:
         node = make_node()

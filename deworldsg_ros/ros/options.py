@@ -1,4 +1,4 @@
-"""Everything that a node can be told."""
+"""The options of the nodes: one structure for the pipeline's nodes, one for replay_node."""
 
 from typing import Annotated
 
@@ -8,37 +8,64 @@ from deworldsg_ros.config import Config, option
 
 
 class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node runs, apart from what it computes."""
+    """Files of graph_node."""
 
-    queue_size: Annotated[
-        int,
-        option(
-            "frames that may wait for this node's work; the oldest goes: overrun",
-            ge=1,
-            le=100000,
-        ),
-    ] = 10
-    patience_s: Annotated[
-        float,
-        option(
-            "longest time a frame waits for depth, camera_info or pose, seconds",
-            gt=0,
-            le=3600,
-        ),
-    ] = 5.0
     save_path: Annotated[str, option("file that graph_node's service ~/save writes")] = (
         "scene_graph.json"
     )
     map_path: Annotated[
         str,
         option(
-            "map that graph_node goes on with, where the file is there, and that "
-            "~/save and a clean end write; empty = none. Poses have to be in the same world frame"
+            "map file: graph_node continues it if it exists; ~/save and a clean shutdown write it; "
+            "empty = no map. Poses must be in the map's world frame"
         ),
     ] = ""
 
 
 class Parameters(Config, frozen=True, forbid_unknown_fields=True):
-    """Everything that a node can be told: the configuration and how it runs."""
+    """Parameters of the pipeline's nodes: the configuration, and `node` without a prefix."""
 
     node: NodeOptions = NodeOptions()
+
+
+class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The recording, the speed of its replay, and the nodes to wait for."""
+
+    recording: Annotated[str, option("rosbag2 folder, .mcap or .db3 file, or data set folder")] = ""
+    topics: Annotated[
+        str,
+        option(
+            "topics of a bag, as rgb=/a,depth=/b,camera_info=/c,pose=/d; "
+            "a role that is left out is found by type and name"
+        ),
+    ] = ""
+    intrinsics: Annotated[
+        str, option("FX,FY,CX,CY in pixels, for a data set folder without intrinsics")
+    ] = ""
+    rate: Annotated[
+        float, option("speed: 1 = as recorded, 0 = as fast as the nodes process frames", ge=0)
+    ] = 1.0
+    wait_s: Annotated[
+        float, option("maximum wait for the four nodes, seconds; 0 = do not wait", ge=0)
+    ] = 10.0
+    save: Annotated[
+        bool,
+        option(
+            "when all frames are processed, call graph_node's service ~/save; requires the four "
+            "nodes: without them replay_node ends with exit code 3"
+        ),
+    ] = False
+    odometry: Annotated[
+        bool, option("wait for odometry_node, and do not publish the recorded poses")
+    ] = False
+    clock: Annotated[bool, option("publish the recorded time on /clock, for use_sim_time")] = False
+    events: Annotated[bool, option("print progress as JSON lines on the standard output")] = False
+
+
+class ReplayParameters(Config, frozen=True, forbid_unknown_fields=True):
+    """Parameters of replay_node: the configuration, and `node` without a prefix.
+
+    The configuration's `inputs` select the topics of a bag and the world frame of poses from TF.
+    """
+
+    node: ReplayOptions = ReplayOptions()

@@ -1,4 +1,4 @@
-"""ROS parameters of a node: declared from the typed configuration, checked once, then fixed."""
+"""ROS parameters of a node: declared from its typed options, checked at start-up, read-only."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 
 import msgspec
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.node import Node
 
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.scene.errors import ConfigurationError
 
-# Parameters that rclpy itself reads from the overrides.
+# Parameters that rclpy reads itself.
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
 RCLPY_PREFIXES = ("qos_overrides.",)
 
@@ -26,14 +27,14 @@ class Field:
     """One parameter.
 
     Attributes:
-        name: as ROS knows it: section.field, or field alone for how a node runs.
+        name: ROS name: ``section.field``, or ``field`` for the section ``node``.
         path: section and field.
         kind: float, int, str or bool.
-        default: its default.
-        description: from the configuration.
-        lowest, highest: inclusive bounds, None where there is none.
+        default: value without an override.
+        description: one line for the user.
+        lowest, highest: bounds; None = unbounded.
         lowest_is_open, highest_is_open: whether the bound itself is refused.
-        choices: the strings that it may be; empty = any.
+        choices: allowed strings; empty = any.
     """
 
     name: str
@@ -48,7 +49,7 @@ class Field:
     choices: tuple[str, ...] = ()
 
     def limits(self) -> str:
-        """The values that are allowed, in words; empty where any is."""
+        """Allowed values, in words; empty = any."""
         if self.choices:
             return "one of " + ", ".join(self.choices)
         parts = []
@@ -59,9 +60,80 @@ class Field:
         return " and ".join(parts)
 
 
+def declare(node: Node, kind: type[P]) -> P:
+    """Declare every parameter of a structure on a node; return the values of this start.
+
+    Raises:
+        ConfigurationError: for an unknown name, a wrong type or a value out of range.
+    """
+    # rclpy has no public access to overrides of parameters that are not declared. Those are the
+    # misspelled ones, which have to be refused.
+    overrides = {
+        name: parameter.value
+        for name, parameter in node._parameter_overrides.items()
+        if name not in RCLPY_NAMES and not name.startswith(RCLPY_PREFIXES)
+    }
+    parameters = resolve(overrides, node.get_name(), kind)
+    for field in fields(kind):
+        value = getattr(getattr(parameters, field.path[0]), field.path[1])
+        node.declare_parameter(field.name, value, descriptor(field), ignore_override=True)
+    return parameters
+
+
+def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
+    """Validate overrides, by ROS name, into a complete structure.
+
+    Args:
+        overrides: values by ROS name.
+        source: name of the node, for the error.
+        kind: structure of sections.
+
+    Raises:
+        ConfigurationError: one line with the parameter, its value and the allowed values.
+    """
+    known = {field.name: field for field in fields(kind)}
+    content: dict[str, dict[str, Any]] = {}
+    for name, value in overrides.items():
+        field = known.get(name)
+        if field is None:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
+        section, key = field.path
+        try:
+            msgspec.convert({section: {key: value}}, kind)
+        except msgspec.ValidationError as error:
+            raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
+        content.setdefault(section, {})[key] = value
+    return msgspec.convert(content, kind)
+
+
 def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
-    """Every parameter, in the order of the configuration."""
+    """Every parameter of a structure of sections, in its order."""
     return list(_walk(kind))
+
+
+def descriptor(field: Field) -> ParameterDescriptor:
+    """ROS description of a parameter; read-only, because nodes read parameters once."""
+    result = ParameterDescriptor(
+        description=field.description, read_only=True, additional_constraints=field.limits()
+    )
+    bounded = field.lowest is not None or field.highest is not None
+    if field.kind is float and bounded:
+        result.floating_point_range = [
+            FloatingPointRange(
+                from_value=float(-sys.float_info.max if field.lowest is None else field.lowest),
+                to_value=float(sys.float_info.max if field.highest is None else field.highest),
+            )
+        ]
+    if field.kind is int and bounded:
+        result.integer_range = [
+            IntegerRange(
+                from_value=int(-(2**63) if field.lowest is None else field.lowest),
+                to_value=int(2**63 - 1 if field.highest is None else field.highest),
+            )
+        ]
+    return result
 
 
 def _walk(struct: type[msgspec.Struct]) -> Iterator[Field]:
@@ -96,75 +168,11 @@ def _field(name: str, path: tuple[str, str], kind: Any, default: Any, descriptio
     )
 
 
-def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
-    """Validate overrides, by full name, into the whole set.
-
-    Raises:
-        ConfigurationError: in one line: the name, what was seen, what was wanted.
-    """
-    known = {field.name: field for field in fields(kind)}
-    content: dict[str, dict[str, Any]] = {}
-    for name, value in overrides.items():
-        field = known.get(name)
-        if field is None:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
-        section, key = field.path
-        try:
-            msgspec.convert({section: {key: value}}, kind)
-        except msgspec.ValidationError as error:
-            raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
-        content.setdefault(section, {})[key] = value
-    return msgspec.convert(content, kind)
-
-
 def _complaint(field: Field, value: Any) -> str:
-    wanted = field.limits() or field.kind.__name__
-    if field.kind is not str and not field.choices and field.limits():
-        wanted = f"{field.kind.__name__} {wanted}"
+    expected = field.limits() or field.kind.__name__
+    if field.kind is not str and field.limits():
+        expected = f"{field.kind.__name__} {expected}"
     hint = ""
     if field.kind is str and isinstance(value, bool):
-        hint = " (YAML reads a bare y, n, on or off as a truth value: put it in quotes)"
-    return f"parameter {field.name} is {value!r}, wanted {wanted}{hint}: {field.description}"
-
-
-def descriptor(field: Field) -> ParameterDescriptor:
-    """The ROS description of a parameter; read-only, for nodes read them at start-up."""
-    result = ParameterDescriptor(
-        description=field.description, read_only=True, additional_constraints=field.limits()
-    )
-    bounded = field.lowest is not None or field.highest is not None
-    if field.kind is float and bounded:
-        result.floating_point_range = [
-            FloatingPointRange(
-                from_value=float(-sys.float_info.max if field.lowest is None else field.lowest),
-                to_value=float(sys.float_info.max if field.highest is None else field.highest),
-            )
-        ]
-    if field.kind is int and bounded:
-        result.integer_range = [
-            IntegerRange(
-                from_value=int(-(2**63) if field.lowest is None else field.lowest),
-                to_value=int(2**63 - 1 if field.highest is None else field.highest),
-            )
-        ]
-    return result
-
-
-def declare(node: Any, kind: type[P]) -> P:
-    """Declare every parameter on a node, with the values it was started with.
-
-    Raises:
-        ConfigurationError: for an unknown name, a wrong type or a value out of range.
-    """
-    overrides = {
-        name: parameter.value
-        for name, parameter in node._parameter_overrides.items()
-        if name not in RCLPY_NAMES and not name.startswith(RCLPY_PREFIXES)
-    }
-    parameters = resolve(overrides, node.get_name(), kind)
-    for field in fields(kind):
-        value = getattr(getattr(parameters, field.path[0]), field.path[1])
-        node.declare_parameter(field.name, value, descriptor(field), ignore_override=True)
-    return parameters
+        hint = " (YAML reads a bare y, n, on or off as a boolean: put it in quotes)"
+    return f"parameter {field.name} is {value!r}, expected {expected}{hint}: {field.description}"

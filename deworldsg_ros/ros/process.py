@@ -1,4 +1,4 @@
-"""The process of a node: signals, exit codes, a clean end."""
+"""The process of a node: signals and exit codes."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ EXIT_USAGE = 2
 
 
 def run_process(body: Callable[[threading.Event], int], args: list[str] | None = None) -> int:
-    """Run something that uses ROS, from its start to its end.
+    """Initialise ROS, run a function, shut ROS down.
 
     Args:
-        body: given an event that SIGINT and SIGTERM set; returns the exit code.
-        args: of the command line; None = those of the process.
+        body: called with an event that SIGINT and SIGTERM set; returns the exit code.
+        args: command line; None = that of the process.
 
     Returns:
-        What the body returns, 2 for what cannot be used, 0 after an interrupt.
+        The exit code of `body`; 2 for unusable input; 0 after an interrupt.
     """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    # Our handlers, not rclpy's: those shut the context down while callbacks still publish.
+    # rclpy's own handlers would shut the context down while callbacks still publish.
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:  # a parameter file that cannot be read, a bad --ros-args
+    except RuntimeError as error:  # an unreadable parameter file, or malformed --ros-args
         return refuse(error)
     try:
         return body(stop)
@@ -45,6 +45,6 @@ def run_process(body: Callable[[threading.Event], int], args: list[str] | None =
 
 
 def refuse(error: Exception, code: int = EXIT_USAGE) -> int:
-    """Say what is wrong in a line of the standard error; gives the exit code."""
+    """Print an error on the standard error; return the exit code."""
     print(f"error: {error}", file=sys.stderr)
     return code

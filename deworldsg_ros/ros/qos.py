@@ -1,4 +1,4 @@
-"""Subscriptions that take what is published: reliable or best effort, raw or compressed."""
+"""Subscriptions that adapt to the publishers: reliable or best effort, raw or compressed."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def best_effort(depth: int) -> QoSProfile:
 
 @dataclass(frozen=True)
 class Source:
-    """A topic and type that a stream may come on.
+    """A possible topic and type of a stream.
 
     Attributes:
-        topic: name; relative names are the node's.
+        topic: topic name.
         kind: message class.
-        type_name: as the graph names it: package/msg/Name.
+        type_name: ROS name of the type, ``package/msg/Name``.
     """
 
     topic: str
@@ -42,14 +42,14 @@ class Source:
 
 
 def source(topic: str, kind: type) -> Source:
-    """A source of a message class."""
+    """The source of a topic and message class."""
     package = kind.__module__.split(".")[0]
     return Source(topic, kind, f"{package}/msg/{kind.__name__}")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What to subscribe to."""
+    """A source to subscribe to, and the reliability."""
 
     source: Source
     reliable: bool
@@ -57,7 +57,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Offer:
-    """What one publisher offers."""
+    """Topic, type and reliability of a publisher."""
 
     topic: str
     type_name: str
@@ -65,15 +65,14 @@ class Offer:
 
 
 def choose(sources: Sequence[Source], offers: Sequence[Offer], reliability: str) -> Choice:
-    """The first source that somebody publishes, and the reliability that matches them all.
+    """The first source with a publisher, and a reliability that matches all its publishers.
 
-    A best-effort publisher and a reliable subscriber never match, so reliable needs every
-    publisher's offer. While nobody publishes it is the first source, reliable: then nothing of a
-    reliable publisher is lost at the start.
+    DDS connects no reliable subscriber to a best-effort publisher. Without publishers the choice is
+    the first source, reliable: the first messages of a reliable publisher are then not lost.
 
     Args:
         sources: in order of preference.
-        offers: of all publishers.
+        offers: all publishers.
         reliability: auto, reliable or best_effort.
     """
     chosen, matching = sources[0], list[Offer]()
@@ -92,17 +91,17 @@ def choose(sources: Sequence[Source], offers: Sequence[Offer], reliability: str)
 
 
 class AutoSubscription:
-    """A subscription that is made anew when the publishers turn out to be others.
+    """A subscription that is recreated when the publishers change type or reliability.
 
     Args:
-        node: an rclpy node.
+        node: rclpy node.
         sources: in order of preference.
-        callback: given each message.
+        callback: called with each message.
         reliability: auto, reliable or best_effort.
         depth: messages that DDS keeps.
 
     Attributes:
-        was_published: whether a publisher was ever there.
+        was_published: whether there has been a publisher.
     """
 
     def __init__(
@@ -129,16 +128,16 @@ class AutoSubscription:
 
     @property
     def topic(self) -> str:
-        """The full name of the topic that is subscribed to."""
+        """Full name of the subscribed topic."""
         assert self._choice is not None
         return self._choice.source.topic
 
     def check(self) -> bool:
-        """Look at the publishers, subscribe anew where need be; True where it did."""
+        """Compare with the publishers; True if the subscription was recreated."""
         offers = self._offers()
         self.was_published = self.was_published or bool(offers)
         choice = choose(self._sources, offers, self._reliability)
-        # When the publishers go, what they were is the best guess of what comes back.
+        # After the last publisher ends, keep the choice: the same publisher is likely to return.
         if choice == self._choice or (self._choice is not None and not offers):
             return False
         if self._subscription is not None:
@@ -153,7 +152,7 @@ class AutoSubscription:
         return True
 
     def describe(self) -> str:
-        """Topic, type and reliability, for the log and the diagnostics."""
+        """Topic, type and reliability, in words."""
         assert self._choice is not None
         kind = self._choice.source.type_name
         return f"{self.topic} [{kind}] {'reliable' if self._choice.reliable else 'best effort'}"

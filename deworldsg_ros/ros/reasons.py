@@ -1,62 +1,87 @@
-"""The reasons under which /diagnostics counts what is refused, and what to do about each."""
+"""The reasons of refused input and dropped frames in /diagnostics: the cause, and the remedy."""
 
 from __future__ import annotations
 
 REASONS: dict[str, str] = {
     # Images
-    "unknown_encoding": "the image's encoding is none of those listed in the log line; convert it, "
-    "or for compressed depth publish PNG",
-    "empty_image": "the image has no pixels; look at the camera driver",
-    "bad_step": "a row is shorter than its pixels, or no whole number of them; look at the driver",
-    "short_buffer": "the image holds fewer bytes than its size needs; look at the driver",
-    "decode_failed": "a compressed image is neither JPEG nor PNG, or is damaged",
-    "grid_mismatch": "RGB, depth and camera_info differ in size; publish depth registered to RGB",
-    "invalid_intrinsics": "camera_info holds zeros or NaN; calibrate the camera",
+    "unknown_encoding": "The encoding of an image is not supported. Convert it to one that the log "
+    "line lists; for compressed depth publish PNG.",
+    "empty_image": "An image has no pixels. Check the camera driver.",
+    "bad_step": "The row length (step) of an image does not fit its width and encoding. Check the "
+    "camera driver.",
+    "short_buffer": "An image contains fewer bytes than its size requires. Check the camera "
+    "driver.",
+    "decode_failed": "A compressed image is damaged, or is neither JPEG nor PNG. Check the camera "
+    "driver and the network.",
+    "grid_mismatch": "RGB, depth and camera_info differ in size. Publish depth that is registered "
+    "to RGB.",
+    "invalid_intrinsics": "camera_info contains zeros or NaN. Calibrate the camera.",
     # Poses
-    "invalid_pose": "a pose holds NaN, infinity, or a quaternion that is not of length 1",
-    "wrong_frame": "a pose is in another world frame than the first one, or than "
-    "`inputs.world_frame`; or a local graph in another than the graph",
-    "pose_jump": "the camera moved more than 1 m between two frames, or rotated faster than 360 "
-    "degrees a second; accepted after five consistent frames at the new position",
-    "no_pose": "no pose within `inputs.pose_slop_s` of the image; look at rates and clocks",
-    "no_transform": "the odometry is of another frame than the camera's, and TF does not connect "
-    "the two; publish that transform, or set `inputs.pose_source` to odometry if the poses are the "
-    "camera's all the same",
-    "odometry_lost": "a frame fits none before it: blocked, blank or too fast; it gets no pose",
+    "invalid_pose": "A pose contains NaN or infinity, or its quaternion is not of length 1. Check "
+    "the source of the poses.",
+    "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "
+    "start. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
+    "pose_jump": "The camera moved more than 1 m between two frames, or rotated faster than 360 "
+    "degrees per second. Check the poses; a new position is accepted after five consistent frames.",
+    "no_pose": "No pose is within `inputs.pose_slop_s` of the image. Check the rate and the clock "
+    "of the poses.",
+    "no_transform": "The odometry describes another frame than the camera's, and TF does not "
+    "connect the two. Publish that transform; if the poses are the camera's, set "
+    "`inputs.pose_source` to odometry.",
+    "odometry_lost": "The odometry could not align a frame, which gets no pose. Move the camera "
+    "more slowly, and keep it unobstructed.",
     # Models
-    "detector_error": "the detector failed on the image; the log has the first traceback, other "
-    "frames go on. Out of memory: a smaller checkpoint, or a free device",
-    "segmenter_error": "the segmenter failed on the image: its frame graph is empty; see "
-    "`detector_error`",
-    "relation_head_error": "the relation head failed on the image: its objects go on without "
-    "relations; see `detector_error`",
+    "detector_error": "The detector failed on an image, which gives no frame graph. Read the "
+    "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
+    "segmenter_error": "The segmenter failed on an image, whose frame graph is empty. Read the "
+    "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
+    "relation_head_error": "The relation head failed on an image, whose frame graph has no "
+    "relations. Read the traceback in the log; if memory is short, choose a smaller checkpoint or "
+    "another device.",
     # Joining
-    "no_depth": "no depth image within `inputs.slop_s` of the RGB image",
-    "no_camera_info": "no usable camera_info came while the frame waited (`patience_s`)",
-    "no_instances": "a frame graph came without its instance image",
-    "no_rgb": "a local graph came without its RGB image",
-    "stale": "a message is not newer than the one before it on its topic; two publishers?",
-    "time_jump": "stamps went back by more than a second: a recording was started again",
-    "overrun": "the node's work is slower than the frames; the oldest of `queue_size` was let go",
-    "unmatched_rgb": "an RGB image belonged to no local graph; harmless, its frame was dropped "
-    "before",
-    "unmatched_depth": "a depth image belonged to no RGB image or frame graph; harmless where "
-    "depth is the faster stream",
-    "unmatched_instances": "an instance image came without its frame graph",
-    "unmatched_local_graph": "a local graph had to go because too many waited for their images",
-    "unmatched_frame_graph": "a frame graph had to go because too many waited for depth or pose",
-    "unmatched_evidence": "relation evidence waited for a local graph that did not come",
+    "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
+    "the stamps of the depth images.",
+    "no_camera_info": "No valid camera_info arrived within five seconds of the image. Publish it "
+    "on `rgb/camera_info`.",
+    "no_instances": "A frame graph arrived without its instance image. Use `config/fastdds.xml` "
+    "in every process.",
+    "no_rgb": "A local graph arrived without its RGB image. Use `config/fastdds.xml` in every "
+    "process.",
+    "stale": "A message is not newer than the last one on its topic. Look for a second publisher.",
+    "time_jump": "Stamps went back by more than a second, because a recording was restarted. "
+    "Nothing has to be done.",
+    "overrun": "A node processes fewer frames than arrive, and dropped the oldest in its queue. "
+    "Lower the camera's frame rate, or choose a faster model.",
+    "unmatched_rgb": "An RGB image belongs to no local graph, because its frame was dropped "
+    "before. See the other reasons.",
+    "unmatched_depth": "A depth image belongs to no RGB image or frame graph. This is harmless if "
+    "depth has the higher rate.",
+    "unmatched_instances": "An instance image arrived without its frame graph. Use "
+    "`config/fastdds.xml` in every process.",
+    "unmatched_local_graph": "Too many local graphs waited for their images, and the oldest was "
+    "dropped. Use `config/fastdds.xml` in every process.",
+    "unmatched_frame_graph": "Too many frame graphs waited for depth or pose, and the oldest was "
+    "dropped. Check the rates of depth and pose.",
+    "unmatched_evidence": "The local graph of relation evidence did not arrive. See the reasons of "
+    "lifting_node.",
     # Messages between the nodes
-    "invalid_message": "a JSON message does not fit its schema; the log line names the field",
-    "unknown_schema": "a JSON message is another one, or of a later version",
-    "unknown_instance": "the instance image holds a value beyond the frame graph's objects",
-    "vocabulary_mismatch": "a message has other classes or predicates than the graph; run all "
-    "nodes with one configuration",
-    "out_of_order": "a local graph is older than one that is merged already; restart graph_node "
-    "after starting a recording again",
-    "no_graph": "a pose correction came before the first local graph: there is nothing to correct",
-    "unknown_frame": "relation evidence speaks of a frame that the graph does not remember",
-    "invalid_prediction": "a world model's answer is no distribution",
-    # Neither
-    "internal_error": "a mistake in the program; the log has its traceback, the node went on",
+    "invalid_message": "A JSON message does not fit its schema. The log line names the field; run "
+    "all nodes in one version.",
+    "unknown_schema": "A JSON message has another schema, or a later version of it. Run all nodes "
+    "in one version.",
+    "unknown_instance": "The instance image contains an id without an object in the frame graph. "
+    "Run one segmentation_node only.",
+    "vocabulary_mismatch": "A message has other classes or predicates than the graph. Run all "
+    "nodes with one configuration.",
+    "out_of_order": "A local graph is older than one that is already merged. Restart graph_node "
+    "after restarting a recording.",
+    "no_graph": "A pose correction arrived before the first local graph, and is ignored. Nothing "
+    "has to be done.",
+    "unknown_frame": "The graph no longer remembers the frame of relation evidence. Choose a "
+    "faster world model or device.",
+    "invalid_prediction": "The prediction of a world model is not a probability distribution. "
+    "Check its probe.",
+    # The program
+    "internal_error": "An unexpected exception occurred, and the node continued. Report the "
+    "traceback in the log.",
 }

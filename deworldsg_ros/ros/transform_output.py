@@ -1,4 +1,4 @@
-"""Poses of the camera on /tf."""
+"""Camera poses on /tf."""
 
 from __future__ import annotations
 
@@ -19,9 +19,16 @@ from deworldsg_ros.streams.transforms import TransformTree
 def camera_transform(
     tree: TransformTree, stamp_ns: int, world_frame: str, camera_frame: str, T_world_camera: Float64
 ) -> TransformStamped:
-    """The transform of a pose, from the world to the root of the tree that the camera is in.
+    """The transform from the world to the root of the TF tree that contains the camera.
 
-    A frame has one parent, and a camera's optical frame mostly has one: its housing, on a robot.
+    In TF a frame has one parent. The optical frame usually has one already: the camera's housing.
+
+    Args:
+        tree: static transforms of the camera's mounting.
+        stamp_ns: stamp of the image.
+        world_frame: frame_id of the pose.
+        camera_frame: optical frame.
+        T_world_camera: (4, 4) pose of the optical frame.
     """
     root = tree.root(camera_frame)
     T_camera_root = tree.between(stamp_ns, camera_frame, root) if root != camera_frame else None
@@ -42,17 +49,17 @@ def put_pose(T: Float64, position: Any, orientation: Any) -> None:
 
 
 class TransformOutput:
-    """Publishes the camera's pose on /tf, knowing from /tf_static what it is mounted on.
+    """Publishes the camera's pose on /tf, for the root of its mounting on /tf_static.
 
     Raises:
-        ConfigurationError: where tf2_msgs is not installed.
+        ConfigurationError: if tf2_msgs is not installed.
     """
 
     def __init__(self, node: StageNode) -> None:
         if TFMessage is None:
             raise ConfigurationError(
-                "parameter odometry.publish_tf is true, but tf2_msgs is not installed: wanted a "
-                "full ROS 2 installation"
+                "parameter odometry.publish_tf is true, but tf2_msgs is not installed: install all "
+                "of ROS 2, or set it to false"
             )
         self._mounting = TransformTree(0)
         self._output = node.create_publisher(TFMessage, "/tf", reliable(POSE_DEPTH))
@@ -66,7 +73,7 @@ class TransformOutput:
     def publish(
         self, stamp_ns: int, world_frame: str, camera_frame: str, T_world_camera: Float64
     ) -> None:
-        """Publish the pose (4, 4) of a stamp."""
+        """Publish a pose (4, 4) of the optical frame."""
         transform = camera_transform(
             self._mounting, stamp_ns, world_frame, camera_frame, T_world_camera
         )

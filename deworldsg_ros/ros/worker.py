@@ -1,4 +1,4 @@
-"""A thread for work that must not hold up the executor, with a bounded queue in order."""
+"""A worker thread with a bounded queue, so that slow work does not block the executor."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ T = TypeVar("T")
 
 
 class Worker(Generic[T]):
-    """Calls `work` with each item, in order, in a thread of its own.
+    """Calls `work` with each item, in order, in its own thread.
 
     Args:
-        name: of the thread.
+        name: thread name.
         work: must not raise.
         size: items that may wait.
-        on_overrun: called when a new item pushes out the oldest.
+        on_overrun: called when a new item replaces the oldest.
     """
 
     def __init__(
@@ -30,17 +30,17 @@ class Worker(Generic[T]):
         self._changed = threading.Condition()
         self._stopping = False
         self._busy = False
-        # A daemon, so that work that never ends cannot keep the process alive.
+        # A daemon, so that endless work cannot keep the process alive.
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @property
     def waiting(self) -> int:
-        """Number of items that wait."""
+        """Number of waiting items."""
         return len(self._items)
 
     def submit(self, item: T) -> None:
-        """Queue an item; never waits."""
+        """Queue an item; does not block."""
         overrun = False
         with self._changed:
             if len(self._items) >= self._size:
@@ -52,12 +52,12 @@ class Worker(Generic[T]):
             self._on_overrun()
 
     def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until nothing is queued or in work; False where time ran out."""
+        """Wait until nothing is queued or processed; False on timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not (self._items or self._busy), timeout_s)
 
     def stop(self, timeout_s: float = 5.0) -> bool:
-        """Leave what is queued, finish what is in work; False where time ran out."""
+        """Drop queued items and finish the current one; False on timeout."""
         with self._changed:
             self._stopping = True
             self._items.clear()

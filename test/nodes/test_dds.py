@@ -1,4 +1,4 @@
-"""Four node processes on DDS: the graph, its updates, its file, and the end of the nodes."""
+"""Four node processes over DDS: the graph, its updates, its file, and the end of the nodes."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def recording_path(root_dir: Path, request: pytest.FixtureRequest) -> Path:
 
 @dataclass
 class Run:
-    """What four nodes made of the first frames of a recording."""
+    """The output of four nodes for the first frames of a recording."""
 
     processes: dict[str, NodeProcess]
     peer: Peer
@@ -66,8 +66,8 @@ class Run:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory, recording_path: Path) -> Iterator[Run]:
     folder = tmp_path_factory.mktemp("nodes")
-    arguments = ("--ros-args", "-p", "queue_size:=100", "-p", "output.rate_hz:=20.0")
-    arguments += ("-p", f"save_path:={folder / 'saved.json'}", "-p", "patience_s:=30.0")
+    arguments = ("--ros-args", "-p", "output.rate_hz:=20.0")
+    arguments += ("-p", f"save_path:={folder / 'saved.json'}")
     source = open_source(recording_path)
     stamps = itertools.islice((m.stamp_ns for m in source.messages() if m.role is Role.RGB), FRAMES)
     last_ns = max(stamps)
@@ -107,7 +107,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, recording_path: Path) -> Itera
             process.end()
 
 
-def test_a_graph_comes_out(run: Run) -> None:
+def test_a_graph_is_published(run: Run) -> None:
     graph = run.latest()
     assert graph.nodes
     assert graph.frame_id
@@ -140,7 +140,7 @@ def test_one_process_gives_the_same_graph(run: Run, recording_path: Path) -> Non
     assert ours.nodes == theirs.nodes
 
 
-def test_who_comes_late_gets_the_graph(run: Run) -> None:
+def test_a_late_subscriber_gets_the_graph(run: Run) -> None:
     with peer("late_peer") as late:
         graphs = late.collect("/scene_graph", 1, latched=True)
         late.spin_until(lambda: bool(graphs), LIMIT_S, "the latched graph")
@@ -153,7 +153,7 @@ def test_markers_are_published(run: Run) -> None:
     assert {marker.header.frame_id for marker in run.markers[-1].markers} == {run.latest().frame_id}
 
 
-def test_every_node_tells_how_it_is(run: Run) -> None:
+def test_every_node_publishes_diagnostics(run: Run) -> None:
     run.peer.spin_until(lambda: set(run.diagnostics) >= set(NODES), LIMIT_S, "diagnostics")
     for name in NODES:
         values = {item.key: item.value for item in run.diagnostics[name].values}
@@ -183,7 +183,7 @@ def test_an_interrupt_ends_each_node_with_0(run: Run) -> None:
 @pytest.mark.parametrize(
     ("argument", "says"),
     [
-        ("lifting.tau:=7.0", "parameter lifting.tau is 7.0, wanted float >= 0 and <= 1"),
+        ("lifting.tau:=7.0", "parameter lifting.tau is 7.0, expected float >= 0 and <= 1"),
         ("lifting.tua:=0.1", "there is no parameter lifting.tua (did you mean lifting.tau?)"),
         ("inputs.world_up:=y", "put it in quotes"),
     ],

@@ -1,4 +1,4 @@
-"""The pages say what the code does; `python test/nodes/test_docs.py` writes their tables."""
+"""Tables of the pages equal the code; `python test/nodes/test_docs.py` writes them."""
 
 from __future__ import annotations
 
@@ -7,21 +7,20 @@ import re
 import sys
 from pathlib import Path
 
-import msgspec
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
-from deworldsg_ros.nodes.replay_options import ReplayParameters  # noqa: E402
-from deworldsg_ros.ros.options import Parameters  # noqa: E402
-from deworldsg_ros.ros.parameters import fields  # noqa: E402
+from deworldsg_ros.ros.options import Parameters, ReplayParameters  # noqa: E402
+from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
 from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
 
 PAGES = (ROOT / "docs" / "nodes.md", ROOT / "docs" / "recordings.md")
-# What the nodes run.
+# Everything that runs in the nodes.
 PACKAGES = (
-    "bridge",
+    "ros",
+    "streams",
     "nodes",
     "poses",
     "perception",
@@ -35,12 +34,12 @@ SCENE = ("camera.py", "codec.py", "wire.py")
 
 def reasons_table() -> str:
     rows = [f"| `{reason}` | {advice} |" for reason, advice in REASONS.items()]
-    return "\n".join(["| reason | what it means, what to do |", "|---|---|", *rows])
+    return "\n".join(["| reason | cause, and remedy |", "|---|---|", *rows])
 
 
-def parameters_table(parameters: type[msgspec.Struct]) -> str:
+def parameters_table(listed: list[Field]) -> str:
     rows = []
-    for field in fields(parameters):
+    for field in listed:
         default = "''" if field.default == "" else str(field.default).lower()
         limits = field.limits() or ("true, false" if field.kind is bool else "")
         kind = field.kind.__name__
@@ -51,8 +50,9 @@ def parameters_table(parameters: type[msgspec.Struct]) -> str:
 def with_tables(text: str) -> str:
     tables = {
         "reasons": reasons_table(),
-        "parameters": parameters_table(Parameters),
-        "replay": parameters_table(ReplayParameters),
+        "parameters": parameters_table(fields(Parameters)),
+        # The configuration is in the other table.
+        "replay": parameters_table([f for f in fields(ReplayParameters) if f.path[0] == "node"]),
     }
     pattern = re.compile(r"(<!-- (\w+) -->\n).*?(<!-- /\2 -->)", re.DOTALL)
     return pattern.sub(lambda match: f"{match[1]}{tables[match[2]]}\n{match[3]}", text)
@@ -83,9 +83,7 @@ def test_every_reason_of_the_code_is_explained() -> None:
     for name in PACKAGES:
         path = package / name
         paths += [path] if path.is_file() else sorted(path.rglob("*.py"))
-    # Training runs from the command line, and says itself what it refuses.
-    training = package / "relations" / "training"
-    used = set().union(*(reasons_in(path) for path in paths if training not in path.parents))
+    used = set().union(*(reasons_in(path) for path in paths))
     assert used
     assert used <= set(REASONS)
 

@@ -1,4 +1,4 @@
-"""A model that fails while the segmentation node runs: told in /diagnostics, and the node lives."""
+"""A model fails while segmentation_node runs: /diagnostics counts it, and the node continues."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def segmentation(backend: Backend) -> Iterator[Bench]:
         ("relation head", "relation_head_error"),
     ],
 )
-def test_a_failing_model_is_told_and_the_node_lives_on(
+def test_a_failing_model_is_counted_and_the_node_continues(
     segmentation: Bench, backend: Backend, part: str, reason: str
 ) -> None:
     works(segmentation, lambda: send_frame(segmentation))
@@ -45,7 +45,7 @@ def test_a_failing_model_is_told_and_the_node_lives_on(
     backend.failing = part
     segmentation.refuses(reason, lambda: send_frame(segmentation))
     report = segmentation.node.health.report(0.0)
-    assert f"the {part} failed: CUDA out of memory" in report.values[f"why {reason}"]
+    assert f"the {part} failed: CUDA out of memory" in report.values[f"example {reason}"]
     # Without a detector there is nothing to publish; else the frame goes on.
     if part != "detector":
         segmentation.expect(lambda: segmentation.products() > published, "a product")

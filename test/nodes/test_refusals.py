@@ -1,4 +1,4 @@
-"""Every refusal, provoked by a message on a topic, and the node alive and at work after it."""
+"""Each refusal, caused by a message on a topic; the node processes the next frame after it."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
+from deworldsg_ros.ros.joining import QUEUE_FRAMES
 from deworldsg_ros.scene import wire
 
 
@@ -59,7 +60,7 @@ SEGMENTATION_CASES = {
 
 
 @pytest.mark.parametrize("reason", SEGMENTATION_CASES)
-def test_segmentation_refuses_and_lives_on(segmentation: Bench, reason: str) -> None:
+def test_segmentation_refuses_and_continues(segmentation: Bench, reason: str) -> None:
     works(segmentation, lambda: send_frame(segmentation))
 
     def provoke() -> None:
@@ -80,7 +81,7 @@ def test_a_zero_quaternion_is_refused(segmentation: Bench) -> None:
     works(segmentation, lambda: send_frame(segmentation))
 
 
-def test_an_image_without_a_pose_near_it_is_refused(segmentation: Bench) -> None:
+def test_an_image_without_a_near_pose_is_refused(segmentation: Bench) -> None:
     works(segmentation, lambda: send_frame(segmentation))
 
     def provoke() -> None:
@@ -92,14 +93,14 @@ def test_an_image_without_a_pose_near_it_is_refused(segmentation: Bench) -> None
     works(segmentation, lambda: send_frame(segmentation))
 
 
-def test_a_recording_played_again_is_followed(segmentation: Bench) -> None:
+def test_a_restarted_recording_is_processed(segmentation: Bench) -> None:
     works(segmentation, lambda: send_frame(segmentation))
     segmentation.stamp_ns -= 100 * 10**9
     segmentation.refuses("time_jump", lambda: send_frame(segmentation))
     works(segmentation, lambda: [send_frame(segmentation) for _ in range(3)])
 
 
-def test_what_nobody_foresaw_is_counted_and_survived(
+def test_an_unexpected_exception_is_counted_and_the_node_continues(
     segmentation: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(frame: Any) -> None:
@@ -111,7 +112,7 @@ def test_what_nobody_foresaw_is_counted_and_survived(
     works(segmentation, lambda: send_frame(segmentation))
 
 
-def test_slow_work_lets_the_oldest_frames_go(
+def test_a_slow_node_drops_the_oldest_frames(
     segmentation: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begin = threading.Event()
@@ -121,12 +122,11 @@ def test_slow_work_lets_the_oldest_frames_go(
         assert begin.wait(LIMIT_S)
         return perceive(frame)
 
-    size = segmentation.node.parameters.node.queue_size
     with monkeypatch.context() as patch:
         patch.setattr(segmentation.node._perception, "perceive", wait)
 
         def provoke() -> None:
-            for _ in range(size + 3):
+            for _ in range(QUEUE_FRAMES + 3):
                 send_frame(segmentation)
                 segmentation.peer.spin_for(0.02)
 
@@ -169,7 +169,7 @@ LIFTING_CASES = {
 
 
 @pytest.mark.parametrize("reason", LIFTING_CASES)
-def test_lifting_refuses_and_lives_on(lifting: Bench, reason: str) -> None:
+def test_lifting_refuses_and_continues(lifting: Bench, reason: str) -> None:
     works(lifting, lambda: send_lifting(lifting))
 
     def provoke() -> None:
@@ -200,7 +200,7 @@ RELATION_CASES = {
 
 
 @pytest.mark.parametrize("reason", RELATION_CASES)
-def test_relation_refuses_and_lives_on(relation: Bench, reason: str) -> None:
+def test_relation_refuses_and_continues(relation: Bench, reason: str) -> None:
     works(relation, lambda: send_relation(relation))
 
     def provoke() -> None:
@@ -230,13 +230,13 @@ GRAPH_CASES = {
 
 
 @pytest.mark.parametrize("reason", GRAPH_CASES)
-def test_graph_refuses_and_lives_on(graph: Bench, reason: str) -> None:
+def test_graph_refuses_and_continues(graph: Bench, reason: str) -> None:
     works(graph, lambda: send_graph(graph))
     graph.refuses(reason, lambda: send_graph(graph, GRAPH_CASES[reason]))
     works(graph, lambda: send_graph(graph))
 
 
-def test_evidence_of_no_frame_is_refused(graph: Bench) -> None:
+def test_evidence_of_an_unknown_frame_is_refused(graph: Bench) -> None:
     works(graph, lambda: send_graph(graph))
     stray = evidence(graph.stamp_ns - 1)
     graph.refuses("unknown_frame", lambda: graph.send(deworldsg__relation_evidence=stray))

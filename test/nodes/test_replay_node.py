@@ -1,4 +1,4 @@
-"""replay_node: what it publishes, how it waits, how it ends."""
+"""replay_node: published messages, waiting, exit codes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def events_of(process):
     return found
 
 
-def test_bytes_of_the_bag_arrive_as_they_are(tmp_path, bag):
+def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
     received = {topic: [] for topic in KINDS}
     with peer() as camera:
         for topic, kind in KINDS.items():
@@ -70,9 +70,9 @@ def test_bytes_of_the_bag_arrive_as_they_are(tmp_path, bag):
     rgb = received["rgb/image_raw/compressed"]
     assert len(rgb) == COUNT
     for message in rgb:
-        wanted = recorded["/color/image_raw/compressed", stamp_ns_of(message)]
-        assert bytes(message.data) == wanted.data.tobytes()
-        assert message.format == wanted.format
+        expected = recorded["/color/image_raw/compressed", stamp_ns_of(message)]
+        assert bytes(message.data) == expected.data.tobytes()
+        assert message.format == expected.format
     assert len(received["depth/image_raw/compressedDepth"]) == COUNT
     assert len(received["rgb/camera_info"]) == COUNT
     assert not received["rgb/image_raw"]
@@ -83,7 +83,7 @@ def test_bytes_of_the_bag_arrive_as_they_are(tmp_path, bag):
     assert finished.published == COUNT
 
 
-def test_poses_out_of_tf_go_out_as_poses(tmp_path):
+def test_poses_from_tf_are_published_as_poses(tmp_path):
     items = camera_items(COUNT, with_pose=False)
     items += [
         (
@@ -111,8 +111,8 @@ def test_poses_out_of_tf_go_out_as_poses(tmp_path):
         assert message.header.frame_id == "map"
 
 
-def test_a_pipeline_that_is_required_and_does_not_come_is_an_error(tmp_path, bag):
-    process = replay(tmp_path, bag, wait_s=1.0, required="true")
+def test_save_requires_the_four_nodes(tmp_path, bag):
+    process = replay(tmp_path, bag, wait_s=1.0, save="true")
     try:
         assert process.wait(30) == 3
         assert "still waiting for" in process.log
@@ -121,21 +121,21 @@ def test_a_pipeline_that_is_required_and_does_not_come_is_an_error(tmp_path, bag
         process.end()
 
 
-def test_alone_it_replays_at_its_own_pace(tmp_path, bag):
-    process = replay(tmp_path, bag, wait_s=0.5, listener_s=0.2)
+def test_without_the_nodes_it_replays_at_the_recorded_rate(tmp_path, bag):
+    process = replay(tmp_path, bag, wait_s=0.5)
     try:
         assert process.wait(30) == 0
     finally:
         process.end()
-    told = events_of(process)
-    assert any(isinstance(event, events.Waiting) for event in told)
-    assert told[-1].published == COUNT
-    assert "replaying at its own pace" in process.log
+    printed = events_of(process)
+    assert any(isinstance(event, events.Waiting) for event in printed)
+    assert printed[-1].published == COUNT
+    assert "replaying without waiting for results" in process.log
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_0(tmp_path, bag, number):
-    process = replay(tmp_path, bag, rate=0.02, listener_s=0.2)
+    process = replay(tmp_path, bag, rate=0.02)
     try:
         wait_until(lambda: '"Started"' in process.log, 30, "the replay to start")
         process._process.send_signal(number)
@@ -151,13 +151,15 @@ def test_a_signal_ends_it_with_0(tmp_path, bag, number):
         ({"recording": "nowhere"}, "nowhere"),
         ({"recording": "''"}, "recording:="),
         ({"intrinsics": "'1,2'"}, "FX,FY,CX,CY"),
-        ({"config": "nowhere.yaml"}, "nowhere.yaml"),
-        ({"pose_topic": "/nothing"}, "/nothing"),
+        ({"topics": "pose=/nothing"}, "/nothing"),
+        ({"topics": "colour=/a"}, "rgb=/a,depth=/b,camera_info=/c,pose=/d"),
+        ({"rgb_topic": "/a"}, "did you mean topics?"),
+        ({"frame_rate": 30.0}, "there is no parameter frame_rate"),
         ({"rates": 2.0}, "did you mean rate"),
-        ({"rate": -1}, "wanted float >= 0"),
+        ({"rate": -1}, "expected float >= 0"),
     ],
 )
-def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, bag, parameters, words):
+def test_unusable_parameters_end_it_with_2(tmp_path, bag, parameters, words):
     process = replay(tmp_path, bag, **parameters)
     try:
         assert process.wait(30) == 2
@@ -165,6 +167,20 @@ def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, bag, parameters, wo
         process.end()
     assert words in process.log
     assert "Traceback" not in process.log
+
+
+def test_named_topics_and_a_parameter_file_are_used(tmp_path, bag):
+    """The file of the pipeline serves the replay, too: here it asks for raw images only."""
+    topics = "rgb=/camera/color/image_raw/compressed"
+    parameters = tmp_path / "parameters.yaml"
+    parameters.write_text("/**: {ros__parameters: {inputs: {transport: raw}, output: {top_k: 3}}}")
+    arguments = ("--ros-args", "--params-file", str(parameters), "-p", f"recording:='{bag}'")
+    process = NodeProcess("replay_node", tmp_path, *arguments, "-p", f"topics:='{topics}'")
+    try:
+        assert process.wait(30) == 2
+    finally:
+        process.end()
+    assert "no depth topic" in process.log  # the named RGB topic is compressed all the same
 
 
 def test_events_survive_their_line():

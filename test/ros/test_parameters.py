@@ -1,4 +1,4 @@
-"""ROS parameters: from the configuration, checked once, told in one line where they are wrong."""
+"""ROS parameters: declared from the configuration, checked at start-up, refused in one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 
 from deworldsg_ros import config as configuration
 from deworldsg_ros.ros import parameters as ros_parameters
-from deworldsg_ros.ros.options import NodeOptions, Parameters
+from deworldsg_ros.ros.options import NodeOptions, Parameters, ReplayOptions, ReplayParameters
 from deworldsg_ros.ros.parameters import Field, descriptor, fields
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -43,6 +43,18 @@ def test_every_field_of_the_configuration_is_a_parameter() -> None:
         for name in values
     }
     assert set(FIELDS) == names | set(NodeOptions.__struct_fields__)
+    replay = {field.name for field in fields(ReplayParameters)}
+    assert replay == names | set(ReplayOptions.__struct_fields__)
+
+
+def test_the_nodes_have_eleven_options_of_their_own() -> None:
+    """A new option needs a reason: this number may fall."""
+    assert len(NodeOptions.__struct_fields__) + len(ReplayOptions.__struct_fields__) <= 11
+
+
+@pytest.mark.parametrize("removed", ["queue_size", "patience_s"])
+def test_a_removed_option_is_unknown(removed: str) -> None:
+    assert f"there is no parameter {removed}" in complaint({removed: 1})
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -59,10 +71,10 @@ def test_every_parameter_is_described_and_its_default_is_allowed(name: str) -> N
 
 
 def test_overrides_by_full_name() -> None:
-    parameters = resolve({"lifting.tau": 0.1, "inputs.world_up": "y", "queue_size": 3})
+    parameters = resolve({"lifting.tau": 0.1, "inputs.world_up": "y", "map_path": "m"})
     assert parameters.lifting.tau == 0.1
     assert parameters.inputs.world_up == "y"
-    assert parameters.node.queue_size == 3
+    assert parameters.node.map_path == "m"
 
 
 def test_a_whole_number_is_a_number() -> None:
@@ -73,26 +85,26 @@ def test_a_whole_number_is_a_number() -> None:
     ("overrides", "says"),
     [
         ({"lifting.tua": 0.1}, "there is no parameter lifting.tua (did you mean lifting.tau?)"),
-        ({"queuesize": 1}, "did you mean queue_size?"),
+        ({"savepath": "m"}, "did you mean save_path?"),
         ({"xyzzy": 1}, "there is no parameter xyzzy"),
-        ({"lifting.tau": 7.0}, "parameter lifting.tau is 7.0, wanted float >= 0 and <= 1"),
-        ({"inputs.max_depth_m": 0.0}, "wanted float > 0"),
-        ({"lifting.tau": "much"}, "is 'much', wanted float"),
-        ({"lifting.min_pixels": 1}, "wanted int >= 2 and <= 100000"),
-        ({"lifting.min_pixels": 10.5}, "wanted int"),
-        ({"inputs.reliability": "often"}, "wanted one of auto, best_effort, reliable"),
+        ({"lifting.tau": 7.0}, "parameter lifting.tau is 7.0, expected float >= 0 and <= 1"),
+        ({"inputs.max_depth_m": 0.0}, "expected float > 0"),
+        ({"lifting.tau": "much"}, "is 'much', expected float"),
+        ({"lifting.min_pixels": 1}, "expected int >= 2 and <= 100000"),
+        ({"lifting.min_pixels": 10.5}, "expected int"),
+        ({"inputs.reliability": "often"}, "expected one of auto, best_effort, reliable"),
         ({"inputs.world_up": True}, "put it in quotes"),
-        ({"output.surface_points": "yes"}, "wanted bool"),
-        ({"inputs.world_frame": 3}, "wanted str"),
+        ({"output.surface_points": "yes"}, "expected bool"),
+        ({"inputs.world_frame": 3}, "expected str"),
     ],
 )
-def test_a_bad_override_is_told_in_one_line(overrides: dict, says: str) -> None:
+def test_a_bad_override_is_refused_in_one_line(overrides: dict, says: str) -> None:
     text = complaint(overrides)
     assert text.startswith("lifting_node: ")
     assert says in text
 
 
-def test_unbounded_sides_have_the_type_s_limits() -> None:
+def test_open_bounds_become_the_limits_of_the_type() -> None:
     (bounds,) = descriptor(FIELDS["inputs.max_depth_m"]).floating_point_range
     assert (bounds.from_value, bounds.to_value) == (0.0, sys.float_info.max)
     assert descriptor(FIELDS["inputs.max_depth_m"]).additional_constraints == "> 0"

@@ -70,7 +70,7 @@ class NodeProcess:
         """Whether it still runs."""
         return self._process.poll() is None
 
-    def wait_ready(self, limit_s: float = 60.0) -> None:
+    def wait_ready(self, limit_s: float = 150.0) -> None:
         """Wait until it says that it is ready."""
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log

@@ -159,7 +159,7 @@ class Bench:
         """Something that grows with every frame that the node has worked on."""
         if isinstance(self.node, GraphNode):  # what it publishes depends on the merging rule
             return self.node._newest_ns
-        return self.node.health._published
+        return self.node.health.products
 
     def expect(self, condition: Callable[[], bool], what: str) -> None:
         self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")

@@ -63,6 +63,24 @@ class TopicChoice:
     pose: str = ""
 
 
+def parse_topics(text: str) -> TopicChoice:
+    """Topics of ``rgb=/a,depth=/b,camera_info=/c,pose=/d``; each role at most once, any left out.
+
+    Raises:
+        RecordingError: for an unknown role, a role given twice, or a part without a topic.
+    """
+    chosen: dict[str, str] = {}
+    for part in filter(None, text.split(",")):
+        role, _, topic = (word.strip() for word in part.partition("="))
+        if role not in TopicChoice.__dataclass_fields__ or role in chosen or not topic:
+            raise RecordingError(
+                f"topics '{text}': cannot read '{part}', expected each of rgb, depth, camera_info "
+                "and pose at most once, as rgb=/a,depth=/b,camera_info=/c,pose=/d"
+            )
+        chosen[role] = topic
+    return TopicChoice(**chosen)
+
+
 def find_topics(
     topics: Sequence[Topic],
     choice: TopicChoice,
