@@ -8,9 +8,9 @@ EXIT_INTERRUPTED = 130
 
 
 def main() -> None:
-    """Run the program; ends the process with 0, 2 for errors of the user, 130 after Ctrl-C."""
+    """Run the program; exit code 0, 2 for an error of the user, 130 after Ctrl-C."""
     try:
-        # This takes a second, in which Ctrl-C may come, too.
+        # The import takes a second: Ctrl-C may come during it, too.
         from deworldsg_ros.cli.app import app
 
         app(prog_name="deworldsg")

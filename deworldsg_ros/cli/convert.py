@@ -1,4 +1,4 @@
-"""`deworldsg convert`: a folder or bag as one MCAP file."""
+"""`deworldsg convert`: convert a folder or bag to one MCAP file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`deworldsg info`: what a recording holds."""
+"""`deworldsg info`: show the topics of a recording."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from deworldsg_ros.recordings.recording import detect_kind, open_source
 
 
 def show_recording(path: Path, console: Console) -> None:
-    """Print kind, topics, and which of them would be used; raises RecordingError."""
+    """Print the kind, the topics and their use, and the lost data; raises RecordingError."""
     kind = detect_kind(path)
     used: dict[str, str] = {}
     problem = None
@@ -48,7 +48,7 @@ def show_recording(path: Path, console: Console) -> None:
     console.print(table)
     if used and Role.POSE.value not in used.values():
         console.print(
-            "[yellow]no poses:[/] run or demo with --odometry, or run with --poses FILE",
+            "[yellow]no poses:[/] use run or demo with --odometry, or run with --poses FILE",
             highlight=False,
         )
     for loss in losses:

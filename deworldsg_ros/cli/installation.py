@@ -1,4 +1,4 @@
-"""Where the files and executables of the package are: in a checkout, or installed."""
+"""Find the files and executables of the package, in a checkout or an installation."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKAGE = "deworldsg_ros"
 
 
 def checkout() -> Path | None:
-    """Root of the source tree that this package runs from; None where it is installed."""
+    """Root of the source tree if the package runs from one; None for an installation."""
     root = Path(deworldsg_ros.__file__).resolve().parents[1]
     return root if (root / "package.xml").exists() else None
 
@@ -21,7 +21,7 @@ def checkout() -> Path | None:
 def prefixes() -> list[Path]:
     """Installation prefixes that may hold the package, best first."""
     found: list[Path] = []
-    # ament_index_python raises where AMENT_PREFIX_PATH is not set or does not know the package.
+    # ament_index_python raises if AMENT_PREFIX_PATH is not set or does not contain the package.
     with contextlib.suppress(Exception):
         from ament_index_python.packages import get_package_prefix
 
@@ -30,7 +30,7 @@ def prefixes() -> list[Path]:
 
 
 def find_shared(relative: str) -> Path | None:
-    """A file or folder of the package's share, e.g. ``config/paper.yaml``."""
+    """A file or folder of the share folder, e.g. ``config/paper.yaml``; None if it is missing."""
     source = checkout()
     folders = [source] if source else []
     folders += [prefix / "share" / PACKAGE for prefix in prefixes()]
@@ -38,7 +38,7 @@ def find_shared(relative: str) -> Path | None:
 
 
 def node_command(name: str) -> list[str]:
-    """Command that runs a node: its installed executable, else its module."""
+    """Command that starts a node: its installed executable, or its module."""
     if checkout() is None:
         for prefix in prefixes():
             executable = prefix / "lib" / PACKAGE / name

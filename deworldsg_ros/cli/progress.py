@@ -1,4 +1,4 @@
-"""One progress bar, and one way to say that something takes a while, for every command."""
+"""The progress bar and the spinner of all commands."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class _RateColumn(ProgressColumn):
 
 
 def working(console: Console, text: str) -> Status:
-    """A spinner beside a text; in a file or a pipe, where none can turn, the text alone."""
+    """A spinner with a text; without a terminal, the text alone."""
     if not console.is_terminal:
         console.print(text, highlight=False, soft_wrap=True)
     return console.status(text)
 
 
 def frame_progress(console: Console) -> Progress:
-    """Progress over frames: bar, count, frames a second, time, and a free text `note`."""
+    """Progress over frames: bar, count, frames per second, time, and a field `note`."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(bar_width=30),

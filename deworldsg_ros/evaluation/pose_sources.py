@@ -13,7 +13,7 @@ from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
 from deworldsg_ros.poses.trajectory import read_trajectory
-from deworldsg_ros.recordings.folders.sequence import SequenceDataset, turned_pose
+from deworldsg_ros.recordings.folders.sequence import SequenceDataset, rotated_pose
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -85,7 +85,7 @@ def _of_slam(
             drops["no_slam_pose"] += 1
             continue
         # Trackers see the images as they are stored.
-        T_slam_camera = turned_pose(T_slam_camera) if dataset.turned else T_slam_camera
+        T_slam_camera = rotated_pose(T_slam_camera) if dataset.rotated else T_slam_camera
         if T_truth_slam is None:
             # Its world is where it began: that is put where the camera truly was.
             T_truth_slam = frame.T_world_camera @ invert_pose(T_slam_camera)

@@ -14,8 +14,8 @@ from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import source
 from deworldsg_ros.scene.codec import frame_graph_from_message, local_graph_to_message
 from deworldsg_ros.scene.wire import FrameGraphMessage
+from deworldsg_ros.streams.frame_assemblers import LiftingAssembler, LiftingFrame
 from deworldsg_ros.streams.poses import stamp_ns_of
-from deworldsg_ros.streams.sync import LiftingAssembler, LiftingFrame
 
 
 class LiftingNode(JoiningNode[LiftingFrame]):

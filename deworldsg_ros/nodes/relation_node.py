@@ -23,7 +23,7 @@ from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
 from deworldsg_ros.scene.frame_graph import RelationEvidence
-from deworldsg_ros.streams.sync import PairingFrame, RelationAssembler
+from deworldsg_ros.streams.frame_assemblers import PairingFrame, RelationAssembler
 
 
 class RelationNode(JoiningNode[PairingFrame]):

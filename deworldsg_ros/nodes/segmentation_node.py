@@ -15,9 +15,9 @@ from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.codec import frame_graph_to_message
+from deworldsg_ros.streams.frame_assemblers import FrameAssembler
 from deworldsg_ros.streams.images import fill_image
 from deworldsg_ros.streams.poses import set_stamp
-from deworldsg_ros.streams.sync import FrameAssembler
 
 
 class SegmentationNode(JoiningNode[RgbdFrame]):

@@ -6,4 +6,4 @@ from deworldsg_ros.scene.errors import DeWorldSGError
 
 
 class RecordingError(DeWorldSGError):
-    """A recording cannot be used: the text says what was looked for, where, and what was seen."""
+    """A recording cannot be used; the text names the file, the problem and the expected content."""

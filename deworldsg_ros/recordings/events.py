@@ -1,4 +1,4 @@
-"""What a replay tells the program that started it: a JSON line an event, on its standard output."""
+"""Events that a replay reports to the program that started it: one JSON line each, on stdout."""
 
 from typing import Union
 
@@ -6,19 +6,19 @@ import msgspec
 
 
 class Waiting(msgspec.Struct, tag=True, frozen=True):
-    """Not everybody is there yet: what is missing, in words."""
+    """The replay waits for the nodes: the missing ones, in words."""
 
     missing: list[str]
 
 
 class Started(msgspec.Struct, tag=True, frozen=True):
-    """Everybody is there; `frames` RGB images will be published."""
+    """All nodes are ready; `frames` RGB images will be published."""
 
     frames: int
 
 
 class Progress(msgspec.Struct, tag=True, frozen=True):
-    """Frames published and answered so far; nodes in the graph."""
+    """Frames published and answered so far, and nodes in the graph."""
 
     published: int
     answered: int
@@ -26,14 +26,14 @@ class Progress(msgspec.Struct, tag=True, frozen=True):
 
 
 class Saved(msgspec.Struct, tag=True, frozen=True):
-    """Whether the graph node saved its graph, and what it said."""
+    """Reply of the graph node to the request to save its graph."""
 
     success: bool
     message: str
 
 
 class Finished(msgspec.Struct, tag=True, frozen=True):
-    """The end: counts, what each node told in /diagnostics, what the recording had lost.
+    """The end: counts, the /diagnostics of each node, drops and losses of the recording.
 
     `poses` are T_world_camera of the lifted frames, 16 values each, row by row.
     """
@@ -52,10 +52,10 @@ Event = Union[Waiting, Started, Progress, Saved, Finished]
 
 
 def encode(event: Event) -> str:
-    """One line, without its end."""
+    """One line, without a line break."""
     return msgspec.json.encode(event).decode()
 
 
 def decode(line: str) -> Event:
-    """Event of a line; raises msgspec.MsgspecError for anything else."""
+    """Event of a line; raises msgspec.MsgspecError for any other line."""
     return msgspec.json.decode(line, type=Event)

@@ -1,8 +1,7 @@
-"""The ROS messages of a posed RGB-D camera, without ROS: rosbags' own message classes.
+"""The ROS messages of a posed RGB-D camera, as message classes of rosbags, without ROS.
 
-Bags and data set folders both speak these, and so does everything in `bridge/` that only reads
-attributes; a recording therefore takes the same path into frames whether it is replayed through
-DDS or read in one process.
+Bags and data set folders give these messages. `streams` reads attributes only, so a recording
+becomes the same frames in one process as in a replay through DDS.
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
-# compressed_depth_image_transport puts this struct before the PNG: format, depth quantisation.
+# compressed_depth_image_transport writes this struct before the PNG: format, depth quantisation.
 COMPRESSED_DEPTH_HEADER = struct.pack("<iff", 0, 0.0, 0.0)
 
 
 class Role(str, Enum):
-    """What a message is to the pipeline."""
+    """Role of a message in the pipeline."""
 
     RGB = "rgb"
     DEPTH = "depth"
@@ -45,7 +44,7 @@ class RoleMessage:
     """One message of a recording.
 
     Attributes:
-        role: what it is to the pipeline.
+        role: its role in the pipeline.
         msgtype: e.g. ``sensor_msgs/msg/Image``.
         stamp_ns: time in its header, nanoseconds.
         message: the decoded message; attributes as in ROS.
@@ -74,7 +73,7 @@ def encode(message: Any, msgtype: str) -> bytes:
 
 
 def stamp_ns_of_cdr(data: bytes) -> int:
-    """Header time of a serialized message whose first field is its header, without decoding it."""
+    """Stamp of a serialized message, nanoseconds, without decoding it; its header comes first."""
     sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(sec) * 10**9 + int(nanosec)
 
@@ -91,7 +90,7 @@ def header(stamp_ns: int, frame_id: str) -> Any:
 def compressed_image(
     stamp_ns: int, frame_id: str, encoded: bytes, image_format: str
 ) -> RoleMessage:
-    """RGB image as CompressedImage; `encoded` is a whole JPEG or PNG file."""
+    """RGB image as CompressedImage; `encoded` is the content of a JPEG or PNG file."""
     message = typestore().types[COMPRESSED_IMAGE](
         header=header(stamp_ns, frame_id),
         format=image_format,
@@ -101,7 +100,7 @@ def compressed_image(
 
 
 def compressed_depth(stamp_ns: int, frame_id: str, png: bytes) -> RoleMessage:
-    """Depth image as CompressedImage; `png` is a 16-bit PNG file in millimetres, 0 = invalid."""
+    """Depth image as CompressedImage; `png` is a 16-bit PNG file, millimetres, 0 = invalid."""
     message = typestore().types[COMPRESSED_IMAGE](
         header=header(stamp_ns, frame_id),
         format="16UC1; compressedDepth png",

@@ -1,4 +1,4 @@
-"""A recording whose poses come from elsewhere: a trajectory file, or nowhere yet."""
+"""Replace the poses of a recording: by a trajectory file, by odometry, or by perturbed poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.poses.frames import OnRefusal, track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
 from deworldsg_ros.poses.trajectory import Trajectory, read_trajectory
-from deworldsg_ros.recordings.folders.sequence import turned_pose
+from deworldsg_ros.recordings.folders.sequence import rotated_pose
 from deworldsg_ros.recordings.messages import (
     POSE_STAMPED,
     Role,
@@ -30,22 +30,23 @@ from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.streams.jump_gate import JumpGate
 from deworldsg_ros.streams.poses import pose_from_message
 
-# World frame where the recording names none.
+# World frame of a trajectory if the recording has no poses.
 TRAJECTORY_FRAME = "world"
 
 
 @dataclass(frozen=True)
 class PoseChoice:
-    """Whose poses a run takes.
+    """Source of the camera poses.
 
     Attributes:
         trajectory: file or folder of poses; None = the recording's own.
         trajectory_format: tum, kitti, 3rscan, slam or auto.
-        odometry: whether the poses are made of the images; they begin at the recording's first.
-        noise: what is added to the poses.
+        odometry: whether odometry estimates the poses from the images; it starts at the recording's
+            first pose, if there is one.
+        noise: perturbation of the poses.
 
     Raises:
-        ConfigurationError: for a trajectory and odometry at once.
+        ConfigurationError: for both a trajectory and odometry.
     """
 
     trajectory: Path | None = None
@@ -55,7 +56,9 @@ class PoseChoice:
 
     def __post_init__(self) -> None:
         if self.trajectory is not None and self.odometry:
-            raise ConfigurationError("poses from a trajectory and from odometry: wanted one")
+            raise ConfigurationError(
+                "poses from a trajectory and from odometry: expected only one of them"
+            )
 
     @property
     def need_poses(self) -> bool:
@@ -64,10 +67,12 @@ class PoseChoice:
 
 
 def choose_poses(source: Source, choice: PoseChoice, config: Config) -> Source:
-    """The source with its poses as chosen; odometry and noise are `posed_frames`' to add.
+    """The source with the poses of a trajectory, or without poses for odometry.
+
+    `posed_frames` adds odometry and noise.
 
     Raises:
-        TrajectoryError: where a trajectory cannot be read.
+        TrajectoryError: for a trajectory that cannot be read.
     """
     if choice.trajectory is not None:
         trajectory = read_trajectory(choice.trajectory, choice.trajectory_format)
@@ -84,10 +89,10 @@ def posed_frames(
     """Frames of a recording over `choose_poses`, with odometry and noise as chosen.
 
     Args:
-        recording: its source is what `choose_poses` gave.
-        choice: whose poses.
+        recording: its source comes from `choose_poses`.
+        choice: source of the poses.
         config: sections ``inputs`` and ``odometry`` are used.
-        on_refusal: called with the refusal of each frame that is left out here.
+        on_refusal: called for each frame that odometry or the jump gate refuses.
     """
     frames = recording.frames()
     if isinstance(recording.source, UnposedSource):
@@ -113,23 +118,22 @@ def gate_jumps(frames: Iterable[RgbdFrame], on_refusal: OnRefusal) -> Iterator[R
 def _tracked(
     frames: Iterator[RgbdFrame], source: UnposedSource, config: Config, on_refusal: OnRefusal
 ) -> Iterator[RgbdFrame]:
-    for first in frames:  # by then the source knows its first pose
+    for first in frames:  # reading a frame sets source.T_first
         yield from track_poses(chain([first], frames), config.odometry, source.T_first, on_refusal)
 
 
 class PosedSource(ABC):
-    """A `Source` whose poses are replaced, one before each RGB image, with its stamp.
+    """A `Source` with replaced poses: one before each RGB image, with the stamp of the image.
 
     An RGB image without a pose is left out and counted as ``no_pose``.
 
     Args:
-        source: as recorded; opened with ``need_poses=False`` it need not have poses.
-        topic: what to call the origin of the poses.
+        source: the recording; it may be opened with ``need_poses=False``.
+        topic: name of the origin of the poses.
 
     Attributes:
-        original: as recorded.
-        T_first: the recording's own pose (4, 4) when its first RGB image came; None where it had
-            none.
+        original: the recording.
+        T_first: the recording's own pose (4, 4) at its first RGB image; None if it has none.
     """
 
     def __init__(self, source: Source, topic: str) -> None:
@@ -147,26 +151,26 @@ class PosedSource(ABC):
         }
 
     @abstractmethod
-    def _pose_at(self, stamp_ns: int, place: int) -> Float64 | None:
-        """The pose (4, 4) of an RGB image, None where there is none."""
+    def _pose_at(self, stamp_ns: int, index: int) -> Float64 | None:
+        """The pose (4, 4) of the index-th RGB image; None if there is none."""
 
     @property
     def kind(self) -> str:
-        """That of the recording."""
+        """Kind of the recording."""
         return self.original.kind
 
     def messages(self) -> Iterator[RoleMessage]:
-        """Messages in order; of the recording's own poses only the world frame is kept."""
-        place = -1
+        """Messages in order; the recording's own poses give only the world frame and `T_first`."""
+        index = -1
         for item in self.original.messages():
             if item.role is Role.POSE:
                 self._note_recorded(item)
                 continue
             if item.role is Role.RGB:
-                place += 1
-                if place == 0:
+                index += 1
+                if index == 0:
                     self.T_first = self._T_recorded
-                T = self._pose_at(item.stamp_ns, place)
+                T = self._pose_at(item.stamp_ns, index)
                 if T is None:
                     self.drops["no_pose"] += 1
                     continue
@@ -179,7 +183,7 @@ class PosedSource(ABC):
             yield item
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
-        """The same, serialized."""
+        """The same messages, serialized."""
         for item in self.messages():
             data = encode(item.message, item.msgtype)
             yield RawRoleMessage(item.role, item.msgtype, item.stamp_ns, item.stamp_ns, data)
@@ -191,9 +195,9 @@ class PosedSource(ABC):
     def _note_recorded(self, item: RoleMessage) -> None:
         try:
             T, frame_id = pose_from_message(item.message)
-        except RefusedInput:  # it is not used
+        except RefusedInput:  # the pose itself is not used
             return
-        # One world frame from beginning to end.
+        # The first world frame stays.
         self._frame_id = self._frame_id or frame_id
         self._T_recorded = T
 
@@ -201,41 +205,41 @@ class PosedSource(ABC):
 class TrajectorySource(PosedSource):
     """A recording with the poses of a trajectory.
 
-    Poses are those of the images as they are stored: where a data set turns its images, the poses
-    turn along.
+    The trajectory contains the poses of the images as stored: if a data set rotates its images, the
+    poses are rotated too.
 
     Args:
-        source: as recorded.
+        source: the recording.
         trajectory: poses of its colour camera.
-        slop_s: most time between an image and the poses that stand for it, seconds.
-        topic: what to call the trajectory.
+        slop_s: maximum time between an image and the poses that are used for it, seconds.
+        topic: name of the trajectory.
     """
 
     def __init__(self, source: Source, trajectory: Trajectory, slop_s: float, topic: str) -> None:
         super().__init__(source, topic)
         self._trajectory = trajectory
         self._slop_ns = round(slop_s * 1e9)
-        self._turned = bool(getattr(source, "turned", False))
+        self._rotated = bool(getattr(source, "rotated", False))
         self._numbers: dict[int, int] = getattr(source, "frame_numbers", {})
 
-    def _pose_at(self, stamp_ns: int, place: int) -> Float64 | None:
-        number = self._numbers.get(stamp_ns, place)
-        T = self._trajectory.at(stamp_ns, number, place, self._slop_ns)
-        return turned_pose(T) if T is not None and self._turned else T
+    def _pose_at(self, stamp_ns: int, index: int) -> Float64 | None:
+        number = self._numbers.get(stamp_ns, index)
+        T = self._trajectory.at(stamp_ns, number, index, self._slop_ns)
+        return rotated_pose(T) if T is not None and self._rotated else T
 
 
 class UnposedSource(PosedSource):
-    """A recording whose frames all have the identity as their pose, until odometry gives another.
+    """A recording whose poses are all the identity; odometry replaces them in `posed_frames`.
 
     Args:
-        source: as recorded.
-        frame_id: world frame, where the recording names none.
+        source: the recording.
+        frame_id: world frame if the recording has no poses.
     """
 
     def __init__(self, source: Source, frame_id: str) -> None:
         super().__init__(source, "odometry")
         self._default_frame_id = frame_id
 
-    def _pose_at(self, stamp_ns: int, place: int) -> Float64:
+    def _pose_at(self, stamp_ns: int, index: int) -> Float64:
         self._frame_id = self._frame_id or self._default_frame_id
         return np.eye(4)

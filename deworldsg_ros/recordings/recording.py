@@ -21,7 +21,7 @@ from deworldsg_ros.recordings.folders.registry import expectations
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.streams.sync import FrameAssembler
+from deworldsg_ros.streams.frame_assemblers import FrameAssembler
 
 BAG_SUFFIXES = frozenset(SALVAGERS)
 
@@ -29,18 +29,19 @@ BAG_SUFFIXES = frozenset(SALVAGERS)
 class Recording:
     """Frames of a bag or a data set folder.
 
-    Messages are paired and checked by the assembler that the nodes use, so that a replay through
-    DDS and a run in one process see the same frames.
+    The assembler of the nodes joins and checks the messages: a replay through DDS and a run in one
+    process give the same frames.
 
     Attributes:
-        source: what is underneath.
+        source: the messages.
+        reasons: one example for each reason of `drops`, if there is one.
     """
 
     def __init__(self, source: Source, inputs: InputsConfig | None = None) -> None:
         self.source = source
         self.reasons: dict[str, str] = {}
         self._assembler = FrameAssembler(
-            # Whatever the recording has, its source gives poses.
+            # The source has chosen the poses already.
             msgspec.structs.replace(inputs or InputsConfig(), pose_source="auto"),
             topics={role.value: topic.name for role, topic in source.topics.items()},
             on_drop=self._remember,
@@ -48,22 +49,22 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """What to call it."""
+        """Name of the bag or folder."""
         return self.source.name
 
     @property
     def frame_count(self) -> int:
-        """Number of RGB images: the frames, unless some are dropped."""
+        """Number of RGB images: of frames, if none is dropped."""
         return self.source.frame_count
 
     @property
     def drops(self) -> Counter[str]:
-        """Messages and frames left out so far, by reason; `reasons` has an example of each."""
+        """Messages and frames left out so far, by reason."""
         return self.source.drops + self._assembler.drops
 
     @property
     def losses(self) -> list[str]:
-        """Sentences on data that the recording has lost."""
+        """Sentences about data that the recording has lost."""
         return self.source.losses
 
     def frames(self) -> Iterator[RgbdFrame]:
@@ -100,15 +101,15 @@ def open_source(
 
     Args:
         path: rosbag2 folder, .mcap or .db3 file, or data set folder.
-        kind: name of a data set, ``rosbag2``, or ``auto`` = by looking.
-        topics: of a bag, where they are not to be found by name.
-        inputs: world frame and pose slop for poses from TF.
+        kind: name of a data set or ``rosbag2``; ``auto`` = detect.
+        topics: topics of a bag that the user named; the others are found by type and name.
+        inputs: transport, pose source, and for TF the world frame and pose slop.
         options: of a data set folder.
-        need_poses: whether what has no poses is refused or left out; False where they come from
-            elsewhere.
+        need_poses: whether a bag without poses is refused, and a frame without a pose left out;
+            False if the poses come from elsewhere.
 
     Raises:
-        RecordingError: says what was looked for and where.
+        RecordingError: names the path, the content seen and the expected one.
     """
     if kind == "auto":
         kind = detect_kind(path)
@@ -127,27 +128,29 @@ def open_recording(
     topics: TopicChoice | None = None,
     options: DatasetOptions | None = None,
 ) -> Recording:
-    """`open_source` as frames."""
+    """Open a bag or a data set folder as frames; arguments and errors as `open_source`."""
     source = open_source(path, kind=kind, topics=topics, inputs=inputs, options=options)
     return Recording(source, inputs)
 
 
 def detect_kind(path: Path) -> str:
-    """``rosbag2`` or the name of a data set, by looking; raises RecordingError."""
+    """``rosbag2`` or the name of a data set, from the files of the path; raises RecordingError."""
     if not path.exists():
         raise RecordingError(f"recording {path}: there is no such file or folder")
     if path.is_file():
         if path.suffix in BAG_SUFFIXES:
             return "rosbag2"
         if path.name == "metadata.yaml":
-            raise RecordingError(f"recording {path}: give the folder that it is in")
-        raise RecordingError(f"recording {path}: wanted a .mcap or .db3 file, or a folder")
+            raise RecordingError(
+                f"recording {path}: this is a part of a bag; give its folder, {path.parent}"
+            )
+        raise RecordingError(f"recording {path}: expected a .mcap or .db3 file, or a folder")
     if (path / "metadata.yaml").exists() or storage_files(path):
         return "rosbag2"
     found = detect_dataset(path)
     if found is None:
         raise RecordingError(
-            f"recording {path}: neither a rosbag2 folder (metadata.yaml with .mcap or .db3 files) "
-            f"nor a data set folder ({expectations()})"
+            f"recording {path}: unknown content; expected a rosbag2 folder (metadata.yaml with "
+            f".mcap or .db3 files) or a data set folder ({expectations()})"
         )
     return found

@@ -1,4 +1,4 @@
-"""What every recording is underneath: messages by role, in order."""
+"""A source of messages by role: the common interface of bags and folders."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deworldsg_ros.recordings.messages import Role, RoleMessage
 class RawRoleMessage(NamedTuple):
     """One serialized message of a recording.
 
-    `stamp_ns` is the time in its header, `log_time_ns` when it was recorded (for the pace).
+    `stamp_ns` is the time in its header; `log_time_ns` is the time of recording, for the replay.
     """
 
     role: Role
@@ -25,7 +25,7 @@ class RawRoleMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class UsedTopic:
-    """Where the messages of a role come from: a topic of a bag, or files of a folder."""
+    """Origin of the messages of a role: a topic of a bag, or files of a folder."""
 
     name: str
     msgtype: str
@@ -36,11 +36,11 @@ class Source(Protocol):
     """A bag or a folder, open for reading.
 
     Attributes:
-        name: what to call it.
-        topics: where each role comes from.
+        name: of the bag or folder, for messages to the user.
+        topics: origin of each role.
         frame_count: number of RGB images, an estimate of the frames.
-        drops: frames and messages left out while reading, by reason.
-        losses: sentences on data that the recording has lost.
+        drops: frames and messages left out so far, by reason.
+        losses: sentences about data that the recording has lost.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Source(Protocol):
         ...
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
-        """The same, serialized, for a replay."""
+        """The same messages, serialized, for a replay."""
         ...
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Write the messages of a recording as one MCAP file that rosbag2 and Foxglove open."""
+"""Write the messages of a recording to one MCAP file, for rosbag2 and Foxglove."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from deworldsg_ros.recordings.messages import (
 )
 from deworldsg_ros.recordings.source import RawRoleMessage
 
-# Foxglove and RViz find an image's CameraInfo beside it, and take the type from the last word.
+# Foxglove and RViz expect the CameraInfo beside the image, and the transport as the last word.
 TOPICS = {
     (Role.RGB, IMAGE): "/rgb/image_raw",
     (Role.RGB, COMPRESSED_IMAGE): "/rgb/image_raw/compressed",
@@ -40,7 +40,7 @@ NO_LIMIT = QosTime(2**31 - 1, 10**9 - 1)
 
 
 def topic_of(role: Role, msgtype: str) -> str:
-    """Topic on which messages of a role and type are written."""
+    """Topic of the messages of a role and type."""
     if role is Role.CAMERA_INFO:
         return CAMERA_INFO_TOPIC
     if role is Role.POSE:
@@ -49,7 +49,7 @@ def topic_of(role: Role, msgtype: str) -> str:
 
 
 def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
-    """Write messages into one new MCAP file (profile ros2, schemas inside); gives their number.
+    """Write messages into one new MCAP file (profile ros2, with schemas); returns their number.
 
     The file appears when it is complete: a conversion that is interrupted leaves nothing.
 
@@ -61,19 +61,23 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
         bag = Path(folder) / "bag"
         count = _write(iter(messages), bag)
         if not count:
-            raise RecordingError(f"output {path}: the recording gave no messages to write")
+            raise RecordingError(
+                f"output {path}: the recording has no messages; expected at least one"
+            )
         shutil.move(bag / "bag.mcap", path)
     return count
 
 
 def check_output(path: Path) -> None:
-    """Refuse a file that cannot be made: RecordingError."""
+    """Raise RecordingError if the file cannot be created."""
     if path.suffix != ".mcap":
-        raise RecordingError(f"output {path}: wanted a file name that ends in .mcap")
+        raise RecordingError(f"output {path}: expected a file name that ends in .mcap")
     if path.exists():
         raise RecordingError(f"output {path} exists already: remove it or take another name")
     if not path.parent.is_dir():
-        raise RecordingError(f"output {path}: the folder {path.parent} does not exist")
+        raise RecordingError(
+            f"output {path}: the folder {path.parent} does not exist; create it first"
+        )
 
 
 def _write(messages: Iterator[RawRoleMessage], bag: Path) -> int:

@@ -51,7 +51,7 @@ class JoiningNode(StageNode, Generic[Out]):
         """Arguments of every assembler: topic names, maximum wait, counter of drops."""
         return {
             "topics": {name: self.resolve_topic_name(topic) for name, topic in TOPICS.items()},
-            "patience_s": self._max_wait_s,
+            "max_wait_s": self._max_wait_s,
             "on_drop": self.drop,
         }
 

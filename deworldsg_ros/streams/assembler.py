@@ -1,7 +1,7 @@
 """The loop that joins streams in stamp order.
 
-Time is an argument. What comes out depends on what came in on each stream, not on how the
-streams were interleaved, as long as no buffer overflows and nothing times out.
+Time is an argument. The output depends on the messages of each stream, not on how the streams are
+interleaved, as long as no buffer overflows and no wait times out.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ T = TypeVar("T")
 Out = TypeVar("Out")
 OnDrop = Callable[[str, str, int], None]
 
-# A stream that is silent for longer is named in the diagnostics.
+# Diagnostics name a stream that is silent for longer: twenty frames at 10 Hz.
 SILENCE_NS = 2 * 10**9
 
 
 class Assembler(ABC, Generic[T, Out]):
-    """Joins a leading stream with what belongs to each of its items, in stamp order.
+    """Joins each item of a leading stream with the items of other streams, in stamp order.
 
     Args:
         leader: the stream whose items become outputs.
         others: the further streams that an output needs.
-        patience_s: how long an item may wait, by the `now_ns` given, for what it lacks.
-        on_drop: called with the reason, the message and the number of every drop.
+        max_wait_s: maximum time, by the `now_ns` given, that an item waits for the other streams.
+        on_drop: called with the reason, a message and the number of items of each drop.
 
     Attributes:
-        drops: number of drops by reason.
+        drops: number of dropped items by reason.
     """
 
     def __init__(
@@ -40,12 +40,12 @@ class Assembler(ABC, Generic[T, Out]):
         leader: Stream[T],
         others: Sequence[Stream[Any]],
         *,
-        patience_s: float,
+        max_wait_s: float,
         on_drop: OnDrop | None,
     ) -> None:
         self._leader = leader
         self._streams: list[Stream[Any]] = [leader, *others]
-        self._patience_ns = int(patience_s * 1e9)
+        self._max_wait_ns = int(max_wait_s * 1e9)
         self._on_drop = on_drop
         self._waiting_since_ns: dict[int, int] = {}
         self._started_ns: int | None = None
@@ -53,30 +53,30 @@ class Assembler(ABC, Generic[T, Out]):
 
     @abstractmethod
     def _settled(self, stamp_ns: int, value: T) -> bool:
-        """Whether nothing that is yet to come can change the output of this item."""
+        """Whether the output of this item is final: later messages cannot change it."""
 
     @abstractmethod
     def _build(self, stamp_ns: int, value: T) -> Out:
-        """The output of an item, from what is there; raises RefusedInput."""
+        """The output of an item, from the buffered messages; raises RefusedInput."""
 
     @abstractmethod
     def _forget(self, stamp_ns: int) -> None:
-        """Drop what only outputs up to this stamp could need."""
+        """Drop buffered items that only outputs up to this stamp need."""
 
     def _restart(self, stamp_ns: int) -> None:
-        """Forget what lies ahead of a jump back in time, to this stamp.
+        """Clear the streams after a jump back in time to this stamp.
 
-        Streams jump one after the other: what has come of the new time already stays.
+        Streams jump one after the other: messages of the new time that arrived already stay.
         """
         lost = sum(stream.clear() for stream in self._streams if stream.restarts(stamp_ns))
         self._waiting_since_ns.clear()
-        self._drop("time_jump", f"stamps went back: starting again without {lost} messages")
+        self._drop("time_jump", f"stamps went back: {lost} buffered messages are dropped")
 
     def pop_ready(self, now_ns: int | None) -> list[Out]:
-        """What is complete, in stamp order; what waited for too long is decided as it stands.
+        """Complete outputs in stamp order; an item that waited too long is decided as it is.
 
         Args:
-            now_ns: any clock that only goes forward; None = never give up waiting.
+            now_ns: time of any monotonic clock; None = wait without a limit.
         """
         if now_ns is not None:
             self._note_time(now_ns)
@@ -93,14 +93,14 @@ class Assembler(ABC, Generic[T, Out]):
         return ready
 
     def flush(self) -> list[Out]:
-        """Decide everything that still waits, as it stands: nothing more will come."""
+        """Decide all waiting items as they are: the streams have ended."""
         ready: list[Out] = []
         while len(self._leader):
             self._decide(ready)
         return ready
 
     def waiting_for(self, now_ns: int) -> list[str]:
-        """What is missing, in words: streams that are silent, stamps that never meet."""
+        """Missing input, in words: silent streams, or streams whose stamps lag behind."""
         self._note_time(now_ns)
         assert self._started_ns is not None
         missing = [
@@ -114,11 +114,11 @@ class Assembler(ABC, Generic[T, Out]):
         if not len(self._leader):
             return []
         stamp_ns = self._leader.first().stamp_ns
-        if now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) < self._patience_ns // 2:
+        if now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) < self._max_wait_ns // 2:
             return []
         return [
-            f"{self._leader.name} of {stamp_ns / 1e9:.3f} s waits for {stream.name}, whose newest "
-            f"on {stream.topic} is of {stream.newest_ns / 1e9:.3f} s"
+            f"{self._leader.name} at {stamp_ns / 1e9:.3f} s waits for {stream.name}: the newest on "
+            f"{stream.topic} is at {stream.newest_ns / 1e9:.3f} s"
             for stream in self._streams
             if stream.newest_ns is not None and stream.newest_ns < stamp_ns
         ]
@@ -134,7 +134,7 @@ class Assembler(ABC, Generic[T, Out]):
     def _gave_up(self, stamp_ns: int, now_ns: int | None) -> bool:
         if now_ns is None:
             return False
-        return now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) >= self._patience_ns
+        return now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) >= self._max_wait_ns
 
     def _decide(self, ready: list[Out]) -> None:
         item = self._leader.take()
@@ -146,7 +146,7 @@ class Assembler(ABC, Generic[T, Out]):
         self._forget(item.stamp_ns)
 
     def _add(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
-        """Keep an item; count it where it is refused, and what it pushes out."""
+        """Buffer an item; count it if it is refused, and the items that it displaces."""
         if stream.restarts(stamp_ns):
             self._restart(stamp_ns)
         try:
@@ -159,7 +159,7 @@ class Assembler(ABC, Generic[T, Out]):
     def _drop_unmatched(self, stream: Stream[Any], number: int) -> None:
         self._drop(
             f"unmatched_{stream.name}",
-            f"{stream.name} on {stream.topic} belongs to no {self._leader.name}",
+            f"{stream.name} on {stream.topic} matches no {self._leader.name}",
             number,
         )
 

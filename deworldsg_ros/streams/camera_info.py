@@ -1,4 +1,4 @@
-"""CameraInfo messages to intrinsics."""
+"""Convert CameraInfo messages to intrinsics."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from deworldsg_ros.scene.errors import RefusedInput
 
 
 def intrinsics_from_message(message: Any) -> Intrinsics:
-    """Intrinsics of K of a `sensor_msgs/CameraInfo`.
+    """Intrinsics from the matrix K of a `sensor_msgs/CameraInfo`.
 
     Raises:
-        RefusedInput: ``invalid_intrinsics`` for a matrix of another size, NaN, or zeros as an
-            uncalibrated camera sends them.
+        RefusedInput: ``invalid_intrinsics`` for a matrix of another size, for NaN, or for zeros,
+            which an uncalibrated camera publishes.
     """
     matrix = getattr(message, "k", None)
     if matrix is None:
         matrix = message.K  # ROS 1 bags
     if len(matrix) != 9:
-        raise RefusedInput("invalid_intrinsics", f"K has {len(matrix)} values: wanted 9")
+        raise RefusedInput(
+            "invalid_intrinsics", f"camera_info: K has {len(matrix)} values: expected 9"
+        )
     return Intrinsics(
         fx=float(matrix[0]),
         fy=float(matrix[4]),

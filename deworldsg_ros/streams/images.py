@@ -1,7 +1,7 @@
-"""Image messages to numpy and back; checked once, without a copy where the layout allows it.
+"""Convert image messages to numpy and back: checked once, without a copy if the layout allows it.
 
-A message is anything with the attributes of `sensor_msgs/Image` or `sensor_msgs/CompressedImage`;
-its `data` is anything with the buffer protocol.
+A message is any object with the attributes of `sensor_msgs/Image` or `sensor_msgs/CompressedImage`;
+its `data` is any object with the buffer protocol.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _TO_RGB = {
     "mono8": cv2.COLOR_GRAY2RGB,
 }
 
-# compressedDepth puts an int32 format and two float32 quantisation parameters before the PNG.
+# compressedDepth: an int32 format and two float32 quantisation parameters precede the PNG.
 _COMPRESSED_DEPTH_HEADER = np.dtype([("format", "<i4"), ("quantisation", "<f4", (2,))])
 
 
@@ -48,9 +48,9 @@ def is_compressed(message: Any) -> bool:
 
 
 def image_view(message: Any, allowed: tuple[str, ...]) -> NDArray[Any]:
-    """The pixels of an Image, (H, W) or (H, W, C), a view of its buffer.
+    """The pixels of an Image, (H, W) or (H, W, C): a view of its buffer.
 
-    The dtype is the encoding's, in the byte order of the message; rows may be padded.
+    The dtype follows from the encoding, in the byte order of the message; rows may be padded.
 
     Raises:
         RefusedInput: ``unknown_encoding``, ``empty_image``, ``bad_step`` or ``short_buffer``.
@@ -58,18 +58,18 @@ def image_view(message: Any, allowed: tuple[str, ...]) -> NDArray[Any]:
     encoding = str(message.encoding)
     if encoding not in allowed:
         raise RefusedInput(
-            "unknown_encoding", f"image encoding is '{encoding}': wanted {', '.join(allowed)}"
+            "unknown_encoding", f"image encoding is '{encoding}': expected {', '.join(allowed)}"
         )
     kind, channels = LAYOUTS[encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     height, width, step = int(message.height), int(message.width), int(message.step)
     if height <= 0 or width <= 0:
-        raise RefusedInput("empty_image", f"image is {width}x{height}: wanted at least one pixel")
+        raise RefusedInput("empty_image", f"image is {width}x{height}: expected at least one pixel")
     row_bytes = width * channels * dtype.itemsize
     if step < row_bytes or step % dtype.itemsize:
         raise RefusedInput(
             "bad_step",
-            f"step of the {width}x{height} {encoding} image is {step} bytes: wanted at least "
+            f"step of the {width}x{height} {encoding} image is {step} bytes: expected at least "
             f"{row_bytes}, a multiple of {dtype.itemsize}",
         )
     buffer = np.frombuffer(message.data, np.uint8)
@@ -78,7 +78,7 @@ def image_view(message: Any, allowed: tuple[str, ...]) -> NDArray[Any]:
         raise RefusedInput(
             "short_buffer",
             f"{width}x{height} {encoding} image with step {step} holds {len(buffer)} bytes: "
-            f"wanted {step * height}",
+            f"expected {step * height}",
         )
     shape: tuple[int, ...] = (height, width, channels) if channels > 1 else (height, width)
     strides = (step, channels * dtype.itemsize, dtype.itemsize)[: len(shape)]
@@ -86,7 +86,7 @@ def image_view(message: Any, allowed: tuple[str, ...]) -> NDArray[Any]:
 
 
 def rgb_from_message(message: Any) -> UInt8:
-    """(H, W, 3) uint8 in RGB order of an Image or CompressedImage; rgb8 is not copied.
+    """(H, W, 3) uint8, RGB order, of an Image or CompressedImage; rgb8 is not copied.
 
     Raises:
         RefusedInput: as `image_view`, or ``decode_failed``.
@@ -103,12 +103,12 @@ def rgb_from_message(message: Any) -> UInt8:
 def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float) -> Float32:
     """(H, W) float32 depth in metres of an Image or CompressedImage; 0 = invalid.
 
-    NaN, infinity, negative values and what lies beyond `max_depth_m` become 0.
+    NaN, infinity, negative values and values above `max_depth_m` become 0.
 
     Args:
         message: 16UC1 or mono16 in units of `depth_scale_m`, 32FC1 in metres, or compressedDepth
             of either.
-        depth_scale_m: metres of one unit of a 16-bit image.
+        depth_scale_m: metres per unit of a 16-bit image.
         max_depth_m: largest valid depth.
 
     Raises:
@@ -118,7 +118,7 @@ def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float
     depth_m: Float32 = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         depth_m *= np.float32(depth_scale_m)
-    # Written so that NaN fails it too.
+    # The negated comparison also catches NaN.
     depth_m[~((depth_m > 0) & (depth_m <= np.float32(max_depth_m)))] = 0.0
     return depth_m
 
@@ -130,15 +130,15 @@ def instances_from_message(message: Any) -> UInt16:
 
 
 def fill_image(message: Any, pixels: NDArray[Any], encoding: str) -> None:
-    """Put pixels (H, W) or (H, W, C) into an Image; header is left to the caller.
+    """Write pixels (H, W) or (H, W, C) into an Image; the caller sets the header.
 
-    `array.array` takes the bytes at once; assigning a numpy array makes rclpy check every element.
+    `array.array` takes all bytes at once; with a numpy array, rclpy checks every element.
     """
     kind, channels = LAYOUTS[encoding]
-    wanted = pixels.shape[2] if pixels.ndim == 3 else 1
-    if pixels.dtype != np.dtype(kind) or wanted != channels:
+    found = pixels.shape[2] if pixels.ndim == 3 else 1
+    if pixels.dtype != np.dtype(kind) or found != channels:
         raise ValueError(
-            f"pixels are {pixels.dtype} with {wanted} channels: wanted {kind} with {channels} "
+            f"pixels are {pixels.dtype} with {found} channels: expected {kind} with {channels} "
             f"for {encoding}"
         )
     pixels = np.ascontiguousarray(pixels)
@@ -161,7 +161,7 @@ def _decode(data: Any, flags: int, description: str) -> NDArray[Any]:
         raise RefusedInput(
             "decode_failed",
             f"compressed image '{description}' of {len(buffer)} bytes cannot be decoded: "
-            "wanted JPEG or PNG",
+            "expected JPEG or PNG",
         )
     return pixels
 
@@ -176,13 +176,13 @@ def _decode_depth(message: Any) -> NDArray[Any]:
     if encoding not in DEPTH_ENCODINGS or "rvl" in description.lower():
         raise RefusedInput(
             "unknown_encoding",
-            f"compressed depth is '{description}': wanted PNG of {', '.join(DEPTH_ENCODINGS)}",
+            f"compressed depth is '{description}': expected PNG of {', '.join(DEPTH_ENCODINGS)}",
         )
     size = _COMPRESSED_DEPTH_HEADER.itemsize
     if len(data) <= size:
         raise RefusedInput(
             "short_buffer",
-            f"compressed depth '{description}' holds {len(data)} bytes: wanted more than the "
+            f"compressed depth '{description}' holds {len(data)} bytes: expected more than the "
             f"header of {size}",
         )
     header = np.frombuffer(data[:size], _COMPRESSED_DEPTH_HEADER)[0]
@@ -201,6 +201,6 @@ def _grey16(pixels: NDArray[Any], description: str) -> NDArray[Any]:
         raise RefusedInput(
             "decode_failed",
             f"compressed depth '{description}' holds {pixels.dtype} of shape {pixels.shape}: "
-            "wanted 16-bit grey",
+            "expected 16-bit grey",
         )
     return pixels

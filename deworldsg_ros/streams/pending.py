@@ -1,4 +1,4 @@
-"""Evidence that came before the local graph it speaks of."""
+"""Relation evidence that arrives before its local graph."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from deworldsg_ros.scene.frame_graph import RelationEvidence
 
 
 class PendingEvidence:
-    """A bounded waiting room, oldest out first.
+    """A bounded buffer of relation evidence; the oldest is dropped first.
 
     Args:
-        capacity: messages that may wait.
+        capacity: maximum number of messages.
     """
 
     def __init__(self, capacity: int = 256) -> None:
@@ -23,22 +23,22 @@ class PendingEvidence:
         return len(self._waiting)
 
     def add(self, evidence: RelationEvidence) -> None:
-        """Let a message wait.
+        """Keep a message until `take`.
 
         Raises:
-            RefusedInput: ``unmatched_evidence`` for the oldest, where there is no room for it.
+            RefusedInput: ``unmatched_evidence`` for the oldest message, if the buffer is full.
         """
         self._waiting.append(evidence)
         if len(self._waiting) > self._capacity:
             oldest = self._waiting.popleft()
             raise RefusedInput(
                 "unmatched_evidence",
-                f"relation evidence of {oldest.stamp_ns / 1e9:.3f} s: its local graph did not come "
-                f"while {self._capacity} other messages did",
+                f"relation evidence at {oldest.stamp_ns / 1e9:.3f} s: no local graph of this "
+                f"stamp arrived during {self._capacity} later messages. Check lifting_node",
             )
 
     def take(self, stamp_ns: int) -> list[RelationEvidence]:
-        """Messages of this frame, in the order in which they came, and of none before it."""
+        """Remove and return the messages with this stamp, in order of arrival; drop older ones."""
         taken = [evidence for evidence in self._waiting if evidence.stamp_ns == stamp_ns]
         self._waiting = deque(item for item in self._waiting if item.stamp_ns > stamp_ns)
         return taken

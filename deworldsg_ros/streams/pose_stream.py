@@ -1,4 +1,4 @@
-"""The poses of one topic: of the camera, or carried over to it."""
+"""The poses of one topic, transformed to the camera if they are of another frame."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from deworldsg_ros.streams.transforms import TransformTree
 
 
 class PoseStream:
-    """Poses that are all in one world frame.
+    """Camera poses in one world frame.
 
-    An Odometry says what it is the pose of. Where that is another frame than the camera's, say
-    base_link, transforms carry it over, if there are any to ask.
+    An Odometry names the frame whose pose it contains. If this is another frame than the camera's,
+    e.g. base_link, `transforms` transforms the pose to the camera.
 
     Args:
         slop_ns: as `PoseBuffer`.
-        world_frame: frame that poses must have; empty = that of the first.
+        world_frame: expected frame_id of the poses; empty = that of the first pose.
+        transforms: as the attribute.
 
     Attributes:
-        transforms: who knows how the camera is mounted; None = each pose is taken to be the
-            camera's own.
+        world_frame: frame_id of the poses; empty before the first.
+        transforms: TF tree that contains the mounting of the camera; None = each pose is taken as
+            the camera's.
     """
 
     def __init__(
@@ -49,11 +51,11 @@ class PoseStream:
         self._buffer.add(stamp_ns, T)
 
     def is_of(self, camera_frame: str) -> bool:
-        """Whether the poses are those of the camera, as far as they say what they are of."""
+        """Whether the poses are of the camera frame, or name no frame."""
         return self._child_frame in ("", camera_frame.lstrip("/")) or not camera_frame
 
     def settled(self, stamp_ns: int, camera_frame: str) -> bool:
-        """Whether what is yet to come cannot change the answer at this stamp."""
+        """Whether later messages cannot change the pose at this stamp."""
         return self._buffer.settled(stamp_ns) and (
             self.transforms is None
             or self.is_of(camera_frame)
@@ -61,11 +63,11 @@ class PoseStream:
         )
 
     def at(self, stamp_ns: int, camera_frame: str) -> tuple[Float64, str]:
-        """T_world_camera and the world frame at a stamp.
+        """T_world_camera (4, 4) and the world frame at a stamp.
 
         Raises:
-            RefusedInput: ``no_pose`` as `PoseBuffer.at`, ``no_transform`` where nobody tells how
-                the camera is mounted.
+            RefusedInput: ``no_pose`` as `PoseBuffer.at`; ``no_transform`` if TF does not contain
+                the mounting of the camera.
         """
         T_world_child = self._buffer.at(stamp_ns)
         if self.transforms is None or self.is_of(camera_frame):
@@ -74,10 +76,10 @@ class PoseStream:
             T_child_camera = self.transforms.between(stamp_ns, self._child_frame, camera_frame)
         except RefusedInput as refusal:
             raise RefusedInput(
-                "no_transform", f"odometry is of frame '{self._child_frame}': {refusal}"
+                "no_transform", f"the odometry is of frame '{self._child_frame}': {refusal}"
             ) from refusal
         return T_world_child @ T_child_camera, self.world_frame
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop poses that no stamp from here on can need."""
+        """Drop poses that are not needed for this stamp or later ones."""
         self._buffer.forget_before(stamp_ns)

@@ -1,4 +1,4 @@
-"""Depth, camera_info and pose, joined to the items of a leading stream."""
+"""Join depth, camera_info and pose to the items of a leading stream."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from deworldsg_ros.streams.poses import stamp_ns_of
 from deworldsg_ros.streams.stamped import Stream
 from deworldsg_ros.streams.transforms import TransformTree
 
-# Topics as the nodes name them; a caller that knows the remapped names gives those.
+# Topics before remapping; a caller may pass the remapped names instead.
 TOPICS = {
     "rgb": "rgb/image_raw",
     "depth": "depth/image_raw",
@@ -27,13 +27,16 @@ TOPICS = {
     "instances": "deworldsg/instances",
     "local_graph": "deworldsg/local_graph",
 }
+# Changes of the intrinsics that are remembered: a zoom camera changes them often, and frames that
+# still wait for depth or pose need only the newest.
+MAX_INTRINSICS = 16
 
 
 class PosedAssembler(Assembler[T, Out]):
     """Depth, camera_info and pose for the items of a leading stream.
 
     Attributes:
-        camera_frame: the optical frame, as camera_info names it.
+        camera_frame: the optical frame, as camera_info names it; empty before the first.
     """
 
     def __init__(
@@ -43,7 +46,7 @@ class PosedAssembler(Assembler[T, Out]):
         inputs: InputsConfig,
         topics: Mapping[str, str] | None,
         capacity: int,
-        patience_s: float,
+        max_wait_s: float,
         on_drop: OnDrop | None,
     ) -> None:
         names = {**TOPICS, **(topics or {})}
@@ -59,7 +62,7 @@ class PosedAssembler(Assembler[T, Out]):
         super().__init__(
             stream(leader),
             [self._depth, self._info, self._pose, *self._others.values()],
-            patience_s=patience_s,
+            max_wait_s=max_wait_s,
             on_drop=on_drop,
         )
         self._slop_ns = round(inputs.slop_s * 1e9)
@@ -68,7 +71,7 @@ class PosedAssembler(Assembler[T, Out]):
         self._pose_slop_ns = round(inputs.pose_slop_s * 1e9)
         self._poses = PoseStream(self._pose_slop_ns, inputs.world_frame)
         self._transforms = TransformTree(self._pose_slop_ns, inputs.world_frame)
-        # Then TF is not their place, not even where they start again.
+        # After the first pose message, `auto` never changes to TF, not even after a restart.
         self._had_poses = False
 
     def add_depth(self, message: Any, stamp_ns: int) -> None:
@@ -76,9 +79,9 @@ class PosedAssembler(Assembler[T, Out]):
         self._add(self._depth, stamp_ns, message)
 
     def add_camera_info(self, message: Any, stamp_ns: int) -> None:
-        """Keep a CameraInfo; a change counts from its stamp on.
+        """Keep a CameraInfo; new intrinsics are valid from its stamp on.
 
-        It is not in the streams' order: one that is latched may come at any time.
+        It is not part of the stamp order: a latched message may arrive at any time.
         """
         self._info.heard()
         try:
@@ -88,10 +91,10 @@ class PosedAssembler(Assembler[T, Out]):
             return
         self.camera_frame = str(message.header.frame_id)
         if not self._intrinsics or self._intrinsics[-1][1] != intrinsics:
-            self._intrinsics = [*self._intrinsics[-15:], (stamp_ns, intrinsics)]
+            self._intrinsics = [*self._intrinsics, (stamp_ns, intrinsics)][-MAX_INTRINSICS:]
 
     def expect_transforms(self) -> None:
-        """Carry an Odometry of another frame than the camera's over to it, by `add_transforms`."""
+        """Transform an Odometry of another frame to the camera, with TF from `add_transforms`."""
         self._poses.transforms = self._transforms
 
     def add_pose(self, message: Any, stamp_ns: int) -> None:
@@ -111,14 +114,14 @@ class PosedAssembler(Assembler[T, Out]):
             self._drop(refusal.reason, str(refusal))
         if self._source() is not self._transforms:
             return
-        # Many publishers share /tf, each with stamps of its own: going back means nothing here.
+        # /tf has many publishers with different stamps: an older stamp is no jump back in time.
         self._pose.heard()
         if not static:
             stamps_ns = map(stamp_ns_of, message.transforms)
             self._pose.newest_ns = max(self._pose.newest_ns or 0, *stamps_ns, 0)
 
     def _hear_pose(self, stamp_ns: int) -> None:
-        """Note the stamp; poses lie in a buffer of their own, not in the stream."""
+        """Note the stamp of a pose; the poses themselves are in `self._poses`."""
         if self._pose.restarts(stamp_ns):
             self._restart(stamp_ns)
         self._pose.heard()
@@ -133,8 +136,8 @@ class PosedAssembler(Assembler[T, Out]):
         super()._restart(stamp_ns)
 
     def _source(self) -> PoseStream | TransformTree:
-        wanted = self._inputs.pose_source
-        if wanted == "tf" or (wanted == "auto" and not self._had_poses and len(self._transforms)):
+        choice = self._inputs.pose_source
+        if choice == "tf" or (choice == "auto" and not self._had_poses and len(self._transforms)):
             return self._transforms
         return self._poses
 
@@ -150,7 +153,8 @@ class PosedAssembler(Assembler[T, Out]):
         if not self._intrinsics:
             raise RefusedInput(
                 "no_camera_info",
-                f"frame at {stamp_ns / 1e9:.3f} s: no usable camera_info on {self._info.topic}",
+                f"frame at {stamp_ns / 1e9:.3f} s: there is no camera_info: expected a valid one "
+                f"on {self._info.topic}",
             )
         current = self._intrinsics[0][1]
         for since_ns, intrinsics in self._intrinsics:

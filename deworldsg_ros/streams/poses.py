@@ -1,4 +1,4 @@
-"""Pose messages to T_world_camera, and a buffer that interpolates."""
+"""Convert pose messages to T_world_camera; a buffer that interpolates poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deworldsg_ros.scene.camera import interpolate_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
 
 NANOSECONDS = 10**9
-# Where neither the configuration nor the message names the world frame.
+# If neither the configuration nor the message names the world frame.
 UNNAMED_FRAME = "world"
 
 
@@ -41,7 +41,7 @@ def pose_from_message(message: Any) -> tuple[Float64, str]:
 
 
 def pose_from_transform(transform: Any) -> Float64:
-    """T_parent_child (4, 4) of a `geometry_msgs/Transform`; refuses as `pose_from_message`."""
+    """T_parent_child (4, 4) of a `geometry_msgs/Transform`; raises as `pose_from_message`."""
     return _rigid(transform.translation, transform.rotation)
 
 
@@ -53,11 +53,11 @@ def _rigid(position: Any, orientation: Any) -> Float64:
 
 
 class PoseBuffer:
-    """A bounded run of poses in stamp order, read at any stamp.
+    """The newest poses in stamp order, interpolated at any stamp.
 
     Args:
-        slop_ns: most time between a stamp and the poses that stand for it.
-        capacity: poses kept, newest.
+        slop_ns: maximum time between a stamp and the poses that are used for it, nanoseconds.
+        capacity: number of poses kept, at least; the default is 100 s at 100 Hz.
     """
 
     def __init__(self, slop_ns: int, capacity: int = 10000) -> None:
@@ -70,7 +70,7 @@ class PoseBuffer:
         return len(self._stamps_ns)
 
     def add(self, stamp_ns: int, T: Float64) -> None:
-        """Keep a pose; one with the same stamp is replaced."""
+        """Keep a pose (4, 4); it replaces one with the same stamp."""
         row = bisect_left(self._stamps_ns, stamp_ns)
         if row < len(self._stamps_ns) and self._stamps_ns[row] == stamp_ns:
             self._poses[row] = T
@@ -81,9 +81,9 @@ class PoseBuffer:
             self._forget(len(self._stamps_ns) - self._capacity)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop poses that no stamp from here on can need."""
+        """Drop poses that are not needed for this stamp or later ones."""
         rows = bisect_left(self._stamps_ns, stamp_ns - self._slop_ns) - 1
-        # Deleting from the front of a list moves the rest: do it seldom.
+        # Deleting from the front moves the rest of the list: delete many at once.
         if rows > 256:
             self._forget(rows)
 
@@ -92,14 +92,14 @@ class PoseBuffer:
         del self._poses[:rows]
 
     def settled(self, stamp_ns: int) -> bool:
-        """Whether a later pose cannot change the answer at this stamp, poses being in order."""
+        """Whether later poses, in stamp order, cannot change the pose at this stamp."""
         return bool(self._stamps_ns) and self._stamps_ns[-1] >= stamp_ns
 
     def at(self, stamp_ns: int) -> Float64:
-        """The pose at a stamp: interpolated between its neighbours, else the nearest.
+        """The pose (4, 4) at a stamp: interpolated between both neighbours, or the nearest one.
 
         Raises:
-            RefusedInput: ``no_pose`` where the nearest is further away than the slop.
+            RefusedInput: ``no_pose`` if the nearest pose is further away than the slop.
         """
         stamps_ns = self._stamps_ns
         row = bisect_left(stamps_ns, stamp_ns)
@@ -119,6 +119,6 @@ class PoseBuffer:
         seen = f"the nearest pose is {min(known) / 1e9:.3f} s away" if known else "there is no pose"
         raise RefusedInput(
             "no_pose",
-            f"image at {stamp_ns / 1e9:.3f} s: {seen}, wanted one within "
+            f"image at {stamp_ns / 1e9:.3f} s: {seen}, expected one within "
             f"{self._slop_ns / 1e9:g} s (inputs.pose_slop_s)",
         )

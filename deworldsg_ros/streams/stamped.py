@@ -1,4 +1,4 @@
-"""Bounded streams of stamped messages, read by stamp."""
+"""Buffer of one stream of stamped messages, read by stamp."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 
 T = TypeVar("T")
 
-# A stream that goes back by more than this has started again (a looped recording).
+# A stream whose stamps go back by more has restarted (a looped recording); else it is late.
 RESTART_NS = 10**9
 
 
@@ -26,9 +26,12 @@ class Stream(Generic[T]):
     """The newest items of one topic, in stamp order.
 
     Args:
-        name: what it carries, as the diagnostics call it.
-        topic: where it comes from.
-        capacity: items kept.
+        name: content of the stream, for the diagnostics.
+        topic: topic of the stream, for the diagnostics.
+        capacity: maximum number of items.
+
+    Attributes:
+        newest_ns: stamp of the newest item so far; None before the first.
     """
 
     def __init__(self, name: str, topic: str, capacity: int) -> None:
@@ -44,17 +47,17 @@ class Stream(Generic[T]):
         return len(self._items)
 
     def add(self, stamp_ns: int, value: T) -> int:
-        """Keep an item; returns how many unused ones had to go for it.
+        """Keep an item; returns the number of unused items that it displaces.
 
         Raises:
-            RefusedInput: ``stale`` for a stamp that is not after the one before.
+            RefusedInput: ``stale`` for a stamp that is not after the last one.
         """
         self.heard()
         if self.newest_ns is not None and stamp_ns <= self.newest_ns:
             raise RefusedInput(
                 "stale",
-                f"{self.name} of {stamp_ns / 1e9:.3f} s came after that of "
-                f"{self.newest_ns / 1e9:.3f} s: wanted increasing stamps",
+                f"{self.name} at {stamp_ns / 1e9:.3f} s arrived after that at "
+                f"{self.newest_ns / 1e9:.3f} s: expected increasing stamps",
             )
         self.newest_ns = stamp_ns
         self._items.append(_Item(stamp_ns, value))
@@ -64,7 +67,7 @@ class Stream(Generic[T]):
         return lost
 
     def heard(self) -> None:
-        """Note that a message came, good or bad."""
+        """Note that a message arrived, valid or not."""
         self._fresh = True
 
     def first(self) -> _Item[T]:
@@ -85,50 +88,50 @@ class Stream(Generic[T]):
 
     @property
     def full(self) -> bool:
-        """Whether the next item would push one out."""
+        """Whether the next item displaces the oldest."""
         return len(self._items) >= self._capacity
 
     def settled(self, stamp_ns: int) -> bool:
-        """Whether an item that is yet to come cannot be nearer to this stamp."""
+        """Whether later items cannot be nearer to this stamp."""
         return self.newest_ns is not None and self.newest_ns >= stamp_ns
 
     def nearest(self, stamp_ns: int, slop_ns: int) -> T:
         """The item nearest to a stamp; of two equally near, the earlier.
 
         Raises:
-            RefusedInput: ``no_<name>`` where none is within the slop.
+            RefusedInput: ``no_<name>`` if none is within the slop.
         """
         best = min(self._items, key=lambda item: abs(item.stamp_ns - stamp_ns), default=None)
         if best is None or abs(best.stamp_ns - stamp_ns) > slop_ns:
             gap = "there is none" if best is None else _gap(best.stamp_ns, stamp_ns)
             raise RefusedInput(
                 f"no_{self.name}",
-                f"frame at {stamp_ns / 1e9:.3f} s has no {self.name}: {gap}, wanted one within "
+                f"frame at {stamp_ns / 1e9:.3f} s has no {self.name}: {gap}, expected one within "
                 f"{slop_ns / 1e9:g} s",
             )
         best.used = True
         return best.value
 
     def forget_before(self, stamp_ns: int) -> int:
-        """Drop older items; returns how many were never used."""
+        """Drop items before this stamp; returns the number of unused ones."""
         lost = 0
         while self._items and self._items[0].stamp_ns < stamp_ns:
             lost += not self._items.popleft().used
         return lost
 
     def clear(self) -> int:
-        """Start again; returns how many items were never used."""
+        """Drop all items and accept any stamp; returns the number of unused items."""
         lost = sum(not item.used for item in self._items)
         self._items.clear()
         self.newest_ns = None
         return lost
 
     def restarts(self, stamp_ns: int) -> bool:
-        """Whether this stamp lies so far back that the stream has started again."""
+        """Whether this stamp is so far back that the stream has restarted."""
         return self.newest_ns is not None and stamp_ns < self.newest_ns - RESTART_NS
 
     def silence_ns(self, now_ns: int, since_ns: int) -> int:
-        """How long nothing came until now, counted from `since_ns` if nothing ever came."""
+        """Nanoseconds since the last message; before the first message, since `since_ns`."""
         if self._fresh:
             self._fresh = False
             self._heard_ns = now_ns

@@ -1,4 +1,4 @@
-"""A small TF tree of /tf and /tf_static messages, for bags and for nodes."""
+"""A small TF tree, built from /tf and /tf_static messages."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from deworldsg_ros.streams.poses import PoseBuffer, pose_from_transform, stamp_n
 
 
 class TransformTree:
-    """Frames and the transforms between them, read at any stamp.
+    """Frames and the transforms between them, interpolated at any stamp.
 
     Args:
-        slop_ns: most time between a stamp and the transforms that stand for it.
-        world_frame: frame of the answers; empty = the root of the tree above the camera at the
-            first answer, with something that moves between the two.
+        slop_ns: maximum time between a stamp and the transforms that are used for it, nanoseconds.
+        world_frame: world frame of the poses; empty = the root of the tree above the camera when
+            the first pose is read. A transform between the two must be a moving one.
     """
 
     def __init__(self, slop_ns: int, world_frame: str = "") -> None:
@@ -47,11 +47,11 @@ class TransformTree:
             else:
                 buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
                 buffer.add(stamp_ns_of(transform), T_parent_child)
-            # Last: whoever reads in another thread then finds the transform of each frame.
+            # Last: a reader in another thread then finds the transform of each frame in the tree.
             self._parents[child] = parent
 
     def settled(self, stamp_ns: int, camera_frame: str, parent_frame: str = "") -> bool:
-        """Whether later transforms cannot change the answer of `at` or `between`."""
+        """Whether later transforms cannot change the result of `at` or `between`."""
         parent_frame = parent_frame or self._world_frame
         try:
             ours, theirs, _ = self._paths(camera_frame, parent_frame)
@@ -66,15 +66,16 @@ class TransformTree:
         """T_world_camera (4, 4) and the world frame at a stamp.
 
         Raises:
-            RefusedInput: as `between`, or ``no_pose`` where nobody names the world and nothing
-                moves above the camera: then the root is its mounting, and no world.
+            RefusedInput: as `between`; ``no_pose`` if no world frame is configured and all
+                transforms above the camera are static: the root is then its mounting, no world.
         """
         ours, _, world_frame = self._paths(camera_frame, self._world_frame)
         if not self._world_frame and all(frame in self._static for frame in ours):
             raise RefusedInput(
                 "no_pose",
-                f"TF knows camera frame '{camera_frame}' as fixed to '{world_frame}', which does "
-                "not move in any world: wanted a localisation's transforms, or inputs.world_frame",
+                f"TF has camera frame '{camera_frame}' fixed to '{world_frame}', which does "
+                "not move in any world: expected transforms of a localisation, or "
+                "inputs.world_frame",
             )
         T_world_camera = self.between(stamp_ns, world_frame, camera_frame)
         self._world_frame = world_frame
@@ -84,29 +85,29 @@ class TransformTree:
         """T_parent_child (4, 4) at a stamp.
 
         Raises:
-            RefusedInput: ``no_pose`` where the frames are not connected, or a transform is
+            RefusedInput: ``no_pose`` if the frames are not connected, or if a transform is
                 further away in time than the slop.
         """
         ours, theirs, _ = self._paths(child_frame, parent_frame)
         return invert_pose(self._chain(theirs, stamp_ns)) @ self._chain(ours, stamp_ns)
 
     def root(self, frame: str) -> str:
-        """The frame that has no parent, above or at this one."""
+        """The root of the tree above a frame; the frame itself if it has no parent."""
         return self._ancestry(frame)[-1]
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Drop transforms that no stamp from here on can need."""
+        """Drop transforms that are not needed for this stamp or later ones."""
         for buffer in self._moving.values():
             buffer.forget_before(stamp_ns)
 
     def restart(self) -> None:
-        """Forget what moves; static transforms are told only once."""
+        """Drop the moving transforms; static ones are published only once, and stay."""
         for frame in self._moving:
             self._parents.pop(frame, None)
         self._moving.clear()
 
     def _chain(self, frames: list[str], stamp_ns: int) -> Float64:
-        """T_ancestor_frame along a path given from the frame upwards."""
+        """T_ancestor_frame (4, 4) along a path from the frame upwards."""
         T = np.eye(4)
         for frame in frames:
             step = self._static.get(frame)
@@ -120,9 +121,9 @@ class TransformTree:
         return path
 
     def _paths(self, camera_frame: str, world_frame: str) -> tuple[list[str], list[str], str]:
-        """Frames from camera and world up to, without, their common ancestor; the world frame.
+        """Paths from the camera and from the world up to their common ancestor, without it.
 
-        Without a name it is the root of the tree above the camera.
+        The third value is the world frame; if it has no name, the root above the camera.
         """
         ours = self._ancestry(camera_frame.lstrip("/"))
         world_frame = world_frame.lstrip("/") or ours[-1]

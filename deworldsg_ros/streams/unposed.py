@@ -1,4 +1,4 @@
-"""RGB-D frames before they have a pose, for odometry."""
+"""RGB-D frames without a pose, for odometry."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from deworldsg_ros.streams.posed import PosedAssembler
 
 @dataclass(frozen=True)
 class UnposedFrame:
-    """One registered RGB-D image.
+    """One RGB-D image; depth is registered to colour.
 
     Attributes:
         stamp_ns: time of the RGB image.
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32, metres; 0 = invalid.
-        intrinsics: of both.
+        intrinsics: of both images.
     """
 
     stamp_ns: int
@@ -34,7 +34,7 @@ class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
     """RGB images with depth and camera_info, in stamp order."""
 
     def __init__(self, inputs: InputsConfig, **options: Any) -> None:
-        values = {"topics": None, "capacity": 64, "patience_s": 2.0, "on_drop": None, **options}
+        values = {"topics": None, "capacity": 64, "max_wait_s": 2.0, "on_drop": None, **options}
         super().__init__("rgb", (), inputs, **values)
         self._streams.remove(self._pose)
 
@@ -53,7 +53,7 @@ class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
             raise RefusedInput(
                 "grid_mismatch",
                 f"RGB is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x"
-                f"{depth_m.shape[0]}, camera_info {intrinsics.width}x{intrinsics.height}: wanted "
-                "one size (is depth registered to RGB?)",
+                f"{depth_m.shape[0]}, camera_info {intrinsics.width}x{intrinsics.height}: expected "
+                "one size. Register the depth to the RGB image",
             )
         return UnposedFrame(stamp_ns, rgb, depth_m, intrinsics)

@@ -19,14 +19,14 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.timeout(400)
-def test_a_run_leaves_everything_it_names(tmp_path):
-    told = deworldsg(
+def test_a_run_writes_every_file_that_it_names(tmp_path):
+    result = deworldsg(
         tmp_path,
         *("run", DEMO_ROOM, "--out", "out", "--max-frames", 12, "--set", "output.top_k=3"),
         "--timings",
         limit_s=360,
     )
-    assert told.returncode == 0, told.stderr
+    assert result.returncode == 0, result.stderr
     out = tmp_path / "out"
     graph = wire.decode((out / "scene_graph.json").read_bytes(), wire.SceneGraphMessage)
     assert graph.nodes
@@ -40,22 +40,22 @@ def test_a_run_leaves_everything_it_names(tmp_path):
     assert report["frames"] == {"images": 171, "processed": 12}
     assert report["nodes"] == len(graph.nodes)
     assert set(report["times_ms"]) >= {"perception", "masks", "lifting", "merging", "relations"}
-    assert "12/12" in told.stdout
-    assert "relation inference" in told.stdout
+    assert "12/12" in result.stdout
+    assert "relation inference" in result.stdout
     assert report["device"]
     for name in ("scene_graph.html", "scene_graph.png", "scene_graph.json", "run.json"):
-        assert name in told.stdout
+        assert name in result.stdout
 
 
 @pytest.mark.timeout(400)
-def test_a_recording_without_a_usable_frame_is_an_error_that_says_why(tmp_path):
+def test_a_recording_without_a_usable_frame_is_an_error_with_reasons(tmp_path):
     items = [item for item in camera_items(3) if "depth" not in item[0]]
     items += [item for item in camera_items(9)[-4:] if "depth" in item[0]]
     write_bag(tmp_path / "bag", items)
-    told = deworldsg(tmp_path, "run", "bag", "--out", "out", limit_s=360)
-    assert told.returncode == 2
-    assert "3 no_depth" in told.stdout
-    assert "not one frame" in told.stderr
+    result = deworldsg(tmp_path, "run", "bag", "--out", "out", limit_s=360)
+    assert result.returncode == 2
+    assert "3 no_depth" in result.stdout
+    assert "not one frame" in result.stderr
 
 
 class Broken(FakeWorldModel):
@@ -66,12 +66,12 @@ class Broken(FakeWorldModel):
 
 
 @pytest.mark.timeout(400)
-def test_a_world_model_that_fails_is_in_the_report_and_the_run_goes_on(tmp_path, monkeypatch):
+def test_a_failing_world_model_is_in_the_report_and_the_run_continues(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "build_world_model", lambda config: Broken(16))
     options = ["--max-frames", "6", "--set", "relations.max_clips_per_s=0"]
-    told = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
+    assert result.exit_code == 0, result.output
     clips = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["clips"]
     failed = clips["dropped"]["world_model_error"]
     assert failed > 0 and clips["encoded"] == 0
-    assert f"left out by world model: {failed} world_model_error" in told.output
+    assert f"left out by world model: {failed} world_model_error" in result.output

@@ -117,5 +117,5 @@ def test_a_recording_without_ground_truth_says_what_is_missing(tmp_path: Path) -
 
 
 def test_other_layouts_are_data_sets(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="wanted replica, 3rscan or recording"):
+    with pytest.raises(RecordingError, match="expected replica, 3rscan or recording"):
         Annotations(tmp_path, "video")

@@ -27,7 +27,7 @@ from support.recordings import (
 from deworldsg_ros.config import Config
 from deworldsg_ros.poses.trajectory import TrajectoryError, read_trajectory, write_tum
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.sequence import TURNED_AXES
+from deworldsg_ros.recordings.folders.sequence import ROTATED_AXES
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -204,7 +204,7 @@ def test_slams_pose_files_of_a_scan_turn_with_its_images(tmp_path: Path, poses: 
     assert recording.drops["no_pose"] == 1
     wanted = pose(0)
     wanted[0, 3] += 10.0
-    wanted[:3, :3] = wanted[:3, :3] @ TURNED_AXES
+    wanted[:3, :3] = wanted[:3, :3] @ ROTATED_AXES
     np.testing.assert_allclose(frames[0].T_world_camera, wanted, atol=1e-9)
 
 
@@ -215,7 +215,7 @@ def test_a_scan_without_poses_has_no_frames_of_its_own(tmp_path: Path) -> None:
 
 
 def test_poses_come_from_one_place() -> None:
-    with pytest.raises(ConfigurationError, match="wanted one"):
+    with pytest.raises(ConfigurationError, match="expected only one"):
         PoseChoice(Path("t.txt"), odometry=True)
 
 

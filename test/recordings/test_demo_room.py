@@ -49,7 +49,7 @@ def decode_depth_m(message) -> np.ndarray:
     return cv2.imdecode(np.asarray(message.data[12:]), cv2.IMREAD_UNCHANGED) / 1000.0
 
 
-def test_each_topic_has_one_message_a_frame_with_the_same_stamp(messages, truth):
+def test_each_topic_has_one_message_per_frame_with_the_same_stamp(messages, truth):
     assert set(messages) == set(TOPICS)
     stamps = {topic: [stamp_ns(m) for m in column] for topic, column in messages.items()}
     reference = stamps["/rgb/image_raw/compressed"]
@@ -70,7 +70,7 @@ def test_the_first_frame_decodes(messages):
     assert rgb.header.frame_id == depth.header.frame_id
 
 
-def test_depth_is_that_of_a_room_with_holes(messages):
+def test_depth_is_in_the_range_of_a_room_and_has_holes(messages):
     for message in messages["/depth/image_raw/compressedDepth"][::40]:
         depth_m = decode_depth_m(message)
         valid = depth_m > 0
@@ -141,7 +141,7 @@ def test_instances_cover_every_frame_and_name_known_objects(truth):
     assert set(np.unique(labels[::17]).tolist()) <= ids | {0}
 
 
-def test_the_ground_truth_graph_is_sound(truth):
+def test_the_ground_truth_graph_is_consistent(truth):
     objects = {o["id"]: o for o in truth["objects"]}
     assert len(objects) == len(truth["objects"])
     for item in objects.values():
@@ -158,6 +158,6 @@ def test_the_ground_truth_graph_is_sound(truth):
     assert {"chair", "diningtable", "cup", "bowl", "bottle", "sofa", "tvmonitor"} <= classes
 
 
-def test_the_recording_stays_small():
+def test_the_recording_is_smaller_than_20_mb():
     size = sum(path.stat().st_size for path in (BAGS / "demo_room").iterdir())
     assert size < 20e6

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deworldsg_ros.recordings.messages import Role
-from deworldsg_ros.recordings.pacing import MOST_UNDECIDED, Pace, Window
+from deworldsg_ros.recordings.pacing import MAX_UNDECIDED, Pace, Window
 
 
 @pytest.mark.parametrize(("rate", "due_s"), [(1.0, 12.0), (2.0, 11.0), (0.5, 14.0)])
@@ -17,12 +17,12 @@ def test_pace_scales_recorded_time(rate, due_s):
     assert pace.due_s(7 * 10**18 + 2 * 10**9, 10.1) == pytest.approx(due_s)
 
 
-def test_no_pace_is_always_due():
+def test_rate_zero_is_always_due():
     pace = Pace(0.0)
     assert [pace.due_s(time_ns, 3.0) for time_ns in (0, 10**9, 5)] == [3.0] * 3
 
 
-def test_after_a_pause_it_goes_on_at_its_pace():
+def test_after_a_pause_the_replay_keeps_its_rate():
     pace = Pace(1.0)
     pace.due_s(0, 100.0)
     pace.late(30.0)
@@ -38,7 +38,7 @@ def test_an_empty_window_is_not_full_and_zero_is_no_limit():
     assert unlimited.in_flight == 1000
 
 
-def test_an_answer_answers_what_was_before_it():
+def test_an_answer_covers_the_frames_before_it():
     window = Window(3)
     for stamp_ns in (10, 20, 30):
         window.publish(stamp_ns)
@@ -49,7 +49,7 @@ def test_an_answer_answers_what_was_before_it():
     assert window.answered == 1
 
 
-def test_refused_frames_are_not_waited_for_and_the_lost_are_counted():
+def test_refused_frames_leave_the_window_and_lost_frames_are_counted():
     window = Window(2)
     window.publish(1)
     window.publish(2)
@@ -66,8 +66,8 @@ def test_refused_frames_are_not_waited_for_and_the_lost_are_counted():
 NEEDS = (Role.DEPTH, Role.POSE)
 
 
-def test_a_frame_is_in_flight_once_it_can_be_decided():
-    """Here 30 images a second and 5 poses: six images between two poses must not fill a window."""
+def test_a_frame_is_in_flight_once_every_stream_passed_its_stamp():
+    """30 images and 5 poses per second: six images between two poses must not fill a window."""
     window = Window(4, NEEDS)
     for stamp_ns in range(1, 7):
         window.passed(Role.DEPTH, stamp_ns)
@@ -83,17 +83,17 @@ def test_a_frame_is_in_flight_once_it_can_be_decided():
     assert window.in_flight == 2
 
 
-def test_undecided_frames_are_bounded_and_an_answer_answers_them_too():
+def test_undecided_frames_are_bounded_and_an_answer_covers_them():
     window = Window(4, NEEDS)
-    for stamp_ns in range(1, MOST_UNDECIDED + 3):
+    for stamp_ns in range(1, MAX_UNDECIDED + 3):
         window.publish(stamp_ns)
     assert window.in_flight == 2
-    window.answer(MOST_UNDECIDED)
+    window.answer(MAX_UNDECIDED)
     window.close()
     assert window.in_flight == 2
 
 
-def test_a_refusal_that_is_told_before_the_answer_to_an_earlier_frame_counts():
+def test_a_refusal_before_the_answer_to_an_earlier_frame_counts():
     window = Window(4)
     for stamp_ns in range(1, 7):
         window.publish(stamp_ns)
@@ -104,7 +104,7 @@ def test_a_refusal_that_is_told_before_the_answer_to_an_earlier_frame_counts():
     assert window.in_flight == 1
 
 
-def test_a_refusal_that_is_told_after_the_answer_to_a_later_frame_excuses_no_other():
+def test_a_refusal_after_the_answer_to_a_later_frame_is_not_counted_twice():
     window = Window(4)
     for stamp_ns in range(1, 5):
         window.publish(stamp_ns)

@@ -60,7 +60,7 @@ def test_frames_are_what_was_recorded(tmp_path, storage, compressed):
     assert not recording.losses
 
 
-def test_an_empty_choice_of_nothing_recorded_is_refused(tmp_path):
+def test_a_bag_without_poses_is_refused(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(2, with_pose=False))
     with pytest.raises(RecordingError, match="no pose topic"):
         open_recording(bag)
@@ -122,7 +122,7 @@ def robot_items():
         (("/tf_static",), "/tf"),  # the two are not connected
     ],
 )
-def test_an_odometry_of_the_robot_is_carried_over_to_its_camera(tmp_path, without, topic):
+def test_an_odometry_of_the_robot_is_transformed_to_its_camera(tmp_path, without, topic):
     items = [item for item in robot_items() if item[0] not in without]
     bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
     frames, recording = frames_of(bag)
@@ -157,7 +157,7 @@ def test_the_configuration_decides_between_poses_odometry_and_tf(tmp_path):
         open_recording(bag, InputsConfig(transport="raw"))
 
 
-def test_tf_that_does_not_reach_the_camera_drops_frames_with_a_reason(tmp_path):
+def test_tf_that_does_not_connect_the_camera_drops_frames_with_a_reason(tmp_path):
     items = camera_items(COUNT, with_pose=False)
     elsewhere = [
         ("/tf", ros.TF_MESSAGE, stamp_ns(i), transform(stamp_ns(i), WORLD, "arm", np.eye(4)))
@@ -180,7 +180,7 @@ def test_frames_without_depth_are_dropped_and_counted(tmp_path):
     assert "depth" in recording.reasons["no_depth"]
 
 
-def test_slop_of_the_configuration_decides_what_belongs_together(tmp_path):
+def test_the_configured_slop_decides_which_images_match(tmp_path):
     items = camera_items(3)
     for topic, _, _, message in items:
         if "depth" in topic:
@@ -190,7 +190,7 @@ def test_slop_of_the_configuration_decides_what_belongs_together(tmp_path):
     assert len(frames_of(bag, inputs=InputsConfig(slop_s=0.04))[0]) == 3
 
 
-def test_a_robots_odometry_is_carried_over_though_its_first_message_is_broken(tmp_path):
+def test_a_robots_odometry_is_transformed_although_its_first_message_is_broken(tmp_path):
     items = sorted(robot_items(), key=lambda item: item[2])
     first = next(index for index, item in enumerate(items) if item[0] == "/odom")
     topic, kind, time_ns, message = items[first]
@@ -231,7 +231,7 @@ def test_written_bag_gives_the_same_frames_and_foxglove_finds_its_schemas(tmp_pa
     assert [file.name for file in tmp_path.glob(".deworldsg-*")] == []
 
 
-def test_output_is_never_overwritten_and_an_interrupted_one_leaves_nothing(tmp_path):
+def test_output_is_never_overwritten_and_an_interrupted_write_leaves_no_file(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(2))
     output = tmp_path / "out.mcap"
 
@@ -251,7 +251,7 @@ def test_output_is_never_overwritten_and_an_interrupted_one_leaves_nothing(tmp_p
             write_mcap(recording_raw(bag), bad)
 
 
-def test_a_place_that_is_no_recording_says_what_was_expected(tmp_path):
+def test_a_path_without_a_recording_is_refused_with_the_expected_content(tmp_path):
     with pytest.raises(RecordingError, match=r"metadata\.yaml.*rgb\.txt"):
         open_recording(tmp_path)
     (tmp_path / "film.avi").write_text("")

@@ -46,11 +46,11 @@ def test_folder_and_bare_file_give_all_messages_in_order(bag):
     assert len(topics) == 4
 
 
-def test_unknown_topics_are_no_messages(bag):
+def test_an_unknown_topic_has_no_messages(bag):
     assert read(bag, ["/nothing"]) == ([], [])
 
 
-def test_missing_metadata_is_told_and_the_files_are_read(bag, tmp_path):
+def test_missing_metadata_is_reported_and_the_files_are_read(bag, tmp_path):
     folder = tmp_path / "killed"
     shutil.copytree(bag, folder)
     (folder / "metadata.yaml").unlink()
@@ -60,7 +60,7 @@ def test_missing_metadata_is_told_and_the_files_are_read(bag, tmp_path):
 
 
 @pytest.mark.parametrize("kept", [0.95, 0.6])
-def test_truncated_file_gives_its_beginning_and_says_so(bag, tmp_path, kept):
+def test_a_truncated_file_gives_its_beginning_and_reports_the_loss(bag, tmp_path, kept):
     file = storage_file(bag)
     cut = tmp_path / file.name
     content = file.read_bytes()
@@ -87,7 +87,7 @@ def chunk_starts(content):
     return starts
 
 
-def test_a_damaged_chunk_costs_that_chunk_alone(tmp_path):
+def test_a_damaged_chunk_loses_only_its_own_messages(tmp_path):
     # Chunks of a megabyte: large messages make several.
     writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
@@ -114,7 +114,7 @@ def test_a_damaged_chunk_costs_that_chunk_alone(tmp_path):
     assert all(m in whole for m in messages)
 
 
-def test_damaged_pages_of_a_database_cost_their_rows_alone(tmp_path):
+def test_damaged_pages_of_a_database_lose_only_their_rows(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(COUNT), "sqlite3")
     file = storage_file(bag)
     content = bytearray(file.read_bytes())
@@ -131,21 +131,21 @@ def test_damaged_pages_of_a_database_cost_their_rows_alone(tmp_path):
 
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind", b"\x89MCAP0\r\n"])
 @pytest.mark.parametrize("suffix", [".mcap", ".db3"])
-def test_what_is_no_bag_is_refused_by_name(tmp_path, content, suffix):
+def test_a_file_that_is_no_bag_is_refused_by_name(tmp_path, content, suffix):
     file = tmp_path / f"broken{suffix}"
     file.write_bytes(content)
     with pytest.raises(RecordingError, match="broken"):
         RawBag(file)
 
 
-def test_missing_and_empty_places_are_refused(tmp_path):
+def test_missing_and_empty_folders_are_refused(tmp_path):
     with pytest.raises(RecordingError, match="no such file"):
         RawBag(tmp_path / "nothing")
     with pytest.raises(RecordingError, match=r"no \.mcap or \.db3"):
         RawBag(tmp_path)
 
 
-def test_files_of_two_bags_in_one_folder_are_not_taken_for_one(tmp_path):
+def test_files_of_two_bags_in_one_folder_are_refused(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(1))
     for name in ("a.mcap", "b.mcap"):
         shutil.copy(storage_file(bag), tmp_path / name)

@@ -47,7 +47,7 @@ OURS = [
 
 
 @pytest.mark.parametrize(
-    ("topics", "wanted"),
+    ("topics", "expected"),
     [
         (
             REALSENSE,
@@ -78,11 +78,11 @@ OURS = [
         ),
     ],
 )
-def test_usual_names_are_found_whatever_their_order(topics, wanted):
+def test_usual_names_are_found_in_any_order(topics, expected):
     roles = [Role.RGB, Role.DEPTH, Role.CAMERA_INFO, Role.POSE]
     for order in (topics, topics[::-1]):
         found = find_topics(order, TopicChoice(), "bag")
-        assert [found[role].name for role in roles] == wanted
+        assert [found[role].name for role in roles] == expected
 
 
 def test_a_named_topic_wins():
@@ -100,7 +100,7 @@ def test_a_named_topic_wins():
         (TF_MESSAGE, "no pose topic"),
     ],
 )
-def test_what_is_missing_is_told_with_what_is_there(missing, words):
+def test_a_missing_role_is_reported_with_the_existing_topics(missing, words):
     left = [topic for topic in KINECT if topic.msgtype != missing]
     with pytest.raises(RecordingError, match=words) as caught:
         find_topics(left, TopicChoice(), "walk.mcap")

@@ -1,4 +1,4 @@
-"""Images: every layout there and back, every refusal with what was seen and wanted."""
+"""Images: every layout there and back, every refusal with the value seen and expected."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_padding_and_byte_order_do_not_matter(
 
 
 @pytest.mark.parametrize("encoding", sorted(LAYOUTS))
-def test_a_ros_message_there_and_back(encoding: str) -> None:
+def test_a_ros_message_round_trip(encoding: str) -> None:
     kind, channels = LAYOUTS[encoding]
     shape = (4, 6, channels) if channels > 1 else (4, 6)
     pixels = RNG.integers(0, 200, shape).astype(kind)
@@ -89,11 +89,11 @@ def test_a_ros_message_there_and_back(encoding: str) -> None:
     np.testing.assert_array_equal(image_view(message, (encoding,)), pixels)
 
 
-def test_filling_takes_what_is_not_contiguous_and_nothing_of_another_type() -> None:
+def test_fill_image_takes_strided_pixels_and_refuses_another_type() -> None:
     message = Image()
     fill_image(message, RGB[:, :, ::-1], "bgr8")
     np.testing.assert_array_equal(rgb_from_message(message), RGB)
-    with pytest.raises(ValueError, match="uint16 with 1 channels: wanted u1 with 3"):
+    with pytest.raises(ValueError, match="uint16 with 1 channels: expected u1 with 3"):
         fill_image(message, COUNTS, "rgb8")
 
 
@@ -156,12 +156,12 @@ def test_compressed_depth_of_metres_is_quantised_inverse_depth() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason", "says"),
     [
-        ({"encoding": "yuv422"}, "unknown_encoding", "'yuv422': wanted rgb8, bgr8"),
-        ({"encoding": "16UC1"}, "unknown_encoding", "wanted rgb8"),
+        ({"encoding": "yuv422"}, "unknown_encoding", "'yuv422': expected rgb8, bgr8"),
+        ({"encoding": "16UC1"}, "unknown_encoding", "expected rgb8"),
         ({"height": 0}, "empty_image", "7x0"),
-        ({"step": 20}, "bad_step", "20 bytes: wanted at least 21"),
-        ({"step": 30}, "short_buffer", "holds 105 bytes: wanted 150"),
-        ({"data": np.zeros(104, np.uint8)}, "short_buffer", "holds 104 bytes: wanted 105"),
+        ({"step": 20}, "bad_step", "20 bytes: expected at least 21"),
+        ({"step": 30}, "short_buffer", "holds 105 bytes: expected 150"),
+        ({"data": np.zeros(104, np.uint8)}, "short_buffer", "holds 104 bytes: expected 105"),
         ({"data": np.zeros(0, np.uint8)}, "short_buffer", "holds 0 bytes"),
     ],
 )

@@ -26,7 +26,7 @@ SLOP = 100 * MS
 
 
 def at(x: float, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
-    """A pose at (x, y, 0), turned about z."""
+    """A pose at (x, y, 0), rotated about z."""
     quat = np.array([0, 0, math.sin(turn_rad / 2), math.cos(turn_rad / 2)])
     return pose_from_quaternion(np.array([x, y, 0.0]), quat)
 
@@ -64,7 +64,7 @@ def test_interpolation_is_linear_in_position_and_spherical_in_rotation() -> None
 @pytest.mark.parametrize(
     ("offset_ms", "x"), [(-100, 0.0), (-1, 0.0), (0, 0.0), (100, 0.0), (401, 5.0), (600, 5.0)]
 )
-def test_outside_of_a_bracket_the_nearest_pose_counts(offset_ms: int, x: float) -> None:
+def test_with_one_neighbour_the_nearest_pose_is_used(offset_ms: int, x: float) -> None:
     buffer = PoseBuffer(SLOP)
     buffer.add(T0, at(0.0))
     buffer.add(T0 + 500 * MS, at(5.0))
@@ -76,7 +76,7 @@ def test_beyond_the_slop_there_is_no_pose(offset_ms: int) -> None:
     buffer = PoseBuffer(SLOP)
     buffer.add(T0, at(0.0))
     buffer.add(T0 + 500 * MS, at(5.0))
-    with pytest.raises(RefusedInput, match="wanted one within 0.1 s") as caught:
+    with pytest.raises(RefusedInput, match="expected one within 0.1 s") as caught:
         buffer.at(T0 + offset_ms * MS)
     assert caught.value.reason == "no_pose"
 
@@ -87,7 +87,7 @@ def test_an_empty_buffer_has_no_pose() -> None:
 
 
 @given(st.permutations(range(8)))
-def test_poses_may_come_in_any_order(order: list[int]) -> None:
+def test_poses_may_arrive_in_any_order(order: list[int]) -> None:
     buffer = PoseBuffer(SLOP)
     for step in order:
         buffer.add(T0 + step * 10 * MS, at(float(step)))
@@ -102,7 +102,7 @@ def test_a_buffer_is_bounded() -> None:
     assert buffer.at(T0 + 99 * MS)[0, 3] == 99.0
 
 
-def test_forgetting_keeps_what_is_still_needed() -> None:
+def test_forget_before_keeps_the_poses_that_are_needed() -> None:
     buffer = PoseBuffer(SLOP)
     for step in range(1000):
         buffer.add(T0 + step * MS, at(float(step)))
@@ -152,7 +152,7 @@ def test_poses_that_keep_jumping_are_never_accepted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("turns_deg", "step_ms", "wanted"),
+    ("turns_deg", "step_ms", "expected"),
     [
         ([0, 30, 60, 90], 100, ["", "", "", ""]),  # as fast as a hand rotates
         ([0, 60, 10, 20], 100, ["", "pose_jump", "", ""]),
@@ -162,9 +162,9 @@ def test_poses_that_keep_jumping_are_never_accepted() -> None:
     ],
 )
 def test_a_camera_that_rotates_too_fast_has_jumped(
-    turns_deg: list[float], step_ms: int, wanted: list[str]
+    turns_deg: list[float], step_ms: int, expected: list[str]
 ) -> None:
-    assert reasons([0.0] * len(turns_deg), turns_deg, step_ms * MS) == wanted
+    assert reasons([0.0] * len(turns_deg), turns_deg, step_ms * MS) == expected
 
 
 def test_tf_chains_static_and_moving_transforms() -> None:
@@ -183,7 +183,7 @@ def test_tf_chains_static_and_moving_transforms() -> None:
     assert frame == "map"
 
 
-def test_tf_finds_its_way_down_to_a_world_below_the_root() -> None:
+def test_tf_reaches_a_world_frame_below_the_root() -> None:
     tree = TransformTree(SLOP, "world")
     tree.add(tf(transform("root", "world", at(5.0))), static=True)
     tree.add(tf(transform("root", "camera", at(7.0), T0)), static=False)
@@ -201,7 +201,7 @@ def test_without_a_name_the_world_is_the_root_and_stays() -> None:
     assert tree.at(T0, "camera")[1] == "odom"
 
 
-def test_what_the_camera_is_mounted_on_is_no_world() -> None:
+def test_the_mounting_of_the_camera_is_no_world_frame() -> None:
     tree = TransformTree(SLOP)
     tree.add(tf(transform("camera_link", "camera", at(0.1))), static=True)
     with pytest.raises(RefusedInput, match="fixed to 'camera_link', which does not move"):
@@ -211,7 +211,7 @@ def test_what_the_camera_is_mounted_on_is_no_world() -> None:
     np.testing.assert_allclose(named.at(T0, "camera")[0], at(0.1))
 
 
-def test_tf_says_which_frames_it_knows() -> None:
+def test_a_refusal_of_tf_lists_the_known_frames() -> None:
     tree = TransformTree(SLOP, "map")
     tree.add(tf(transform("odom", "base", at(1.0))), static=False)
     with pytest.raises(RefusedInput, match="'camera' with 'map': known frames are base, odom"):

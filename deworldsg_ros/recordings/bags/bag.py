@@ -30,24 +30,24 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import pose_from_message
 from deworldsg_ros.streams.transforms import TransformTree
 
-# Ending of the topic of transforms that do not change.
-STATIC = "tf_static"
+# Static transforms: also /robot/tf_static.
+STATIC_SUFFIX = "tf_static"
 
 
 class BagSource:
     """Messages of the four roles of a bag; see `Source`.
 
-    Where the pose is in TF, a PoseStamped of the RGB frame is computed for every RGB image. Where
-    it is an Odometry of another frame, /tf_static carries it over to the RGB frame.
+    With poses from TF, each RGB image gets a PoseStamped of its frame. An Odometry of another frame
+    is transformed to the RGB frame with /tf_static.
 
     Args:
         path: folder, .mcap or .db3 file.
-        choice: topics named by the user.
-        inputs: ``world_frame`` and ``pose_slop_s`` are used, for poses from TF.
+        choice: topics that the user named.
+        inputs: transport, pose source, and for TF the world frame and pose slop.
         need_pose: whether a bag without poses is refused.
 
     Raises:
-        RecordingError: where it cannot be read, or a topic is missing.
+        RecordingError: for a bag that cannot be read, or without a topic for a role.
     """
 
     kind: ClassVar[str] = "rosbag2"
@@ -97,14 +97,14 @@ class BagSource:
                 if pose is not None:
                     yield _serialized(pose, raw.log_time_ns)
             if role is Role.POSE and self._T_child_camera is not None:
-                yield from self._carried(raw, self._T_child_camera)
+                yield from self._at_camera(raw, self._T_child_camera)
                 continue
             yield RawRoleMessage(role, raw.msgtype, stamp_ns, raw.log_time_ns, raw.data)
         if poses is not None and poses.refusal:
             self.losses.append(poses.refusal)
 
     def messages(self) -> Iterator[RoleMessage]:
-        """Decoded messages; what cannot be decoded is counted as ``invalid_message``."""
+        """Decoded messages; a message that cannot be decoded is counted as ``invalid_message``."""
         for raw in self.raw_messages():
             try:
                 message = decode(raw.data, raw.msgtype)
@@ -118,9 +118,9 @@ class BagSource:
         self._bag.close()
 
     def _mounting(self, found: dict[Role, Topic], choice: TopicChoice) -> Float64 | None:
-        """T_child_camera (4, 4) of an odometry of another frame than the camera's, else None.
+        """T_child_camera (4, 4) for an odometry of another frame than the camera's, else None.
 
-        Where /tf_static does not connect the two, TF alone takes the odometry's place.
+        If /tf_static does not connect the two frames, TF replaces the odometry in `found`.
         """
         pose = found.get(Role.POSE)
         if pose is None or pose.msgtype != ODOMETRY or self._inputs.pose_source != "auto":
@@ -136,13 +136,13 @@ class BagSource:
             return _TfPoses(self._bag, self._inputs).mounting(child, camera)
         except RefusedInput:
             moving = [t for t in self._bag.topics if t.msgtype == TF_MESSAGE and t.count]
-            moving = [t for t in moving if not t.name.endswith(STATIC)]
+            moving = [t for t in moving if not t.name.endswith(STATIC_SUFFIX)]
             if moving and not choice.pose:
                 found[Role.POSE] = next((t for t in moving if t.name == "/tf"), moving[0])
             return None
 
-    def _carried(self, raw: RawMessage, T_child_camera: Float64) -> Iterator[RawRoleMessage]:
-        """PoseStamped of the camera out of an Odometry."""
+    def _at_camera(self, raw: RawMessage, T_child_camera: Float64) -> Iterator[RawRoleMessage]:
+        """PoseStamped of the camera from an Odometry; a bad one is counted and left out."""
         try:
             T_world_child, frame_id = pose_from_message(decode(raw.data, raw.msgtype))
         except RefusedInput as refusal:
@@ -157,7 +157,7 @@ class BagSource:
         yield _serialized(pose, raw.log_time_ns)
 
     def _first(self, topic: Topic) -> Any:
-        """The first message that can be decoded; None where none can."""
+        """The first message that can be decoded; None if there is none."""
         for raw in self._bag.messages([topic.name]):
             with contextlib.suppress(Exception):  # whatever rosbags raises on a broken message
                 return decode(raw.data, raw.msgtype)
@@ -170,23 +170,23 @@ def _serialized(item: RoleMessage, log_time_ns: int) -> RawRoleMessage:
 
 
 class _TfPoses:
-    """Poses of the camera out of /tf and /tf_static, read just as far ahead as is needed."""
+    """Poses of the camera from /tf and /tf_static; reads /tf only as far ahead as needed."""
 
     def __init__(self, bag: RawBag, inputs: InputsConfig) -> None:
         self._tree = TransformTree(round(inputs.pose_slop_s * 1e9), inputs.world_frame)
         names = [t.name for t in bag.topics if t.msgtype == TF_MESSAGE]
-        static = [name for name in names if name.endswith(STATIC)]
+        static = [name for name in names if name.endswith(STATIC_SUFFIX)]
         self.refusal = ""
         for raw in bag.messages(static):
             self._add(raw, is_static=True)
         self._moving = bag.messages([name for name in names if name not in static])
 
     def mounting(self, parent_frame: str, camera_frame: str) -> Float64:
-        """T_parent_camera (4, 4) of frames that do not move; RefusedInput where none is told."""
+        """T_parent_camera (4, 4) from static transforms; raises RefusedInput without them."""
         return self._tree.between(0, parent_frame, camera_frame)
 
     def at(self, stamp_ns: int, camera_frame: str) -> RoleMessage | None:
-        """PoseStamped of the camera; None, with the reason in `refusal`, where TF has none."""
+        """PoseStamped of the camera; None without a pose in TF, with the reason in `refusal`."""
         while not self._tree.settled(stamp_ns, camera_frame):
             raw = next(self._moving, None)
             if raw is None:

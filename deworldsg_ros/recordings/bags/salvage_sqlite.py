@@ -1,4 +1,4 @@
-"""Read what is left of a damaged rosbag2 SQLite3 file: row by row, without its index."""
+"""Read the intact part of a damaged rosbag2 SQLite3 file: row by row, without its index."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from pathlib import Path
 
 Message = tuple[str, str, int, bytes]
 
-# Rows of a broken page raise one by one; after this many in a row the rest is taken for lost.
-MOST_BROKEN_ROWS = 200
+# The rows of a damaged page raise one by one. A page of 4 KiB has fewer rows: after this many in
+# succession, the rest of the file is lost.
+MAX_BROKEN_ROWS = 200
 
 
 def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
-    """Give (topic, type, log time in nanoseconds, CDR) of each readable row in file order.
+    """Yield (topic, type, log time in nanoseconds, CDR) of each readable row in file order.
 
     Args:
         path: the file.
-        note: is told, in a sentence, of each loss.
+        note: called with a sentence for each loss.
     """
     database = sqlite3.connect(f"file:{path.resolve()}?immutable=1", uri=True)
     try:
-        # Without this SQLite refuses a file that is shorter than its header says.
+        # Without this, SQLite refuses a file that is shorter than its header declares.
         database.execute("PRAGMA writable_schema = ON")
         topics = {
             key: (name, msgtype)
@@ -41,7 +42,7 @@ def _rows(
     note: Callable[[str], None],
 ) -> Iterator[Message]:
     row_id = broken = lost = 0
-    while broken < MOST_BROKEN_ROWS:
+    while broken < MAX_BROKEN_ROWS:
         try:
             for key, topic, time_ns, data in database.execute(
                 "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id",

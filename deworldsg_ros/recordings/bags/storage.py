@@ -1,7 +1,7 @@
-"""Raw messages of a rosbag2 bag: a folder with metadata.yaml, a bare .mcap or .db3 file.
+"""Serialized messages of a rosbag2 bag: a folder with metadata.yaml, or one .mcap or .db3 file.
 
-Whole bags are read by rosbags. Where that fails (recording was killed, disk was full, a file was
-cut), a salvage reader takes what is left, and `losses` says in words that data was lost.
+rosbags reads an intact bag. If it fails (recording killed, disk full, file truncated), a salvage
+reader reads the intact part, and `losses` states in words that data was lost.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Topic:
 
 
 class RawMessage(NamedTuple):
-    """A serialized message of a bag; `log_time_ns` is when it was recorded."""
+    """A serialized message of a bag; `log_time_ns` is its time of recording."""
 
     topic: str
     msgtype: str
@@ -48,11 +48,11 @@ class RawBag:
 
     Attributes:
         path: of the bag.
-        topics: what it holds, by name.
-        losses: sentences that say which data was lost; more may come while messages are read.
+        topics: its topics, sorted by name.
+        losses: sentences about lost data; reading messages may add some.
 
     Raises:
-        RecordingError: where it is no bag, or nothing in it can be read.
+        RecordingError: for a path that is no bag, or without a readable message.
     """
 
     def __init__(self, path: Path) -> None:
@@ -64,7 +64,7 @@ class RawBag:
             reader.open()
         except FileNotFoundError:
             self._open_damaged(None if path.is_dir() else f"{path} does not exist")
-        except Exception as error:  # rosbags lets struct, yaml and index errors through
+        except Exception as error:  # rosbags passes struct, yaml and index errors on
             self._open_damaged(_one_line(error))
         else:
             self._reader = reader
@@ -74,24 +74,24 @@ class RawBag:
             )
 
     def _open_damaged(self, cause: str | None) -> None:
-        """Count what can be salvaged; `cause` is what the whole-bag reader said."""
+        """Count the readable messages; `cause`: error of rosbags, None = no metadata.yaml."""
         if not self.path.exists():
             raise RecordingError(f"recording {self.path}: there is no such file or folder")
         if not self.files:
             raise RecordingError(
-                f"recording {self.path}: no .mcap or .db3 file there: "
-                "wanted a rosbag2 folder with its metadata.yaml, or one of these files"
+                f"recording {self.path}: there is no .mcap or .db3 file; expected a rosbag2 folder "
+                "with its metadata.yaml, or one of these files"
             )
         if cause is None:
             self.losses.append("metadata.yaml is missing; the files were read without it")
         else:
-            self.losses.append(f"the bag is damaged ({cause}); what is left of it was read")
+            self.losses.append(f"the bag is damaged ({cause}); its intact part was read")
         counts: dict[tuple[str, str], int] = {}
         for topic, msgtype, _, _ in self._salvage(self.losses):
             counts[topic, msgtype] = counts.get((topic, msgtype), 0) + 1
         if not counts:
             raise RecordingError(
-                f"recording {self.path}: nothing could be read ({'; '.join(self.losses)})"
+                f"recording {self.path}: no message could be read ({'; '.join(self.losses)})"
             )
         self.topics = sorted(Topic(*key, count) for key, count in counts.items())
 
@@ -104,11 +104,11 @@ class RawBag:
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Messages of the topics in the order in which they were recorded."""
-        wanted = frozenset(topics)
+        names = frozenset(topics)
         if self._reader is None:
-            yield from (RawMessage(*item) for item in self._salvage([]) if item[0] in wanted)
+            yield from (RawMessage(*item) for item in self._salvage([]) if item[0] in names)
             return
-        connections = [c for c in self._reader.connections if c.topic in wanted]
+        connections = [c for c in self._reader.connections if c.topic in names]
         if not connections:
             return
         last_time_ns, topics_at_last_time = -1, set[str]()
@@ -120,14 +120,14 @@ class RawBag:
                 topics_at_last_time.add(connection.topic)
         except GeneratorExit:
             raise
-        except Exception as error:  # a damaged chunk: whatever its decompressor raises
-            self._note(f"the bag is damaged ({_one_line(error)}); what is left of it was read")
+        except Exception as error:  # a damaged chunk: its decompressor raises any type
+            self._note(f"the bag is damaged ({_one_line(error)}); its intact part was read")
             for item in self._salvage(self.losses):
                 topic, time_ns = item[0], item[2]
                 known = time_ns < last_time_ns or (
                     time_ns == last_time_ns and topic in topics_at_last_time
                 )
-                if topic in wanted and not known:
+                if topic in names and not known:
                     yield RawMessage(*item)
 
     def _salvage(self, losses: list[str]) -> Iterator[tuple[str, str, int, bytes]]:
@@ -151,7 +151,7 @@ class RawBag:
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The .mcap or .db3 files of a bag folder; none where they are not parts of one bag.
+    """The .mcap or .db3 files of a bag folder; none if they are not parts of one bag.
 
     rosbag2 names the parts of a split bag NAME_0, NAME_1, …
     """

@@ -1,4 +1,4 @@
-"""Which topic of a bag is RGB, which depth, …: by type and name, unless told."""
+"""Find the topic of each role in a bag: by type and name, or as the user named it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from deworldsg_ros.recordings.messages import (
 )
 
 Types = tuple[str, ...]
-# Higher is better; None = not this role.
+# The topic with the highest score has the role; None = the topic cannot have it.
 Score = Callable[[Topic], "tuple[float, ...] | None"]
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
-# Most wanted first.
+# In order of preference.
 POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
-# Images that are neither colour nor depth.
+# Names of images that are neither colour nor depth.
 OTHER_IMAGES = ("infra", "/ir/", "instance", "label", "mask", "segment", "semantic", "mono")
 
 TYPES = {
@@ -45,17 +45,17 @@ POSE_SOURCES: dict[str, Types] = {
     "odometry": (ODOMETRY,),
     "tf": (TF_MESSAGE,),
 }
-WANTED = {
+EXPECTED = {
     Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
     Role.DEPTH: "an Image or CompressedImage with depth in its name",
     Role.CAMERA_INFO: "a CameraInfo beside the RGB image",
-    Role.POSE: "a PoseStamped, an Odometry or /tf, or --odometry, or run with --poses FILE",
+    Role.POSE: "a PoseStamped, an Odometry or /tf (or use --odometry, or run with --poses FILE)",
 }
 
 
 @dataclass(frozen=True)
 class TopicChoice:
-    """Topics named by the user; empty = found by type and name."""
+    """Topics that the user named; empty = found by type and name."""
 
     rgb: str = ""
     depth: str = ""
@@ -93,13 +93,13 @@ def find_topics(
 
     Args:
         topics: of the bag.
-        choice: what the user named; that need not be of a type that `inputs` asks for.
-        recording: what to call the bag in an error.
-        inputs: ``transport`` and ``pose_source`` narrow the types down.
-        need_pose: whether a bag without poses is refused; otherwise it has no such role.
+        choice: topics that the user named; their types need not match `inputs`.
+        recording: name of the bag, for errors.
+        inputs: ``transport`` and ``pose_source`` select the types.
+        need_pose: whether a bag without poses is refused; if not, the role may be missing.
 
     Raises:
-        RecordingError: names the role, the topics seen and what was wanted.
+        RecordingError: names the role, the topics seen and the expected type and name.
     """
     inputs = inputs or InputsConfig()
     images = TRANSPORTS[inputs.transport]
@@ -139,7 +139,7 @@ def _find(
         for topic in topics:
             if topic.name == chosen and topic.msgtype in TYPES[role]:
                 return topic
-        problem = f"{option} {chosen} is not a topic that can be {role.value}"
+        problem = f"{option} {chosen} is no topic with messages of a type for {role.value}"
     else:
         scored = [
             (value, topic)
@@ -147,13 +147,13 @@ def _find(
             if topic.msgtype in types and (value := score(topic)) is not None
         ]
         if scored:
-            # The best; among equals the one that sorts first.
+            # Of equal scores, the first name.
             return min(scored, key=lambda item: ([-value for value in item[0]], item[1].name))[1]
         problem = f"no {role.value} topic"
     seen = ", ".join(f"{topic.name} ({topic.msgtype}, {topic.count})" for topic in topics)
     raise RecordingError(
         f"recording {recording}: {problem}. It has: {seen or 'no messages at all'}. "
-        f"Wanted {WANTED[role]}; name one with {option} TOPIC"
+        f"Expected {EXPECTED[role]}; name one with {option} TOPIC"
     )
 
 
@@ -172,7 +172,7 @@ def _depth_score(topic: Topic) -> tuple[float, ...] | None:
 
 
 def _plain(topic: Topic) -> tuple[float, ...]:
-    """More messages, and of equally many the uncompressed ones."""
+    """Prefer more messages, then the uncompressed topic."""
     return (topic.count, topic.msgtype == IMAGE)
 
 

@@ -1,4 +1,9 @@
-"""Data set folders as recordings; one data set a file, found by what the folder holds."""
+"""Data set folders as recordings: one module per data set, detected by the files of the folder.
+
+`dataset` is the base class, `registry` finds the data sets. `frame_files` reads folders with a few
+files per frame: `seven_scenes`, and via `sequence` the layout of 3RScan: `rio`, `replica`, `rooms`.
+`tum` reads TUM RGB-D. `annotations`, `instances` and `ply` read the ground truth.
+"""
 
 from deworldsg_ros.recordings.folders.registry import dataset_names, detect_dataset, open_dataset
 

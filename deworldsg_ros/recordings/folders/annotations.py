@@ -1,6 +1,6 @@
 """Ground truth of a data set in one of the two official layouts: objects, relations, points.
 
-Rules of reading, as the official evaluation program has them, are in docs/evaluation/protocol.md.
+docs/evaluation/protocol.md lists the rules of the official evaluation program followed here.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ ALIGNED_PLY_NAME = "labels.instances.align.annotated.v2.ply"
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a data set keeps its annotations, relative to its root, and what its keys are called.
+    """Files of the annotations of a data set, relative to its root, and their JSON keys.
 
     Attributes:
-        name: as the command line takes it.
+        name: for the command line.
         lists: folder of the split files.
-        objects, relations, mapping: files.
+        objects, relations, mapping: JSON files.
         label_map, classes, predicates: keys in the mapping file.
-        how_to_get: one sentence for whoever lacks a file.
+        how_to_get: where a missing file can be downloaded, one sentence.
     """
 
     name: str
@@ -83,14 +83,14 @@ LAYOUTS = {
 
 @dataclass(frozen=True)
 class ScanAnnotation:
-    """What is annotated of one scan, in file order.
+    """The annotations of one scan, in file order.
 
     Attributes:
         scan: id of the scan.
-        objects: place in the class list of each object id; objects of other classes are left out.
-        relations: (subject id, object id, place in the predicate list, or -1 where it is none).
-        related_ids: ids in the *last* relation entry of the scan; None where it has no entry.
-        notes: what the official program would have stopped at, and what was done instead.
+        objects: index into the class list by object id; objects of other classes are left out.
+        relations: (subject id, object id, index into the predicate list, or -1 if not in it).
+        related_ids: ids in the *last* relation entry of the scan; None if it has no entry.
+        notes: problems at which the official program stops, and their handling here.
     """
 
     scan: str
@@ -122,7 +122,7 @@ class Annotations:
     def __init__(self, root: Path, layout: str) -> None:
         if layout not in LAYOUTS:
             raise RecordingError(
-                f"layout '{layout}' is unknown: wanted {', '.join(LAYOUTS)} or recording"
+                f"layout '{layout}' is unknown: expected {', '.join(LAYOUTS)} or recording"
             )
         self.root = root
         self.layout = LAYOUTS[layout]
@@ -134,28 +134,32 @@ class Annotations:
             )
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
-                f"{root / self.layout.mapping}: wanted the keys {self.layout.label_map}, "
+                f"{root / self.layout.mapping}: expected the keys {self.layout.label_map}, "
                 f"{self.layout.classes} and {self.layout.predicates}"
             ) from error
         self._objects = self._entries(self.layout.objects)
         self._relations = self._entries(self.layout.relations)
 
     def scans(self, split: str = "test") -> list[str]:
-        """Ids of the scans of a split, in file order; a scan written twice is given twice."""
+        """Ids of the scans of a split, in file order, with repetitions."""
         if split not in SPLIT_FILES:
-            raise RecordingError(f"split '{split}' is unknown: wanted {', '.join(SPLIT_FILES)}")
+            raise RecordingError(f"split '{split}' is unknown: expected {', '.join(SPLIT_FILES)}")
         text = self._read(f"{self.layout.lists}/{SPLIT_FILES[split]}").decode()
         return [line.strip() for line in text.splitlines() if line.strip()]
 
     def scan(self, scan: str) -> ScanAnnotation:
-        """What is annotated of one scan."""
+        """The annotations of one scan; raises RecordingError."""
         notes: list[str] = []
         objects = self._scan_objects(scan, notes)
         relations, related_ids = self._scan_relations(scan, objects, notes)
         return ScanAnnotation(scan, objects, relations, related_ids, notes)
 
     def points(self, scan: str, *, aligned: bool = False) -> ScanPoints:
-        """All annotated surface points of a scan, of walls and unlisted ids too."""
+        """All annotated surface points of a scan, including walls and ids that are not listed.
+
+        Raises:
+            RecordingError: for a missing or unreadable file.
+        """
         path = self.ply_path(scan, aligned=aligned)
         if not path.exists():
             raise RecordingError(f"{path} is missing; {self.layout.how_to_get}")
@@ -164,22 +168,22 @@ class Annotations:
         return ScanPoints(points, columns["objectId"].astype(np.int64))
 
     def ply_path(self, scan: str, *, aligned: bool = False) -> Path:
-        """Where a scan's points are."""
+        """PLY file with the surface points of a scan."""
         return self.scan_folder(scan) / (ALIGNED_PLY_NAME if aligned else PLY_NAME)
 
     def scan_folder(self, scan: str) -> Path:
-        """Where a scan is."""
+        """Folder of a scan."""
         return self.root / "data" / scan
 
     def ground_truth(self, scan: str) -> dict[str, Any] | None:
-        """Content of the scan's gt.json; None where it has none."""
+        """Content of the scan's gt.json; None if it has none."""
         return read_ground_truth(self.scan_folder(scan))
 
     def _scan_objects(self, scan: str, notes: list[str]) -> dict[int, int]:
         if scan not in self._objects:
-            notes.append(f"{scan} is not in {self.layout.objects}: it has no objects")
+            notes.append(f"{scan} is not in {self.layout.objects}: no objects")
             return {}
-        place = _places(self.vocabulary.classes)
+        index_of = _indices(self.vocabulary.classes)
         objects: dict[int, int] = {}
         try:
             # The last entry of a scan replaces the others.
@@ -188,12 +192,12 @@ class Annotations:
                 if label not in self.class_of_label and self.layout.name == "3rscan":
                     notes.append(f"{scan}: label '{label}' is not in the mapping: left out")
                 class_name = self.class_of_label.get(label, "")
-                if class_name in place:
-                    objects[int(item["id"])] = place[class_name]
+                if class_name in index_of:
+                    objects[int(item["id"])] = index_of[class_name]
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
-                f"{self.root / self.layout.objects}, scan {scan}: wanted objects with a label and "
-                f"a whole number as id"
+                f"{self.root / self.layout.objects}, scan {scan}: expected objects with a label "
+                "and a whole number as id"
             ) from error
         return objects
 
@@ -201,7 +205,7 @@ class Annotations:
         self, scan: str, objects: dict[int, int], notes: list[str]
     ) -> tuple[list[tuple[int, int, int]], frozenset[int] | None]:
         entries = self._relations.get(scan, [])
-        place = _places(self.vocabulary.predicates)
+        index_of = _indices(self.vocabulary.predicates)
         relations: list[tuple[int, int, int]] = []
         related_ids: frozenset[int] | None = None
         try:
@@ -209,19 +213,21 @@ class Annotations:
                 lines = entry["relationships"]
                 related_ids = frozenset(int(end) for line in lines for end in line[:2])
                 for subject, object_, _, name in lines:
-                    relations.append((int(subject), int(object_), place.get(name, -1)))
-                    if name not in place:
-                        notes.append(f"{scan}: predicate '{name}' is in no list: never right")
+                    relations.append((int(subject), int(object_), index_of.get(name, -1)))
+                    if name not in index_of:
+                        notes.append(
+                            f"{scan}: predicate '{name}' is in no list: it counts as never found"
+                        )
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
-                f"{self.root / self.layout.relations}, scan {scan}: wanted relationships "
+                f"{self.root / self.layout.relations}, scan {scan}: expected relationships "
                 "[subject, object, number, name]"
             ) from error
-        strangers = {end for line in relations for end in line[:2]} - set(objects)
-        if strangers:
+        unknown = {end for line in relations for end in line[:2]} - set(objects)
+        if unknown:
             notes.append(
-                f"{scan}: relations name {sorted(strangers)}, no objects of a known class: "
-                "never right"
+                f"{scan}: relations name {sorted(unknown)}, no objects of a known class: "
+                "they count as never found"
             )
         return relations, related_ids
 
@@ -232,14 +238,16 @@ class Annotations:
             for entry in content["scans"]:
                 entries.setdefault(str(entry["scan"]), []).append(entry)
         except (KeyError, TypeError) as error:
-            raise RecordingError(f"{self.root / name}: wanted scans, each with a scan") from error
+            raise RecordingError(
+                f"{self.root / name}: expected a list 'scans', each with the key 'scan'"
+            ) from error
         return entries
 
     def _read_json(self, name: str) -> Any:
         try:
             return json.loads(self._read(name))
         except ValueError as error:
-            raise RecordingError(f"{self.root / name} is no JSON: {error}") from error
+            raise RecordingError(f"{self.root / name}: {error}; expected JSON") from error
 
     def _read(self, name: str) -> bytes:
         path = self.root / name
@@ -251,9 +259,9 @@ class Annotations:
         return read_file(path)
 
 
-def _places(names: tuple[str, ...]) -> dict[str, int]:
-    """Place of each name; the first one of a name that is listed twice."""
-    places: dict[str, int] = {}
-    for place, name in enumerate(names):
-        places.setdefault(name, place)
-    return places
+def _indices(names: tuple[str, ...]) -> dict[str, int]:
+    """Index of each name; of a repeated name, the first."""
+    indices: dict[str, int] = {}
+    for index, name in enumerate(names):
+        indices.setdefault(name, index)
+    return indices

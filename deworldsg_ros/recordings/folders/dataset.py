@@ -1,4 +1,4 @@
-"""What data set folders have in common."""
+"""Common base of the data set folders: options, interface, file and image helpers."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ DEPTH_SOURCES = ("auto", "rendered", "sensor")
 
 @dataclass(frozen=True)
 class DatasetOptions:
-    """What a folder may not say itself.
+    """Information that a folder may not contain.
 
     Attributes:
-        rate_hz: frames a second; 0 = as the data set has it.
-        intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = as the data set has them.
-        depth_source: ``rendered`` from the mesh or from the ``sensor``, where a data set has both;
-            ``auto`` = what the compared numbers use.
-        poses_needed: whether a frame without a valid pose file is left out; otherwise it comes
-            without a pose.
+        rate_hz: frames per second; 0 = the rate of the data set.
+        intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = those of the data set.
+        depth_source: ``rendered`` from the mesh or from the ``sensor``, if a data set has both;
+            ``auto`` = the depth of published results.
+        poses_needed: whether a frame without a valid pose file is left out; if not, it has no
+            pose.
 
     Raises:
         RecordingError: for another depth source.
@@ -48,12 +48,12 @@ class DatasetOptions:
     def __post_init__(self) -> None:
         if self.depth_source not in DEPTH_SOURCES:
             raise RecordingError(
-                f"depth source '{self.depth_source}': wanted {', '.join(DEPTH_SOURCES)}"
+                f"depth source '{self.depth_source}': expected {', '.join(DEPTH_SOURCES)}"
             )
 
 
 def parse_intrinsics(text: str) -> tuple[float, float, float, float] | None:
-    """fx, fy, cx, cy of ``FX,FY,CX,CY``, None of an empty text; raises RecordingError."""
+    """fx, fy, cx, cy of ``FX,FY,CX,CY``; None for an empty text; raises RecordingError."""
     if not text:
         return None
     try:
@@ -62,7 +62,7 @@ def parse_intrinsics(text: str) -> tuple[float, float, float, float] | None:
             raise ValueError
     except ValueError as error:
         raise RecordingError(
-            f"intrinsics '{text}': wanted FX,FY,CX,CY, four numbers in pixels, FX and FY above 0"
+            f"intrinsics '{text}': expected FX,FY,CX,CY, four numbers in pixels, FX and FY above 0"
         ) from error
     return fx, fy, cx, cy
 
@@ -71,8 +71,8 @@ class Dataset(ABC):
     """A folder as a `Source` of messages.
 
     Attributes:
-        kind: name of the data set, as the command line takes it.
-        expects: what such a folder holds, in words.
+        kind: name of the data set, for the command line.
+        expects: files of such a folder, in words.
     """
 
     kind: ClassVar[str]
@@ -90,22 +90,22 @@ class Dataset(ABC):
     @staticmethod
     @abstractmethod
     def looks_like(path: Path) -> bool:
-        """Whether a folder is of this data set, judged by a few file names."""
+        """Whether a folder is of this data set, by a few file names."""
 
     @abstractmethod
     def messages(self) -> Iterator[RoleMessage]:
         """Messages in order of time."""
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
-        """The same, serialized."""
+        """The same messages, serialized."""
         return serialized(self.messages())
 
     def close(self) -> None:  # noqa: B027
-        """Nothing is held open."""
+        """Nothing to close: files are open only while they are read."""
 
 
 def serialized(messages: Iterable[RoleMessage]) -> Iterator[RawRoleMessage]:
-    """Messages as CDR bytes, recorded when they were stamped."""
+    """Messages as CDR bytes; their time of recording is their stamp."""
     for item in messages:
         yield RawRoleMessage(
             item.role,
@@ -117,13 +117,11 @@ def serialized(messages: Iterable[RoleMessage]) -> Iterator[RawRoleMessage]:
 
 
 def read_file(path: Path) -> bytes:
-    """Content of a file that must be there; raises RecordingError."""
+    """Content of a file; raises RecordingError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}): expected it there") from (
-            error
-        )
+        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -132,24 +130,25 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:
-    """Pixels of an image file's content; raises RecordingError where they cannot be decoded."""
+    """Pixels of an image file's content; raises RecordingError if it cannot be decoded."""
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
     if pixels is None:
-        raise RecordingError(f"{path} cannot be decoded: wanted a JPEG or PNG image")
+        raise RecordingError(f"{path} cannot be decoded: expected a JPEG or PNG image")
     return pixels
 
 
 def encode_png(pixels: UInt8 | UInt16, *, stored: bool = False) -> bytes:
-    """PNG file of BGR or grey pixels; fast rather than small, `stored` = not compressed at all."""
+    """PNG file of BGR or grey pixels, fast rather than small; `stored` = without compression."""
     if not stored:
         return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
     parameters = [cv2.IMWRITE_PNG_COMPRESSION, 0]
-    # OpenCV 4 cannot choose: its filters cost more than the rest and gain nothing here.
+    # The filters take most of the time and gain nothing without compression; OpenCV 4 has no
+    # option for them.
     if hasattr(cv2, "IMWRITE_PNG_FILTER"):
         parameters += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
     return bytes(cv2.imencode(".png", pixels, parameters)[1])
 
 
 def image_format(path: Path) -> str:
-    """Format of a CompressedImage by the suffix of its file."""
+    """Format of a CompressedImage, from the suffix of its file: png or jpeg."""
     return "png" if path.suffix.lower() == ".png" else "jpeg"

@@ -1,7 +1,6 @@
-"""Folders with a few files a frame, frame-NNNNNN.color.jpg, .pose.txt and so on: one loop for all.
+"""Folders with a few files per frame: frame-NNNNNN.color.jpg, .pose.txt and so on.
 
-A frame that lacks a file, whose pose is none or whose images cannot be read is left out and
-counted.
+A frame with a missing file, an invalid pose or an unreadable image is left out and counted.
 """
 
 from __future__ import annotations
@@ -28,18 +27,19 @@ from deworldsg_ros.scene.camera import (
 )
 from deworldsg_ros.scene.errors import RefusedInput
 
-# Stamps count from here: a ROS time of zero means "unset" to many programs.
+# Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9
 COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)$")
 
 
 class FrameFiles(Dataset):
-    """A data set of numbered frames, each in files of its own.
+    """A data set of numbered frames, each in its own files.
 
     Attributes:
         intrinsics: of the images in the messages.
         depth_suffix: ending of the depth files.
-        frame_numbers: number of the frame in its file names, by its stamp in nanoseconds.
+        pose_suffix: ending of the pose files.
+        frame_numbers: number in the file names of each frame, by its stamp in nanoseconds.
     """
 
     intrinsics: Intrinsics
@@ -49,7 +49,13 @@ class FrameFiles(Dataset):
     def _set_frames(
         self, colors: dict[int, Path], stamps_ns: list[int], camera_info_name: str
     ) -> None:
-        """Colour image of each frame by its number, their stamps, and whence the intrinsics are."""
+        """Set the frames.
+
+        Args:
+            colors: colour image of each frame, by its number.
+            stamps_ns: stamp of each of them.
+            camera_info_name: origin of the intrinsics, e.g. a file name.
+        """
         self._colors = colors
         self.frame_numbers = dict(zip(stamps_ns, colors))
         self.frame_count = len(colors)
@@ -71,23 +77,23 @@ class FrameFiles(Dataset):
         Args:
             color_path: of the frame.
             depth_path: of the frame.
-            stored: whether PNG files that are made here need not be compressed.
+            stored: whether PNG files that are encoded here stay uncompressed.
 
         Raises:
             RecordingError: for a file that cannot be read.
         """
 
     def _camera_pose(self, T_world_file: Float64) -> Float64:
-        """Pose (4, 4) of the messages' colour camera, from that of the pose file."""
+        """Pose (4, 4) of the colour camera of the messages, from the pose of the file."""
         return T_world_file
 
     def messages(self) -> Iterator[RoleMessage]:
-        """camera_info, pose, depth and RGB of each frame; frames without a valid pose are left."""
-        # What is decoded at once is not worth compressing: half of the time of reading a frame.
+        """camera_info, pose, depth and RGB of each frame; incomplete frames are left out."""
+        # Uncompressed: these images are decoded at once, and compression is half of the time.
         return self._messages(stored=True)
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
-        """The same, serialized and compressed."""
+        """The same messages, serialized; their images are compressed."""
         return serialized(self._messages(stored=False))
 
     def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
@@ -96,8 +102,8 @@ class FrameFiles(Dataset):
             stem = color_path.name.split(".")[0]
             depth_path = color_path.with_name(stem + self.depth_suffix)
             pose_path = color_path.with_name(stem + self.pose_suffix)
-            wanted = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
-            missing = next((file for file in wanted if not file.exists()), None)
+            needed = (depth_path, pose_path) if self.options.poses_needed else (depth_path,)
+            missing = next((file for file in needed if not file.exists()), None)
             if missing is not None:
                 self.drops["missing_file"] += 1
                 self.losses.append(f"{missing.name} is missing: its frame is left out")
@@ -124,7 +130,7 @@ class FrameFiles(Dataset):
 
 
 def color_files(folder: Path) -> dict[int, Path]:
-    """Colour images of a folder by the number in their names, in order."""
+    """Colour images of a folder by the number in their names, sorted by name."""
     return {
         int(match[1]): file
         for file in sorted(folder.iterdir())
@@ -137,7 +143,7 @@ def read_pose(path: Path) -> Float64:
     try:
         T = np.array(path.read_text().split(), np.float64).reshape(4, 4)
     except (OSError, ValueError) as error:
-        raise RefusedInput("invalid_pose", f"{path}: {error}; wanted a 4x4 matrix") from error
+        raise RefusedInput("invalid_pose", f"{path}: {error}; expected a 4x4 matrix") from error
     check_pose(T)
-    # Printed decimals are not quite a rotation; the message's quaternion is exactly one.
+    # The printed decimals are only nearly a rotation. The message has a quaternion, so use it here.
     return pose_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))

@@ -1,4 +1,4 @@
-"""Instance images of the data sets that have them: which object each pixel shows."""
+"""Instance images of the data sets that have them: the object id of each pixel."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from deworldsg_ros.scene.arrays import UInt16
 
 
 def read_instances(source: object, stamp_ns: int) -> UInt16 | None:
-    """Object ids of a frame's pixels, (H, W) uint16, 0 = none; None where there is no such image.
+    """Object ids of a frame's pixels, (H, W) uint16, 0 = none; None without an instance image.
 
     Raises:
-        RecordingError: where the image is there and cannot be decoded.
+        RecordingError: for an image that cannot be decoded.
     """
-    # Instance images are as the images lie on disk.
-    if not isinstance(source, SequenceDataset) or source.turned:
+    # Instance images are not rotated: they do not fit rotated images.
+    if not isinstance(source, SequenceDataset) or source.rotated:
         return None
     if stamp_ns not in source.frame_numbers:
         return None

@@ -1,4 +1,4 @@
-"""Registration: a depth image seen from the colour camera."""
+"""Registration of a depth image to the colour camera."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from deworldsg_ros.scene.camera import Intrinsics
 def register_depth(
     depth_mm: UInt16, depth_camera: Intrinsics, color_camera: Intrinsics, T_color_depth: Float64
 ) -> UInt16:
-    """Project depth into the colour camera; where surfaces meet in a pixel the nearest wins.
+    """Project depth into the colour camera; of several surfaces in a pixel, the nearest wins.
 
     Args:
         depth_mm: (H, W) uint16 of the depth camera; 0 = invalid.
         depth_camera: its intrinsics.
-        color_camera: intrinsics of the image to be made.
-        T_color_depth: (4, 4), depth camera to colour camera, metres.
+        color_camera: intrinsics of the output image.
+        T_color_depth: (4, 4) float64, depth camera to colour camera, metres.
 
     Returns:
-        (H', W') uint16 millimetres on the colour camera's grid; 0 = nothing projects there.
+        (H', W') uint16 millimetres on the grid of the colour camera; 0 = no depth.
     """
     rows, columns = np.nonzero(depth_mm)
     z = depth_mm[rows, columns] * 1e-3

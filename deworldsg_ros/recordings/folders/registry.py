@@ -1,6 +1,6 @@
-"""The data sets of this folder, found by looking: a new one touches no other file.
+"""The data sets of this folder: each class that derives from `Dataset` is found automatically.
 
-A data set is a module with a class that derives from `Dataset`.
+A new data set is one new module; no other file changes.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from deworldsg_ros.recordings.folders.dataset import Dataset, DatasetOptions
 
 
 def _is_dataset(item: Any) -> TypeGuard[type[Dataset]]:
-    # Python 3.10 takes an alias such as list[int] for a type, and issubclass() then refuses it.
+    # In Python 3.10, an alias such as list[int] is a type, but issubclass() refuses it.
     is_class = isinstance(item, type) and not isinstance(item, GenericAlias)
     return is_class and issubclass(item, Dataset) and not isabstract(item)
 
@@ -41,17 +41,17 @@ def dataset_names() -> list[str]:
 
 
 def detect_dataset(path: Path) -> str | None:
-    """Name of the data set that a folder looks like; None for none of them.
+    """Name of the data set of a folder; None if it is of none of them.
 
     Raises:
-        RecordingError: for a whole data set of many scans, which is no recording.
+        RecordingError: for the root of a data set of many scans.
     """
     scans = sorted(folder.parent.name for folder in path.glob("data/*/sequence"))
     if scans:
         shown = ", ".join(scans[:3]) + (", …" if len(scans) > 3 else "")
         raise RecordingError(
-            f"recording {path}: it is a data set with the scans {shown}; name one of them, e.g. "
-            f"{path / 'data' / scans[0]}"
+            f"recording {path}: it is a data set with the scans {shown}; expected one of them, "
+            f"e.g. {path / 'data' / scans[0]}"
         )
     return next((name for name, kind in _datasets().items() if kind.looks_like(path)), None)
 
@@ -60,11 +60,11 @@ def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -
     """Open a folder as a data set.
 
     Raises:
-        RecordingError: for an unknown name, or with the file that was expected and where.
+        RecordingError: for an unknown name, a missing folder or a missing file.
     """
     if name not in _datasets():
         raise RecordingError(
-            f"format '{name}' is unknown: wanted {', '.join(_datasets())}, rosbag2 or auto"
+            f"format '{name}' is unknown: expected {', '.join(_datasets())}, rosbag2 or auto"
         )
     if not path.is_dir():
         raise RecordingError(f"recording {path}: there is no such folder")
@@ -72,5 +72,5 @@ def open_dataset(name: str, path: Path, options: DatasetOptions | None = None) -
 
 
 def expectations() -> str:
-    """What a folder of each data set holds, in words."""
+    """Files of a folder of each data set, in words."""
     return "; ".join(f"{name}: {kind.expects}" for name, kind in _datasets().items())

@@ -9,12 +9,12 @@ from deworldsg_ros.recordings.folders.sequence import SequenceDataset, dataset_r
 
 
 def belongs_to_replica(path: Path) -> bool:
-    """Whether a scan's data set has ReplicaSSG's annotations."""
+    """Whether the data set of a scan has the annotations of ReplicaSSG."""
     return (dataset_root(path) / "ReplicaSSG").is_dir()
 
 
 class ReplicaScan(SequenceDataset):
-    """One scene of ReplicaSSG, see the module."""
+    """One scene of ReplicaSSG."""
 
     kind = "replica"
     expects = (
@@ -23,11 +23,11 @@ class ReplicaScan(SequenceDataset):
     )
     default_rate_hz = 30.0
     how_to_get = (
-        "get Replica (https://github.com/facebookresearch/Replica-Dataset) and run the scripts of "
-        "https://github.com/Howardkhh/ReplicaSSG, which render the frames"
+        "download Replica (https://github.com/facebookresearch/Replica-Dataset) and run the "
+        "scripts of https://github.com/Howardkhh/ReplicaSSG, which render the frames"
     )
 
     @staticmethod
     def looks_like(path: Path) -> bool:
-        """Whether it is a scan of a data set with ReplicaSSG/, and no rendered room."""
+        """Whether it is a scan of a data set with ReplicaSSG/, but no rendered room."""
         return looks_like_scan(path) and belongs_to_replica(path) and not belongs_to_rooms(path)

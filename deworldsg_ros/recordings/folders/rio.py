@@ -1,9 +1,9 @@
-"""3RScan with 3DSSG's annotations: data/SCAN/sequence, images turned upright by 90 degrees.
+"""3RScan with annotations of 3DSSG: data/SCAN/sequence, images rotated upright by 90 degrees.
 
-The phone was held upright while its images are stored lying: they are turned clockwise, with the
-intrinsics and the poses (`turned_intrinsics`, `turned_pose`). Depth is rendered from the mesh
-where such files are (``frame-*.rendered.depth.png``, as the compared numbers use it), else the
-sensor's; `DatasetOptions.depth_source` chooses.
+The phone was held upright but its images are stored in landscape format: they are rotated
+clockwise, with the intrinsics and the poses (`rotated_intrinsics`, `rotated_pose`). Depth is
+rendered from the mesh if such files exist (``frame-*.rendered.depth.png``, as in published
+results), else it is of the sensor; `DatasetOptions.depth_source` selects it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from deworldsg_ros.recordings.folders.sequence import (
 
 
 class RioScan(SequenceDataset):
-    """One scan of 3RScan, see the module."""
+    """One scan of 3RScan."""
 
     kind = "3rscan"
     expects = "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt}"
     default_rate_hz = 10.0
-    turned = True
+    rotated = True
     how_to_get = (
         "agree to the terms at https://github.com/WaldJohannaU/3RScan, download the scan and "
         "unpack its sequence.zip into sequence/"
@@ -33,7 +33,7 @@ class RioScan(SequenceDataset):
 
     @staticmethod
     def looks_like(path: Path) -> bool:
-        """Whether it is a scan that is neither ReplicaSSG's nor a rendered room."""
+        """Whether it is a scan that is neither of ReplicaSSG nor a rendered room."""
         return looks_like_scan(path) and not belongs_to_replica(path) and not belongs_to_rooms(path)
 
     def _choose_depth(self, first: int) -> str:

@@ -1,4 +1,4 @@
-"""Rendered rooms: ReplicaSSG's layout with instance images, recorded detections and gt.json."""
+"""Rendered rooms: the layout of ReplicaSSG with instance images, recorded detections, gt.json."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def belongs_to_rooms(path: Path) -> bool:
 
 
 class RoomsScan(SequenceDataset):
-    """One rendered room, see the module."""
+    """One rendered room."""
 
     kind = "rooms"
     expects = (
@@ -32,7 +32,7 @@ class RoomsScan(SequenceDataset):
         "frontend.json}"
     )
     default_rate_hz = 10.0
-    how_to_get = "unpack.py of the rendered rooms makes all of it"
+    how_to_get = "run unpack.py of the rendered rooms, which writes all files"
 
     @staticmethod
     def looks_like(path: Path) -> bool:
@@ -41,14 +41,14 @@ class RoomsScan(SequenceDataset):
 
 
 def read_ground_truth(scan_folder: Path) -> dict[str, Any] | None:
-    """Content of a room's gt.json; None where there is none. Raises RecordingError."""
+    """Content of a room's gt.json; None if there is none. Raises RecordingError."""
     path = sequence_folder(scan_folder).parent / GROUND_TRUTH_NAME
     if not path.exists():
         return None
     try:
         content = json.loads(read_file(path))
     except ValueError as error:
-        raise RecordingError(f"{path} is no JSON: {error}") from error
+        raise RecordingError(f"{path}: {error}; expected JSON") from error
     if not isinstance(content, dict) or "objects" not in content:
-        raise RecordingError(f"{path}: wanted the key objects")
+        raise RecordingError(f"{path}: there is no key objects; expected one")
     return content

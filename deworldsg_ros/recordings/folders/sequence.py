@@ -1,4 +1,4 @@
-"""What 3RScan, ReplicaSSG and the rendered rooms share: a scan folder with sequence/_info.txt."""
+"""Common layout of 3RScan, ReplicaSSG and the rendered rooms: a scan with sequence/_info.txt."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from deworldsg_ros.scene.errors import RefusedInput
 INFO_NAME = "_info.txt"
 RENDERED_DEPTH = ".rendered.depth.png"
 
-# Axes of the turned camera in those of the camera: x is what was -y, y is what was x.
-TURNED_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+# R_camera_rotated: axes of the rotated camera in the camera frame; its x is -y, its y is x.
+ROTATED_AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class SensorInfo:
-    """What _info.txt says of the two cameras.
+    """Calibration of the two cameras, from _info.txt.
 
     Attributes:
-        color, depth: intrinsics of the images as they lie on disk.
+        color, depth: intrinsics of the stored images.
         depth_units_per_m: value of a depth pixel at one metre.
     """
 
@@ -45,19 +45,19 @@ class SensorInfo:
 
 
 class SequenceDataset(FrameFiles):
-    """One scan of a data set in 3RScan's layout.
+    """One scan of a data set in the layout of 3RScan.
 
     Attributes:
-        default_rate_hz: frames a second, where the data set has no stamps of its own.
-        turned: whether the images are turned by 90 degrees clockwise.
-        how_to_get: one sentence for whoever lacks a file.
+        default_rate_hz: frames per second; these data sets have no stamps.
+        rotated: whether the images are rotated by 90 degrees clockwise.
+        how_to_get: where a missing file can be downloaded, one sentence.
 
     Raises:
-        RecordingError: names the file that was expected, and how to get it.
+        RecordingError: names the missing file and how to get it.
     """
 
     default_rate_hz: ClassVar[float]
-    turned: ClassVar[bool] = False
+    rotated: ClassVar[bool] = False
     how_to_get: ClassVar[str]
 
     def __init__(self, path: Path, options: DatasetOptions) -> None:
@@ -80,8 +80,8 @@ class SequenceDataset(FrameFiles):
         info = read_info(info_path)
         if image_size(first) != (info.color.width, info.color.height):
             raise RecordingError(
-                f"{first} is {'x'.join(map(str, image_size(first)))}: {info_path} says "
-                f"{info.color.width}x{info.color.height}"
+                f"{first} is {'x'.join(map(str, image_size(first)))}: expected "
+                f"{info.color.width}x{info.color.height}, as {info_path} states"
             )
         if options.intrinsics:
             size = info.color.width, info.color.height
@@ -89,7 +89,7 @@ class SequenceDataset(FrameFiles):
                 Intrinsics(*options.intrinsics, *size), info.depth, info.depth_units_per_m
             )
         self.info = info
-        self.intrinsics = turned_intrinsics(info.color) if self.turned else info.color
+        self.intrinsics = rotated_intrinsics(info.color) if self.rotated else info.color
         self.depth_suffix = self._choose_depth(min(colors))
         rate_hz = options.rate_hz or self.default_rate_hz
         stamps_ns = [FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in colors]
@@ -100,24 +100,24 @@ class SequenceDataset(FrameFiles):
         return self.sequence / f"frame-{number:06d}{suffix}"
 
     def _choose_depth(self, first: int) -> str:
-        """Ending of the depth files, by the first frame; RecordingError where they are absent."""
+        """Ending of the depth files, by the first frame; raises RecordingError without them."""
         if self.options.depth_source == "rendered":
             path = self.file(first, RENDERED_DEPTH)
             if not path.exists():
                 raise RecordingError(
-                    f"{path} is missing: rendered depth was asked for, this scan has the "
-                    "sensor's only"
+                    f"{path} is missing: rendered depth was asked for, but this scan has only "
+                    "depth of the sensor. Use --depth-source sensor"
                 )
             return RENDERED_DEPTH
         return ".depth.pgm"
 
     def _camera_pose(self, T_world_file: Float64) -> Float64:
-        return turned_pose(T_world_file) if self.turned else T_world_file
+        return rotated_pose(T_world_file) if self.rotated else T_world_file
 
     def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
         color, color_format = read_file(color_path), image_format(color_path)
         depth_mm = self._depth_mm(depth_path)
-        if self.turned:
+        if self.rotated:
             bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
             bgr = np.asarray(cv2.rotate(bgr, cv2.ROTATE_90_CLOCKWISE), np.uint8)
             color, color_format = encode_png(bgr, stored=stored), "png"
@@ -128,13 +128,13 @@ class SequenceDataset(FrameFiles):
         """Depth of the colour image's pixels, (H, W) uint16 millimetres; raises RecordingError."""
         units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
         if units.dtype != np.uint16 or units.ndim != 2:
-            raise RecordingError(f"{path} is {units.dtype}: wanted 16-bit grey")
+            raise RecordingError(f"{path} is {units.dtype}: expected 16-bit grey")
         size = (units.shape[1], units.shape[0])
         if size != (self.info.color.width, self.info.color.height):
             if size != (self.info.depth.width, self.info.depth.height):
                 raise RecordingError(
-                    f"{path} is {size[0]}x{size[1]}: {INFO_NAME} says "
-                    f"{self.info.depth.width}x{self.info.depth.height}"
+                    f"{path} is {size[0]}x{size[1]}: expected "
+                    f"{self.info.depth.width}x{self.info.depth.height}, as {INFO_NAME} states"
                 )
             units = resample(units, self.info.depth, self.info.color)
         if self.info.depth_units_per_m != 1000.0:
@@ -143,7 +143,7 @@ class SequenceDataset(FrameFiles):
 
 
 def sequence_folder(path: Path) -> Path:
-    """Folder of the frames, for a scan's folder or that folder itself."""
+    """Folder of the frames, for the folder of a scan or that folder itself."""
     return (
         path
         if path.name == "sequence" and not (path / "sequence").is_dir()
@@ -152,7 +152,7 @@ def sequence_folder(path: Path) -> Path:
 
 
 def dataset_root(path: Path) -> Path:
-    """Root of the data set that a scan's folder (or its frames') belongs to."""
+    """Root of the data set of a scan, for the folder of the scan or of its frames."""
     return sequence_folder(path.resolve()).parents[2]
 
 
@@ -162,15 +162,15 @@ def has_frames(path: Path, suffix: str) -> bool:
 
 
 def looks_like_scan(path: Path) -> bool:
-    """Whether a folder is a scan in 3RScan's layout."""
+    """Whether a folder is a scan in the layout of 3RScan."""
     return (sequence_folder(path) / INFO_NAME).exists()
 
 
-def turned_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
-    """Intrinsics of an image turned by 90 degrees clockwise, as 3DSSG's users compute them.
+def rotated_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
+    """Intrinsics of an image rotated by 90 degrees clockwise, as in published results on 3DSSG.
 
-    The principal point goes to H - cy, where pixel centres at integers would make it H - 1 - cy;
-    the numbers that are compared were all made with H - cy.
+    The principal point becomes H - cy, as in those results. With pixel centres at integers it is
+    H - 1 - cy.
     """
     return Intrinsics(
         fx=intrinsics.fy,
@@ -182,20 +182,26 @@ def turned_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
     )
 
 
-def turned_pose(T_world_camera: Float64) -> Float64:
-    """Pose of the camera whose image is turned by 90 degrees clockwise."""
+def rotated_pose(T_world_camera: Float64) -> Float64:
+    """Pose (4, 4) of the camera whose image is rotated by 90 degrees clockwise."""
     T = T_world_camera.copy()
-    T[:3, :3] = T_world_camera[:3, :3] @ TURNED_AXES
+    T[:3, :3] = T_world_camera[:3, :3] @ ROTATED_AXES
     return T
 
 
 def resample(depth: UInt16, depth_camera: Intrinsics, color_camera: Intrinsics) -> UInt16:
-    """Depth on the colour image's pixels, for two cameras in one place; 0 outside the image."""
+    """Depth on the pixels of the colour image, for two cameras at one position; 0 outside.
+
+    Args:
+        depth: (H, W) uint16.
+        depth_camera: its intrinsics.
+        color_camera: intrinsics of the output, (H', W') uint16.
+    """
     u = np.arange(color_camera.width, dtype=np.float64)
     v = np.arange(color_camera.height, dtype=np.float64)
     columns = (u - color_camera.cx) / color_camera.fx * depth_camera.fx + depth_camera.cx
     rows = (v - color_camera.cy) / color_camera.fy * depth_camera.fy + depth_camera.cy
-    # The nearest pixel: between a near and a far surface there is nothing.
+    # The nearest pixel: an interpolated depth between a near and a far surface is on neither.
     column, row = np.rint(columns).astype(int), np.rint(rows).astype(int)
     inside_u = (column >= 0) & (column < depth_camera.width)
     inside_v = (row >= 0) & (row < depth_camera.height)
@@ -207,7 +213,7 @@ def resample(depth: UInt16, depth_camera: Intrinsics, color_camera: Intrinsics) 
 
 
 def read_info(path: Path) -> SensorInfo:
-    """Read _info.txt; raises RecordingError with the key that was wanted."""
+    """Read _info.txt; raises RecordingError, which names the missing or wrong key."""
     values: dict[str, str] = {}
     for line in read_file(path).decode(errors="replace").splitlines():
         key, equals, value = line.partition("=")
@@ -218,11 +224,11 @@ def read_info(path: Path) -> SensorInfo:
         depth = _camera(values, "Depth")
         units_per_m = float(values.get("m_depthShift", "1000"))
     except KeyError as error:
-        raise RecordingError(f"{path} has no {error.args[0]}: wanted one") from error
+        raise RecordingError(f"{path} has no {error.args[0]}: expected one") from error
     except (ValueError, RefusedInput) as error:
         raise RecordingError(f"{path}: {error}") from error
     if not units_per_m > 0:
-        raise RecordingError(f"{path}: m_depthShift is {units_per_m}: wanted > 0")
+        raise RecordingError(f"{path}: m_depthShift is {units_per_m}: expected > 0")
     return SensorInfo(color, depth, units_per_m)
 
 
@@ -230,7 +236,7 @@ def _camera(values: dict[str, str], which: str) -> Intrinsics:
     key = f"m_calibration{which}Intrinsic"
     numbers = [float(word) for word in values[key].split()]
     if len(numbers) != 16:
-        raise ValueError(f"{key} has {len(numbers)} numbers: wanted 16, row by row")
+        raise ValueError(f"{key} has {len(numbers)} numbers: expected 16, row by row")
     lower = which.lower()
     size = int(values[f"m_{lower}Width"]), int(values[f"m_{lower}Height"])
     return Intrinsics(numbers[0], numbers[5], numbers[2], numbers[6], *size)

@@ -1,10 +1,10 @@
 """Microsoft 7-Scenes: frame-NNNNNN.color.*, .depth.png, .pose.txt.
 
-Two layouts are known. With a camera-intrinsics.txt the depth is taken as registered to colour,
-0 = invalid, the poses are those of the colour camera, and the images are passed on as they are.
-Without one the folder is as Microsoft distributes it: raw Kinect images, 65535 = invalid, poses of
-the depth camera. Then colour is undistorted and depth is projected into the colour camera, with
-the calibration below.
+There are two layouts. With a camera-intrinsics.txt, the depth is registered to colour, 0 is
+invalid, the poses are of the colour camera, and the images are used as they are. Without this file,
+the folder is as Microsoft distributes it: raw Kinect images, 65535 is invalid, poses of the depth
+camera. Colour is then undistorted and depth is projected into the colour camera, with the
+calibration below.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from deworldsg_ros.scene.camera import Intrinsics
 
 INTRINSICS_NAME = "camera-intrinsics.txt"
 SENSOR_RATE_HZ = 30.0
+# Value of an invalid pixel in a raw depth image.
 NO_DEPTH = 65535
 
-# The Kinect v1 of the data set. The depth camera's values are the publisher's; the colour camera
-# was calibrated against it on the RedKitchen sequence (it sits 26 mm to the right of it).
+# The Kinect v1 of the data set. The values of the depth camera are those of the publisher. The
+# colour camera was calibrated against it on the RedKitchen sequence: it is 26 mm to the right.
 DEPTH_FX_FY_CX_CY = (585.0, 585.0, 320.0, 240.0)
 COLOR_FX_FY_CX_CY = (528.41, 528.41, 320.32, 236.72)
 COLOR_K1 = -0.0153
@@ -41,10 +42,10 @@ BASELINE_M = 0.026
 
 
 class SevenScenes(FrameFiles):
-    """One sequence folder of 7-Scenes, see the module.
+    """One sequence folder of 7-Scenes; the module describes the two layouts.
 
     Raises:
-        RecordingError: names the file that was expected.
+        RecordingError: names the missing file.
     """
 
     kind = "7scenes"
@@ -63,17 +64,17 @@ class SevenScenes(FrameFiles):
         )
         self.intrinsics = Intrinsics(*fx_fy_cx_cy, *size)
         self._depth_camera = Intrinsics(*DEPTH_FX_FY_CX_CY, *size)
-        # Every fourth frame of the 30 Hz sensor comes at 7.5 Hz.
-        places = range(len(colors)) if options.rate_hz else colors
+        # The file numbers count frames of the sensor, and some copies keep every N-th frame only.
+        numbers = range(len(colors)) if options.rate_hz else colors
         rate_hz = options.rate_hz or SENSOR_RATE_HZ
-        stamps_ns = [FIRST_STAMP_NS + round(place * 1e9 / rate_hz) for place in places]
+        stamps_ns = [FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in numbers]
         calibration = INTRINSICS_NAME if self.registered else "(built-in calibration)"
         self._set_frames(colors, stamps_ns, calibration)
 
     @staticmethod
     def looks_like(path: Path) -> bool:
         """Whether there are files named frame-NNNNNN.color.*, here or one level below."""
-        # Data sets in 3RScan's layout name theirs alike, and have this besides.
+        # Data sets in the layout of 3RScan have the same file names, and this file.
         if (path / "_info.txt").exists():
             return False
         return any(True for _ in path.glob("frame-*.color.*")) or any(
@@ -83,7 +84,7 @@ class SevenScenes(FrameFiles):
     def _camera_pose(self, T_world_file: Float64) -> Float64:
         if self.registered:
             return T_world_file
-        # The poses are the depth camera's: the colour camera is at x = baseline in it.
+        # The file has the pose of the depth camera; the colour camera is at x = baseline in it.
         return T_world_file @ _translation_x(BASELINE_M)
 
     def _images(self, color_path: Path, depth_path: Path, stored: bool) -> tuple[bytes, str, bytes]:
@@ -93,7 +94,7 @@ class SevenScenes(FrameFiles):
         bgr = decode_image(color, cv2.IMREAD_COLOR, color_path)
         depth_mm = decode_image(depth, cv2.IMREAD_UNCHANGED, depth_path)
         if depth_mm.dtype != np.uint16 or depth_mm.ndim != 2:
-            raise RecordingError(f"{depth_path} is {depth_mm.dtype}: wanted 16-bit grey")
+            raise RecordingError(f"{depth_path} is {depth_mm.dtype}: expected 16-bit grey")
         undistorted = cv2.undistort(bgr, self.intrinsics.matrix, np.array([COLOR_K1, 0, 0, 0]))
         registered = register_depth(
             np.where(depth_mm == NO_DEPTH, 0, depth_mm).astype(np.uint16),
@@ -118,7 +119,7 @@ def _where_else(path: Path) -> str:
     sequences = sorted(folder.name for folder in path.glob("seq-*") if folder.is_dir())
     expected = "expected frame-NNNNNN.color.png (or .jpg) in it"
     if sequences:
-        return f"{expected}; it holds the sequences {', '.join(sequences)}: name one of them"
+        return f"it holds the sequences {', '.join(sequences)}: expected one of them"
     return expected
 
 
@@ -126,5 +127,5 @@ def _read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     try:
         K = np.array(read_file(path).split(), np.float64).reshape(3, 3)
     except ValueError as error:
-        raise RecordingError(f"{path}: {error}; wanted a 3x3 camera matrix") from error
+        raise RecordingError(f"{path}: {error}; expected a 3x3 camera matrix") from error
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

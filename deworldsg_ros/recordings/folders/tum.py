@@ -1,7 +1,7 @@
 """TUM RGB-D: rgb.txt, depth.txt, groundtruth.txt; depth in 1/5000 m, registered to colour.
 
-Images and poses keep their own stamps; they are associated like those of a bag. The distortion of
-the colour camera (fr1 and fr2) is left in the images, as most dense systems leave it.
+Images and poses keep their stamps; they are joined like those of a bag. The images of fr1 and fr2
+stay distorted, as in most dense systems.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class Entry(NamedTuple):
 
 
 class TumRgbd(Dataset):
-    """One sequence folder of TUM RGB-D, see the module.
+    """One sequence folder of TUM RGB-D.
 
     Raises:
-        RecordingError: names the file that was expected, or asks for the intrinsics.
+        RecordingError: names the missing file, or asks for the intrinsics.
     """
 
     kind = "tum"
@@ -63,7 +63,7 @@ class TumRgbd(Dataset):
     def __init__(self, path: Path, options: DatasetOptions) -> None:
         super().__init__(path, options)
         if options.rate_hz:
-            raise RecordingError("--rate: TUM RGB-D has stamps of its own; leave it out")
+            raise RecordingError("--rate: TUM RGB-D has stamps; expected no --rate")
         self._rgb = _read_index(path / "rgb.txt", 1)
         self._depth = _read_index(path / "depth.txt", 1)
         self._poses = _read_index(path / "groundtruth.txt", 7)
@@ -79,11 +79,11 @@ class TumRgbd(Dataset):
 
     @staticmethod
     def looks_like(path: Path) -> bool:
-        """Whether rgb.txt or depth.txt is there."""
+        """Whether rgb.txt or depth.txt exists."""
         return (path / "rgb.txt").exists() or (path / "depth.txt").exists()
 
     def messages(self) -> Iterator[RoleMessage]:
-        """Poses, depth and RGB images by their own stamps; a camera_info with each RGB image."""
+        """Poses, depth and RGB images by their stamps; a camera_info with each RGB image."""
         return heapq.merge(
             self._each(self._poses, self._pose_message),
             self._each(self._depth, self._depth_messages),
@@ -116,7 +116,7 @@ class TumRgbd(Dataset):
         path = self.path / entry.values[0]
         units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
         if units.dtype != np.uint16 or units.ndim != 2:
-            raise RecordingError(f"{path} is {units.dtype}: wanted 16-bit grey")
+            raise RecordingError(f"{path} is {units.dtype}: expected 16-bit grey")
         # Rounding to millimetres is far below the noise of the sensor.
         depth_mm = np.rint(units * (1000.0 / DEPTH_UNITS_PER_M)).astype(np.uint16)
         return [ros.compressed_depth(entry.stamp_ns, CAMERA_FRAME, encode_png(depth_mm))]
@@ -125,14 +125,14 @@ class TumRgbd(Dataset):
         match = SEQUENCE_NAME.search(self.name)
         if match is None:
             raise RecordingError(
-                f"TUM RGB-D folder {self.path}: its name does not say which camera it is "
-                "(freiburg1, freiburg2 or freiburg3); give --intrinsics FX,FY,CX,CY"
+                f"TUM RGB-D folder {self.path}: its name does not contain the camera; expected "
+                "freiburg1, freiburg2 or freiburg3 in it, or --intrinsics FX,FY,CX,CY"
             )
         return INTRINSICS[int(match[1])]
 
 
-def _read_index(path: Path, wanted: int) -> list[Entry]:
-    """Lines of 'stamp value …' in order of time; comments start with #."""
+def _read_index(path: Path, value_count: int) -> list[Entry]:
+    """Lines 'stamp value …' in order of time, each with that many values; # starts a comment."""
     entries: list[Entry] = []
     for number, line in enumerate(read_file(path).decode(errors="replace").splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -140,16 +140,18 @@ def _read_index(path: Path, wanted: int) -> list[Entry]:
             continue
         try:
             stamp_ns = int(Decimal(words[0]) * 10**9)
-            if wanted > 1:
+            if value_count > 1:
                 [float(word) for word in words[1:]]
         except (InvalidOperation, ValueError, OverflowError) as error:
-            raise RecordingError(f"{path}, line {number}: '{line}': wanted numbers") from error
-        if len(words) <= wanted:
+            raise RecordingError(f"{path}, line {number}: '{line}': expected numbers") from error
+        if len(words) <= value_count:
             raise RecordingError(
                 f"{path}, line {number}: '{line}' has {len(words) - 1} values after the stamp: "
-                f"wanted {wanted}"
+                f"expected {value_count}"
             )
         entries.append(Entry(stamp_ns, tuple(words[1:])))
     if not entries:
-        raise RecordingError(f"{path} lists nothing: wanted lines of a stamp and {wanted} values")
+        raise RecordingError(
+            f"{path} has no entry: expected lines of a stamp and {value_count} value(s)"
+        )
     return sorted(entries)

@@ -18,7 +18,7 @@ def shift(x_m):
     return T
 
 
-def test_nothing_in_nothing_out():
+def test_no_depth_gives_no_depth():
     out = register_depth(np.zeros((30, 40), np.uint16), CAMERA, CAMERA, np.eye(4))
     assert out.shape == (30, 40)
     assert out.dtype == np.uint16
@@ -33,7 +33,7 @@ def test_the_same_camera_sees_the_same_image(seed):
     np.testing.assert_array_equal(register_depth(depth_mm, CAMERA, CAMERA, np.eye(4)), depth_mm)
 
 
-def test_a_wall_moves_by_its_disparity():
+def test_a_wall_is_displaced_by_its_disparity():
     depth_mm = np.full((30, 40), 1000, np.uint16)
     # 0.1 m at 1 m with f = 50: five columns to the left in a camera that stands to the right.
     out = register_depth(depth_mm, CAMERA, CAMERA, shift(-0.1))
@@ -41,7 +41,7 @@ def test_a_wall_moves_by_its_disparity():
     assert not out[:, 35:].any()
 
 
-def test_where_surfaces_meet_the_nearest_wins():
+def test_the_nearest_surface_in_a_pixel_wins():
     depth_mm = np.zeros((30, 40), np.uint16)
     depth_mm[10, 20] = 1000  # moves by 5 columns
     depth_mm[10, 17] = 2500  # moves by 2, to the same place
@@ -50,7 +50,7 @@ def test_where_surfaces_meet_the_nearest_wins():
     assert np.count_nonzero(out) == 1
 
 
-def test_what_lies_behind_or_beside_the_camera_is_left_out():
+def test_points_behind_or_beside_the_camera_are_left_out():
     depth_mm = np.full((30, 40), 500, np.uint16)
     behind = np.eye(4)
     behind[2, 3] = -1.0

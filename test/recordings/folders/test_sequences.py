@@ -26,8 +26,8 @@ from deworldsg_ros.recordings.folders import detect_dataset
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.folders.sequence import (
     resample,
-    turned_intrinsics,
-    turned_pose,
+    rotated_intrinsics,
+    rotated_pose,
 )
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.writer import write_mcap
@@ -47,7 +47,7 @@ def test_each_folder_is_recognised(tmp_path: Path) -> None:
 
 def test_a_whole_data_set_is_no_recording(tmp_path: Path) -> None:
     root = write_room(tmp_path / "rooms")
-    with pytest.raises(RecordingError, match=r"with the scans room_0; name one.*data/room_0"):
+    with pytest.raises(RecordingError, match=r"with the scans room_0; expected one.*data/room_0"):
         open_source(root)
 
 
@@ -64,7 +64,7 @@ def test_frames_of_a_room(tmp_path: Path) -> None:
         assert recording.source.frame_numbers[frame.stamp_ns] == number  # type: ignore[attr-defined]
 
 
-def test_images_poses_and_intrinsics_of_3rscan_are_turned(tmp_path: Path) -> None:
+def test_images_poses_and_intrinsics_of_3rscan_are_rotated(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "data" / "a")
     frame = next(open_recording(folder).frames())
     assert frame.rgb.shape == (WIDTH, HEIGHT, 3)
@@ -84,18 +84,18 @@ def test_images_poses_and_intrinsics_of_3rscan_are_turned(tmp_path: Path) -> Non
         lambda q: sum(x * x for x in q) > 0.1
     ),
 )
-def test_a_turned_camera_sees_the_same_points(u: float, v: float, quat: list[float]) -> None:
+def test_a_rotated_camera_sees_the_same_points(u: float, v: float, quat: list[float]) -> None:
     T = pose_from_quaternion(
         np.array([1.0, 2.0, 3.0]), np.array(quat) / np.linalg.norm(np.array(quat))
     )
-    turned = turned_intrinsics(CAMERA)
+    turned = rotated_intrinsics(CAMERA)
     ray = np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0])
     # Turned clockwise, a corner-based pixel (u, v) is at (H - v, u).
     turned_ray = np.array([(HEIGHT - v - turned.cx) / turned.fx, (u - turned.cy) / turned.fy, 1.0])
-    np.testing.assert_allclose(T[:3, :3] @ ray, turned_pose(T)[:3, :3] @ turned_ray, atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3] @ ray, rotated_pose(T)[:3, :3] @ turned_ray, atol=1e-12)
 
 
-def test_depth_of_a_smaller_image_lands_on_the_colour_image(tmp_path: Path) -> None:
+def test_depth_of_a_smaller_image_is_resampled_to_the_colour_image(tmp_path: Path) -> None:
     small = Intrinsics(40.0, 40.0, 23.5, 15.5, WIDTH // 2, HEIGHT // 2)
     folder = tmp_path / "replica" / "data" / "a"
     (tmp_path / "replica" / "ReplicaSSG").mkdir(parents=True)
@@ -107,7 +107,7 @@ def test_depth_of_a_smaller_image_lands_on_the_colour_image(tmp_path: Path) -> N
     assert wrong < 0.05
 
 
-def test_resampling_to_the_same_camera_changes_nothing_and_outside_is_nothing() -> None:
+def test_resampling_to_the_same_camera_is_the_identity_and_outside_is_zero() -> None:
     image = np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH)
     assert (resample(image, CAMERA, CAMERA) == image).all()
     narrow = Intrinsics(160.0, 160.0, CAMERA.cx, CAMERA.cy, WIDTH, HEIGHT)
@@ -121,15 +121,17 @@ def test_depth_source_of_3rscan(tmp_path: Path) -> None:
         open_source(folder, options=DatasetOptions(depth_source="rendered"))
     rendered = np.full((HEIGHT, WIDTH), 1500, np.uint16)
     cv2.imwrite(str(folder / "sequence" / "frame-000000.rendered.depth.png"), rendered)
-    for source, wanted in (("auto", 1.5), ("rendered", 1.5), ("sensor", BACKGROUND_M)):
+    for source, expected in (("auto", 1.5), ("rendered", 1.5), ("sensor", BACKGROUND_M)):
         options = DatasetOptions(depth_source=source)
         frame = next(open_recording(folder, options=options).frames())
-        assert frame.depth_m[0, 0] == pytest.approx(wanted, abs=1e-6)
-    with pytest.raises(RecordingError, match="depth source 'laser': wanted auto, rendered, sensor"):
+        assert frame.depth_m[0, 0] == pytest.approx(expected, abs=1e-6)
+    with pytest.raises(
+        RecordingError, match="depth source 'laser': expected auto, rendered, sensor"
+    ):
         DatasetOptions(depth_source="laser")
 
 
-def test_a_missing_info_says_where_and_how_to_get_it(tmp_path: Path) -> None:
+def test_a_missing_info_is_refused_with_its_path_and_source(tmp_path: Path) -> None:
     folder = tmp_path / "data" / "a"
     folder.mkdir(parents=True)
     with pytest.raises(RecordingError, match=r"sequence/_info\.txt is missing; .*3RScan"):
@@ -140,19 +142,19 @@ def test_a_missing_info_says_where_and_how_to_get_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "wanted"),
+    ("line", "expected"),
     [
-        ("m_calibrationColorIntrinsic = 1 2 3", "wanted 16"),
-        ("m_depthShift = 0", "wanted > 0"),
+        ("m_calibrationColorIntrinsic = 1 2 3", "expected 16"),
+        ("m_depthShift = 0", "expected > 0"),
         ("m_colorWidth = many", "many"),
-        ("m_colorWidth = 95", "says 95x64"),
+        ("m_colorWidth = 95", "expected 95x64"),
     ],
 )
-def test_a_wrong_info_is_named(tmp_path: Path, line: str, wanted: str) -> None:
+def test_a_wrong_line_of_info_is_refused_by_name(tmp_path: Path, line: str, expected: str) -> None:
     folder = write_sequence(tmp_path / "data" / "a", 1)
     info = folder / "sequence" / "_info.txt"
     info.write_text(info.read_text() + line + "\n")
-    with pytest.raises(RecordingError, match=wanted):
+    with pytest.raises(RecordingError, match=expected):
         open_source(folder)
 
 

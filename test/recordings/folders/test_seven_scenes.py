@@ -50,7 +50,7 @@ def test_registered_frames_with_their_times_and_poses(tmp_path):
         assert np.abs(frame.rgb.astype(int) - rgb_pixels(index)).mean() < 4  # JPEG
 
 
-def test_a_rate_of_the_user_takes_the_place_of_the_sensors(tmp_path):
+def test_the_rate_option_replaces_the_rate_of_the_sensor(tmp_path):
     frames, _ = frames_of(write_seven_scenes(tmp_path / "k", COUNT), rate_hz=10.0)
     assert [frame.stamp_ns - FIRST_STAMP_NS for frame in frames] == [
         index * 10**8 for index in range(COUNT)
@@ -76,7 +76,7 @@ def test_frames_with_an_invalid_pose_are_dropped_and_counted(tmp_path, text):
     assert recording.drops == {"invalid_pose": 1}
 
 
-def test_missing_and_broken_files_cost_their_frame_and_are_named(tmp_path):
+def test_frames_with_missing_or_broken_files_are_dropped_and_the_files_named(tmp_path):
     folder = write_seven_scenes(tmp_path / "k", COUNT)
     (folder / "frame-000004.depth.png").unlink()
     (folder / "frame-000012.color.jpg").write_bytes(b"no image")
@@ -87,7 +87,7 @@ def test_missing_and_broken_files_cost_their_frame_and_are_named(tmp_path):
     assert any("frame-000004.depth.png" in loss for loss in recording.losses)
 
 
-def test_a_folder_and_the_bag_made_of_it_give_equal_frames(tmp_path):
+def test_a_folder_and_its_converted_bag_give_equal_frames(tmp_path):
     folder = write_seven_scenes(tmp_path / "k", COUNT)
     write_mcap(open_source(folder).raw_messages(), tmp_path / "k.mcap")
     ours, theirs = frames_of(folder)[0], list(open_recording(tmp_path / "k.mcap").frames())
@@ -99,7 +99,7 @@ def test_a_folder_and_the_bag_made_of_it_give_equal_frames(tmp_path):
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
 
 
-def test_the_folder_of_several_sequences_tells_which_there_are(tmp_path):
+def test_a_folder_of_several_sequences_is_refused_with_their_names(tmp_path):
     for name in ("seq-01", "seq-02"):
         write_seven_scenes(tmp_path / name, 1)
     with pytest.raises(RecordingError, match="seq-01, seq-02"):
@@ -165,7 +165,7 @@ def test_original_layout_is_registered_with_the_known_calibration(tmp_path):
     np.testing.assert_allclose(frame.T_world_camera[:3, 3], [BASELINE_M, 0, 0], atol=1e-9)
 
 
-def test_intrinsics_of_the_user_mean_that_depth_is_registered(tmp_path):
+def test_the_intrinsics_option_implies_registered_depth(tmp_path):
     folder = write_original(tmp_path / "seq-01")
     frames, _ = frames_of(folder, intrinsics=(525.0, 525.0, 319.5, 239.5))
     assert frames[0].intrinsics.fx == 525.0

@@ -25,7 +25,11 @@ from support.streams import (
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
-from deworldsg_ros.streams.sync import FrameAssembler, LiftingAssembler, RelationAssembler
+from deworldsg_ros.streams.frame_assemblers import (
+    FrameAssembler,
+    LiftingAssembler,
+    RelationAssembler,
+)
 
 INPUTS = InputsConfig()
 PERIOD = 100 * MS
@@ -125,13 +129,13 @@ def complete(stamp_ns: int, x: float = 0.0, **images: Any) -> list[Event]:
     ]
 
 
-def test_nothing_comes_of_nothing() -> None:
+def test_no_messages_give_no_frames() -> None:
     assembler = FrameAssembler(INPUTS)
     assert assembler.pop_ready(0) == assembler.flush() == []
     assert not assembler.drops
 
 
-def test_a_frame_is_out_as_soon_as_it_is_certain() -> None:
+def test_a_frame_is_complete_with_its_last_message() -> None:
     assembler = FrameAssembler(INPUTS)
     for event in complete(T0):
         assert assembler.pop_ready(None) == []
@@ -141,7 +145,7 @@ def test_a_frame_is_out_as_soon_as_it_is_certain() -> None:
     assert frame.depth_m.dtype == np.float32
 
 
-def test_odometry_is_as_good_as_a_pose() -> None:
+def test_an_odometry_of_the_camera_gives_the_pose() -> None:
     events = complete(T0)
     events[1] = Event("add_pose", odometry(T0, 3.0), T0)
     assembler = FrameAssembler(INPUTS)
@@ -150,7 +154,7 @@ def test_odometry_is_as_good_as_a_pose() -> None:
     assert assembler.pop_ready(None)[0].T_world_camera[0, 3] == 3.0
 
 
-def test_tf_is_as_good_as_a_pose() -> None:
+def test_tf_gives_the_pose() -> None:
     assembler = FrameAssembler(InputsConfig(pose_source="tf", world_frame="map"))
     for event in complete(T0):
         if event.method != "add_pose":
@@ -168,7 +172,7 @@ MOUNT = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]
 
 
 def robot(options: InputsConfig = INPUTS) -> FrameAssembler:
-    """An assembler that is told the odometry of base_link 3 m along x, and one image."""
+    """An assembler with an odometry of base_link at x = 3 m, and one image."""
     assembler = FrameAssembler(options)
     assembler.expect_transforms()
     for event in complete(T0):
@@ -178,7 +182,7 @@ def robot(options: InputsConfig = INPUTS) -> FrameAssembler:
     return assembler
 
 
-def test_an_odometry_of_the_robot_is_carried_over_to_its_camera() -> None:
+def test_an_odometry_of_the_robot_is_transformed_to_its_camera() -> None:
     assembler = robot()
     assert assembler.pop_ready(0) == []  # how the camera is mounted is yet to come
     assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
@@ -186,9 +190,9 @@ def test_an_odometry_of_the_robot_is_carried_over_to_its_camera() -> None:
     ahead_ns = T0 + 2 * SECOND
     assembler.add_transforms(tf(transform("map", "odom", np.eye(4), ahead_ns)))
     (frame,) = assembler.pop_ready(0)
-    wanted = MOUNT.copy()
-    wanted[0, 3] += 3.0
-    np.testing.assert_allclose(frame.T_world_camera, wanted, atol=1e-12)
+    expected = MOUNT.copy()
+    expected[0, 3] += 3.0
+    np.testing.assert_allclose(frame.T_world_camera, expected, atol=1e-12)
     for event in complete(T0 + PERIOD):
         if event.method != "add_pose":
             add(assembler, event)
@@ -198,7 +202,7 @@ def test_an_odometry_of_the_robot_is_carried_over_to_its_camera() -> None:
     assert not assembler.drops
 
 
-def test_tf_does_not_take_the_place_of_an_odometry_that_starts_again() -> None:
+def test_tf_does_not_replace_an_odometry_that_restarts() -> None:
     assembler = robot()
     assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
     assert len(assembler.pop_ready(0)) == 1
@@ -214,7 +218,7 @@ def test_tf_does_not_take_the_place_of_an_odometry_that_starts_again() -> None:
     assert frame.T_world_camera[0, 3] == pytest.approx(1.3)
 
 
-def test_a_camera_whose_mounting_nobody_tells_gives_no_frame() -> None:
+def test_an_odometry_of_the_robot_without_the_mounting_gives_no_frame() -> None:
     assembler = robot()
     assert assembler.flush() == []
     assert assembler.drops == {"no_transform": 1}
@@ -228,15 +232,15 @@ def test_an_odometry_of_the_camera_needs_no_transforms() -> None:
 
 
 @pytest.mark.parametrize("missing", ["add_camera_info", "add_pose", "add_depth"])
-def test_what_is_missing_is_the_reason(missing: str) -> None:
+def test_the_missing_stream_is_the_reason(missing: str) -> None:
     events = [event for event in complete(T0) if event.method != missing]
     frames, drops = feed(events)
     assert frames == []
     assert drops[missing.replace("add_", "no_")] == 1
 
 
-def test_a_frame_waits_for_its_patience_and_not_longer() -> None:
-    assembler = FrameAssembler(INPUTS, patience_s=2.0)
+def test_a_frame_waits_for_the_maximum_wait_and_not_longer() -> None:
+    assembler = FrameAssembler(INPUTS, max_wait_s=2.0)
     for event in complete(T0):
         if event.method != "add_depth":
             add(assembler, event)
@@ -247,8 +251,8 @@ def test_a_frame_waits_for_its_patience_and_not_longer() -> None:
     assert assembler.drops == {"no_depth": 1}
 
 
-def test_patience_takes_the_pose_that_there_is() -> None:
-    assembler = FrameAssembler(INPUTS, patience_s=2.0)
+def test_after_the_maximum_wait_the_available_pose_is_used() -> None:
+    assembler = FrameAssembler(INPUTS, max_wait_s=2.0)
     for event in complete(T0 + 50 * MS):
         if event.method != "add_pose":
             add(assembler, event)
@@ -267,7 +271,7 @@ def test_patience_takes_the_pose_that_there_is() -> None:
         ({"depth": image(np.zeros((6, 8), np.uint16), "16UC1", T0, data=b"")}, "short_buffer"),
     ],
 )
-def test_a_refused_frame_is_counted_and_the_next_is_fine(images: dict, reason: str) -> None:
+def test_a_refused_frame_is_counted_and_the_next_is_accepted(images: dict, reason: str) -> None:
     frames, drops = feed(complete(T0, **images) + complete(T0 + PERIOD))
     assert [frame[0] for frame in frames] == [T0 + PERIOD]
     assert drops == {reason: 1}
@@ -285,7 +289,7 @@ def test_bad_camera_info_and_poses_do_not_replace_good_ones() -> None:
     assert drops == {"invalid_intrinsics": 1, "invalid_pose": 2, "wrong_frame": 1}
 
 
-def test_a_jump_is_refused_and_a_relocalisation_is_believed() -> None:
+def test_a_jump_is_refused_and_a_relocalisation_is_accepted() -> None:
     xs = [0.0, 0.1, 9.0, 0.2] + [5.0] * 6
     events = [event for row, x in enumerate(xs) for event in complete(T0 + row * PERIOD, x)]
     frames, drops = feed(events)
@@ -300,7 +304,7 @@ def test_an_older_image_is_stale() -> None:
     assert drops == {"stale": 1}
 
 
-def test_a_recording_that_starts_again_is_followed() -> None:
+def test_frames_continue_after_a_recording_restarts() -> None:
     first = [event for step in range(30) for event in complete(T0 + step * PERIOD)]
     frames, drops = feed(first + first)
     assert len(frames) >= 30 + 28
@@ -308,7 +312,7 @@ def test_a_recording_that_starts_again_is_followed() -> None:
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_streams_that_start_again_one_after_the_other_lose_nothing(late: bool) -> None:
+def test_streams_that_restart_one_after_the_other_lose_nothing(late: bool) -> None:
     """Poses and depth of the new time come first, an image of the old time after them."""
     old = complete(T0 + 100 * SECOND)
     new = [event for place in range(3) for event in complete(T0 + place * PERIOD)]
@@ -320,7 +324,7 @@ def test_streams_that_start_again_one_after_the_other_lose_nothing(late: bool) -
     assert set(drops) == {"time_jump"}
 
 
-def test_a_changed_camera_info_counts_from_its_stamp_on() -> None:
+def test_a_changed_camera_info_is_valid_from_its_stamp_on() -> None:
     changed = camera_info(T0 + PERIOD, (20.0, 0, 4, 0, 20.0, 3, 0, 0, 1))
     assembler = FrameAssembler(INPUTS)
     assembler.add_camera_info(camera_info(T0), T0)
@@ -330,7 +334,7 @@ def test_a_changed_camera_info_counts_from_its_stamp_on() -> None:
     assert [frame.intrinsics.fx for frame in assembler.pop_ready(None)] == [10.0, 20.0]
 
 
-def test_buffers_are_bounded_and_what_overflows_is_counted() -> None:
+def test_buffers_are_bounded_and_displaced_items_are_counted() -> None:
     assembler = FrameAssembler(INPUTS, capacity=4)
     for step in range(50):
         stamp_ns = T0 + step * PERIOD
@@ -341,7 +345,7 @@ def test_buffers_are_bounded_and_what_overflows_is_counted() -> None:
     assert assembler.drops["unmatched_depth"] >= 40
 
 
-def test_waiting_names_what_is_silent_and_where() -> None:
+def test_waiting_for_names_silent_streams_and_their_topics() -> None:
     assembler = FrameAssembler(INPUTS, topics={"camera_info": "/front/camera_info"})
     assert assembler.waiting_for(0) == []
     for event in complete(T0):
@@ -354,8 +358,8 @@ def test_waiting_names_what_is_silent_and_where() -> None:
     assert len(assembler.waiting_for(10 * SECOND)) == 4
 
 
-def test_waiting_names_stamps_that_do_not_meet() -> None:
-    assembler = FrameAssembler(INPUTS, patience_s=2.0)
+def test_waiting_for_names_streams_that_lag_behind() -> None:
+    assembler = FrameAssembler(INPUTS, max_wait_s=2.0)
     for event in complete(T0):
         if event.method != "add_pose":
             add(assembler, event)
@@ -363,16 +367,16 @@ def test_waiting_names_stamps_that_do_not_meet() -> None:
     assembler.add_pose(pose(early), early)
     assembler.pop_ready(0)
     (text,) = assembler.waiting_for(int(1.5 * SECOND))
-    assert "waits for pose, whose newest on camera/pose is of" in text
+    assert "waits for pose: the newest on camera/pose is at" in text
 
 
-def test_drops_are_told_as_they_happen() -> None:
+def test_drops_are_reported_immediately() -> None:
     told: list[tuple[str, str, int]] = []
     assembler = FrameAssembler(INPUTS, on_drop=lambda *arguments: told.append(arguments))
     assembler.add_pose(pose(w=0.0), T0)
     ((reason, message, number),) = told
     assert (reason, number) == ("invalid_pose", 1)
-    assert "norm 0.0000: wanted 1" in message
+    assert "norm 0.0000: expected 1" in message
 
 
 VOCABULARY = Vocabulary(("chair", "cup"), ("on",))
@@ -472,7 +476,7 @@ def test_relation_frames_pair_by_stamp(order: list[int]) -> None:
     assert [int(frame.rgb[0, 0, 0]) for frame in frames] == [0, 1, 2, 3]
 
 
-def test_images_of_frames_that_were_not_lifted_are_let_go() -> None:
+def test_images_of_frames_without_a_local_graph_are_dropped() -> None:
     assembler = RelationAssembler()
     for step in range(5):
         stamp_ns = T0 + step * PERIOD

@@ -1,4 +1,4 @@
-"""What belongs together: RGB, depth, camera_info and pose; what lifting and relations need."""
+"""Assemblers of complete frames: for perception, for lifting and for relations."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from deworldsg_ros.streams.stamped import Stream
 
 @dataclass(frozen=True)
 class LiftingFrame:
-    """What lifting needs of one frame.
+    """The input of lifting for one frame.
 
     Attributes:
         frame_graph: objects of the image.
-        instances: (H, W) uint16, k = k-th object of the frame graph, from 1.
+        instances: (H, W) uint16; 0 = no object, k = k-th object of the frame graph.
         depth_m: (H, W) float32, metres; 0 = invalid.
         intrinsics: of the image.
         T_world_camera: (4, 4) float64.
-        frame_id: world frame.
+        frame_id: name of the world frame.
     """
 
     frame_graph: FrameGraph
@@ -40,26 +40,26 @@ class LiftingFrame:
 
 @dataclass(frozen=True)
 class PairingFrame:
-    """What relations need of one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
+    """The input of relations for one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
 
     local: LocalGraph
     rgb: UInt8
 
 
 class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
-    """Complete RGB-D frames with poses, in the order of the RGB images' stamps.
+    """Complete RGB-D frames with poses, in order of the stamps of the RGB images.
 
-    Messages are those of ROS or of a bag: PoseStamped or Odometry, Image or CompressedImage.
+    Messages may be of ROS or of a bag: PoseStamped, Odometry or TF; Image or CompressedImage.
 
     Args:
-        inputs: slops, frames, scales and limits.
-        topics: names for the diagnostics, by stream.
-        capacity: messages kept of each image stream.
-        patience_s: how long an RGB image waits for what it lacks.
-        on_drop: called with the reason, the message and the number of every drop.
+        inputs: section ``inputs`` of the configuration.
+        topics: topic of each stream, for the diagnostics.
+        capacity: maximum number of messages in the buffer of each stream.
+        max_wait_s: maximum time that an RGB image waits for the other streams.
+        on_drop: called with the reason, a message and the number of items of each drop.
 
     Attributes:
-        drops: number of drops by reason.
+        drops: number of dropped items by reason.
     """
 
     def __init__(
@@ -68,10 +68,10 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         *,
         topics: Mapping[str, str] | None = None,
         capacity: int = 64,
-        patience_s: float = 2.0,
+        max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
     ) -> None:
-        super().__init__("rgb", (), inputs, topics, capacity, patience_s, on_drop)
+        super().__init__("rgb", (), inputs, topics, capacity, max_wait_s, on_drop)
         self._gate = JumpGate()
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
@@ -86,7 +86,7 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
         return self._posed(stamp_ns)
 
     def _build(self, stamp_ns: int, value: Any) -> RgbdFrame:
-        # Cheap questions first: what is refused need not be decoded.
+        # The cheap checks come first: a refused frame is not decoded.
         intrinsics = self._intrinsics_at(stamp_ns)
         T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
         depth_m = self._depth_at(stamp_ns)
@@ -99,8 +99,8 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
 class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
     """Frame graphs with the instances, depth, intrinsics and pose that lift them.
 
-    That their sizes agree is lifting's to check. Jumps of the pose are the segmentation's to
-    refuse: what has a frame graph is accepted.
+    Lifting checks the sizes. The segmentation refuses pose jumps: a frame with a frame graph has
+    passed that gate.
     """
 
     def __init__(
@@ -109,11 +109,11 @@ class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
         *,
         topics: Mapping[str, str] | None = None,
         capacity: int = 256,
-        patience_s: float = 2.0,
+        max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
     ) -> None:
         super().__init__(
-            "frame_graph", ("instances",), inputs, topics, capacity, patience_s, on_drop
+            "frame_graph", ("instances",), inputs, topics, capacity, max_wait_s, on_drop
         )
         self._instances = self._others["instances"]
 
@@ -148,13 +148,13 @@ class RelationAssembler(Assembler[LocalGraph, PairingFrame]):
         *,
         topics: Mapping[str, str] | None = None,
         capacity: int = 256,
-        patience_s: float = 2.0,
+        max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
     ) -> None:
         names = {**TOPICS, **(topics or {})}
         self._rgb: Stream[Any] = Stream("rgb", names["rgb"], capacity)
         leader: Stream[LocalGraph] = Stream("local_graph", names["local_graph"], capacity)
-        super().__init__(leader, [self._rgb], patience_s=patience_s, on_drop=on_drop)
+        super().__init__(leader, [self._rgb], max_wait_s=max_wait_s, on_drop=on_drop)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""
