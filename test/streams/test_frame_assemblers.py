@@ -376,7 +376,7 @@ def test_drops_are_reported_immediately() -> None:
     assembler.add_pose(pose(w=0.0), T0)
     ((reason, message, number),) = told
     assert (reason, number) == ("invalid_pose", 1)
-    assert "norm 0.0000: expected 1" in message
+    assert "norm 0.0000" in message
 
 
 VOCABULARY = Vocabulary(("chair", "cup"), ("on",))
