@@ -166,7 +166,7 @@ def main() -> None:
     paired(
         f"prior of {edges} edges",
         lambda: prior.lookup(classes),
-        lambda: [prior.mean(subject, object_) for subject, object_ in classes.tolist()],
+        lambda: [prior.lookup(pair[None]) for pair in classes],
         options.turns,
     )
     ids = np.stack([np.arange(edges) // 2, np.arange(edges) // 2 + 1], axis=1)

@@ -216,13 +216,14 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         option("entropy of the visual distribution above which the prior is used", ge=0, le=10),
     ] = 1.0
     fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
-    outlier_rate: Annotated[
-        float,
-        option("share of frames whose relations say nothing; 0 = sum logits, Eq. 9", ge=0, le=0.9),
-    ] = 0.1
-    consistent_directions: Annotated[
-        bool, option("predicates of a pair's two directions do not contradict each other")
-    ] = True
+    edge_belief: Annotated[
+        Literal["paper", "robust"],
+        option(
+            "how an edge's evidence is combined: paper = sum of logits, each direction by itself "
+            "(Eq. 9); robust = each frame is bounded by an outlier model, and the two directions "
+            "do not contradict each other"
+        ),
+    ] = "robust"
     max_clips_per_s: Annotated[
         float,
         option(
@@ -351,15 +352,19 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What goes out on /scene_graph."""
+    """The published graph."""
 
-    rate_hz: Annotated[float, option("most updates of /scene_graph a second", gt=0, le=1000)] = 5.0
-    top_k: Annotated[int, option("classes or predicates told a node or edge", ge=1, le=1000)] = 5
-    tentative_nodes: Annotated[
-        bool, option("also nodes that were seen too rarely to be sure of (paper: there are none)")
+    rate_hz: Annotated[
+        float, option("maximum rate of /scene_graph and its updates, Hz", gt=0, le=1000)
+    ] = 5.0
+    top_k: Annotated[
+        int, option("most probable classes or predicates in each node or edge", ge=1, le=1000)
+    ] = 5
+    include_tentative: Annotated[
+        bool, option("publish tentative nodes too (the paper has none)")
     ] = False
-    surface_points: Annotated[
-        bool, option("surface points of each node in /scene_graph (large)")
+    include_surface_points: Annotated[
+        bool, option("publish the surface points of each node (large messages)")
     ] = False
 
 

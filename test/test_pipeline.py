@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from support.relations import mean_of
 from support.scripted import CONFIGURATIONS, INTRINSICS, PAPER, VOCABULARY, Scripted, frame
 
 from deworldsg_ros.config import (
@@ -28,7 +29,7 @@ from deworldsg_ros.scene.replica import GraphReplica
 
 ASKING = msgspec.structs.replace(
     PAPER,
-    relations=RelationsConfig(world_model="fake", outlier_rate=0.0, consistent_directions=False),
+    relations=RelationsConfig(world_model="fake", edge_belief="paper"),
 )
 
 
@@ -78,7 +79,7 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
     (edge,) = pipeline.graph().edges  # cup and table alone are neighbours (Eq. 8)
     assert edge.provenance == "fused"
     assert edge.entropy_nats == pytest.approx(np.log(3), abs=1e-4)
-    prior = builder.prior.mean(0, 1)
+    prior = mean_of(builder.prior, 0, 1)
     visual = np.exp([0.003, 0.0, 0.0]) / np.exp([0.003, 0.0, 0.0]).sum()
     expected = (visual + 0.5 * prior) / 1.5
     told = {belief.label: belief.probability for belief in edge.predicates}
@@ -118,7 +119,7 @@ def test_evidence_that_comes_late_gives_the_same_graph() -> None:
 
 @pytest.mark.parametrize("points", [False, True])
 def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> None:
-    config = msgspec.structs.replace(PAPER, output=OutputConfig(surface_points=points))
+    config = msgspec.structs.replace(PAPER, output=OutputConfig(include_surface_points=points))
     builder = GraphBuilder(config, VOCABULARY, "map")
     replica = GraphReplica()
     replica.reset(builder.snapshot())
@@ -173,7 +174,9 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
 def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
     merging = MergingConfig(association="surface", confirm_observations=2)
     pipeline = Pipeline(Config(merging=merging), Scripted())
-    asked = Pipeline(Config(merging=merging, output=OutputConfig(tentative_nodes=True)), Scripted())
+    asked = Pipeline(
+        Config(merging=merging, output=OutputConfig(include_tentative=True)), Scripted()
+    )
     pipeline.process(frame(0))
     asked.process(frame(0))
     assert pipeline.graph().nodes == [] == pipeline.graph().edges
@@ -196,6 +199,5 @@ def test_the_shipped_configurations_are_what_they_say() -> None:
         ("perception", "refine_detections"),
         ("merging", "association"),
         ("relations", "max_clips_per_s"),
-        ("relations", "outlier_rate"),
-        ("relations", "consistent_directions"),
+        ("relations", "edge_belief"),
     }

@@ -19,7 +19,7 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
-from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
+from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
@@ -134,7 +134,7 @@ def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> 
         pipeline = Pipeline(config)
         pipeline.lifting.warm_up()
     if map_path is not None and map_path.exists():
-        pipeline.go_on_with(GraphBuilder.from_map(config, map_path))
+        pipeline.go_on_with(read_map(config, map_path))
         console.print(f"loaded the map {map_path}", highlight=False, soft_wrap=True)
     return pipeline
 
@@ -201,7 +201,7 @@ def _write_results(
     if options.trajectory_out is not None:
         write_tum(options.trajectory_out, list(processed.poses), T_world_cameras)
     if options.map_path is not None and pipeline.builder is not None:
-        pipeline.builder.save_map(options.map_path)
+        write_map(pipeline.builder, options.map_path)
 
 
 def _report(

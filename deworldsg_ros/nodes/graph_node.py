@@ -12,7 +12,9 @@ from geometry_msgs.msg import PoseStamped
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from deworldsg_ros.graph_builder import GraphBuilder, check_map_writable
+from deworldsg_ros.files import write_atomically
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode, run
@@ -69,7 +71,7 @@ class GraphNode(StageNode):
 
     def _continue_map(self, path: Path) -> None:
         """Start with the graph of a map file; raises ConfigurationError if it contains none."""
-        self._builder = GraphBuilder.from_map(self.parameters, path)
+        self._builder = read_map(self.parameters, path)
         graph = self._builder.graph
         self.get_logger().info(
             f"continuing map {path}: {len(graph)} nodes in frame '{graph.frame_id}'"
@@ -159,7 +161,7 @@ class GraphNode(StageNode):
         if self._builder is None:
             return False, "no map written: no local graph has arrived"
         try:
-            self._builder.save_map(path)
+            write_map(self._builder, path)
         except ConfigurationError as error:
             return False, str(error)
         return True, f"map {path}: {self._builder.confirmed} nodes"
@@ -170,9 +172,7 @@ class GraphNode(StageNode):
         message = self._builder.full()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(path.name + ".part")
-            part.write_text(wire.encode(message), encoding="utf-8")
-            part.replace(path)
+            write_atomically(path, wire.encode(message).encode())
         except OSError as error:
             return False, f"{path}: {error}"
         return True, f"{path}: {len(message.nodes)} nodes, {len(message.edges)} edges"

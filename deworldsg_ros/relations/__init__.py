@@ -4,19 +4,18 @@ from deworldsg_ros.relations.clip_policy import ClipPolicy
 from deworldsg_ros.relations.clip_queue import ClipQueue
 from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, union_box
 from deworldsg_ros.relations.consistency import Consistency, contradictions
+from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.evidence import (
-    ClassPairPrior,
-    FusedEdge,
     FusedEdges,
     choose_directions,
     entropy_nats,
     fuse_distributions,
-    fuse_edge,
     fuse_edges,
     visual_distribution,
 )
 from deworldsg_ros.relations.graph_view import GraphView, LiveGraph, NodeView, PublishedGraph
 from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
+from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
 from deworldsg_ros.relations.world_model import (
@@ -33,9 +32,9 @@ __all__ = [
     "ClipQueue",
     "ClipRequest",
     "Consistency",
+    "EdgeBeliefs",
     "EvidenceWorker",
     "FrameBuffer",
-    "FusedEdge",
     "FusedEdges",
     "GraphView",
     "LiveGraph",
@@ -52,7 +51,6 @@ __all__ = [
     "crop_clip",
     "entropy_nats",
     "fuse_distributions",
-    "fuse_edge",
     "fuse_edges",
     "geometric_costs",
     "neighbour_pairs",

@@ -1,4 +1,4 @@
-"""Which predicates of a pair's two directions contradict each other, and what follows from it."""
+"""Contradictions between the predicates of a pair's two directions, and their removal."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
 _VISUAL = PROVENANCES.index("visual")
 
-# A pair with less than this probability of a contradiction is left as it is.
-NEGLIGIBLE = 1e-9
+# Below this probability of a contradiction, the beliefs of a pair are not changed.
+_NEGLIGIBLE = 1e-9
 
 _RESTING = frozenset(
     {
@@ -27,13 +27,13 @@ _RESTING = frozenset(
     }
 )  # fmt: skip
 
-# Orders in which one of two objects is first: names by which the subject is, and by which the
-# object is. Not both can be first. What holds both ways (near, with, against, attached to,
-# connected to, looking at) and what says nothing of an order is in none.
+# Each order puts one of two objects first. The first set contains the predicates whose subject is
+# first, the second set those whose object is first. Both objects cannot be first. Symmetric
+# predicates (near, with, against, attached to, connected to, looking at) are in no order.
 ORDERS: tuple[tuple[frozenset[str], frozenset[str]], ...] = (
-    # The higher one. What hangs on something, or is mounted on it, may well be lower.
+    # The higher one. An object that hangs on another, or is mounted on it, may be lower.
     (_RESTING | {"above", "over", "higher than"}, frozenset({"under", "below", "lower than"})),
-    # The one that is held, by the one that holds it.
+    # The held one, before its holder.
     (
         _RESTING
         | {
@@ -43,9 +43,9 @@ ORDERS: tuple[tuple[frozenset[str], frozenset[str]], ...] = (
         },
         frozenset({"holding", "carrying", "wearing", "wears"}),
     ),
-    # The part, of the whole.
+    # The part, before the whole.
     (frozenset({"part of", "belonging to", "of"}), frozenset({"has", "made of"})),
-    # What covers, and what is covered.
+    # The cover, before the covered one.
     (frozenset({"covering", "cover", "painted on"}), frozenset({"covered in"})),
     (frozenset({"in front of", "front"}), frozenset({"behind"})),
     (frozenset({"left", "left of"}), frozenset({"right", "right of"})),
@@ -54,10 +54,10 @@ ORDERS: tuple[tuple[frozenset[str], frozenset[str]], ...] = (
 
 
 def contradictions(predicates: Sequence[str]) -> Bool:
-    """Whether A r B contradicts B s A, by names.
+    """Whether "A r B" contradicts "B s A", for all predicates r and s.
 
     Args:
-        predicates: R names, in any case, with blanks or underscores; a name that is in no order
+        predicates: R names in any case, with blanks or underscores. A name that is in no order
             contradicts nothing.
 
     Returns:
@@ -73,11 +73,12 @@ def contradictions(predicates: Sequence[str]) -> Bool:
 
 
 class Consistency:
-    """The two directions of a pair as one belief, in which contradictions have no place.
+    """The two directions of a pair as one belief without contradictions.
 
     P(r_ab, r_ba) ∝ p_ab(r_ab) · p_ba(r_ba) · C(r_ab, r_ba), where C is 0 for predicates that
-    contradict each other and 1 for others. An edge gets its marginal, and so of two certain but
-    contradictory predicates the one whose alternatives are less likely; equals get half each.
+    contradict each other and 1 otherwise. Each edge gets its marginal. If both directions are
+    certain and contradict each other, the one with the less likely alternatives prevails. Equal
+    ones get half each.
 
     Args:
         predicates: names, in the order of the distributions.
@@ -85,10 +86,10 @@ class Consistency:
 
     def __init__(self, predicates: Sequence[str]) -> None:
         contradictory = contradictions(predicates)
-        if contradictory.all():  # nothing goes together: there is no joint belief
+        if contradictory.all():  # no pair of predicates is allowed: there is no joint belief
             contradictory[:] = False
         self._contestable = contradictory.any(axis=0)
-        # Predicates that contradict the same ones are of one kind: few kinds stand for many names.
+        # Predicates that contradict the same ones are of one kind. There are few kinds.
         kinds, firsts, kind_of = np.unique(
             contradictory, axis=0, return_index=True, return_inverse=True
         )
@@ -106,26 +107,26 @@ class Consistency:
     ) -> FusedEdges:
         """Fused beliefs in which the directions of a pair do not contradict each other.
 
-        Only pairs of which both directions were seen are touched: of others one direction is told
-        (`choose_directions`). Each pair's result is the same to the last bit whatever other pairs
-        are beside it, and whichever of its directions comes first.
+        Only pairs with visual evidence in both directions change; of others one direction is
+        published (`choose_directions`). The result of a pair does not depend on the other pairs or
+        on the order of its directions, to the last bit.
 
         Args:
             edges: (E, 2) subject and object ids, each directed edge at most once, any order.
-            summed_logits: (E, R) float64, as `fuse_edges` had them.
+            summed_logits: (E, R) float64, the argument of `fuse_edges`.
             has_visual: (E,) bool, likewise.
-            fused: what `fuse_edges` made of them.
+            fused: the result of `fuse_edges`.
         """
         contested = (fused.probabilities * self._contestable).sum(axis=1)
         first, second = opposite_rows(edges)
         seen = has_visual[first] & has_visual[second]
-        chosen = seen & (contested[first] * contested[second] > NEGLIGIBLE)
+        chosen = seen & (contested[first] * contested[second] > _NEGLIGIBLE)
         if not chosen.any():
             return fused
         first, second = first[chosen], second[chosen]
         rows = np.concatenate([first, second])
-        # The visual distributions out of the logits themselves, for they may be so certain that
-        # all but one predicate have probability 0.
+        # Visual distributions come from the logits: they may be so certain that all but one
+        # predicate have probability 0.
         logs = np.where(
             (fused.provenance_codes[rows] == _VISUAL)[:, None],
             summed_logits[rows],
@@ -145,6 +146,6 @@ class Consistency:
         masses = np.logaddexp.reduceat(other[:, self._by_kind], self._starts, axis=1)
         allowed = np.where(self._allowed, masses[:, None, :], -np.inf)
         greatest = np.maximum(allowed.max(axis=2), np.finfo(np.float64).min)
-        with np.errstate(divide="ignore"):  # a kind that contradicts all others has no chance
+        with np.errstate(divide="ignore"):  # a kind that contradicts all others
             sums = np.log(np.exp(allowed - greatest[:, :, None]).sum(axis=2)) + greatest
         return visual_distribution(own + sums[:, self._kind_of])

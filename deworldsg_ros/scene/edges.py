@@ -1,4 +1,4 @@
-"""The directed edges of the global graph: a sparse map, and who is joined to whom."""
+"""The directed edges of the global graph: a sparse map, and the neighbours of each node."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Pair = tuple[int, int]
 
 
 class EdgeEvidence(NamedTuple):
-    """What is known of one directed pair of nodes (R predicates); a value, never changed in place.
+    """Evidence of one directed pair of nodes (R predicates); a value, never changed in place.
 
     Attributes:
-        visual_logits: (R,) float64, the sum of the visual relation logits (Eq. 9); zeros where
-            there were none, which is the uniform distribution.
+        visual_logits: (R,) float64, the sum of the visual relation logits (Eq. 9). Zeros if there
+            were none, which is the uniform distribution.
         frames: number of frames with visual evidence; 0 = a geometric neighbour only.
         last_seen_ns: time of the newest evidence of either kind.
         neighbour_frames: number of frames in which the pair was a geometric neighbour (Eq. 8).
@@ -47,53 +47,49 @@ class EdgeMap:
         """The map itself, read only."""
         return MappingProxyType(self._evidence)
 
-    def partners(self, node_id: int) -> list[int]:
-        """Nodes that share an edge with this one, in either direction."""
-        return list(self._partners.get(node_id, ()))
+    def add_visual(self, pair: Pair, logits: Float64, stamp_ns: int, revision: int) -> None:
+        """Sum a frame's relation logits (R,) into a pair (Eq. 9).
 
-    def add(
-        self,
-        pair: Pair,
-        *,
-        logits: Float64 | None,
-        frames: int,
-        neighbour_frames: int,
-        stamp_ns: int,
-        revision: int,
-    ) -> None:
+        Raises:
+            ValueError: if the logits have another shape.
+        """
+        if logits.shape != self._no_logits.shape:
+            raise ValueError(
+                f"relation logits have shape {logits.shape}: expected {self._no_logits.shape}"
+            )
+        self.add(pair, EdgeEvidence(logits, 1, stamp_ns, 0, revision))
+
+    def add_neighbour(self, pair: Pair, stamp_ns: int, revision: int) -> None:
+        """Count a frame in which a pair was a geometric neighbour (Eq. 8)."""
+        self.add(pair, EdgeEvidence(self._no_logits, 0, stamp_ns, 1, revision))
+
+    def add(self, pair: Pair, more: EdgeEvidence) -> None:
         """Add evidence to a pair: logits and frames are summed."""
         known = self._evidence.get(pair)
         if known is None:
-            known = EdgeEvidence(self._no_logits, 0, stamp_ns, 0, revision)
+            known = EdgeEvidence(self._no_logits, 0, more.last_seen_ns, 0, more.revision)
             self._partners.setdefault(pair[0], {})[pair[1]] = None
             self._partners.setdefault(pair[1], {})[pair[0]] = None
         self._evidence[pair] = EdgeEvidence(
-            known.visual_logits if logits is None else known.visual_logits + logits,
-            known.frames + frames,
-            max(known.last_seen_ns, stamp_ns),
-            known.neighbour_frames + neighbour_frames,
-            revision,
+            known.visual_logits + more.visual_logits if more.frames else known.visual_logits,
+            known.frames + more.frames,
+            max(known.last_seen_ns, more.last_seen_ns),
+            known.neighbour_frames + more.neighbour_frames,
+            more.revision,
         )
 
-    def repoint(self, gone_id: int, keep_id: int, revision: int) -> None:
-        """Move all edges of one node to another, summing evidence; O(degree of `gone_id`).
+    def repoint(self, old_id: int, new_id: int, revision: int) -> None:
+        """Move all edges of one node to another, summing evidence; O(degree of `old_id`).
 
         An edge between the two would become one from a node to itself and is dropped.
         """
-        for (subject, object_), evidence in self._pop_all(gone_id):
+        for (subject, object_), evidence in self._pop_all(old_id):
             pair = (
-                keep_id if subject == gone_id else subject,
-                keep_id if object_ == gone_id else object_,
+                new_id if subject == old_id else subject,
+                new_id if object_ == old_id else object_,
             )
             if pair[0] != pair[1]:
-                self.add(
-                    pair,
-                    logits=evidence.visual_logits if evidence.frames else None,
-                    frames=evidence.frames,
-                    neighbour_frames=evidence.neighbour_frames,
-                    stamp_ns=evidence.last_seen_ns,
-                    revision=revision,
-                )
+                self.add(pair, evidence._replace(revision=revision))
 
     def drop(self, node_id: int) -> None:
         """Drop all edges of a node."""

@@ -1,190 +1,180 @@
-"""The whole state of a scene graph as named arrays, and as one .npz file.
+"""A scene graph as one .npz file, without loss.
 
-Nothing is lost: the graph that is read goes on exactly as the one that was written.
+The graph that is read continues exactly as the one that was written.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import zipfile
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.graph import GraphState, SceneGraph
+from deworldsg_ros.scene.node_ids import IdState
+from deworldsg_ros.scene.nodes import SAVED_COLUMNS
 
-if TYPE_CHECKING:
-    from deworldsg_ros.scene.graph import SceneGraph
-
-State = dict[str, NDArray[Any]]
+Arrays = dict[str, NDArray[Any]]
 
 # A reader of version N reads N - 1 too.
 FORMAT_VERSION = 1
 
-_NODE_COLUMNS = (
-    "ids",
-    "means",
-    "covariances",
-    "class_probabilities",
-    "weights",
-    "observations",
-    "confirmed",
-    "first_seen_ns",
-    "last_seen_ns",
-    "revisions",
-)
+
+def save(graph: SceneGraph, path: str | Path) -> None:
+    """Write the whole state of a graph; OSError if that fails."""
+    write(path, to_arrays(graph.state()))
 
 
-def state_of(graph: SceneGraph) -> State:
-    """Every array that makes up a graph, and its settings as JSON bytes."""
-    nodes = graph.nodes
+def load(path: str | Path) -> SceneGraph:
+    """Read what `save` wrote; RefusedInput ``invalid_graph_file`` if the file is not one."""
+    return graph_from_arrays(read(path), str(path))
+
+
+def to_arrays(state: GraphState) -> Arrays:
+    """The arrays of a graph by name, and its settings as JSON bytes under ``header``."""
     header = {
         "format": "deworldsg scene graph",
         "version": FORMAT_VERSION,
-        "classes": graph.vocabulary.classes,
-        "predicates": graph.vocabulary.predicates,
-        "frame_id": graph.frame_id,
-        "surface_point_capacity": graph.surface_point_capacity,
-        "remembered_frames": graph.remembered_frames,
-        "even_gaussians": graph.even_gaussians,
-        "revision": graph.revision,
-        "next_id": graph._next_id,
+        "classes": state.vocabulary.classes,
+        "predicates": state.vocabulary.predicates,
+        "frame_id": state.frame_id,
+        "surface_point_capacity": state.surface_point_capacity,
+        "remembered_frames": state.remembered_frames,
+        "even_gaussians": state.even_gaussians,
+        "revision": state.revision,
+        "next_id": state.ids.next_id,
     }
-    edges = graph.edges
-    frames = graph._frames
-    points = [nodes.surface(row) for row in range(len(nodes))]
     return {
         "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
-        **{name: getattr(nodes, name).copy() for name in _NODE_COLUMNS},
-        "surface_points": np.concatenate([np.zeros((0, 3), np.float32), *points]),
-        "surface_point_counts": np.array([len(item) for item in points], np.int64),
-        "edge_pairs": np.array(list(edges), np.int64).reshape(-1, 2),
-        "edge_visual_logits": np.array(
-            [edge.visual_logits for edge in edges.values()], np.float64
-        ).reshape(-1, len(graph.vocabulary.predicates)),
-        "edge_counts": np.array(
-            [
-                (edge.frames, edge.last_seen_ns, edge.neighbour_frames, edge.revision)
-                for edge in edges.values()
-            ],
-            np.int64,
-        ).reshape(-1, 4),
-        "successors": np.array(list(graph._successors.items()), np.int64).reshape(-1, 2),
-        "removals": np.array(graph._removals, np.int64),
-        "frame_stamps_ns": np.array(list(frames), np.int64),
-        "frame_node_counts": np.array([len(ids) for ids in frames.values()], np.int64),
-        "frame_nodes": np.array([node for ids in frames.values() for node in ids], np.int64),
+        **state.nodes,
+        "surface_points": np.concatenate([np.zeros((0, 3), np.float32), *state.surfaces]),
+        "surface_point_counts": np.array([len(points) for points in state.surfaces], np.int64),
+        **_edge_arrays(state),
+        **_id_arrays(state.ids),
     }
 
 
-def graph_of(state: State, source: str, **settings: Any) -> SceneGraph:
-    """The graph of a state; settings of `SceneGraph` take the place of those saved.
+def _edge_arrays(state: GraphState) -> Arrays:
+    edges = state.edges.values()
+    counts = [(e.frames, e.last_seen_ns, e.neighbour_frames, e.revision) for e in edges]
+    logits = np.array([edge.visual_logits for edge in edges], np.float64)
+    return {
+        "edge_pairs": np.array(list(state.edges), np.int64).reshape(-1, 2),
+        "edge_visual_logits": logits.reshape(-1, len(state.vocabulary.predicates)),
+        "edge_counts": np.array(counts, np.int64).reshape(-1, 4),
+    }
+
+
+def _id_arrays(ids: IdState) -> Arrays:
+    rows = ids.frames.values()
+    return {
+        "successors": np.array(list(ids.successors.items()), np.int64).reshape(-1, 2),
+        "removals": np.array(ids.removals, np.int64),
+        "frame_stamps_ns": np.array(list(ids.frames), np.int64),
+        "frame_node_counts": np.array([len(row) for row in rows], np.int64),
+        "frame_nodes": np.array([node_id for row in rows for node_id in row], np.int64),
+    }
+
+
+def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> SceneGraph:
+    """The graph of `to_arrays`.
+
+    Args:
+        arrays: by name; others are ignored.
+        source: file name for errors.
+        settings: of `SceneGraph`, in place of the saved ones.
 
     Raises:
-        RefusedInput: ``invalid_graph_file``, with `source`, where the state is not one.
+        RefusedInput: ``invalid_graph_file`` if the arrays are not those of a graph.
     """
     try:
-        return _graph_of(state, settings)
+        return SceneGraph.from_state(replace(_state(arrays), **settings))
     except (KeyError, ValueError, TypeError, IndexError, MemoryError) as error:
-        raise RefusedInput("invalid_graph_file", f"graph file {source}: {told(error)}") from error
+        raise RefusedInput(
+            "invalid_graph_file", f"graph file {source}: {reason_of(error)}"
+        ) from error
 
 
-def told(error: Exception) -> str:
-    """What is wrong with a file, in words, where the exception tells no more than a name."""
-    if isinstance(error, KeyError):
-        return f"there is no {error} in it"
-    return getattr(error, "strerror", None) or str(error)
-
-
-def _graph_of(state: State, settings: dict[str, Any]) -> SceneGraph:
-    from deworldsg_ros.scene.graph import SceneGraph
-
-    header = json.loads(state["header"].tobytes())
+def _state(arrays: Arrays) -> GraphState:
+    header = json.loads(arrays["header"].tobytes())
     if header.get("version", 0) > FORMAT_VERSION:
-        raise ValueError(f"version {header['version']}: wanted {FORMAT_VERSION} or older")
-    saved = ("surface_point_capacity", "remembered_frames", "even_gaussians")
-    graph = SceneGraph(
-        Vocabulary(tuple(header["classes"]), tuple(header["predicates"])),
-        header["frame_id"],
-        **{name: header[name] for name in saved if name in header} | settings,
+        raise ValueError(f"version {header['version']}: expected {FORMAT_VERSION} or older")
+    return GraphState(
+        vocabulary=Vocabulary(tuple(header["classes"]), tuple(header["predicates"])),
+        frame_id=header["frame_id"],
+        nodes={name: arrays[name] for name in SAVED_COLUMNS},
+        surfaces=_split(arrays["surface_points"], arrays["surface_point_counts"]),
+        edges=_edges(arrays),
+        ids=_ids(arrays, int(header["next_id"])),
+        revision=int(header["revision"]),
+        surface_point_capacity=header["surface_point_capacity"],
+        remembered_frames=header["remembered_frames"],
+        # Files of earlier releases do not have it.
+        even_gaussians=header.get("even_gaussians", False),
     )
-    nodes = graph.nodes
-    points = _split(state["surface_points"], state["surface_point_counts"])
-    for index, node_id in enumerate(state["ids"].tolist()):
-        row = nodes.append(node_id)
-        nodes.put(
-            row,
-            state["means"][index],
-            state["covariances"][index],
-            state["class_probabilities"][index],
-            float(state["weights"][index]),
-            int(state["observations"][index]),
-        )
-        nodes.set_surface(row, points[index])
-        for name in ("confirmed", "first_seen_ns", "last_seen_ns", "revisions"):
-            getattr(nodes, name)[row] = state[name][index]
-    for pair, logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(
-        state["edge_pairs"].tolist(),
-        state["edge_visual_logits"],
-        state["edge_counts"].tolist(),
+
+
+def _edges(arrays: Arrays) -> dict[Pair, EdgeEvidence]:
+    edges = {}
+    for (subject, object_), logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(
+        arrays["edge_pairs"].tolist(), arrays["edge_visual_logits"], arrays["edge_counts"].tolist()
     ):
-        graph._edges.add(
-            (pair[0], pair[1]),
-            logits=logits if frames else None,
-            frames=frames,
-            neighbour_frames=neighbour_frames,
-            stamp_ns=last_seen_ns,
-            revision=revision,
+        edges[subject, object_] = EdgeEvidence(
+            logits, frames, last_seen_ns, neighbour_frames, revision
         )
-    graph.revision = int(header["revision"])
-    graph._next_id = int(header["next_id"])
-    graph._successors = {gone: kept for gone, kept in state["successors"].tolist()}
-    graph._removals = state["removals"].tolist()
-    frame_nodes = _split(state["frame_nodes"], state["frame_node_counts"])
-    for stamp_ns, ids in zip(state["frame_stamps_ns"].tolist(), frame_nodes):
-        graph._frames[stamp_ns] = tuple(ids.tolist())
-    return graph
+    return edges
+
+
+def _ids(arrays: Arrays, next_id: int) -> IdState:
+    rows = _split(arrays["frame_nodes"], arrays["frame_node_counts"])
+    return IdState(
+        next_id=next_id,
+        successors={removed: kept for removed, kept in arrays["successors"].tolist()},
+        removals=tuple(arrays["removals"].tolist()),
+        frames={
+            stamp_ns: tuple(row.tolist())
+            for stamp_ns, row in zip(arrays["frame_stamps_ns"].tolist(), rows)
+        },
+    )
 
 
 def _split(flat: NDArray[Any], counts: Int64) -> list[NDArray[Any]]:
     return np.split(flat, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-def check_writable(path: Path) -> None:
-    """Make the folder of a file that `write` is to write; raises OSError where it cannot be."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = _partial(path)
-    partial.touch()
-    partial.unlink()
+def write(path: str | Path, arrays: Arrays) -> None:
+    """Write arrays as .npz; the file appears complete or not at all."""
+    write_atomically(
+        Path(path),
+        lambda file: np.savez(file, **arrays),  # type: ignore[arg-type]  # names of its options
+    )
 
 
-def _partial(path: Path) -> Path:
-    return path.with_name(path.name + ".partial")
-
-
-def write(path: str | Path, state: State) -> None:
-    """Write a state as .npz; the file appears complete or not at all."""
-    path = Path(path)
-    partial = _partial(path)
-    with partial.open("wb") as file:
-        np.savez(file, **state)  # type: ignore[arg-type]  # its own options are named in the stub
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
-
-
-def read(path: str | Path) -> State:
-    """Read a state; raises RefusedInput ``invalid_graph_file``."""
+def read(path: str | Path) -> Arrays:
+    """Read arrays; RefusedInput ``invalid_graph_file`` if the file is no .npz."""
     try:
         with Path(path).open("rb") as file:
             if not zipfile.is_zipfile(file):
-                raise ValueError("no .npz archive, as a saved graph or map is")
+                raise ValueError("not an .npz archive; expected a saved graph or map")
         with np.load(Path(path), allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
-        raise RefusedInput("invalid_graph_file", f"graph file {path}: {told(error)}") from error
+        raise RefusedInput(
+            "invalid_graph_file", f"graph file {path}: {reason_of(error)}"
+        ) from error
+
+
+def reason_of(error: Exception) -> str:
+    """A readable reason, also for exceptions whose text is only a name."""
+    if isinstance(error, KeyError):
+        return f"there is no {error} in it"
+    return getattr(error, "strerror", None) or str(error)

@@ -1,14 +1,10 @@
-"""The nodes of the global graph as parallel, contiguous arrays.
-
-Row r of every array belongs to the node `ids[r]`. Rows are compact: when a node goes, the last
-row takes its place, so rows move and ids do not. The public arrays are views of the live rows;
-they are replaced when a node is added or removed, so do not keep them across such a change.
-"""
+"""The nodes of the global graph as parallel, contiguous arrays."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,24 +12,61 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt64
-from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
+from deworldsg_ros.scene.columns import Columns
+from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
 from deworldsg_ros.scene.surface import add_points
 
-_FIRST_CAPACITY = 64
+# All that is saved of a node beside its surface points; the rest follows from these.
+SAVED_COLUMNS = (
+    "ids",
+    "means",
+    "covariances",
+    "class_probabilities",
+    "weights",
+    "observations",
+    "confirmed",
+    "first_seen_ns",
+    "last_seen_ns",
+    "revisions",
+)
 
 
-class NodeTable:
-    """n nodes with distributions over C classes.
+@dataclass(frozen=True)
+class Observations:
+    """What n nodes are fused with: one row for each of them.
+
+    Attributes:
+        means_world: (n, 3) float64, metres.
+        covariances_world: (n, 3, 3) float64, square metres.
+        class_probabilities: (n, C) float64, rows sum to one.
+        weights: (n,) float64, w of Eq. 7.
+        counts: (n,) int64, number of frames in each row.
+        surfaces: n arrays (k, 3) float32 of surface points, metres.
+        first_seen_ns, last_seen_ns: time span of all rows.
+    """
+
+    means_world: Float64
+    covariances_world: Float64
+    class_probabilities: Float64
+    weights: Float64
+    counts: Int64
+    surfaces: Sequence[Float32]
+    first_seen_ns: int
+    last_seen_ns: int
+
+
+class NodeTable(Columns):
+    """n nodes with distributions over C classes; see `Columns` for rows and ids.
 
     Attributes:
         ids: (n,) int64, stable, from 1.
         means: (n, 3) float64, metres, world frame.
         covariances: (n, 3, 3) float64, square metres, positive definite.
         class_probabilities: (n, C) float64, rows sum to one.
-        weights: (n,) float64, the w of Eq. 7: number of observations, or a rule's own weight.
+        weights: (n,) float64, w of Eq. 7: number of observations, or a rule's own weight.
         observations: (n,) int64, frames in which it was observed; class distributions average
             with these.
-        confirmed: (n,) bool, whether the node is sure to be an object; others are tentative.
+        confirmed: (n,) bool; false = tentative.
         log_determinants: (n,) float64, of the covariances.
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
@@ -43,7 +76,6 @@ class NodeTable:
         surface_counts: (n,) int64 points; see `surface`.
     """
 
-    ids: Int64
     means: Float64
     covariances: Float64
     class_probabilities: Float64
@@ -60,51 +92,24 @@ class NodeTable:
     surface_counts: Int64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
-        self._rows: dict[int, int] = {}
-        capacity = _FIRST_CAPACITY
-        self._storage: dict[str, NDArray[Any]] = {
-            "ids": np.zeros(capacity, np.int64),
-            "means": np.zeros((capacity, 3)),
-            "covariances": np.zeros((capacity, 3, 3)),
-            "class_probabilities": np.zeros((capacity, class_count)),
-            "weights": np.zeros(capacity),
-            "observations": np.zeros(capacity, np.int64),
-            "confirmed": np.zeros(capacity, np.bool_),
-            "log_determinants": np.zeros(capacity),
-            "eigenvalue_bounds": np.zeros(capacity),
-            "first_seen_ns": np.zeros(capacity, np.int64),
-            "last_seen_ns": np.zeros(capacity, np.int64),
-            "revisions": np.zeros(capacity, np.int64),
-            "surface_hashes": np.zeros((capacity, surface_point_capacity), np.uint64),
-            "surface_points_world": np.zeros((capacity, surface_point_capacity, 3), np.float32),
-            "surface_counts": np.zeros(capacity, np.int64),
-        }
-        self._show(0)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __contains__(self, node_id: object) -> bool:
-        return node_id in self._rows
-
-    def row(self, node_id: int) -> int:
-        """Present row of a live node; KeyError where it is not in the graph."""
-        try:
-            return self._rows[node_id]
-        except KeyError:
-            raise KeyError(f"node {node_id} is not in the graph") from None
-
-    def append(self, node_id: int) -> int:
-        """Add an empty row for a new node and return it; `put` fills it."""
-        row = len(self._rows)
-        if row == len(self._storage["ids"]):
-            for name, column in self._storage.items():
-                self._storage[name] = np.concatenate((column, np.zeros_like(column)))
-        self._rows[node_id] = row
-        self._show(row + 1)
-        self.ids[row] = node_id
-        self.surface_counts[row] = 0
-        return row
+        super().__init__(
+            {
+                "means": (np.float64, (3,)),
+                "covariances": (np.float64, (3, 3)),
+                "class_probabilities": (np.float64, (class_count,)),
+                "weights": (np.float64, ()),
+                "observations": (np.int64, ()),
+                "confirmed": (np.bool_, ()),
+                "log_determinants": (np.float64, ()),
+                "eigenvalue_bounds": (np.float64, ()),
+                "first_seen_ns": (np.int64, ()),
+                "last_seen_ns": (np.int64, ()),
+                "revisions": (np.int64, ()),
+                "surface_hashes": (np.uint64, (surface_point_capacity,)),
+                "surface_points_world": (np.float32, (surface_point_capacity, 3)),
+                "surface_counts": (np.int64, ()),
+            }
+        )
 
     def put(
         self,
@@ -115,10 +120,10 @@ class NodeTable:
         weight: float,
         observations: int,
     ) -> None:
-        """Replace a row's Gaussian, classes and counts, and what is cached of its covariance.
+        """Replace a row's Gaussian, classes and counts, and the cached values of its covariance.
 
         Raises:
-            ValueError: where the covariance is not positive definite.
+            ValueError: if the covariance is not positive definite; the row is unchanged.
         """
         self.log_determinants[row] = log_determinant(covariance_world)
         self.eigenvalue_bounds[row] = eigenvalue_bound(covariance_world)
@@ -128,19 +133,11 @@ class NodeTable:
         self.weights[row] = weight
         self.observations[row] = observations
 
-    def fuse(
-        self,
-        rows: list[int],
-        means_world: Float64,
-        covariances_world: Float64,
-        class_probabilities: Float64,
-        weights: Float64,
-        observations: Int64,
-    ) -> None:
-        """Fuse a Gaussian, classes and counts into each of n different rows (Eq. 7).
+    def fuse(self, rows: list[int], seen: Observations) -> None:
+        """Fuse one observation into each of n different rows (Eq. 7).
 
         Raises:
-            ValueError: where a covariance is not positive definite; rows before it were fused.
+            ValueError: if a covariance is not positive definite; rows before it were fused.
         """
         refused = _fuse(
             np.array(rows, np.int64),
@@ -151,17 +148,69 @@ class NodeTable:
             self.observations,
             self.log_determinants,
             self.eigenvalue_bounds,
-            means_world,
-            covariances_world,
-            class_probabilities,
-            weights,
-            observations,
+            seen.means_world,
+            seen.covariances_world,
+            seen.class_probabilities,
+            seen.weights,
+            seen.counts,
         )
         if refused >= 0:
             raise ValueError(
-                f"covariance {covariances_world[refused].tolist()}, fused into node "
+                f"covariance {seen.covariances_world[refused].tolist()}, fused into node "
                 f"{self.ids[rows[refused]]}, gives one that is not positive definite"
             )
+        self._add_surfaces(rows, seen.surfaces)
+        self.first_seen_ns[rows] = np.minimum(self.first_seen_ns[rows], seen.first_seen_ns)
+        self.last_seen_ns[rows] = np.maximum(self.last_seen_ns[rows], seen.last_seen_ns)
+
+    def merge(self, row: int, other: int) -> None:
+        """Fuse everything that was observed of another row into a row."""
+        one = [other]
+        self.fuse(
+            [row],
+            Observations(
+                self.means[one],
+                self.covariances[one],
+                self.class_probabilities[one],
+                self.weights[one],
+                self.observations[one],
+                [self.surface(other)],
+                int(self.first_seen_ns[other]),
+                int(self.last_seen_ns[other]),
+            ),
+        )
+        self.confirmed[row] |= self.confirmed[other]
+
+    def take_over(self, row: int, other: int) -> None:
+        """Give a row the Gaussian, surface and state of another one.
+
+        Class distributions average with the numbers of observations, which add up.
+        """
+        counts = self.observations[[row, other]]
+        self.put(
+            row,
+            self.means[other].copy(),
+            self.covariances[other].copy(),
+            counts @ self.class_probabilities[[row, other]] / counts.sum(),
+            float(self.weights[other]),
+            int(counts.sum()),
+        )
+        self.set_surface(row, self.surface(other))
+        self.confirmed[row] = self.confirmed[other]
+        self.last_seen_ns[row] = self.last_seen_ns[other]
+
+    def move(self, row: int, T: Float64) -> None:
+        """Apply a rigid transform (4, 4) to the Gaussian and the surface points of a row."""
+        self.put(
+            row,
+            *transform(self.means[row], self.covariances[row], T),
+            self.class_probabilities[row].copy(),
+            float(self.weights[row]),
+            int(self.observations[row]),
+        )
+        points = self.surface(row).astype(np.float64) @ T[:3, :3].T
+        points += T[:3, 3]
+        self.set_surface(row, points.astype(np.float32))
 
     def surface(self, row: int) -> Float32:
         """The surface points (k, 3) of a row, metres; a view."""
@@ -170,10 +219,25 @@ class NodeTable:
     def set_surface(self, row: int, points_world: Float32) -> None:
         """Replace the surface points of a row by a sample of these (k, 3)."""
         self.surface_counts[row] = 0
-        self.add_surfaces([row], [points_world])
+        self._add_surfaces([row], [points_world])
 
-    def add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:
-        """Take surface points (k, 3) into the sample of each of n different rows."""
+    def restore(self, columns: Mapping[str, NDArray[Any]], surfaces: Sequence[Float32]) -> None:
+        """Fill an empty table with saved columns and the surface points of each row."""
+        for index, node_id in enumerate(columns["ids"].tolist()):
+            row = self.append(node_id)
+            self.put(
+                row,
+                columns["means"][index],
+                columns["covariances"][index],
+                columns["class_probabilities"][index],
+                float(columns["weights"][index]),
+                int(columns["observations"][index]),
+            )
+            self.set_surface(row, surfaces[index])
+            for name in ("confirmed", "first_seen_ns", "last_seen_ns", "revisions"):
+                getattr(self, name)[row] = columns[name][index]
+
+    def _add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:
         add_points(
             self.surface_hashes,
             self.surface_points_world,
@@ -181,20 +245,6 @@ class NodeTable:
             rows,
             point_sets,
         )
-
-    def remove(self, node_id: int) -> None:
-        """Remove a node; the last row takes its place."""
-        row, last = self.row(node_id), len(self._rows) - 1
-        moved = int(self.ids[last])
-        for column in self._storage.values():
-            column[row] = column[last]
-        self._rows[moved] = row
-        del self._rows[node_id]
-        self._show(last)
-
-    def _show(self, count: int) -> None:
-        for name, column in self._storage.items():
-            setattr(self, name, column[:count])
 
 
 @kernel
@@ -213,9 +263,9 @@ def _fuse(
     new_weights: Float64,
     new_observations: Int64,
 ) -> int:
-    """`scene.gaussian.fuse` with what is cached of the result; place that was refused, -1 = none.
+    """`scene.gaussian.fuse` for each row, with cached values; the index refused, -1 = none.
 
-    The operations are those of `fuse`, `log_determinant` and `eigenvalue_bound`, one by one.
+    The operations are those of `fuse`, `log_determinant` and `eigenvalue_bound`, in the same order.
     """
     c = np.empty((3, 3))
     for index in range(len(rows)):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.training.labelled_clips import LabelledClip, of_length
@@ -55,14 +56,10 @@ class FeatureCache:
             return
         digests = self._unsaved
         path = self.folder / f"{_digest(' '.join(digests))}.npz"
-        partial = path.with_suffix(".part")
-        with partial.open("wb") as file:
-            np.savez(
-                file,
-                digests=np.array(digests),
-                features=np.stack([self._features[digest] for digest in digests]),
-            )
-        partial.replace(path)
+        features = np.stack([self._features[digest] for digest in digests])
+        write_atomically(
+            path, lambda file: np.savez(file, digests=np.array(digests), features=features)
+        )
         self._unsaved = []
 
     def _load(self, path: Path) -> None:

@@ -128,12 +128,12 @@ def test_info_reports_lost_data(invoke, tmp_path):
 
 
 def test_the_printed_configuration_reads_back_equal(invoke, tmp_path):
-    config = effective_config(None, ["lifting.tau=0.1", "output.surface_points=true"])
+    config = effective_config(None, ["lifting.tau=0.1", "output.include_surface_points=true"])
     path = tmp_path / "config.yaml"
     path.write_text(described_yaml(config))
     assert load_config(path) == config
     assert config.lifting.tau == 0.1
-    assert config.output.surface_points is True
+    assert config.output.include_surface_points is True
     result = invoke("config", "--config", path)
     assert result.stdout == described_yaml(config)
     for number, line in enumerate(result.stdout.splitlines()):
@@ -157,7 +157,11 @@ def test_single_settings_keep_the_type_of_their_field(setting, section, field, v
 
 
 def test_a_setting_of_the_wrong_type_is_refused():
-    for setting in ("relations.clip_length=many", "lifting.tau=yes", "output.surface_points=3"):
+    for setting in (
+        "relations.clip_length=many",
+        "lifting.tau=yes",
+        "output.include_surface_points=3",
+    ):
         with pytest.raises(ConfigurationError, match=setting.split("=")[0].split(".")[1]):
             effective_config(None, [setting])
 

@@ -14,6 +14,7 @@ from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.absence import HALF, LITTLE
 from deworldsg_ros.merging.absence import WHOLE as ALL
 from deworldsg_ros.merging.existence import Existence
+from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.graph import SceneGraph
 
 STEP_M = 0.05  # 4 degrees, seen from the cup
@@ -53,8 +54,8 @@ class Walk:
 
     def reload(self, path: Path) -> None:
         """Go on with the graph as it was saved, and nothing else."""
-        self.graph.save(path)
-        self.graph = SceneGraph.load(path)
+        graph_io.save(self.graph, path)
+        self.graph = graph_io.load(path)
         self.merging = SurfaceMerging(MergingConfig(association="surface"))
         self.merging.restore(self.graph, {})
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.relations import provenances
 
 from deworldsg_ros.relations.consistency import ORDERS, Consistency, contradictions
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_edges, visual_distribution
@@ -242,5 +243,5 @@ def test_the_gate_looks_at_each_direction_for_itself() -> None:
     prior = np.full((2, WIDTH), 1 / WIDTH)
     fused = fuse_edges(logits, np.ones(2, bool), prior, np.ones(2, bool), 0.5, 1.0)
     after = Consistency(PREDICATES).reconcile(BOTH, logits, np.ones(2, bool), fused)
-    assert after.provenances() == ["visual", "visual"]
+    assert provenances(after) == ["visual", "visual"]
     assert (after.entropies_nats == entropy_nats(visual_distribution(logits))).all()

@@ -8,17 +8,38 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import merging
 
-from deworldsg_ros.relations.evidence import bounded_logits
+from deworldsg_ros.config import Config, RelationsConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.relations.evidence import OUTLIER_RATE, bounded_logits
 
 rates = st.sampled_from([0.01, 0.1, 0.5, 0.9])
 
 
 @pytest.mark.parametrize("shape", [(0, 5), (3, 0), (3, 5)])
-def test_no_outliers_are_the_sum_of_the_paper(shape):
+def test_shapes_stay(shape):
     logits = np.random.default_rng(0).normal(size=shape)
-    assert bounded_logits(logits, 0.0) is logits
     assert bounded_logits(logits, 0.1).shape == shape
+
+
+@pytest.mark.parametrize(("edge_belief", "rate"), [("paper", None), ("robust", OUTLIER_RATE)])
+def test_the_option_chooses_the_logits_that_are_summed(edge_belief, rate):
+    local = merging.local_graph(
+        1,
+        np.zeros((2, 3)),
+        np.tile(np.eye(3), (2, 1, 1)),
+        np.full((2, 4), 0.25),
+        pairs=[(0, 1), (1, 0)],
+        logits=np.random.default_rng(0).normal(0, 5, (2, 3)),
+    )
+    config = Config(relations=RelationsConfig(edge_belief=edge_belief))
+    builder = GraphBuilder(config, merging.VOCABULARY, "world")
+    (a, b) = builder.integrate(local)
+    logits = local.relations.logits
+    expected = logits if rate is None else bounded_logits(logits, rate)
+    assert (builder.graph.edges[a, b].visual_logits == expected[0]).all()
+    assert (builder.graph.edges[b, a].visual_logits == expected[1]).all()
 
 
 @settings(max_examples=30, deadline=None)

@@ -94,7 +94,7 @@ def test_a_whole_number_is_a_number() -> None:
         ({"lifting.min_pixels": 10.5}, "expected int"),
         ({"inputs.reliability": "often"}, "expected one of auto, best_effort, reliable"),
         ({"inputs.world_up": True}, "put it in quotes"),
-        ({"output.surface_points": "yes"}, "expected bool"),
+        ({"output.include_surface_points": "yes"}, "expected bool"),
         ({"inputs.world_frame": 3}, "expected str"),
     ],
 )

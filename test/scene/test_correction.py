@@ -25,7 +25,7 @@ TOLERANCE_M = {"paper": 1e-9, "surface": 1e-3}
 def config(association: str) -> Config:
     return Config(
         merging=MergingConfig(association=association, confirm_observations=1),
-        output=OutputConfig(tentative_nodes=True),
+        output=OutputConfig(include_tentative=True),
     )
 
 

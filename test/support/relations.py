@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
+from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 
@@ -91,3 +94,41 @@ class GatedModel(RecordingModel):
         self.begun.release()
         assert self.allowed.acquire(timeout=30)
         return super().predict(request)
+
+
+@dataclass(frozen=True)
+class FusedEdge:
+    """Belief of one directed edge."""
+
+    probabilities: np.ndarray
+    provenance: str
+    entropy_nats: float
+
+
+def fuse_edge(visual_logits, prior, alpha, entropy_threshold_nats) -> FusedEdge | None:
+    """`fuse_edges` for one edge; None for logits or prior = there is none, None = no edge."""
+    known = visual_logits if visual_logits is not None else prior
+    if known is None:
+        return None
+    empty = np.zeros_like(known)
+    fused = fuse_edges(
+        (empty if visual_logits is None else visual_logits)[None],
+        np.array([visual_logits is not None]),
+        (empty if prior is None else prior)[None],
+        np.array([prior is not None]),
+        alpha,
+        entropy_threshold_nats,
+    )
+    if not fused.known[0]:
+        return None
+    return FusedEdge(fused.probabilities[0], provenances(fused)[0], float(fused.entropies_nats[0]))
+
+
+def provenances(fused: FusedEdges) -> list[str]:
+    return [PROVENANCES[code] for code in fused.provenance_codes.tolist()]
+
+
+def mean_of(prior: ClassPairPrior, subject_class: int, object_class: int) -> np.ndarray | None:
+    """The prior of one class pair; None if it has none."""
+    priors, has_prior = prior.lookup(np.array([[subject_class, object_class]]))
+    return priors[0] if has_prior[0] else None

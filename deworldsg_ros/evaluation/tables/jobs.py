@@ -14,6 +14,7 @@ import msgspec
 from deworldsg_ros import __version__
 from deworldsg_ros.evaluation.runner import GRAPH_FILE, ScanOutcome, ScanTask, evaluate_scan
 from deworldsg_ros.evaluation.tables.rows import Row
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 OUTCOME_FILE = "outcome.json"
@@ -112,10 +113,7 @@ def read_kept(folder: Path, wanted: str) -> ScanOutcome | None:
 
 def _keep(folder: Path, kept: _Kept) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f"{OUTCOME_FILE}.part"
-    partial.write_bytes(msgspec.json.encode(kept, enc_hook=_as_text))
-    # Whole or not at all, also when it is interrupted now.
-    partial.replace(folder / OUTCOME_FILE)
+    write_atomically(folder / OUTCOME_FILE, msgspec.json.encode(kept, enc_hook=_as_text))
 
 
 def _as_text(value: Any) -> str:

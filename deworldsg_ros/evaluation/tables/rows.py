@@ -130,8 +130,7 @@ SWITCHES = (
     ("rate", "missed looks not counted", ("merging.min_detection_rate=0.0",)),
     ("absent", "seen through, not lost", ("merging.absent_frames=0",)),
     ("rough", "no depth refinement", ("lifting.refine=false",)),
-    ("logits", "relation logits as they are", ("relations.outlier_rate=0.0",)),
-    ("ways", "directions may contradict", ("relations.consistent_directions=false",)),
+    ("belief", "the paper's edge belief", ("relations.edge_belief=paper",)),
 )
 SWITCH_CONDITIONS = (
     Condition("flip0", "no flips", flip=0.0),

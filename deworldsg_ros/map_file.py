@@ -1,0 +1,94 @@
+"""A graph as a map: a file from which a later run continues.
+
+It contains the graph, the state of merging, and the priors of class pairs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.files import check_writable
+from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
+from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.scene import graph_io
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.frame_graph import Vocabulary
+
+# Before the names of the arrays of merging.
+_MERGING = "merging."
+
+
+def write_map(builder: GraphBuilder, path: Path) -> None:
+    """Write a map.
+
+    Raises:
+        ConfigurationError: if it cannot be written; an older file is then still there.
+    """
+    prior = np.frombuffer(json.dumps(builder.prior.to_state()).encode(), np.uint8)
+    memory = {_MERGING + name: values for name, values in builder.merging.memory().items()}
+    arrays = graph_io.to_arrays(builder.graph.state())
+    with _writing(path):
+        graph_io.write(path, {**arrays, **memory, "prior": prior})
+
+
+def read_map(config: Config, path: Path) -> GraphBuilder:
+    """Continue with the graph of a map; the first `GraphBuilder.update` contains all of it.
+
+    Tentative nodes are dropped: they were never published.
+
+    Raises:
+        ConfigurationError: if the file is no map.
+    """
+    try:
+        return _read(config, path)
+    except (RefusedInput, KeyError, TypeError, ValueError, IndexError) as error:
+        reason = graph_io.reason_of(error).removeprefix(f"graph file {path}: ")
+        raise ConfigurationError(f"map {path} cannot be used: {reason}") from error
+
+
+def _read(config: Config, path: Path) -> GraphBuilder:
+    arrays = graph_io.read(path)
+    graph = graph_io.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
+    prior = ClassPairPrior.from_state(json.loads(arrays["prior"].tobytes()))
+    _check_prior(prior, graph.vocabulary)
+    for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
+        graph.remove_node(node_id)
+    graph.take_removals()
+    builder = GraphBuilder(config, graph.vocabulary, graph.frame_id, graph, prior)
+    memory = {
+        name.removeprefix(_MERGING): values
+        for name, values in arrays.items()
+        if name.startswith(_MERGING)
+    }
+    builder.merging.restore(graph, memory)
+    return builder
+
+
+def _check_prior(prior: ClassPairPrior, vocabulary: Vocabulary) -> None:
+    seen = prior.class_count, prior.predicate_count
+    expected = len(vocabulary.classes), len(vocabulary.predicates)
+    if seen != expected:
+        raise ValueError(
+            f"its priors are of {seen[0]} classes and {seen[1]} predicates: expected the graph's "
+            f"{expected[0]} and {expected[1]}"
+        )
+
+
+def check_map_writable(path: Path) -> None:
+    """Make a map's folder; raises ConfigurationError if the map could not be written there."""
+    with _writing(path):
+        check_writable(path)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigurationError(f"map {path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,78 @@
+"""Parallel arrays with compact rows, found by id."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from deworldsg_ros.scene.arrays import Int64
+
+_FIRST_CAPACITY = 64
+
+
+class Columns:
+    """n rows of several arrays. Row r of every array belongs to the id `ids[r]`.
+
+    Rows are compact: if a row is removed, the last row takes its place. So rows move and ids do
+    not. Each array is an attribute: a view of the live rows. Adding or removing a row replaces the
+    views, so do not keep them.
+
+    Args:
+        layout: dtype and shape of a row of each array, by name; ``ids`` is added.
+
+    Attributes:
+        ids: (n,) int64.
+    """
+
+    ids: Int64
+
+    def __init__(self, layout: Mapping[str, tuple[DTypeLike, tuple[int, ...]]]) -> None:
+        self._rows: dict[int, int] = {}
+        self._storage: dict[str, NDArray[Any]] = {
+            name: np.zeros((_FIRST_CAPACITY, *shape), dtype)
+            for name, (dtype, shape) in {"ids": (np.int64, ()), **layout}.items()
+        }
+        self._show(0)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __contains__(self, node_id: object) -> bool:
+        return node_id in self._rows
+
+    def row(self, node_id: int) -> int:
+        """The present row of an id; KeyError if there is none."""
+        try:
+            return self._rows[node_id]
+        except KeyError:
+            raise KeyError(f"node {node_id} is not in the graph") from None
+
+    def append(self, node_id: int) -> int:
+        """Add a row of zeros for a new id and return it."""
+        row = len(self._rows)
+        if row == len(self._storage["ids"]):
+            for name, column in self._storage.items():
+                self._storage[name] = np.concatenate((column, np.zeros_like(column)))
+        for column in self._storage.values():
+            column[row] = 0
+        self._rows[node_id] = row
+        self._show(row + 1)
+        self.ids[row] = node_id
+        return row
+
+    def remove(self, node_id: int) -> None:
+        """Remove a row; the last row takes its place."""
+        row, last = self.row(node_id), len(self._rows) - 1
+        moved = int(self.ids[last])
+        for column in self._storage.values():
+            column[row] = column[last]
+        self._rows[moved] = row
+        del self._rows[node_id]
+        self._show(last)
+
+    def _show(self, count: int) -> None:
+        for name, column in self._storage.items():
+            setattr(self, name, column[:count])
