@@ -203,5 +203,5 @@ def test_the_node_applies_corrections_and_refuses_what_it_cannot(graph_bench) ->
     at.refuses("invalid_pose", lambda: send(lambda stamp_ns: pose(stamp_ns, float("nan"))))
     send(lambda stamp_ns: pose(stamp_ns, 0.5))
     at.expect(lambda: at.node.more_values().get("pose corrections") == "1", "the correction")
-    assert at.node.more_values()["nodes moved by them"] == "1"
+    assert at.node.more_values()["nodes moved by corrections"] == "1"
     works(at, lambda: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
