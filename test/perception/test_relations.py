@@ -14,12 +14,9 @@ from support.perception import (
     segmented,
 )
 
-from deworldsg_ros.perception.backends.geometric import (
-    CEILING_LOGIT,
-    FLOOR_LOGIT,
-    GeometricRelationHead,
-)
+from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.geometry.layout import upright_axes
+from deworldsg_ros.perception.geometry.predicates import CEILING_LOGIT, FLOOR_LOGIT
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, SCANNET_PREDICATES
 
 SHELF = Slab((-0.5, 2.6, 0.75), (0.5, 2.95, 1.05), (90, 90, 100))

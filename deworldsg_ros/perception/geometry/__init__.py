@@ -1,1 +1,1 @@
-"""Metric layout of the objects of one frame."""
+"""Relations from geometry: `layout` measures the objects of a frame, `predicates` judges pairs."""

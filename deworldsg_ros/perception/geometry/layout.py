@@ -1,4 +1,4 @@
-"""Where the objects of a frame are, relative to each other and to gravity."""
+"""Metric layout of the objects of one frame: bounds in an upright frame, and pairwise distances."""
 
 from __future__ import annotations
 
@@ -10,58 +10,58 @@ from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 
+# The bounds are quantiles, which more points hardly change; the time grows with the points.
 POINTS_PER_OBJECT = 256
-# An object of fewer points with depth has no place.
+# The bounds of an object with fewer points are not reliable.
 MIN_POINTS = 10
-# Bounds leave out this share of the points at either end: a few flying pixels must not stretch an
-# object.
-LOW_SHARE = 0.04
-# The surface an object rests on is looked for within this distance of its own outline.
+# Bounds leave out this fraction of the points at either end, because of flying pixels.
+OUTLIER_FRACTION = 0.04
+# An object rests on a surface within this horizontal distance of its own bounds.
 SUPPORT_MARGIN_M = 0.08
-# Of a cabinet one sees the front: its footprint goes on behind it.
+# The camera sees only the front of furniture; its footprint extends this far behind it.
 HIDDEN_DEPTH_M = 0.15
+# Keeps fractions of a footprint finite.
+MIN_FOOTPRINT_M2 = 1e-6
 
 
 @dataclass(frozen=True)
 class Layout:
     """Metric layout of n objects; axes 0 and 1 are horizontal, 2 is up.
 
+    In (n, n) arrays the row is object i and the column is object j.
+
     Attributes:
         valid: (n,) bool, has enough points.
         low, high: (n, 3) metres, robust bounds.
-        contact_m: (n, n) distance in height from the bottom of i to the nearest surface of j
-            below or around i; inf where j has nothing there.
-        above_share: (n, n) share of the smaller footprint that the footprints of i and j share.
-        deep_share: the same, with every footprint grown by the depth that cannot be seen.
-        gap_m: (n, n) horizontal distance between the bounds; 0 where they overlap.
-        clearance_m: (n, n) height of the bottom of i over the top of j; negative = overlap.
-        covered: (n, n) share of the footprint of i that lies inside that of j.
+        contact_m: (n, n) vertical distance from the bottom of i to the nearest surface of j below
+            or around i; inf if j has none there.
+        shared: (n, n) overlap of the footprints, as a fraction of the smaller one.
+        shared_deep: (n, n) the same for footprints that are extended by the hidden depth.
+        covered: (n, n) fraction of the footprint of i inside that of j.
+        gap_m: (n, n) horizontal distance between the bounds; 0 if they overlap.
+        clearance_m: (n, n) height of the bottom of i over the top of j; negative if it is lower.
     """
 
     valid: Bool
     low: Float64
     high: Float64
     contact_m: Float64
-    above_share: Float64
-    deep_share: Float64
+    shared: Float64
+    shared_deep: Float64
+    covered: Float64
     gap_m: Float64
     clearance_m: Float64
-    covered: Float64
 
 
 def measure_layout(
-    depth_m: Float32,
-    intrinsics: Intrinsics,
-    instances: UInt16,
-    count: int,
-    up_camera: Float64,
+    depth_m: Float32, intrinsics: Intrinsics, instances: UInt16, count: int, up_camera: Float64
 ) -> Layout:
-    """The layout of the objects 1..count of a label image.
+    """Layout of the objects 1..count of an instance image.
 
     Args:
-        depth_m: (H, W) metres; 0 = invalid.
+        depth_m: (H, W) float32, metres; 0 = invalid.
         intrinsics: of the depth.
-        instances: (H, W) uint16 labels.
+        instances: (H, W) uint16.
         count: number of objects.
         up_camera: (3,) unit vector against gravity, camera frame.
     """
@@ -70,51 +70,31 @@ def measure_layout(
     z = depth_m[v, u].astype(np.float64)
     x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z
     points = np.stack([x, y, z], axis=1) @ upright_axes(up_camera).T
-    low, high = np.zeros((count, 3)), np.zeros((count, 3))
-    starts = np.searchsorted(owners, np.arange(count + 1))
-    valid = np.diff(starts) >= MIN_POINTS
-    for row in np.flatnonzero(valid):
-        own = np.sort(points[starts[row] : starts[row + 1]], axis=0)
-        low[row] = own[round(LOW_SHARE * (len(own) - 1))]
-        high[row] = own[round((1.0 - LOW_SHARE) * (len(own) - 1))]
-        # What this cuts off an evenly covered surface, given back. Not in height: most of what
-        # one sees of a plate or a table is at one height.
-        trimmed = (high[row, :2] - low[row, :2]) * LOW_SHARE / (1.0 - 2.0 * LOW_SHARE)
-        low[row, :2] -= trimmed
-        high[row, :2] += trimmed
-    overlap = np.clip(
-        np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None]), 0.0, None
-    )
+    low, high, valid = _bounds(points, owners, count)
     separation = np.clip(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
     )
-    deep_low, deep_high = low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M
-    deep = (deep_high - deep_low).prod(axis=1)
-    deep_shared = np.clip(
-        np.minimum(deep_high[:, None], deep_high[None])
-        - np.maximum(deep_low[:, None], deep_low[None]),
-        0.0,
-        None,
-    ).prod(axis=2)
-    footprint = np.maximum((high - low)[:, :2].prod(axis=1), 1e-6)
-    shared = overlap[..., :2].prod(axis=2)
+    area, shared = _footprints(low[:, :2], high[:, :2])
+    area = np.maximum(area, MIN_FOOTPRINT_M2)
+    deep, deep_shared = _footprints(low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M)
     return Layout(
         valid=valid,
         low=low,
         high=high,
-        contact_m=_contacts(points, owners, low, high, valid, count),
-        above_share=shared / np.minimum(footprint[:, None], footprint[None]),
-        deep_share=deep_shared / np.minimum(deep[:, None], deep[None]),
+        contact_m=_contacts(points, owners, low, high, valid),
+        shared=shared / np.minimum(area[:, None], area[None]),
+        shared_deep=deep_shared / np.minimum(deep[:, None], deep[None]),
+        covered=shared / area[:, None],
         gap_m=np.hypot(separation[..., 0], separation[..., 1]),
         clearance_m=low[:, None, 2] - high[None, :, 2],
-        covered=shared / footprint[:, None],
     )
 
 
 def upright_axes(up_camera: Float64) -> Float64:
-    """Rotation (3, 3) from the camera frame into one whose third axis is up."""
+    """Rotation (3, 3) from the camera frame to a frame whose axis 2 is up."""
     up = np.asarray(up_camera, dtype=np.float64) / np.linalg.norm(up_camera)
-    # The viewing direction, levelled; the image's downward axis where the camera looks along up.
+    # Axis 1 is the viewing direction, made horizontal. A camera that looks straight up or down
+    # has none; then axis 1 is the image's downward direction.
     forward = np.array([0.0, 0.0, 1.0])
     if abs(up[2]) > 0.95:
         forward = np.array([0.0, 1.0, 0.0])
@@ -125,9 +105,9 @@ def upright_axes(up_camera: Float64) -> Float64:
 
 @kernel
 def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple[Int64, Int64]:
-    """Pixels (k, 2) as row, column, and the row of their object, in the order of the objects.
+    """Pixels (k, 2) as row and column, and their object (k,) from 0, in the order of the objects.
 
-    Of an object with many pixels, `most` that are evenly spread in scan order.
+    At most `most` pixels of an object, evenly spread in scan order.
     """
     height, width = instances.shape
     sizes = np.zeros(count, np.int64)
@@ -147,26 +127,50 @@ def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple
             if not (0 < label <= count and 0 < depth_m[y, x] < np.inf):
                 continue
             row = label - 1
-            share = min(sizes[row], most)
-            # The n-th of `share` is the first pixel beyond n / share of the object.
-            if seen[row] * share >= taken[row] * sizes[row]:
-                place = ends[row] - share + taken[row]
-                pixels[place, 0], pixels[place, 1] = y, x
-                owners[place] = row
+            quota = min(sizes[row], most)
+            # The n-th of `quota` samples is the first pixel past the fraction n / quota.
+            if seen[row] * quota >= taken[row] * sizes[row]:
+                slot = ends[row] - quota + taken[row]
+                pixels[slot, 0], pixels[slot, 1] = y, x
+                owners[slot] = row
                 taken[row] += 1
             seen[row] += 1
     return pixels, owners
 
 
-def _contacts(
-    points: Float64,
-    owners: Int64,
-    low: Float64,
-    high: Float64,
-    valid: Bool,
-    count: int,
-) -> Float64:
-    contact = np.full((count, count), np.inf)
+def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float64, Bool]:
+    """Robust bounds (count, 3) of each object's points, 0 if it has too few; (count,) has enough.
+
+    Args:
+        points: (k, 3) upright frame, metres.
+        owners: (k,) ascending object of each point.
+        count: number of objects.
+    """
+    low, high = np.zeros((count, 3)), np.zeros((count, 3))
+    starts = np.searchsorted(owners, np.arange(count + 1))
+    valid = np.diff(starts) >= MIN_POINTS
+    for row in np.flatnonzero(valid):
+        own = np.sort(points[starts[row] : starts[row + 1]], axis=0)
+        low[row] = own[round(OUTLIER_FRACTION * (len(own) - 1))]
+        high[row] = own[round((1.0 - OUTLIER_FRACTION) * (len(own) - 1))]
+        # Give back the part of an evenly covered surface that the quantiles cut off. Not in
+        # height: most visible points of a plate or a table are at one height.
+        width = high[row, :2] - low[row, :2]
+        trimmed = width * OUTLIER_FRACTION / (1.0 - 2.0 * OUTLIER_FRACTION)
+        low[row, :2] -= trimmed
+        high[row, :2] += trimmed
+    return low, high, valid
+
+
+def _footprints(low: Float64, high: Float64) -> tuple[Float64, Float64]:
+    """Areas (n,) of rectangles with corners (n, 2), and areas (n, n) that two have in common."""
+    sides = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
+    return (high - low).prod(axis=1), np.clip(sides, 0.0, None).prod(axis=2)
+
+
+def _contacts(points: Float64, owners: Int64, low: Float64, high: Float64, valid: Bool) -> Float64:
+    """`Layout.contact_m`."""
+    contact = np.full((len(low), len(low)), np.inf)
     for row in np.flatnonzero(valid):
         around = (
             (points[:, :2] > low[row, :2] - SUPPORT_MARGIN_M)
