@@ -1,1 +1,3 @@
-"""Backends, one model a file."""
+"""Detectors (`nanodet`, `rtdetr`), segmenters (`rgbd`, `sam2`, `sam`), relation heads
+(`geometric`, `egtr`): one module each.
+"""

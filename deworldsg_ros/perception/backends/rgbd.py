@@ -6,9 +6,9 @@ import numpy as np
 
 from deworldsg_ros.kernels import read_only
 from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception.superpixels.box_cut import cut_boxes
 from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
-from deworldsg_ros.perception.superpixels.region_cut import cut_boxes
-from deworldsg_ros.perception.superpixels.superpixels import cut_regions, reduce_frame
+from deworldsg_ros.perception.superpixels.regions import find_regions, reduce_frame
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
@@ -43,7 +43,7 @@ class RgbdSegmenter:
         height, width = depth_m.shape
         stride = max(1, round(width / TARGET_WIDTH))
         cells = reduce_frame(rgb, depth_m, intrinsics, stride)
-        regions = cut_regions(cells)
+        regions = find_regions(cells)
         rows, columns = regions.labels.shape
         limits = np.array([columns - 1, rows - 1] * 2)
         boxes_cells = np.clip(np.round(boxes_xyxy) // stride, 0, limits).astype(np.int64)

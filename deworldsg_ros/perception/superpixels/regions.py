@@ -1,12 +1,13 @@
-"""A reduced RGB-D image cut into small regions of one surface and one colour.
+"""Regions of an RGB-D image: small, of one surface and one colour.
 
-Felzenszwalb and Huttenlocher's graph-based segmentation (2004) on edge weights of colour, depth
-and surface direction, and the adjacency of its regions.
+Felzenszwalb and Huttenlocher's graph-based segmentation (2004) of a reduced image, with edge
+weights of colour, depth and surface direction; and the adjacency of its regions.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,32 +16,39 @@ from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
-# Differences between neighbouring cells that count 1, of CIE Lab colour (8-bit scale), of depth
-# relative to depth, and of 1 - cos of the angle between normals.
+# An edge weight is the root of summed squares. Each of these differences between neighbouring cells
+# counts 1: CIE Lab colour, 8-bit scale; depth, relative to the depth; 1 - cos of the angle between
+# normals. Chosen with the others below on every 16th frame of two rendered rooms
+# (bench/segmenter_iou.py).
 COLOUR_STEP = 8.0
 DEPTH_STEP = 0.015
 NORMAL_STEP = 1.0
-# A border between a cell with depth and one without says little.
+# Weight of an edge between a cell with depth and one without. Holes in the depth also occur within
+# a surface, so it is below 1.
 HOLE_STEP = 0.55
-# Felzenszwalb's k: the larger, the coarser.
+# Felzenszwalb's k, cells: larger regions for a larger value.
 COARSENESS = 4.0
+# Smaller regions join their most similar neighbour.
 MIN_CELLS = 3
-# Beyond this, and NaN, is no depth.
+# Larger depths, and NaN, are invalid; the limit keeps the arithmetic of points finite.
 MAX_DEPTH_M = 1000.0
+# The slope of the depth is measured this far to either side, against the noise of the sensor.
+SLOPE_REACH_CELLS = 2
+# Counting sort of the edge weights: 64 bins per unit; differences below 1/64 do not matter.
+BINS_PER_UNIT = 64.0
 WEIGHT_BINS = 512
-BINS_A_UNIT = 64.0
 
 
 @dataclass(frozen=True)
 class Cells:
-    """The reduced image (h, w), one cell for `stride` x `stride` pixels.
+    """The reduced image (h, w): each cell stands for `stride` x `stride` pixels.
 
     Attributes:
-        stride: pixels a cell; cell (y, x) covers pixels from (y stride, x stride).
+        stride: pixels per cell; cell (y, x) covers pixels from (y stride, x stride).
         rgb: (h, w, 3) uint8, mean colour.
-        lab: (h, w, 3) float32, the same in CIE Lab, 8-bit scale.
-        points: (h, w, 3) float32, metres, camera frame; 0 where depth is invalid.
-        normals: (h, w, 3) float32, unit, towards the camera.
+        lab: (h, w, 3) float32, mean colour in CIE Lab, 8-bit scale.
+        points: (h, w, 3) float32, metres, camera frame; 0 if the depth is invalid.
+        normals: (h, w, 3) float32, unit, towards the camera; 0 if the depth is invalid.
     """
 
     stride: int
@@ -50,20 +58,19 @@ class Cells:
     normals: Float32
 
 
-@dataclass(frozen=True)
-class Regions:
-    """Regions of a reduced image (c regions, m adjacent pairs).
+class Regions(NamedTuple):
+    """Regions of a reduced image (c regions, m adjacent pairs); a tuple, as kernels take it.
 
     Attributes:
-        labels: (h, w) int32 from 0.
-        area: (c,) cells.
-        lab: (c, 3) mean colour.
-        valid: (c,) cells with depth.
-        point: (c, 3) mean point, metres.
-        normal: (c, 3) mean normal, unit.
-        flatness: (c,) length of the mean of the unit normals; 1 = flat.
-        pairs: (m, 2) int32 adjacent regions.
-        strength: (m,) mean edge weight along the border.
+        labels: (h, w) int32, region of each cell, from 0.
+        area: (c,) float64, cells.
+        lab: (c, 3) float64, mean colour in CIE Lab.
+        valid: (c,) float64, cells with depth.
+        point: (c, 3) float64, mean point, metres, camera frame.
+        normal: (c, 3) float64, mean normal, unit.
+        flatness: (c,) float64, length of the mean of the unit normals; 1 = flat.
+        pairs: (m, 2) int32, adjacent regions.
+        strength: (m,) float64, mean edge weight along the border.
     """
 
     labels: Int32
@@ -78,7 +85,14 @@ class Regions:
 
 
 def reduce_frame(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics, stride: int) -> Cells:
-    """The cells of a frame: mean colour, median depth, normals by plane gradients."""
+    """The cells of a frame: mean colour, median depth, normals from the slope of the depth.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32, metres; 0, NaN or infinity = invalid.
+        intrinsics: of both images.
+        stride: pixels per cell.
+    """
     height, width = depth_m.shape[0] // stride, depth_m.shape[1] // stride
     middle = slice(stride // 2, None, stride)
     smooth = np.asarray(cv2.blur(rgb, (stride, stride)), dtype=np.uint8)
@@ -94,10 +108,10 @@ def reduce_frame(rgb: UInt8, depth_m: Float32, intrinsics: Intrinsics, stride: i
     return Cells(stride, mean, lab, points, normals)
 
 
-def cut_regions(cells: Cells) -> Regions:
+def find_regions(cells: Cells) -> Regions:
     """The regions of a reduced image and their adjacency."""
     weights = _edge_weights(cells.lab, cells.points, cells.normals)
-    labels, count = _merge(weights, COARSENESS, MIN_CELLS)
+    labels, count = _merge(weights)
     sums = _region_sums(labels, count, cells.lab, cells.points, cells.normals)
     area, valid = sums[:, 0], sums[:, 4]
     normal_length = np.linalg.norm(sums[:, 8:11], axis=1)
@@ -119,10 +133,17 @@ def cut_regions(cells: Cells) -> Regions:
 def _geometry(
     z: Float32, smooth: Float32, columns: Float32, rows: Float32
 ) -> tuple[Float32, Float32]:
+    """Points and normals (h, w, 3) of the cells.
+
+    Args:
+        z: (h, w) float32, metres; 0 = invalid.
+        smooth: (h, w) float32, the same, smoothed for the slope.
+        columns: (w,) float32, x of the cells on the image plane at 1 m.
+        rows: (h,) float32, y of the cells on the image plane at 1 m.
+    """
     height, width = z.shape
     points = np.zeros((height, width, 3), np.float32)
     normals = np.zeros((height, width, 3), np.float32)
-    reach = 2
     step_x = columns[1] - columns[0]
     step_y = rows[1] - rows[0]
     for y in range(height):
@@ -133,11 +154,11 @@ def _geometry(
             points[y, x, 0] = columns[x] * depth
             points[y, x, 1] = rows[y] * depth
             points[y, x, 2] = depth
-            left, right = max(x - reach, 0), min(x + reach, width - 1)
-            top, bottom = max(y - reach, 0), min(y + reach, height - 1)
+            left, right = max(x - SLOPE_REACH_CELLS, 0), min(x + SLOPE_REACH_CELLS, width - 1)
+            top, bottom = max(y - SLOPE_REACH_CELLS, 0), min(y + SLOPE_REACH_CELLS, height - 1)
             slope_x = (smooth[y, right] - smooth[y, left]) / ((right - left) * step_x)
             slope_y = (smooth[bottom, x] - smooth[top, x]) / ((bottom - top) * step_y)
-            # Gradient of the depth over the image plane at distance 1.
+            # Normal of the plane with this gradient of the depth over the image plane at 1 m.
             a, b = slope_x, slope_y
             c = -(depth + columns[x] * slope_x + rows[y] * slope_y)
             length = np.sqrt(a * a + b * b + c * c) + 1e-12
@@ -149,35 +170,43 @@ def _geometry(
 
 @kernel
 def _edge_weights(lab: Float32, points: Float32, normals: Float32) -> Float32:
+    """(2, h, w): weights of the edges to the cells on the right and below; inf at the border."""
     height, width = lab.shape[:2]
     weights = np.full((2, height, width), np.float32(np.inf))
     for y in range(height):
         for x in range(width):
-            for direction in range(2):
-                v = y + direction
-                u = x + 1 - direction
-                if v >= height or u >= width:
-                    continue
-                square = np.float32(0.0)
-                for k in range(3):
-                    d = (lab[y, x, k] - lab[v, u, k]) / np.float32(COLOUR_STEP)
-                    square += d * d
-                here, there = points[y, x, 2], points[v, u, 2]
-                if here > 0 and there > 0:
-                    d = (here - there) / (np.float32(DEPTH_STEP) * min(here, there))
-                    square += d * d
-                    cosine = np.float32(0.0)
-                    for k in range(3):
-                        cosine += normals[y, x, k] * normals[v, u, k]
-                    square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
-                elif here > 0 or there > 0:
-                    square += np.float32(HOLE_STEP * HOLE_STEP)
-                weights[direction, y, x] = np.sqrt(square)
+            if x + 1 < width:
+                weights[0, y, x] = _edge_weight(lab, points, normals, y, x, y, x + 1)
+            if y + 1 < height:
+                weights[1, y, x] = _edge_weight(lab, points, normals, y, x, y + 1, x)
     return weights
 
 
 @kernel
+def _edge_weight(
+    lab: Float32, points: Float32, normals: Float32, y: int, x: int, v: int, u: int
+) -> float:
+    """Weight of the edge between the cells (y, x) and (v, u)."""
+    square = np.float32(0.0)
+    for k in range(3):
+        d = (lab[y, x, k] - lab[v, u, k]) / np.float32(COLOUR_STEP)
+        square += d * d
+    here, there = points[y, x, 2], points[v, u, 2]
+    if here > 0 and there > 0:
+        d = (here - there) / (np.float32(DEPTH_STEP) * min(here, there))
+        square += d * d
+        cosine = np.float32(0.0)
+        for k in range(3):
+            cosine += normals[y, x, k] * normals[v, u, k]
+        square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
+    elif here > 0 or there > 0:
+        square += np.float32(HOLE_STEP * HOLE_STEP)
+    return np.sqrt(square)  # type: ignore[no-any-return]
+
+
+@kernel
 def _root(parent: Int32, node: int) -> int:
+    """Root of a cell in the union-find forest; halves the path on the way."""
     while parent[node] != node:
         parent[node] = parent[parent[node]]
         node = parent[node]
@@ -185,32 +214,22 @@ def _root(parent: Int32, node: int) -> int:
 
 
 @kernel
-def _merge(weights: Float32, coarseness: float, min_cells: int) -> tuple[Int32, int]:
+def _merge(weights: Float32) -> tuple[Int32, int]:
+    """Labels (h, w) int32 of the regions, from 0, and their number.
+
+    Edge `i` of the flat weights joins cell `i` and the one on its right, or, in the second half,
+    cell `i - cells` and the one below.
+    """
     _, height, width = weights.shape
     cells = height * width
     flat = weights.reshape(2 * cells)
-    # Counting sort: the order within 1/64 of a step does not matter.
-    start = np.zeros(WEIGHT_BINS + 1, np.int32)
-    bins = np.empty(2 * cells, np.int16)
-    for edge in range(2 * cells):
-        weight = flat[edge]
-        if weight == np.inf:
-            bins[edge] = -1
-            continue
-        bins[edge] = min(int(weight * BINS_A_UNIT), WEIGHT_BINS - 1)
-        start[bins[edge] + 1] += 1
-    for b in range(WEIGHT_BINS):
-        start[b + 1] += start[b]
-    total = start[WEIGHT_BINS]
-    order = np.empty(total, np.int32)
-    for edge in range(2 * cells):
-        if bins[edge] >= 0:
-            order[start[bins[edge]]] = edge
-            start[bins[edge]] += 1
+    order = _order_edges(flat)
+    total = len(order)
     parent = np.arange(cells).astype(np.int32)
     size = np.ones(cells, np.int32)
     internal = np.zeros(cells, np.float32)
-    # First by strength; then what stayed too small joins its most similar neighbour.
+    # The first sweep joins similar cells. The second joins each region that is still too small
+    # with its most similar neighbour.
     for sweep in range(2):
         left = 0
         for i in range(total):
@@ -223,10 +242,10 @@ def _merge(weights: Float32, coarseness: float, min_cells: int) -> tuple[Int32, 
             weight = flat[edge]
             if sweep == 0:
                 join = weight <= min(
-                    internal[a] + coarseness / size[a], internal[b] + coarseness / size[b]
+                    internal[a] + COARSENESS / size[a], internal[b] + COARSENESS / size[b]
                 )
             else:
-                join = size[a] < min_cells or size[b] < min_cells
+                join = size[a] < MIN_CELLS or size[b] < MIN_CELLS
             if not join:
                 order[left] = edge
                 left += 1
@@ -237,22 +256,52 @@ def _merge(weights: Float32, coarseness: float, min_cells: int) -> tuple[Int32, 
             size[a] += size[b]
             internal[a] = weight
         total = left
-    labels = np.empty(cells, np.int32)
-    number = np.full(cells, -1, np.int32)
+    labels, count = _number_regions(parent)
+    return labels.reshape(height, width), count
+
+
+@kernel
+def _order_edges(flat: Float32) -> Int32:
+    """Indices of the finite weights, in ascending order up to the bin width."""
+    start = np.zeros(WEIGHT_BINS + 1, np.int32)
+    bins = np.empty(len(flat), np.int16)
+    for edge in range(len(flat)):
+        weight = flat[edge]
+        if weight == np.inf:
+            bins[edge] = -1
+            continue
+        bins[edge] = min(int(weight * BINS_PER_UNIT), WEIGHT_BINS - 1)
+        start[bins[edge] + 1] += 1
+    for b in range(WEIGHT_BINS):
+        start[b + 1] += start[b]
+    order = np.empty(start[WEIGHT_BINS], np.int32)
+    for edge in range(len(flat)):
+        if bins[edge] >= 0:
+            order[start[bins[edge]]] = edge
+            start[bins[edge]] += 1
+    return order
+
+
+@kernel
+def _number_regions(parent: Int32) -> tuple[Int32, int]:
+    """Region of each cell, numbered from 0 in scan order, and the number of regions."""
+    labels = np.empty(len(parent), np.int32)
+    number = np.full(len(parent), -1, np.int32)
     count = 0
-    for cell in range(cells):
+    for cell in range(len(parent)):
         root = _root(parent, cell)
         if number[root] < 0:
             number[root] = count
             count += 1
         labels[cell] = number[root]
-    return labels.reshape(height, width), count
+    return labels, count
 
 
 @kernel
 def _region_sums(
     labels: Int32, count: int, lab: Float32, points: Float32, normals: Float32
 ) -> Float64:
+    """(count, 11) sums per region: cells; Lab (3); cells with depth; points (3); normals (3)."""
     sums = np.zeros((count, 11))
     height, width = labels.shape
     for y in range(height):
@@ -271,6 +320,7 @@ def _region_sums(
 
 @kernel
 def _adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
+    """Adjacent regions (m, 2), and the mean edge weight (m,) along each border."""
     height, width = labels.shape
     keys = np.empty(2 * height * width, np.int64)
     values = np.empty(2 * height * width, np.float32)
