@@ -1,1 +1,3 @@
-"""A scene graph for people: tables, a picture, a page with the 3D view, markers for RViz."""
+"""Views of a scene graph: `table` for the terminal, `picture` from above as a PNG, `page` with a 3D
+view as HTML, `markers` for RViz and Foxglove.
+"""

@@ -1,4 +1,4 @@
-"""One colour a class, the same in every view, and the same while a graph grows."""
+"""One colour per class: the same in every view, and stable while a graph grows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PALETTE = (
 PREDICATE_PALETTE = (
     "#2f6fab", "#c2571a", "#2e8b57", "#8a4fbf", "#b8336a", "#8a7a1f", "#1f8a8a", "#7a4a2b",
 )  # fmt: skip
-# Said of so many pairs that its arrows should stay in the background.
+# So frequent that its arrows are grey.
 QUIET = frozenset({"near"})
 GREY = "#8d93a5"
 
@@ -24,8 +24,8 @@ GREY = "#8d93a5"
 def class_colours(labels: Iterable[str]) -> dict[str, str]:
     """#rrggbb of each label.
 
-    A label has a preferred colour of its own; the next free one where that is taken by a label
-    that came before it. In the order of node ids, a colour thus stays when new labels turn up.
+    A label has a preferred colour; if an earlier label uses it, the next free one is taken. With
+    labels in the order of node ids, a new label changes no colour.
     """
     colours: dict[str, str] = {}
     for label in labels:
@@ -39,13 +39,13 @@ def class_colours(labels: Iterable[str]) -> dict[str, str]:
 
 
 def to_rgb(colour: str) -> Rgb:
-    """#rrggbb as three values from 0 to 1."""
+    """Red, green and blue from 0 to 1, of #rrggbb."""
     red, green, blue = (int(colour[at : at + 2], 16) / 255 for at in (1, 3, 5))
     return red, green, blue
 
 
 def predicate_colours(counts: Mapping[str, int]) -> dict[str, str]:
-    """#rrggbb of each predicate, the most frequent first; those beyond the palette are grey."""
+    """#rrggbb of each predicate, most frequent first; grey beyond the palette."""
     ordered = sorted(counts, key=lambda name: (-counts[name], name))
     colours = dict.fromkeys(ordered, GREY)
     loud = [name for name in ordered if name not in QUIET]
@@ -54,5 +54,5 @@ def predicate_colours(counts: Mapping[str, int]) -> dict[str, str]:
 
 
 def shade(colour: str, factor: float) -> str:
-    """A darker colour: #rrggbb times a factor below one."""
+    """A darker #rrggbb: each channel times a factor below one."""
     return "#" + "".join(f"{round(255 * factor * value):02x}" for value in to_rgb(colour))

@@ -1,4 +1,4 @@
-"""What the views share: axes of ellipsoids, the top view's axes, the edges worth drawing."""
+"""Geometry of all views: axes of ellipsoids, axes of the top view, edges to draw."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 
-# Ellipses and ellipsoids are drawn at this many standard deviations.
+# Size of ellipses and ellipsoids, in standard deviations.
 SIGMAS = 2.0
 
-# Relations that hold both ways, as far as a drawing is concerned: one line is enough.
+# Symmetric relations: one line shows both directions.
 MUTUAL = frozenset({"near", "close by", "next to", "with", "against", "and"})
 
 
@@ -35,15 +35,18 @@ def principal_axes(covariance: Float64) -> tuple[Float64, Float64]:
 def view_axes(up_world: Sequence[float] | Float64) -> Float64:
     """Axes of a view from above: (3, 3), rows right, forward and up, right-handed.
 
-    Right is the world's x axis as far as that is level.
+    Right is the horizontal part of the world's x axis, or of its y axis where x points up.
 
     Args:
-        up_world: (3,) direction that points up in the world frame, not zero.
+        up_world: (3,) direction that points up in the world frame.
+
+    Raises:
+        ValueError: for another shape, a length of zero, or values that are not finite.
     """
     up = np.asarray(up_world, np.float64)
     norm = float(np.linalg.norm(up)) if up.shape == (3,) else 0.0
     if not np.isfinite(norm) or norm < 1e-9:
-        raise ValueError(f"up direction {up.tolist()}: wanted three values that are not all zero")
+        raise ValueError(f"up direction {up.tolist()}: expected three finite values, not all zero")
     up = up / norm
     seed = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     right = seed - (seed @ up) * up
@@ -52,17 +55,17 @@ def view_axes(up_world: Sequence[float] | Float64) -> Float64:
 
 
 def means_of(graph: wire.SceneGraphMessage) -> Float64:
-    """(n, 3) metres, world frame."""
+    """Means of the nodes: (n, 3) metres, world frame."""
     return np.array([node.mean_m for node in graph.nodes], np.float64).reshape(-1, 3)
 
 
 def covariances_of(graph: wire.SceneGraphMessage) -> Float64:
-    """(n, 3, 3) square metres, world frame."""
+    """Covariances of the nodes: (n, 3, 3) square metres, world frame."""
     return np.array([node.covariance_m2 for node in graph.nodes], np.float64).reshape(-1, 3, 3)
 
 
 def drawable_edges(graph: wire.SceneGraphMessage) -> list[wire.EdgeState]:
-    """Edges whose both ends are in the graph, one of two that say the same the other way round."""
+    """Edges with both ends in the graph; of two opposite symmetric ones the more probable."""
     known = {node.id for node in graph.nodes}
     best: dict[tuple[int, int, str], wire.EdgeState] = {}
     for edge in graph.edges:

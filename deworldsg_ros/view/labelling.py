@@ -1,6 +1,6 @@
-"""Where to put labels so that they do not cover one another: greedy, then improved in sweeps.
+"""Positions of labels that do not overlap: greedy, then improved in sweeps.
 
-Everything is in pixels of the picture, y upwards; boxes are x1, y1, x2, y2.
+All coordinates are pixels of the picture, y upwards; boxes are x1, y1, x2, y2.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64
 
+# Candidates of a label: a ring of directions at each distance from its anchor.
 DIRECTIONS = 16
 DISTANCES_PX = (9.0, 18.0, 30.0, 45.0, 62.0, 85.0, 112.0, 145.0)
+# More sweeps over a room of 90 labels change nothing.
 SWEEPS = 3
 
+# Costs of a candidate: per px² of overlap, px outside the frame, covered anchor, px of distance.
 OVERLAP_COST, OUTSIDE_COST, ANCHOR_COST, DISTANCE_COST = 6.0, 50.0, 60.0, 1.6
+# Text boxes include a margin: an overlap of this area is not visible.
 FREE_OVERLAP_PX2 = 4.0
 
 
@@ -34,22 +38,27 @@ class Placement:
     @property
     def boxes(self) -> Float64:
         """(n, 4) float64."""
-        return np.hstack([self.centres - self.sizes / 2, self.centres + self.sizes / 2])
+        return boxes_at(self.centres, self.sizes)
+
+
+def boxes_at(centres: Float64, sizes: Float64) -> Float64:
+    """(n, 4) boxes of centres (n, 2) and sizes (n, 2); or (4,) of (2,) and (2,)."""
+    return np.hstack([centres - sizes / 2, centres + sizes / 2])
 
 
 def place(anchors: Float64, sizes: Float64, frame: Float64) -> Placement:
-    """Put each label near its anchor, clear of the other labels and anchors, inside the frame.
+    """Place each label near its anchor and inside the frame, off other labels and anchors.
 
     Args:
-        anchors: (n, 2), what the labels belong to; the first are placed first.
+        anchors: (n, 2), positions of the objects; the first are placed first.
         sizes: (n, 2), width and height of the labels.
-        frame: (4,) box that they must stay inside.
+        frame: (4,) box around all labels.
     """
     centres = anchors.copy()
     for sweep in range(SWEEPS + 1):
         for index in range(len(anchors)):
             candidates = _candidates(anchors[index], sizes[index])
-            boxes = np.hstack([candidates - sizes[index] / 2, candidates + sizes[index] / 2])
+            boxes = boxes_at(candidates, sizes[index])
             others = np.arange(len(anchors)) != index
             if sweep == 0:
                 others[index:] = False
@@ -63,8 +72,8 @@ def place(anchors: Float64, sizes: Float64, frame: Float64) -> Placement:
 
 
 def place_if_free(candidates: Float64, size: Float64, taken: Float64, frame: Float64) -> int | None:
-    """The first candidate centre (m, 2) at which a label covers none of the boxes, or None."""
-    boxes = np.hstack([candidates - size / 2, candidates + size / 2])
+    """Index of the first candidate centre (m, 2) at which a label covers no box, or None."""
+    boxes = boxes_at(candidates, size)
     free = (overlap_areas(boxes, taken).sum(axis=1) <= FREE_OVERLAP_PX2) & (
         _outside(boxes, frame) == 0
     )
@@ -72,7 +81,7 @@ def place_if_free(candidates: Float64, size: Float64, taken: Float64, frame: Flo
 
 
 def overlap_areas(boxes: Float64, others: Float64) -> Float64:
-    """(n, m) areas that n boxes share with m others."""
+    """(n, m) overlap areas of n boxes with m others."""
     low = np.maximum(boxes[:, None, :2], others[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
     sides = np.maximum(high - low, 0.0)
@@ -80,12 +89,12 @@ def overlap_areas(boxes: Float64, others: Float64) -> Float64:
 
 
 def nearest_on_box(point: Float64, box: Float64) -> Float64:
-    """The point of a box (4,) that is nearest to a point (2,)."""
+    """The point of a box (4,) nearest to a point (2,)."""
     return np.clip(point, box[:2], box[2:])
 
 
 def _candidates(anchor: Float64, size: Float64) -> Float64:
-    """Centres around an anchor: the box's rim lies at each distance in each direction."""
+    """Centres around an anchor, with the box's rim at each distance in each direction."""
     angles = np.pi / 2 + 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     reach = rays * size / 2
@@ -93,13 +102,13 @@ def _candidates(anchor: Float64, size: Float64) -> Float64:
 
 
 def _outside(boxes: Float64, frame: Float64) -> Float64:
-    """By how many pixels each box sticks out of the frame."""
+    """(n,) pixels by which boxes exceed the frame."""
     below = np.maximum(frame[:2] - boxes[:, :2], 0.0).sum(axis=1)
     return np.asarray(below + np.maximum(boxes[:, 2:] - frame[2:], 0.0).sum(axis=1))
 
 
 def _covered(boxes: Float64, points: Float64, margin: float = 3.0) -> Float64:
-    """How many points each box covers."""
+    """(n,) number of points that each box covers, with a margin."""
     inside = (points[None] > boxes[:, None, :2] - margin) & (
         points[None] < boxes[:, None, 2:] + margin
     )

@@ -1,4 +1,4 @@
-"""Markers for RViz and Foxglove, as plain descriptions; the bridge turns them into messages."""
+"""Markers for RViz and Foxglove, without ROS; `ros.markers` converts them to messages."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
+# RViz refuses a scale of zero, and thinner ellipsoids are hard to see.
 LEAST_DIAMETER_M = 0.01
 SHAFT_M, HEAD_M, HEAD_LENGTH_M = 0.012, 0.035, 0.06
 TEXT_M, SMALL_TEXT_M = 0.09, 0.06
-ID_LIMIT = 2**31
+ID_LIMIT = 2**31  # Marker.id is an int32
 
 
 @dataclass(frozen=True)
 class Marker:
-    """One thing to draw, in the frame of the graph.
+    """One marker, in the frame of the graph.
 
     Attributes:
-        namespace, id: name it for the life of the node or edge that it shows.
+        namespace, id: identity, stable for the life of a node or edge.
         kind: "sphere" (an ellipsoid by its scale), "text" or "arrow".
         position: metres; the origin for arrows.
         quat_xyzw: orientation.
-        scale: metres; diameters of a sphere; (shaft, head, head length) of an arrow; the height
-            of a text is its third.
+        scale: metres; diameters of a sphere; (shaft, head, head length) of an arrow; (0, 0, height)
+            of a text.
         rgba: 0 to 1.
-        text: of a text.
+        text: content of a text.
         points: tail and tip of an arrow.
     """
 
@@ -66,7 +67,7 @@ def markers(message: wire.SceneGraphMessage) -> list[Marker]:
 
 
 def pair_id(subject: int, object_: int) -> int:
-    """One id for an ordered pair (Szudzik's pairing), unique while ids are below 46341."""
+    """An id of an ordered pair (Szudzik's pairing), unique for node ids below 46341."""
     low_first = object_ * object_ + subject
     high_first = subject * subject + subject + object_
     return (high_first if subject >= object_ else low_first) % ID_LIMIT
@@ -99,14 +100,14 @@ def _node_markers(
 def _edge_markers(edge: wire.EdgeState, tail: Float64, tip: Float64) -> list[Marker]:
     number = pair_id(edge.subject, edge.object)
     alpha = 0.25 + 0.7 * min(edge.probability, 1.0)
-    # The text is nearer to the tail: that of the opposite edge does not lie upon it.
-    place = tail + 0.4 * (tip - tail)
+    # Nearer to the tail, so that the texts of two opposite edges do not overlap.
+    position = tail + 0.4 * (tip - tail)
     arrow = Marker(
         "relations", number, "arrow", (0.0, 0.0, 0.0), IDENTITY, (SHAFT_M, HEAD_M, HEAD_LENGTH_M),
         (0.95, 0.75, 0.2, alpha), "", (_vector(tail), _vector(tip)),
     )  # fmt: skip
     predicate = Marker(
-        "predicates", number, "text", _vector(place), IDENTITY, (0.0, 0.0, SMALL_TEXT_M),
+        "predicates", number, "text", _vector(position), IDENTITY, (0.0, 0.0, SMALL_TEXT_M),
         (1.0, 0.9, 0.6, alpha), edge.predicate,
     )  # fmt: skip
     return [arrow, predicate]

@@ -9,6 +9,7 @@ import numpy as np
 from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.view.geometry import SIGMAS, principal_axes
 
+# Thinner ellipsoids are invisible from the side.
 LEAST_SEMI_AXIS_M = 0.006
 HEAD_SIDES = 10
 
@@ -74,7 +75,7 @@ def ellipsoid(mean: Float64, covariance: Float64, subdivisions: int) -> tuple[Fl
 
 
 def arrow_head(tip: Float64, direction: Float64, length_m: float) -> tuple[Float64, Int64]:
-    """Cone with this tip along a direction (not zero): vertices (v, 3), triangles (f, 3)."""
+    """Cone with a tip along a direction (not zero): vertices (v, 3), triangles (f, 3)."""
     along = direction / np.linalg.norm(direction)
     seed = np.eye(3)[int(np.abs(along).argmin())]
     side = np.cross(along, seed)
@@ -89,7 +90,7 @@ def arrow_head(tip: Float64, direction: Float64, length_m: float) -> tuple[Float
 
 
 def joined(parts: list[tuple[Float64, Int64]]) -> tuple[Float64, Int64]:
-    """One mesh of several."""
+    """Several meshes as one: vertices (v, 3), triangles (f, 3)."""
     offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     return (
         np.concatenate([vertices for vertices, _ in parts]),

@@ -16,22 +16,23 @@ PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}
 
 
 def print_graph(console: Console, graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> None:
-    """Print the objects seen most often and the surest relations, `most` of each at most."""
+    """Print the most observed objects and the most probable relations, at most `most` of each."""
     console.print(object_table(graph, most))
     console.print(relation_table(graph, most))
 
 
 def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
-    """Objects, the most observed first; the size is that of the 2σ ellipsoid."""
+    """Objects, most observed first; the size is that of the 2σ ellipsoid."""
     table = Table(
         title=_title("object", len(graph.nodes), most),
-        caption=f"position in frame {graph.frame_id!r}; size: {SIGMAS:g}σ ellipsoid, longest first",
+        caption=f"p: class probability; position in frame {graph.frame_id!r}; "
+        f"size: axes of the {SIGMAS:g}σ ellipsoid; obs.: observations",
     )
     table.add_column("object", no_wrap=True)
     table.add_column("p", justify="right")
     table.add_column("x, y, z (m)", justify="right", no_wrap=True)
     table.add_column("size (cm)", justify="right", no_wrap=True)
-    table.add_column("seen", justify="right")
+    table.add_column("obs.", justify="right")
     colours = class_colours(node.label for node in graph.nodes)
     rows = sorted(
         zip(graph.nodes, covariances_of(graph)), key=lambda row: (-row[0].observations, row[0].id)
@@ -49,13 +50,13 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
 
 
 def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
-    """Relations, the surest first."""
+    """Relations, most probable first."""
     table = Table(title=_title("relation", len(graph.edges), most))
     for name in ("subject", "predicate", "object"):
         table.add_column(name, no_wrap=True)
     table.add_column("p", justify="right")
-    table.add_column("from", no_wrap=True)
-    table.add_column("seen", justify="right")
+    table.add_column("provenance", no_wrap=True)
+    table.add_column("obs.", justify="right")
     names = {node.id: _name(node.label, node.id) for node in graph.nodes}
     edges = sorted(
         graph.edges,

@@ -49,7 +49,7 @@ def make_graph(nodes=(), edges=(), frame_id="map"):
 
 
 def make_room(count=25, seed=0, points=40):
-    """A graph like a room's: clusters, big and small objects, three kinds of relations."""
+    """A graph of a room: clusters, large and small objects, three predicates."""
     rng = np.random.default_rng(seed)
     labels = ["cup", "table", "chair", "book", "lamp", "<shelf>", "plant & pot"]
     nodes = []

@@ -1,4 +1,4 @@
-"""Axes, meshes, colours, label places: what the views stand on."""
+"""Axes, meshes, colours and label positions of the views."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def test_principal_axes_rebuild_the_covariance_with_a_rotation(seed):
         ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ],
 )
-def test_view_axes_of_the_usual_worlds(up, right, forward):
+def test_view_axes_of_usual_world_frames(up, right, forward):
     axes = view_axes(up)
     np.testing.assert_allclose(axes[0], right, atol=1e-12)
     np.testing.assert_allclose(axes[1], forward, atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_view_axes_are_a_rotation_and_end_in_up(seed):
+def test_view_axes_are_a_rotation_whose_last_row_is_up(seed):
     up = np.random.default_rng(seed).normal(size=3)
     axes = view_axes(up)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
@@ -54,7 +54,7 @@ def test_view_axes_are_a_rotation_and_end_in_up(seed):
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (1, 0)])
-def test_view_axes_refuse_what_is_no_direction(up):
+def test_view_axes_refuse_an_invalid_direction(up):
     with pytest.raises(ValueError, match="up direction"):
         view_axes(up)
 
@@ -93,7 +93,7 @@ def test_joined_meshes_keep_their_triangles():
     np.testing.assert_array_equal(vertices[triangles[20:]], parts[1][0][parts[1][1]])
 
 
-def test_class_colours_stay_when_labels_come():
+def test_a_new_label_changes_no_class_colour():
     labels = [f"class {index}" for index in range(len(PALETTE))]
     all_colours = class_colours(labels)
     assert len(set(all_colours.values())) == len(PALETTE)
@@ -104,7 +104,7 @@ def test_class_colours_stay_when_labels_come():
     assert class_colours([]) == {}
 
 
-def test_predicate_colours_leave_near_in_the_background():
+def test_the_predicate_near_is_grey():
     colours = predicate_colours({"near": 50, "on": 10, "under": 3})
     assert list(colours) == ["near", "on", "under"]
     assert len(set(colours.values())) == 3
@@ -116,7 +116,7 @@ def test_shade_and_rgb():
     assert shade("#ff0080", 0.5) == "#800040"
 
 
-def test_drawable_edges_know_both_ends_and_say_mutual_things_once():
+def test_drawable_edges_have_both_ends_and_symmetric_ones_appear_once():
     nodes = [make_node(1, "cup"), make_node(2, "table")]
     edges = [
         make_edge(1, 2, "near", 0.6),
@@ -142,11 +142,11 @@ def test_labels_do_not_overlap_and_stay_inside(count):
     assert (shared <= 4).all()
     assert (boxes[:, :2] >= 0).all()
     assert (boxes[:, 2:] <= 1200).all()
-    # Not further away than it takes.
+    # Near their anchors.
     assert (np.linalg.norm(placed.centres - anchors, axis=1) < 200).all()
 
 
-def test_a_predicate_takes_the_first_free_place_or_none():
+def test_a_predicate_takes_the_first_free_position_or_none():
     frame = np.array([0.0, 0.0, 100.0, 100.0])
     candidates = np.array([[50.0, 50.0], [50.0, 80.0]])
     size = np.array([20.0, 10.0])

@@ -25,7 +25,7 @@ def by_namespace(graph):
     return found
 
 
-def test_no_markers_of_an_empty_graph():
+def test_an_empty_graph_has_no_markers():
     assert markers(make_graph()) == []
 
 
@@ -76,7 +76,7 @@ def printed(graph, **options):
     return capture.get()
 
 
-def test_tables_tell_objects_and_relations():
+def test_tables_list_objects_and_relations():
     nodes = [
         make_node(1, "cup [red]", (0.5, -1.25, 2), np.diag([0.01, 0.0025, 1e-4]), observations=7),
         make_node(2, "table", observations=30),
@@ -94,7 +94,7 @@ def test_tables_tell_objects_and_relations():
     assert re.search(r"cup \[red\] #1.*on.*table #2.*83 %.*fused.*4", relation)
 
 
-def test_tables_of_nothing_and_of_too_much():
+def test_tables_of_an_empty_and_of_a_large_graph():
     assert "0 objects" in printed(make_graph())
     text = printed(make_room(25), most=3)
     assert "25 objects (the first 3)" in text
@@ -109,7 +109,7 @@ def test_tables_of_nothing_and_of_too_much():
         make_graph([make_node(1, "cup"), make_node(2, "cup")], [make_edge(1, 2), make_edge(2, 3)]),
         make_room(40),
     ],
-    ids=["empty", "one", "two in one place", "room"],
+    ids=["empty", "one", "two at one position", "room"],
 )
 def test_picture_and_page_of_any_graph(tmp_path, graph):
     picture.draw(graph, tmp_path / "graph.png")
@@ -120,8 +120,8 @@ def test_picture_and_page_of_any_graph(tmp_path, graph):
     assert (tmp_path / "graph.html").stat().st_size < 6e6
 
 
-def test_picture_puts_an_object_where_up_says(tmp_path):
-    # A red flag: one object far to the right and forward, in the world of a camera (y down).
+def test_up_direction_decides_where_the_picture_shows_an_object(tmp_path):
+    # One object far to the right and forward, in the world frame of a camera (y down).
     nodes = [make_node(1, "cup", (0, 0, 0)), make_node(2, "lamp", (3, 0, 2))]
     coloured = {}
     for name, up in {"down": (0, -1, 0), "up": (0, 1, 0)}.items():
@@ -170,7 +170,7 @@ def test_page_is_self_contained_and_complete(tmp_path):
     assert any(trace["meta"] == "camera" for trace in traces)
 
 
-def test_page_is_safe_against_labels(tmp_path):
+def test_page_escapes_labels(tmp_path):
     evil = "</script><script>alert(1)</script>"
     nodes = [make_node(1, evil), make_node(2, "cup", (1, 0, 0))]
     page.write(make_graph(nodes, [make_edge(1, 2, evil)], evil), tmp_path / "graph.html")
@@ -184,7 +184,7 @@ def test_large_graphs_stay_below_six_megabytes(tmp_path):
     assert (tmp_path / "graph.html").stat().st_size < 6e6
 
 
-def test_page_looks_from_above_in_any_world(tmp_path):
+def test_page_shows_up_as_z_in_any_world_frame(tmp_path):
     nodes = [make_node(1, "cup", (0, -2.0, 0)), make_node(2, "table", (0, 0, 0))]
     page.write(make_graph(nodes), tmp_path / "graph.html", up_world=(0, -1, 0))
     text = (tmp_path / "graph.html").read_text(encoding="utf-8")
