@@ -2,7 +2,7 @@
 
 ros2 launch deworldsg_ros deworldsg.launch.py rgb:=/my/rgb depth:=/my/depth_registered ...
 
-A robot without SLAM or odometry adds odometry:=true: then odometry_node makes the poses.
+For a robot without SLAM or odometry, add odometry:=true: odometry_node then computes the poses.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from launch_ros.substitutions import FindPackageShare
 PACKAGE = "deworldsg_ros"
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 
-# Launch argument, the topic that the nodes subscribe to, what it carries.
+# Launch argument, topic in the nodes, content.
 INPUTS = (
     ("rgb", "rgb/image_raw", "colour images"),
     ("camera_info", "rgb/camera_info", "intrinsics of the colour camera"),
@@ -37,23 +37,23 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "params_file",
             default_value=PathJoinSubstitution([share, "config", "default.yaml"]),
-            description="ROS parameter file for all nodes",
+            description="ROS parameter file of all nodes; the default file changes no value",
         ),
         DeclareLaunchArgument(
             "use_sim_time",
             default_value="false",
             choices=["true", "false"],
-            description="take the time from /clock, as with ros2 bag play --clock",
+            description="use the time of /clock, e.g. of ros2 bag play --clock",
         ),
         DeclareLaunchArgument(
             "odometry",
             default_value="false",
             choices=["true", "false"],
-            description="start odometry_node, which makes the poses out of the images",
+            description="start odometry_node, which computes poses from the images",
         ),
         *(
-            DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {what}")
-            for name, topic, what in INPUTS
+            DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {content}")
+            for name, topic, content in INPUTS
         ),
     ]
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
@@ -71,8 +71,7 @@ def generate_launch_description() -> LaunchDescription:
 
     nodes = [node(name) for name in NODES]
     nodes.append(node("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))))
-    # Images between processes need the larger shared-memory segment; a profile that is set already
-    # is the user's.
+    # Images between processes need its larger shared-memory segment. A profile of the user is kept.
     profile = SetEnvironmentVariable(
         "FASTRTPS_DEFAULT_PROFILES_FILE",
         EnvironmentVariable(

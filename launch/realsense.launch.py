@@ -1,8 +1,8 @@
-"""deworldsg_ros on an Intel RealSense: its topic names, everything else as in deworldsg.launch.py.
+"""deworldsg_ros on an Intel RealSense: deworldsg.launch.py with the topics of that camera.
 
-Start the camera with depth aligned to colour and of its stamps (align_depth.enable:=true
-enable_sync:=true). The pose comes from your odometry or SLAM: from TF, or pose:=/odom. Without
-either, odometry:=true makes it.
+Start the camera with depth aligned to colour and synchronised stamps (align_depth.enable:=true
+enable_sync:=true). Poses come from your odometry or SLAM: from TF, or with pose:=/odom. Without
+either, add odometry:=true.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def generate_launch_description() -> LaunchDescription:
     camera = DeclareLaunchArgument(
         "camera",
         default_value="/camera/camera",
-        description="namespace and name of the camera node; of older drivers /camera",
+        description="namespace and name of the camera node; /camera in older drivers",
     )
     nodes = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(
@@ -32,7 +32,7 @@ def generate_launch_description() -> LaunchDescription:
                 [FindPackageShare("deworldsg_ros"), "launch", "deworldsg.launch.py"]
             )
         ),
-        # What else is given on the command line reaches the included file by itself.
+        # ros2 launch passes all other arguments of the command line to the included file.
         launch_arguments=[
             (name, [LaunchConfiguration("camera"), topic]) for name, topic in CAMERA_TOPICS.items()
         ],

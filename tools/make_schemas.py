@@ -26,11 +26,11 @@ EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
 
 
 def message_schema(name: str) -> dict[str, Any]:
-    """JSON Schema of a message, which says the name that it must carry."""
+    """JSON Schema of a message, with its name as a constant."""
     schema = wire.json_schema(wire.MESSAGES[name])
     definition = schema["$defs"][wire.MESSAGES[name].__name__]
     for described in schema["$defs"].values():
-        if "description" in described:  # A docstring, which Python 3.13 strips of its indentation.
+        if "description" in described:  # a docstring; Python 3.13 removes its indentation
             described["description"] = inspect.cleandoc(described["description"])
     definition["properties"]["schema"] = {
         "allOf": [
@@ -42,19 +42,23 @@ def message_schema(name: str) -> dict[str, Any]:
 
 
 def examples() -> dict[str, wire.Message]:
-    """A cup on a table and a chair under it, in each message."""
+    """A cup on a table, in each message."""
+    return {**_frame_examples(), **_graph_examples()}
+
+
+def _head(name: str, frame_id: str = "map") -> dict[str, Any]:
+    schema = wire.schema_of(wire.MESSAGES[name])
+    return {"schema": schema, "stamp": STAMP, "frame_id": frame_id}
+
+
+def _frame_examples() -> dict[str, wire.Message]:
+    """The messages of one frame."""
     relations = [wire.RelationLogits(subject=0, object=1, score=0.87, logits=[4.0, 1.5, -3.0])]
-    head: dict[str, dict[str, Any]] = {
-        name: {"schema": wire.schema_of(kind)} for name, kind in wire.MESSAGES.items()
-    }
-    world: dict[str, Any] = {"stamp": STAMP, "frame_id": "map"}
     words: dict[str, Any] = {"classes": CLASSES, "predicates": PREDICATES}
     image: dict[str, Any] = {"width": 640, "height": 480}
     return {
         "frame_graph": wire.FrameGraphMessage(
-            **head["frame_graph"],
-            stamp=STAMP,
-            frame_id="camera_color_optical_frame",
+            **_head("frame_graph", "camera_color_optical_frame"),
             **image,
             **words,
             objects=[
@@ -64,8 +68,7 @@ def examples() -> dict[str, wire.Message]:
             relations=relations,
         ),
         "local_graph": wire.LocalGraphMessage(
-            **head["local_graph"],
-            **world,
+            **_head("local_graph"),
             **image,
             T_world_camera=[
                 1.0, 0.0, 0.0, 0.4,
@@ -80,12 +83,11 @@ def examples() -> dict[str, wire.Message]:
             ],
             relations=relations,
             drops={"few_mask_pixels": 1},
-            # As coarse as can be: one sample, 1.85 m, in the middle of the image.
+            # The coarsest grid: one sample of 1.85 m in the middle of the image.
             depth_grid=wire.DepthGridState(640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07"),
         ),
         "relation_evidence": wire.RelationEvidenceMessage(
-            **head["relation_evidence"],
-            **world,
+            **_head("relation_evidence"),
             **words,
             source="fake",
             pairs=[
@@ -93,16 +95,20 @@ def examples() -> dict[str, wire.Message]:
                 wire.PairEvidence(1, 0, 1, 0, 0.12),
             ],
         ),
+    }  # fmt: skip
+
+
+def _graph_examples() -> dict[str, wire.Message]:
+    """The graph, and its next update."""
+    return {
         "scene_graph": wire.SceneGraphMessage(
-            **head["scene_graph"],
-            **world,
+            **_head("scene_graph"),
             sequence=41,
             nodes=[_cup(), _node(2, "table", [0.45, 0.1, 0.71], 0.09, 29)],
             edges=[_cup_on_table()],
         ),
         "scene_graph_updates": wire.SceneGraphUpdateMessage(
-            **head["scene_graph_updates"],
-            **world,
+            **_head("scene_graph_updates"),
             sequence=42,
             removed_nodes=[wire.RemovedNode(id=7, merged_into=2), wire.RemovedNode(id=9)],
             removed_edges=[wire.RemovedEdge(subject=1, object=7)],
@@ -110,7 +116,7 @@ def examples() -> dict[str, wire.Message]:
             edges=[_cup_on_table()],
             associations=[wire.Association(stamp=STAMP, nodes=[1, 2])],
         ),
-    }  # fmt: skip
+    }
 
 
 def _lifted(
@@ -174,7 +180,7 @@ def _cup_on_table() -> wire.EdgeState:
 
 
 def files() -> dict[str, str]:
-    """Text of each file of msg_schemas/, by its name."""
+    """Text of each file in msg_schemas/, by file name."""
     texts: dict[str, str] = {}
     for name, example in examples().items():
         texts[f"{name}.schema.json"] = _pretty(message_schema(name))
@@ -187,7 +193,7 @@ def _pretty(content: Any) -> str:
 
 
 def main(folder: Path) -> None:
-    """Write them all."""
+    """Write all files."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files().items():
         (folder / name).write_text(text, encoding="utf-8")

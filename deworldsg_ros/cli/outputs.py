@@ -1,4 +1,4 @@
-"""What run and demo leave: graph, picture, page, configuration, a report; and what they print."""
+"""The results of run and demo: files in the output folder, and tables on the terminal."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from deworldsg_ros.config import Config, to_yaml
+from deworldsg_ros.ros.health import UNMATCHED_PREFIX
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -21,17 +22,21 @@ PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
 CONFIG_FILE = "config.yaml"
 REPORT_FILE = "run.json"
-# Rows of each printed table; the page shows everything.
+# Rows of each printed table, to fit a screen; the page shows everything.
 MOST_ROWS = 25
+# Printed losses of a recording; run.json has all.
+MOST_LOSSES = 5
 
 
 def prepare_folder(out: Path, config: Config) -> None:
-    """Make the folder and save the effective configuration; raises ConfigurationError."""
+    """Create the folder and save the effective configuration; raises ConfigurationError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / CONFIG_FILE).write_text(to_yaml(config), encoding="utf-8")
     except OSError as error:
-        raise ConfigurationError(f"--out {out}: cannot be written ({error.strerror})") from error
+        raise ConfigurationError(
+            f"--out {out}: cannot be written ({error.strerror}); give a writable folder"
+        ) from error
 
 
 def write_graph(out: Path, graph: wire.SceneGraphMessage) -> None:
@@ -55,12 +60,12 @@ def show_graph(
 
     Args:
         out: folder of picture and page.
-        graph: with surface points.
-        console: for the tables.
-        T_world_cameras: poses (4, 4) of the frames that it was made of.
-        world_up: as configured: auto, z, y or -y.
+        graph: the graph, with surface points.
+        console: terminal.
+        T_world_cameras: poses (4, 4) of the processed frames.
+        world_up: `inputs.world_up`: auto, z, y or -y.
     """
-    # These load matplotlib and plotly, which takes a second.
+    # Imported here because matplotlib and plotly take a second to load.
     from deworldsg_ros.view import page, picture, table
 
     up = UpEstimator(world_up)
@@ -82,13 +87,13 @@ def write_report(out: Path, report: Mapping[str, Any]) -> None:
 
 
 def print_files(console: Console, out: Path) -> None:
-    """Say where the results are."""
+    """Print the paths of the results."""
     console.print(f"results in {out}:", highlight=False, soft_wrap=True)
     for name, meaning in (
         (PAGE_FILE, "3D view, open it in a browser"),
         (PICTURE_FILE, "top view"),
         (GRAPH_FILE, "the graph, with surface points"),
-        (CONFIG_FILE, "the configuration it was made with"),
+        (CONFIG_FILE, "the effective configuration"),
         (REPORT_FILE, "frames, drops by reason, times"),
     ):
         if (out / name).exists():
@@ -101,18 +106,22 @@ def print_drops(
     drops: Mapping[str, Mapping[str, int]],
     reasons: Mapping[str, str],
 ) -> None:
-    """Say what was lost and left out: by who and reason, with an example where one is known.
+    """Print losses and drops; unmatched images are in run.json only.
 
-    Images that belonged to a frame that was left out, or to none, are in run.json only.
+    Args:
+        console: terminal.
+        losses: damaged parts of the recording, in words.
+        drops: counts by owner and reason.
+        reasons: an example by reason.
     """
     shown = list(dict.fromkeys(losses))
-    for loss in shown[:5]:
+    for loss in shown[:MOST_LOSSES]:
         console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
-    if len(shown) > 5:
-        console.print(f"[yellow]lost:[/] … and {len(shown) - 5} more")
+    if len(shown) > MOST_LOSSES:
+        console.print(f"[yellow]lost:[/] … and {len(shown) - MOST_LOSSES} more")
     for owner, counts in drops.items():
         for reason, count in sorted(counts.items()):
-            if reason.startswith("unmatched_"):
+            if reason.startswith(UNMATCHED_PREFIX):
                 continue
             example = f" ({reasons[reason]})" if reason in reasons else ""
             console.print(

@@ -38,6 +38,8 @@ REASONS: dict[str, str] = {
     "relation_head_error": "The relation head failed on an image, whose frame graph has no "
     "relations. Read the traceback in the log; if memory is short, choose a smaller checkpoint or "
     "another device.",
+    "world_model_error": "The world model failed on a clip, which gives no prediction. Read the "
+    "message in the log; if memory is short, choose another device.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
     "the stamps of the depth images.",
