@@ -1,4 +1,4 @@
-"""`deworldsg demo`: four real nodes over DDS, and the same graph as a run in one process."""
+"""`deworldsg demo`: four node processes over DDS give the same graph as one process."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def read_graph(folder):
 
 @pytest.fixture(scope="module")
 def unposed(tmp_path_factory):
-    """The same without poses."""
+    """The same recording without poses."""
     source = open_source(DEMO_ROOM)
     source.raw_messages = partial(without_poses, source.raw_messages)
     return first_frames(source, FRAMES, tmp_path_factory.mktemp("unposed") / "short.mcap")
@@ -74,7 +74,7 @@ def test_demo_and_run_end_with_the_same_graph(recording, unposed, tmp_path, pose
         assert (tmp_path / "shown" / name).stat().st_size > 0
     for node in NODES:
         assert "ready" in (tmp_path / "shown" / "logs" / f"{node}.log").read_text()
-    # No node had to be killed.
+    # Every node ended by itself.
     assert "ended with code" not in shown.stdout
 
 
@@ -110,7 +110,7 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
     nodes = children(process.pid)
     assert len(nodes) == 5
     process.send_signal(number)
-    process.send_signal(number)  # the impatient press twice
+    process.send_signal(number)  # a user who presses Ctrl-C twice
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted" in errors

@@ -1,4 +1,4 @@
-"""Processes of the demo: logs, exit codes, and that they end."""
+"""Processes of the demo: logs, exit codes, shutdown."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def wait_for_log(process, text):
         time.sleep(0.02)
 
 
-def test_nothing_to_end():
+def test_ending_no_process():
     assert end_all([]) == {}
 
 
-def test_int_is_enough_for_the_gentle_and_kill_for_the_stubborn(tmp_path, monkeypatch):
+def test_sigint_ends_a_process_and_sigkill_one_that_ignores_it(tmp_path, monkeypatch):
     monkeypatch.setattr(
         processes,
         "GRACE_S",
@@ -67,7 +67,7 @@ def test_int_is_enough_for_the_gentle_and_kill_for_the_stubborn(tmp_path, monkey
     assert end_all([stubborn, ended]) == {"stubborn": -signal.SIGKILL, "ended": 3}
 
 
-def test_the_log_holds_both_outputs_and_its_end_is_told(tmp_path):
+def test_the_log_contains_both_outputs(tmp_path):
     code = "import sys; [print(i, file=sys.stderr) for i in range(100)]; print('out')"
     process = start(tmp_path, "talker", code)
     assert process.wait(20) == 0
@@ -75,17 +75,17 @@ def test_the_log_holds_both_outputs_and_its_end_is_told(tmp_path):
     assert len(process.last_lines(3).splitlines()) == 3
 
 
-def test_output_that_is_read_stays_out_of_the_log(tmp_path):
+def test_output_for_the_parent_is_not_in_the_log(tmp_path):
     process = start(tmp_path, "teller", "print('hello')", read_output=True)
     assert process.output.read() == b"hello\n"
     assert process.wait(20) == 0
     assert process.log.read_text() == ""
 
 
-def test_a_terminal_s_ctrl_c_does_not_reach_it(tmp_path):
+def test_ctrl_c_in_the_terminal_does_not_reach_a_process(tmp_path):
     process = start(tmp_path, "apart", GENTLE)
     wait_for_log(process, "ready")
-    assert os.getpgid(process._process.pid) != os.getpgid(0)
+    assert os.getpgid(process.pid) != os.getpgid(0)
     end_all([process])
 
 
@@ -97,7 +97,7 @@ def test_files_of_the_package_are_found():
 
 
 @pytest.mark.parametrize("given", [{}, {"ROS_DOMAIN_ID": "77"}])
-def test_the_demo_has_a_domain_of_its_own_unless_one_is_set(monkeypatch, given):
+def test_the_demo_has_its_own_domain_unless_one_is_set(monkeypatch, given):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
     monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE", raising=False)
@@ -111,7 +111,7 @@ def test_the_demo_has_a_domain_of_its_own_unless_one_is_set(monkeypatch, given):
     assert environment["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("fastdds.xml")
 
 
-def test_installed_executables_are_preferred_where_this_is_no_checkout(tmp_path, monkeypatch):
+def test_an_installation_runs_the_installed_executables(tmp_path, monkeypatch):
     executable = tmp_path / "lib" / "deworldsg_ros" / "graph_node"
     executable.parent.mkdir(parents=True)
     executable.write_text("#!/bin/sh\n")
@@ -125,14 +125,14 @@ def test_installed_executables_are_preferred_where_this_is_no_checkout(tmp_path,
 
 
 @pytest.mark.parametrize(
-    ("program", "while_importing", "wanted"),
+    ("program", "while_importing", "exit_code"),
     [
         ("from deworldsg_ros.cli import main; main()", "typer", 130),
         ("from deworldsg_ros.nodes.start import start; start('graph_node')", "rclpy", 0),
     ],
 )
-def test_ctrl_c_while_python_imports_is_quiet(tmp_path, program, while_importing, wanted):
-    """A module that is slow to import stands in for those that the programs begin with."""
+def test_ctrl_c_while_python_imports_is_quiet(tmp_path, program, while_importing, exit_code):
+    """A placeholder module that is slow to import replaces the first import of each program."""
     (tmp_path / f"{while_importing}.py").write_text(
         "import time; print('ready', flush=True); time.sleep(60)"
     )
@@ -140,5 +140,5 @@ def test_ctrl_c_while_python_imports_is_quiet(tmp_path, program, while_importing
     process = start(tmp_path, "slow", code)
     wait_for_log(process, "ready")
     process.signal(signal.SIGINT)
-    assert process.wait(20) == wanted
+    assert process.wait(20) == exit_code
     assert process.log.read_text() == "ready\n"

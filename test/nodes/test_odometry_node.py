@@ -1,4 +1,4 @@
-"""odometry_node: images in, poses out; what is refused; and the segmentation node fed by it."""
+"""odometry_node: poses from images, lost frames, the transform on /tf."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def collect(at: Bench, kind: type, topic: str) -> list[Any]:
     return messages
 
 
-def test_a_walk_comes_out_as_poses_of_the_images(odometry: Bench) -> None:
+def test_poses_follow_the_camera(odometry: Bench) -> None:
     poses = collect(odometry, PoseStamped, "camera/pose")
     odometries = collect(odometry, Odometry, "camera/odometry")
     path, stamps_ns = walk(6), []
@@ -71,8 +71,8 @@ def test_a_walk_comes_out_as_poses_of_the_images(odometry: Bench) -> None:
     for T, message, other in zip(path, poses, odometries):
         estimate, frame_id = pose_from_message(message)
         assert frame_id == "odom"
-        wanted = LEVEL @ invert_pose(path[0]) @ T
-        assert np.linalg.norm(estimate[:3, 3] - wanted[:3, 3]) < 0.02
+        expected = LEVEL @ invert_pose(path[0]) @ T
+        assert np.linalg.norm(estimate[:3, 3] - expected[:3, 3]) < 0.02
         assert other.child_frame_id == "camera"
         np.testing.assert_array_equal(pose_from_message(other)[0], estimate)
     assert odometry.node.more_values()["odometry tracked"] == "6"
@@ -90,7 +90,7 @@ def test_a_lost_frame_has_no_pose_and_is_counted(odometry: Bench) -> None:
     assert odometry.node.more_values()["odometry lost"] == "1"
 
 
-def test_a_recording_played_again_starts_anew(odometry: Bench) -> None:
+def test_a_restarted_recording_restarts_the_odometry(odometry: Bench) -> None:
     path = walk(3)
     for T in path:
         works(odometry, lambda T=T: send(odometry, T))
@@ -105,8 +105,8 @@ def at(x: float = 0.0, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
     return rigid_motion(np.array([x, y, 0.0]), np.array([0.0, 0.0, turn_rad]))
 
 
-def test_the_camera_is_published_below_what_it_is_mounted_on() -> None:
-    """A frame has one parent: an optical frame that has one already gets no other."""
+def test_the_root_of_the_mounting_is_published_on_tf() -> None:
+    """A frame has one parent in TF, and the optical frame has one already."""
     tree = TransformTree(0)
     T_world_camera = at(1.0, 2.0, 0.5)
     alone = camera_transform(tree, STAMP_NS, "odom", "optical", T_world_camera)

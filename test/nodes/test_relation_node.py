@@ -1,4 +1,4 @@
-"""relation_node and the graph that it hears of: which pairs the world model looks at."""
+"""relation_node and the published graph: the pairs that the world model encodes."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def send_two_objects(at: Bench) -> int:
     return stamp_ns
 
 
-def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
-    """Updates lost, a graph that starts anew: the relation node goes on by what it is told."""
+def test_the_published_graph_selects_the_pairs_of_the_world_model() -> None:
+    """Lost updates and a restarted graph_node, too."""
     topics = {
         "rgb/image_raw": Image,
         "deworldsg/local_graph": String,
@@ -95,16 +95,16 @@ def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
 
     try:
         stamp_ns = send_two_objects(at)
-        clips(encoded=1)  # no graph is known: all are
+        clips(encoded=1)  # without a graph, every pair is encoded
         publish(1, stamp_ns, 3)
         at.expect(lambda: at.node._graph.newest_ns == stamp_ns, "the update to come")
         stamp_ns = send_two_objects(at)
-        clips(encoded=1, waiting=1)  # until the graph has answered
+        clips(encoded=1, waiting=1)  # until the graph is updated
         publish(2, stamp_ns, 4)
         clips(encoded=2, waiting=0)
         publish(3, send_two_objects(at), 5)
         clips(encoded=2, dropped__already_encoded=1)
-        publish(7, send_two_objects(at), 8)  # updates are lost, and twice as often seen
+        publish(7, send_two_objects(at), 8)  # lost updates, and twice the observations
         clips(encoded=3, waiting=0)
         publish(1, send_two_objects(at), 3)  # another graph
         clips(encoded=4, waiting=0)
@@ -113,7 +113,7 @@ def test_the_published_graph_decides_what_the_world_model_looks_at() -> None:
         at.close()
 
 
-def test_a_recording_that_starts_again_is_looked_at_again() -> None:
+def test_a_restarted_recording_is_encoded_again() -> None:
     at = Bench(
         RelationNode,
         {"rgb/image_raw": Image, "deworldsg/local_graph": String},
@@ -155,7 +155,7 @@ def start(**overrides: str) -> RelationNode:
 
 
 class Bound(FakeWorldModel):
-    """A world model of certain predicates, as one with a probe is."""
+    """A world model with fixed predicates, like one with a probe."""
 
     def require_predicates(self, predicates: tuple[str, ...]) -> None:
         if predicates != ("on", "under"):

@@ -1,4 +1,4 @@
-"""A node takes what the robot publishes: best effort, compressed, odometry, a late best effort."""
+"""A node adapts to the publishers: best effort, compressed images, odometry, TF, later changes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def other_camera() -> Iterator[Bench]:
     yield from published(topics)
 
 
-def test_best_effort_publishers_are_heard(best_effort_camera: Bench) -> None:
+def test_best_effort_publishers_are_received(best_effort_camera: Bench) -> None:
     works(best_effort_camera, lambda: [send_frame(best_effort_camera) for _ in range(5)])
 
 
@@ -97,7 +97,7 @@ def send_other(at: Bench, **changes: Any) -> None:
     send_frame(at, **{**others, **changes})
 
 
-def test_compressed_images_and_odometry_are_heard(other_camera: Bench) -> None:
+def test_compressed_images_and_odometry_are_received(other_camera: Bench) -> None:
     works(other_camera, lambda: send_other(other_camera))
     assert not other_camera.node.health.drops
 
@@ -125,7 +125,7 @@ def test_a_subscription_follows_its_publishers() -> None:
         assert not subscription.check()
 
 
-def test_one_topic_can_change_its_type() -> None:
+def test_a_topic_can_change_its_type() -> None:
     with peer() as me:
         got: list[Any] = []
         sources = [source("pose", PoseStamped), source("pose", Odometry)]
@@ -139,7 +139,7 @@ def test_one_topic_can_change_its_type() -> None:
             assert isinstance(got[0], Odometry)
 
 
-def test_tf_without_its_messages_is_refused_at_the_start() -> None:
+def test_tf_without_tf2_msgs_is_refused_at_the_start() -> None:
     if TFMessage is not None:
         pytest.skip("tf2_msgs is installed")
     with peer() as me, pytest.raises(ConfigurationError, match="tf2_msgs is not installed"):
@@ -148,7 +148,7 @@ def test_tf_without_its_messages_is_refused_at_the_start() -> None:
         )
 
 
-def test_predictions_of_a_world_model_follow_the_pairs() -> None:
+def test_predictions_follow_the_pairs_of_a_frame() -> None:
     overrides = [
         Parameter("relations.world_model", value="fake"),
         Parameter("relations.clip_length", value=4),
@@ -181,14 +181,14 @@ def test_predictions_of_a_world_model_follow_the_pairs() -> None:
         at.close()
 
 
-def test_diagnostics_name_what_is_missing_and_what_is_wrong(other_camera: Bench) -> None:
+def test_diagnostics_name_missing_and_refused_input(other_camera: Bench) -> None:
     at = other_camera
     statuses: list[DiagnosticStatus] = []
     at.peer.node.create_subscription(
         DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 10
     )
 
-    def told(text: str) -> Callable[[], bool]:
+    def reported(text: str) -> Callable[[], bool]:
         def sending() -> bool:
             send_other(at, rgb__camera_info=None)
             at.peer.spin_for(0.1)
@@ -196,10 +196,12 @@ def test_diagnostics_name_what_is_missing_and_what_is_wrong(other_camera: Bench)
 
         return sending
 
-    at.expect(told("no camera_info on /rgb/camera_info for 3 s"), "what is missing")
+    at.expect(reported("no camera_info on /rgb/camera_info for 3 s"), "the missing input")
     assert statuses[-1].level == DiagnosticStatus.WARN
     at.send(camera__pose=odometry(at.next_stamp(), "elsewhere"))
-    at.expect(told("wrong_frame: pose is in frame 'elsewhere', expected 'odom'"), "what is wrong")
+    at.expect(
+        reported("wrong_frame: pose is in frame 'elsewhere', expected 'odom'"), "the refused input"
+    )
 
 
 def topics_of(node: StageNode) -> set[str]:
@@ -207,7 +209,7 @@ def topics_of(node: StageNode) -> set[str]:
 
 
 @pytest.mark.parametrize("posed", [False, True])
-def test_tf_stands_in_only_where_nobody_publishes_poses(
+def test_tf_is_used_only_without_a_publisher_of_poses(
     monkeypatch: pytest.MonkeyPatch, posed: bool
 ) -> None:
     # Only the topic matters here, and any message type will do.
@@ -224,7 +226,7 @@ def test_tf_stands_in_only_where_nobody_publishes_poses(
 
 
 @pytest.mark.parametrize("child", ["camera", "base_link"])
-def test_transforms_are_listened_to_for_the_odometry_of_a_robot(
+def test_tf_is_used_for_odometry_of_another_frame(
     monkeypatch: pytest.MonkeyPatch, child: str
 ) -> None:
     monkeypatch.setattr(inputs, "TFMessage", TransformStamped)

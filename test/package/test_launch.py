@@ -1,8 +1,8 @@
-"""The launch files' content.
+"""Content of the launch files.
 
-`launch` and `launch_ros` exist on a full ROS 2 installation only. Elsewhere the classes that the
-launch files use are replaced by ones that keep their arguments: that shows what the files ask for,
-and not that ROS 2 accepts it.
+`launch` and `launch_ros` are not among the wheels of ROS 2. Test doubles, which keep their
+arguments, replace their classes. These tests show the arguments of the launch files; they do not
+show that ROS 2 accepts them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import pytest
 
 
 class Kept:
-    """Any class of launch: its arguments, and nothing else."""
+    """Test double of a class of launch: it keeps its arguments."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.args = args
@@ -43,7 +43,7 @@ CLASSES = {
 
 @pytest.fixture()
 def launch_classes(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[Kept]]:
-    """Modules launch and launch_ros whose classes keep their arguments; the classes by name."""
+    """Test doubles of the modules launch and launch_ros; returns the classes by name."""
     classes = {name: type(name, (Kept,), {}) for names in CLASSES.values() for name in names}
     for path, names in CLASSES.items():
         module = ModuleType(path)
@@ -54,12 +54,12 @@ def launch_classes(monkeypatch: pytest.MonkeyPatch) -> dict[str, type[Kept]]:
 
 
 def describe(path: Path, classes: dict[str, type[Kept]], kind: str) -> list[Kept]:
-    """The entities of one kind in a launch file's description."""
+    """Entities of one kind in the description of a launch file."""
     (description,) = runpy.run_path(str(path))["generate_launch_description"]().args
     return [entity for entity in description if isinstance(entity, classes[kind])]
 
 
-def test_the_nodes_take_the_parameter_file_and_the_inputs(
+def test_every_node_has_the_parameter_file_and_the_remappings(
     root_dir: Path, launch_classes: dict[str, type[Kept]]
 ) -> None:
     path = root_dir / "launch" / "deworldsg.launch.py"
@@ -97,7 +97,7 @@ def test_every_launch_configuration_is_a_declared_argument(
     }
 
 
-def test_realsense_passes_the_topics_of_its_camera_on(
+def test_realsense_passes_the_topics_of_the_camera(
     root_dir: Path, launch_classes: dict[str, type[Kept]]
 ) -> None:
     path = root_dir / "launch" / "realsense.launch.py"

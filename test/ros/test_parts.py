@@ -1,4 +1,4 @@
-"""The small parts of the nodes: the choice of a subscription, the worker, the waiting room."""
+"""Parts of the nodes: choice of a subscription, worker thread, pending evidence, markers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ AUTO = image_sources("/rgb", "/compressed", "auto")
         ([Offer("/rgb", "std_msgs/msg/String", False)], "/rgb", Image, True),
     ],
 )
-def test_what_is_published_is_chosen(
+def test_the_first_published_source_is_chosen(
     offers: list[Offer], topic: str, kind: type, reliable: bool
 ) -> None:
     choice = choose(AUTO, offers, "auto")
@@ -50,19 +50,19 @@ def test_what_is_published_is_chosen(
 
 
 @pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
-def test_a_given_reliability_is_kept(reliability: str) -> None:
+def test_a_configured_reliability_is_used(reliability: str) -> None:
     for offered in (True, False):
         choice = choose(AUTO, [Offer("/rgb", RAW, offered)], reliability)
         assert choice.reliable == (reliability == "reliable")
 
 
-def test_a_given_transport_is_kept() -> None:
+def test_a_configured_transport_is_used() -> None:
     offers = [Offer("/rgb", RAW, True), Offer("/rgb/compressed", COMPRESSED, True)]
     sources = image_sources("/rgb", "/compressed", "compressed")
     assert choose(sources, offers, "auto").source.kind is CompressedImage
 
 
-def test_a_worker_keeps_the_order_and_lets_the_oldest_go() -> None:
+def test_a_worker_keeps_the_order_and_drops_the_oldest() -> None:
     begin, done, overruns = threading.Event(), [], []
 
     def work(item: int) -> None:
@@ -83,7 +83,7 @@ def test_a_worker_keeps_the_order_and_lets_the_oldest_go() -> None:
     assert worker.stop(10)
 
 
-def test_a_worker_stops_with_work_left() -> None:
+def test_a_worker_stops_with_items_in_its_queue() -> None:
     begin, done = threading.Event(), []
     worker: Worker[int] = Worker(
         "test", lambda item: (begin.wait(10), done.append(item)), size=9, on_overrun=lambda: None
@@ -120,7 +120,7 @@ def test_evidence_waits_for_its_frame() -> None:
     assert [item.stamp_ns for item in waiting.take(5)] == [5]
 
 
-def test_evidence_does_not_wait_without_bound() -> None:
+def test_pending_evidence_is_bounded() -> None:
     waiting = PendingEvidence(capacity=2)
     waiting.add(evidence(1))
     waiting.add(evidence(2))
@@ -130,7 +130,7 @@ def test_evidence_does_not_wait_without_bound() -> None:
     assert [item.stamp_ns for item in waiting.take(3)] == [3]
 
 
-def test_markers_replace_the_whole_picture() -> None:
+def test_a_marker_array_replaces_all_markers() -> None:
     item = SimpleNamespace(
         namespace="nodes",
         id=7,

@@ -37,17 +37,17 @@ TOPICS = {
     Role.CAMERA_INFO: "rgb/camera_info",
     Role.POSE: "camera/pose",
 }
-# How many of the four nodes listen to each.
+# Number of subscribers among the four nodes.
 LISTENERS = {Role.RGB: 2, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
 
 
 class NodeProcess:
-    """One node, started as a user starts it; ended by INT, then TERM, then KILL."""
+    """One node process, ended by SIGINT, then SIGTERM, then SIGKILL."""
 
     def __init__(self, name: str, folder: Path, *arguments: str) -> None:
         self.name = name
         self.log_path = folder / f"{name}.log"
-        # In front of what a sourced ROS 2 put there.
+        # This checkout first, before the paths of a sourced ROS 2.
         python_path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {
             **os.environ,
@@ -62,7 +62,7 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
-        """What it printed."""
+        """Its output."""
         return self.log_path.read_text()
 
     @property
@@ -71,7 +71,7 @@ class NodeProcess:
         return self._process.poll() is None
 
     def wait_ready(self, limit_s: float = 150.0) -> None:
-        """Wait until it says that it is ready."""
+        """Wait until it logs that it is ready."""
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log
 
@@ -86,7 +86,7 @@ class NodeProcess:
         return self._process.wait(limit_s)
 
     def end(self) -> None:
-        """End it, whatever it takes."""
+        """End it, by SIGKILL if necessary."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if not self.alive:
                 return
@@ -96,7 +96,7 @@ class NodeProcess:
 
 
 def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None:
-    """Wait for a condition; fails by name when time runs out."""
+    """Wait for a condition; the failure names it."""
     end_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
@@ -104,7 +104,7 @@ def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None
 
 
 class Peer:
-    """A node of the test itself, with its own context."""
+    """A node in the process of the test, with its own context."""
 
     def __init__(self, name: str) -> None:
         self.context = rclpy.Context()
@@ -160,7 +160,7 @@ def peer(name: str = "test_peer") -> Iterator[Peer]:
 
 
 class Camera:
-    """Publishes a recording's messages as they are."""
+    """Publishes the messages of a recording byte for byte."""
 
     def __init__(self, peer: Peer, messages: list[RawRoleMessage]) -> None:
         self._peer = peer
@@ -172,7 +172,7 @@ class Camera:
         }
 
     def wait_for_listeners(self, limit_s: float = 30.0) -> None:
-        """Wait until all nodes listen, so that nothing of the start is lost."""
+        """Wait until all nodes have subscribed, so that no message is lost."""
         self._peer.spin_until(
             lambda: all(
                 publisher.get_subscription_count() >= LISTENERS[role]

@@ -1,4 +1,4 @@
-"""One node in the test's process, fed through DDS, and the messages that feed it."""
+"""One node in the process of the test, its DDS inputs, and messages for them."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
 
 
 class Bench:
-    """One node in this process, fed through DDS."""
+    """One node in this process, with publishers on its input topics."""
 
     def __init__(
         self,
@@ -124,7 +124,7 @@ class Bench:
         **options: Any,
     ) -> None:
         self.peer = Peer("bench")
-        # A context of its own, as in a process of its own: one context has one type a topic.
+        # Its own context, as in its own process: a context allows one type per topic.
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = make(context=self._context, **options)
@@ -156,8 +156,8 @@ class Bench:
         return self.stamp_ns
 
     def products(self) -> int:
-        """Something that grows with every frame that the node has worked on."""
-        if isinstance(self.node, GraphNode):  # what it publishes depends on the merging rule
+        """A number that grows with every processed frame."""
+        if isinstance(self.node, GraphNode):  # its output depends on the merging rule
             return self.node._newest_ns
         return self.node.health.products
 
@@ -207,7 +207,7 @@ def send_frame(at: Bench, **changes: Any) -> None:
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:
-    """Good input gives a product."""
+    """Valid input gives a product."""
     before = at.products()
     send()
     at.expect(lambda: at.products() > before, "a product")
