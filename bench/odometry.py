@@ -1,6 +1,7 @@
 """RGB-D odometry against a recording's own poses: error a step, drift, time a frame.
 
-Both methods see every frame, one after the other, so that the ratio of their times is paired.
+Both methods, with OpenCV's RGB-D odometry and with depth alone (the fallback for OpenCV 4), process
+every frame one after the other, so that the ratio of their times is paired.
 
     python bench/odometry.py RECORDING [--max-frames N]
 """
@@ -18,7 +19,6 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.poses.odometry import RgbdOdometry
 from deworldsg_ros.recordings.recording import open_recording
@@ -29,11 +29,11 @@ Pose = Any
 
 
 class Tracked:
-    """One method's poses beside the true ones."""
+    """Poses of one method and the true poses."""
 
     def __init__(self, method: str, T_world_start: Pose) -> None:
         self.method = method
-        self.odometry = RgbdOdometry(OdometryConfig(method=method), T_world_start)
+        self.odometry = RgbdOdometry(T_world_start, depth_only=method == "depth")
         self.pairs: list[tuple[Pose, Pose]] = []
         self.times_ms: list[float] = []
 
@@ -49,7 +49,7 @@ class Tracked:
         self.pairs.append((frame.T_world_camera, T))
 
     def report(self) -> None:
-        """Print what was measured."""
+        """Print errors and times."""
         steps = [
             invert_pose(invert_pose(a) @ b) @ (invert_pose(x) @ y)
             for (a, x), (b, y) in zip(self.pairs, self.pairs[1:])

@@ -78,126 +78,52 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tau: Annotated[float, option("relative tolerance to the local median, Eq. 1", ge=0, le=1)] = (
         0.05
     )
-    epsilon_m: Annotated[
-        float, option("absolute tolerance to the local median, metres, Eq. 1", ge=0, le=1)
-    ] = 1e-3
     gamma_base_m: Annotated[
         float, option("least separation of depth clusters, metres, Eq. 2", gt=0, le=10)
     ] = 0.03
-    alpha: Annotated[float, option("factor of the median depth step, Eq. 2", ge=0, le=1000)] = 10.0
-    beta: Annotated[float, option("factor of the reference depth, Eq. 2", ge=0, le=1)] = 0.02
-    min_pixels: Annotated[
-        int, option("valid pixels below which an object is no observation", ge=2, le=100000)
-    ] = 10
     covariance_ridge_m2: Annotated[
         float, option("ridge of the covariance, square metres, Eq. 4", gt=0, le=1)
     ] = 1e-6
-    surface_points: Annotated[
-        int, option("surface points sampled an object and frame", ge=0, le=4096)
-    ] = 200
-    depth_grid_stride_px: Annotated[
-        int,
-        option("pixels between depth samples that tell what was seen through; 0 = none", ge=0),
-    ] = 8
-    regions: Annotated[
-        Literal["masks", "boxes"],
-        option("pixels that are an object's: of its mask, or of its box (ablation)"),
-    ] = "masks"
-    refine: Annotated[bool, option("refine depth by Eq. 1 and 2; false is an ablation")] = True
+    pixels: Annotated[
+        Literal["refined", "mask", "box"],
+        option(
+            "pixels of an object: depth-refined mask (Eq. 1-2), mask without refinement, or box "
+            "without refinement; the latter two are the paper's ablation"
+        ),
+    ] = "refined"
 
 
 class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage c: association and fusion (Eq. 5-7)."""
 
-    hellinger_threshold: Annotated[
-        float, option("Hellinger distance below which nodes may merge, Eq. 6", gt=0, lt=1)
-    ] = 0.7
-    class_distance_threshold: Annotated[
-        float, option("class distance below which nodes may merge, Eq. 6", gt=0, le=1)
-    ] = 0.8
     association: Annotated[
         Literal["paper", "surface"],
-        option("rule that finds an object's node: the paper's Eq. 5-6, or overlap of surfaces"),
+        option(
+            "association rule: paper = Gaussian and class distance (Eq. 5-6), surface = overlap of "
+            "surfaces"
+        ),
     ] = "surface"
-    cell_m: Annotated[
-        float, option("edge of a cell of the surface map, metres (surface rule)", gt=0, le=1)
-    ] = 0.03
+    hellinger_threshold: Annotated[
+        float, option("maximum Hellinger distance of a match, Eq. 6 (paper rule)", gt=0, lt=1)
+    ] = 0.7
+    class_distance_threshold: Annotated[
+        float, option("maximum class distance of a match, Eq. 6 (paper rule)", gt=0, le=1)
+    ] = 0.8
     overlap_threshold: Annotated[
         float,
-        option("share of overlap that makes two one, classes agreeing (surface rule)", gt=0, le=1),
+        option(
+            "minimum overlap fraction of a match whose classes agree (surface rule)", gt=0, le=1
+        ),
     ] = 0.3
-    overlap_threshold_other_class: Annotated[
-        float,
-        option("share of overlap that makes two one whatever the class (surface rule)", gt=0, le=1),
-    ] = 0.55
-    size_ratio_other_class: Annotated[
-        float,
-        option(
-            "most times that one is larger across than the other where the classes of two that are "
-            "one do not agree (surface rule)",
-            ge=1,
-        ),
-    ] = 5.0
-    contest_cells: Annotated[
-        bool,
-        option(
-            "what a frame shows to be one object is no longer part of another that it shows, too "
-            "(surface rule)"
-        ),
-    ] = True
-    even_gaussians: Annotated[
-        bool,
-        option("published Gaussians do not lean to what of a surface was seen most (surface rule)"),
-    ] = True
+    confirm_observations: Annotated[
+        int, option("observations that confirm a node (surface rule)", ge=1, le=1000)
+    ] = 3
     align_poses: Annotated[
         bool,
         option(
-            "each frame is laid on the graph before it is merged: for poses that drift "
-            "(surface rule)"
+            "align each frame with the graph before merging; for poses that drift (surface rule)"
         ),
     ] = False
-    confirm_observations: Annotated[
-        int, option("frames that make a node sure (surface rule)", ge=1, le=1000)
-    ] = 3
-    confirm_score: Annotated[
-        float,
-        option(
-            "detection score that a node has to have once, or it takes four times as many frames "
-            "to be sure (surface rule); 0 = none",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.45
-    baseline_deg: Annotated[
-        float,
-        option(
-            "movement of the camera, seen from a node, that makes another look at it; where the "
-            "camera moves, a node is not sure before that, or half a second (surface rule)",
-            ge=0,
-            le=90,
-        ),
-    ] = 0.5
-    min_detection_rate: Annotated[
-        float,
-        option(
-            "share of the looks at a node in full view that have to detect it, or it is tentative "
-            "again (surface rule); 0 = none",
-            ge=0,
-            le=1,
-        ),
-    ] = 0.4
-    expire_tentative_s: Annotated[
-        float, option("time unseen after which a tentative node goes (surface rule)", gt=0)
-    ] = 10.0
-    absent_frames: Annotated[
-        int,
-        option("frames that see through a node before it is gone; 0 = never (surface rule)", ge=0),
-    ] = 5
-    lost_s: Annotated[
-        float,
-        option("time in which a moved object may take up its id again (surface rule)", ge=0),
-    ] = 30.0
-    surface_points: Annotated[int, option("surface points kept a node", ge=0, le=100000)] = 512
 
 
 class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -318,36 +244,11 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Poses out of the images alone: odometry_node, `deworldsg run --odometry`."""
+    """Camera poses estimated from the images: odometry_node, `deworldsg run --odometry`."""
 
-    method: Annotated[
-        Literal["rgbd", "depth"],
-        option("align colour and depth, or depth alone (twice as fast, drifts more)"),
-    ] = "rgbd"
-    max_depth_m: Annotated[
-        float, option("depth beyond which is not aligned, metres", gt=0, le=100)
-    ] = 4.0
-    max_step_m: Annotated[
-        float, option("camera movement between frames above which it is lost, metres", gt=0, le=10)
-    ] = 0.3
-    max_rotation_deg: Annotated[
-        float, option("rotation between frames above which it is lost, degrees", gt=0, le=180)
-    ] = 30.0
-    min_fit: Annotated[
-        float, option("share of the depth that has to fit, or the frame is lost", ge=0, le=1)
-    ] = 0.6
-    keyframe_m: Annotated[
-        float, option("movement up to which the same frame stays the reference, metres", ge=0)
-    ] = 0.02
-    keyframe_deg: Annotated[
-        float, option("rotation up to which the same frame stays the reference, degrees", ge=0)
-    ] = 1.0
-    restart_after: Annotated[
-        int, option("lost frames before it starts anew at the last known pose", ge=1, le=100000)
-    ] = 15
-    frame_id: Annotated[str, option("world frame of the poses, where nothing gives one")] = "odom"
     publish_tf: Annotated[
-        bool, option("also publish what the camera is mounted on to /tf (needs tf2_msgs)")
+        bool,
+        option("also publish the pose of the root of the camera's static TF tree (needs tf2_msgs)"),
     ] = False
 
 

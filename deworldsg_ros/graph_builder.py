@@ -130,7 +130,4 @@ class GraphBuilder:
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:
     """Settings of `SceneGraph` by name."""
-    return {
-        "surface_point_capacity": merging.surface_points,
-        "even_gaussians": merging.association == "surface" and merging.even_gaussians,
-    }
+    return {"even_gaussians": merging.association == "surface"}

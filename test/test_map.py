@@ -36,10 +36,8 @@ def saved(builder: GraphBuilder, folder: Path) -> Path:
 @pytest.mark.parametrize("association", ["surface", "paper"])
 @pytest.mark.parametrize("seed", range(4))
 def test_going_on_is_as_never_having_stopped(tmp_path, association, seed):
-    # Nothing is tentative, which a map leaves out.
-    config = config_of(
-        association=association, confirm_observations=1, confirm_score=0.0, min_detection_rate=0.0
-    )
+    # A map leaves out tentative nodes. Here every node is confirmed.
+    config = config_of(association=association, confirm_observations=1)
     frames = random_local_graphs(np.random.default_rng(seed), 60)
     whole = GraphBuilder(config, VOCABULARY, "world")
     for local in frames[:30]:
@@ -95,12 +93,23 @@ def test_priors_are_kept(tmp_path):
     np.testing.assert_allclose(again.prior.lookup(np.array([[CUP, TABLE]]))[0][0], [0.7, 0.2, 0.1])
 
 
-@pytest.mark.parametrize("merging", [{"association": "paper"}, {"cell_m": 0.02}])
-def test_the_map_of_another_rule_is_known_again(tmp_path, merging):
-    builder = builder_of(**merging)
+def test_objects_of_a_map_of_another_rule_are_recognised(tmp_path):
+    builder = builder_of(association="paper")
     for stamp in range(1, 5):
         builder.integrate(frame(stamp, (WHOLE, TABLE)))
     again = read_map(Config(), saved(builder, tmp_path))
+    assert again.integrate(frame(6, (WHOLE, TABLE))) == [1]
+
+
+def test_objects_of_a_map_with_another_cell_size_are_recognised(tmp_path):
+    builder = builder_of()
+    for stamp in range(1, 5):
+        builder.integrate(frame(stamp, (WHOLE, TABLE)))
+    path = saved(builder, tmp_path)
+    # The cells themselves must not be used: they are not those of the object.
+    other = {"merging.cell_m": np.array(0.02), "merging.blocks": np.zeros(0)}
+    graph_io.write(path, {**graph_io.read(path), **other})
+    again = read_map(Config(), path)
     assert again.integrate(frame(6, (WHOLE, TABLE))) == [1]
 
 

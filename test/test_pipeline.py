@@ -172,7 +172,7 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
 
 
 def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
-    merging = MergingConfig(association="surface", confirm_observations=2)
+    merging = MergingConfig(confirm_observations=2)
     pipeline = Pipeline(Config(merging=merging), Scripted())
     asked = Pipeline(
         Config(merging=merging, output=OutputConfig(include_tentative=True)), Scripted()

@@ -155,7 +155,7 @@ def _process(
     total = min(recording.frame_count, options.max_frames or recording.frame_count)
     with frame_progress(console) as progress:
         task = progress.add_task("building the graph", total=total, note="")
-        frames = posed_frames(recording, options.poses, pipeline.config, refuse)
+        frames = posed_frames(recording, options.poses, refuse)
         for frame in itertools.islice(frames, options.max_frames or None):
             try:
                 result = pipeline.process(frame)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Literal
 
-from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
@@ -46,7 +45,6 @@ def repose(
     frames: Iterator[RgbdFrame],
     choice: PoseSource,
     source: Source,
-    odometry: OdometryConfig,
     drops: Counter[str],
 ) -> Iterator[RgbdFrame]:
     """The frames with the chosen poses; those without one are left out and counted in `drops`.
@@ -70,7 +68,7 @@ def repose(
     def lost(refusal: RefusedInput) -> None:
         drops[refusal.reason] += 1
 
-    return track_poses(again, odometry, first.T_world_camera, lost)
+    return track_poses(again, first.T_world_camera, lost)
 
 
 def _of_slam(

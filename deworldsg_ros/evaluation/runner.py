@@ -158,7 +158,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     frames = 0
     started_ns: int | None = None
     taken = islice(islice(recording.frames(), 0, None, task.every), total)
-    for frame in repose(taken, task.poses, source, task.config.odometry, refused):
+    for frame in repose(taken, task.poses, source, refused):
         started_ns = frame.stamp_ns if started_ns is None else started_ns
         try:
             pipeline.process(frame)

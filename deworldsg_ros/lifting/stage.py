@@ -1,4 +1,4 @@
-"""Stage b in one reading: frame graph, instance labels and depth become a local 3D graph."""
+"""The lifting stage: frame graph, instance image and depth become a local 3D graph."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from collections import Counter
 import numpy as np
 
 from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.lifting.constants import (
+    DEPTH_GRID_STRIDE_PX,
+    LARGE_SURFACE_FACTOR,
+    POINT_AREA_M2,
+    LiftingConstants,
+)
 from deworldsg_ros.lifting.depth_layer import dominant_layer
 from deworldsg_ros.lifting.moments import back_project, estimate_gaussians
 from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
-from deworldsg_ros.lifting.regions import box_pixels, mask_pixels, smooth_pixels, valid_pixels
 from deworldsg_ros.lifting.spatial import spatial_inliers
+from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -23,17 +29,20 @@ from deworldsg_ros.scene.frame_graph import (
     Vocabulary,
 )
 
-# Two samples of a wardrobe have to meet in cells of 3 cm, with those beside them: so much visible
-# surface gets a point of its own, where the usual number leaves more, up to a few times that.
-POINT_AREA_M2 = 0.003
-LARGE_FACTOR = 4
-
 
 class Lifting:
-    """Lifts the objects of a frame to 3D Gaussians in the world frame; keeps no state."""
+    """Lifts the objects of a frame to 3D Gaussians in the world frame; keeps no state.
 
-    def __init__(self, config: LiftingConfig) -> None:
-        self.config = config
+    Args:
+        config: thresholds of Eq. 1-4, and which pixels belong to an object.
+        constants: fixed values; only tests change them.
+    """
+
+    def __init__(
+        self, config: LiftingConfig, constants: LiftingConstants = LiftingConstants()
+    ) -> None:
+        self._config = config
+        self._constants = constants
 
     def lift(
         self,
@@ -48,31 +57,32 @@ class Lifting:
 
         Args:
             frame_graph: n objects and the relations between them.
-            instances: (H, W) uint16, 0 = nothing, k = k-th object of the frame graph.
+            instances: (H, W) uint16, 0 = no object, k = k-th object of the frame graph.
             depth_m: (H, W) float32 metres; 0, NaN, infinity and negative values are invalid.
             intrinsics: of both images.
             T_world_camera: (4, 4) float64.
             frame_id: name of the world frame.
 
         Returns:
-            The objects with enough valid pixels, in the order of the frame graph; the others are
-            counted in `drops` under ``few_mask_pixels``, ``few_spatial_inliers`` (Eq. 1) or
-            ``few_depth_inliers`` (Eq. 2), and their relations vanish with them.
+            The objects with enough valid pixels, in the order of the frame graph. Dropped objects
+            are counted in `drops` under ``few_mask_pixels``, ``few_spatial_inliers`` (Eq. 1) or
+            ``few_depth_inliers`` (Eq. 2). Their relations are removed.
 
         Raises:
-            RefusedInput: ``grid_mismatch`` where sizes differ, ``invalid_pose``,
-                ``unknown_instance`` where the instance image has values beyond the frame graph.
+            RefusedInput: ``grid_mismatch`` if sizes differ, ``invalid_pose``, or
+                ``unknown_instance`` if the instance image has ids beyond the frame graph.
         """
         _check_grids(frame_graph, instances, depth_m, intrinsics)
         check_pose(T_world_camera)
         depth_m = valid_depth(depth_m)
-        refined, drops = self._refine(depth_m, instances, frame_graph)
+        inliers, drops = self._inliers(depth_m, instances, frame_graph)
 
-        rows = np.array(sorted(refined), np.int64)
-        objects = [refined[row] for row in rows]
+        rows = np.array(sorted(inliers), np.int64)
+        objects = [inliers[row] for row in rows]
         means, covariances, depths_m = estimate_gaussians(
-            objects, intrinsics, T_world_camera, self.config.covariance_ridge_m2
+            objects, intrinsics, T_world_camera, self._config.covariance_ridge_m2
         )
+        point_counts = self._point_counts(objects, depths_m, intrinsics)
         return LocalGraph(
             stamp_ns=frame_graph.stamp_ns,
             frame_id=frame_id,
@@ -88,85 +98,87 @@ class Lifting:
             covariances_world=covariances,
             depths_m=depths_m,
             pixel_counts=np.array([len(pixels) for pixels in objects], np.int64),
-            surface_points_world=_surface_points(
-                objects,
-                _point_numbers(objects, depths_m, intrinsics, self.config.surface_points),
-                intrinsics,
-                T_world_camera,
-            ),
+            surface_points_world=_surface_points(objects, point_counts, intrinsics, T_world_camera),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
-            depth_grid=_depth_grid(depth_m, intrinsics, self.config.depth_grid_stride_px),
+            depth_grid=_depth_grid(depth_m, intrinsics),
         )
 
     def warm_up(self) -> None:
         """Compile the kernels, or load them from numba's cache, before the first frame."""
-        vocabulary = Vocabulary(("thing",), ())
-        nothing = Relations.none(0)
+        vocabulary = Vocabulary(("object",), ())
+        no_relations = Relations.none(0)
         graph = FrameGraph(
-            0, "", 8, 8, vocabulary, np.zeros((1, 4)), np.ones((1, 1)), np.ones(1), nothing
+            0, "", 8, 8, vocabulary, np.zeros((1, 4)), np.ones((1, 1)), np.ones(1), no_relations
         )
-        # Two layers, steps of many sizes: every kernel has work.
+        # Two depth layers with steps of many sizes run every kernel.
         depth_m = (1.0 + 0.001 * np.arange(64) ** 1.5).reshape(8, 8).astype(np.float32)
         depth_m[5:] += 5.0
         instances = np.ones((8, 8), np.uint16)
         intrinsics = Intrinsics(8.0, 8.0, 4.0, 4.0, 8, 8)
         Lifting(LiftingConfig()).lift(graph, instances, depth_m, intrinsics, np.eye(4), "")
 
-    def _refine(
+    def _inliers(
         self, depth_m: Float32, instances: UInt16, frame_graph: FrameGraph
     ) -> tuple[dict[int, Pixels], dict[str, int]]:
-        """Final inliers by object (row of the frame graph), and the drops by reason."""
-        config = self.config
-        valid_counts = valid_pixel_counts(depth_m, instances, len(frame_graph))
-        if valid_counts[0]:
-            raise RefusedInput(
-                "unknown_instance",
-                f"{valid_counts[0]} pixels of the instance image, up to {instances.max()}: "
-                f"wanted values up to {len(frame_graph)}, the number of objects in the frame graph",
-            )
-        if config.regions == "boxes":
-            valid = box_pixels(depth_m, valid_pixels(depth_m), frame_graph.boxes_xyxy)
-            valid_counts = np.array([0, *map(len, valid)], np.int64)
-        refined: dict[int, Pixels] = {}
+        """Final pixels of each kept object, by row of the frame graph, and the drops by reason."""
+        config, constants = self._config, self._constants
+        min_pixels = constants.min_pixels
+        inliers: dict[int, Pixels] = {}
         drops: Counter[str] = Counter()
-        for row, pixels in enumerate(
-            self._spatial(depth_m, instances, valid_counts, frame_graph.boxes_xyxy)
-        ):
-            if valid_counts[row + 1] < config.min_pixels:
+        candidates, valid_counts = self._candidates(depth_m, instances, frame_graph)
+        for row, (pixels, valid_count) in enumerate(zip(candidates, valid_counts)):
+            if valid_count < min_pixels:
                 drops["few_mask_pixels"] += 1
                 continue
-            if len(pixels) < config.min_pixels:
+            if len(pixels) < min_pixels:
                 drops["few_spatial_inliers"] += 1
                 continue
-            if not config.refine:
-                refined[row] = pixels
-                continue
-            layer_m = dominant_layer(
-                pixels.depths_m, config.gamma_base_m, config.alpha, config.beta
-            )
-            kept = pixels.within(*layer_m)
-            if len(kept) < config.min_pixels:
-                drops["few_depth_inliers"] += 1
-                continue
-            refined[row] = kept
-        return refined, dict(drops)
+            if config.pixels == "refined":
+                layer_m = dominant_layer(
+                    pixels.depths_m, config.gamma_base_m, constants.alpha, constants.beta
+                )
+                pixels = pixels.within(*layer_m)
+                if len(pixels) < min_pixels:
+                    drops["few_depth_inliers"] += 1
+                    continue
+            inliers[row] = pixels
+        return inliers, dict(drops)
 
-    def _spatial(
-        self,
-        depth_m: Float32,
-        instances: UInt16,
-        valid_counts: Int64,
-        boxes_xyxy: Float64,
-    ) -> list[Pixels]:
-        """Pixels of each object, of its mask or box, after Eq. 1 or without it."""
-        tau, epsilon_m, refine = self.config.tau, self.config.epsilon_m, self.config.refine
-        if self.config.regions == "boxes":
-            kept = smooth_pixels(depth_m, tau, epsilon_m) if refine else valid_pixels(depth_m)
-            return box_pixels(depth_m, kept, boxes_xyxy)
-        if not refine:
-            return mask_pixels(depth_m, instances, valid_counts)
-        return spatial_inliers(depth_m, instances, valid_counts, tau, epsilon_m)
+    def _candidates(
+        self, depth_m: Float32, instances: UInt16, frame_graph: FrameGraph
+    ) -> tuple[list[Pixels], list[int]]:
+        """Pixels of each object before Eq. 2, and its number of valid pixels before Eq. 1."""
+        counts = valid_pixel_counts(depth_m, instances, len(frame_graph))
+        if counts[0]:
+            raise RefusedInput(
+                "unknown_instance",
+                f"{counts[0]} pixels of the instance image have an id above {len(frame_graph)}, up "
+                f"to {instances.max()}: expected at most {len(frame_graph)}, the number of objects "
+                "in the frame graph",
+            )
+        if self._config.pixels == "box":
+            candidates = box_pixels(depth_m, frame_graph.boxes_xyxy)
+            return candidates, [len(pixels) for pixels in candidates]
+        if self._config.pixels == "mask":
+            candidates = mask_pixels(depth_m, instances, counts)
+        else:
+            candidates = spatial_inliers(
+                depth_m, instances, counts, self._config.tau, self._constants.epsilon_m
+            )
+        return candidates, counts[1:].tolist()
+
+    def _point_counts(
+        self, objects: list[Pixels], depths_m: Float64, intrinsics: Intrinsics
+    ) -> list[int]:
+        """Number of surface points of each object: more for a large surface, at most its pixels."""
+        usual = self._constants.surface_points
+        pixels = np.array([len(item) for item in objects], np.int64)
+        areas_m2 = pixels * depths_m**2 / (intrinsics.fx * intrinsics.fy)
+        by_area = (areas_m2 / POINT_AREA_M2).astype(np.int64)
+        counts = np.clip(by_area, usual, LARGE_SURFACE_FACTOR * usual)
+        numbers: list[int] = np.minimum(counts, pixels).tolist()
+        return numbers
 
 
 def _check_grids(
@@ -175,39 +187,28 @@ def _check_grids(
     depth_m: Float32,
     intrinsics: Intrinsics,
 ) -> None:
-    wanted = (frame_graph.height, frame_graph.width)
+    expected = (frame_graph.height, frame_graph.width)
     grids = {
         "instance image": instances.shape,
         "depth": depth_m.shape,
         "camera_info": (intrinsics.height, intrinsics.width),
     }
     for name, shape in grids.items():
-        if shape != wanted:
+        if shape != expected:
             raise RefusedInput(
-                "grid_mismatch", f"{name} is (rows, columns) {shape}: the frame graph has {wanted}"
+                "grid_mismatch",
+                f"{name} has (rows, columns) {shape}: expected {expected} as in the frame graph",
             )
 
 
-def _point_numbers(
-    objects: list[Pixels], depths_m: Float64, intrinsics: Intrinsics, number: int
-) -> list[int]:
-    """Surface points that each object gives: this number, more of a large surface, or all."""
-    pixels = np.array([len(item) for item in objects], np.int64)
-    areas_m2 = pixels * depths_m**2 / (intrinsics.fx * intrinsics.fy)
-    wanted = np.clip((areas_m2 / POINT_AREA_M2).astype(np.int64), number, LARGE_FACTOR * number)
-    numbers: list[int] = np.minimum(wanted, pixels).tolist()
-    return numbers
-
-
 def _surface_points(
-    objects: list[Pixels], numbers: list[int], intrinsics: Intrinsics, T_world_camera: Float64
+    objects: list[Pixels], counts: list[int], intrinsics: Intrinsics, T_world_camera: Float64
 ) -> tuple[Float32, ...]:
-    """So many points of each object, world frame: every n-th of its inliers."""
+    """Evenly spaced sample of each object's pixels as points (count, 3), world frame, metres."""
     if not objects:
         return ()
     chosen = [
-        np.arange(number) * len(pixels) // max(number, 1)
-        for number, pixels in zip(numbers, objects)
+        np.arange(count) * len(pixels) // max(count, 1) for count, pixels in zip(counts, objects)
     ]
     sample = Pixels(
         np.concatenate([pixels.columns[at] for pixels, at in zip(objects, chosen)]),
@@ -215,20 +216,19 @@ def _surface_points(
         np.concatenate([pixels.depths_m[at] for pixels, at in zip(objects, chosen)]),
     )
     points = back_project(sample, intrinsics, T_world_camera).astype(np.float32)
-    return tuple(np.split(points, np.cumsum(numbers)[:-1]))
+    return tuple(np.split(points, np.cumsum(counts)[:-1]))
 
 
-def _depth_grid(depth_m: Float32, intrinsics: Intrinsics, stride_px: int) -> DepthGrid | None:
-    """Valid depth on every n-th pixel, in whole millimetres; None where n is 0."""
-    if stride_px == 0:
-        return None
-    samples_mm = np.rint(depth_m[stride_px // 2 :: stride_px, stride_px // 2 :: stride_px] * 1000.0)
+def _depth_grid(depth_m: Float32, intrinsics: Intrinsics) -> DepthGrid:
+    """Valid depth on every N-th pixel, in whole millimetres."""
+    stride = DEPTH_GRID_STRIDE_PX
+    samples_mm = np.rint(depth_m[stride // 2 :: stride, stride // 2 :: stride] * 1000.0)
     samples_mm = np.minimum(samples_mm, np.iinfo(np.uint16).max).astype(np.uint16)
-    return DepthGrid(samples_mm, stride_px, intrinsics)
+    return DepthGrid(samples_mm, stride, intrinsics)
 
 
 def _kept_relations(relations: Relations, rows: Int64, count: int) -> Relations:
-    """Relations whose both ends are among these rows, with the rows renumbered."""
+    """Relations between kept rows, with the rows renumbered."""
     renumbered = np.full(count, -1, np.int64)
     renumbered[rows] = np.arange(len(rows))
     pairs = renumbered[relations.pairs]

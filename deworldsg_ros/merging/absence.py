@@ -37,7 +37,7 @@ class SeenThrough:
     """Counts, by owner, the frames in a row that looked through a node's place.
 
     Args:
-        enough_frames: so many, and the node is gone from there; 0 = never.
+        enough_frames: after this many, the node is no longer at its position.
     """
 
     def __init__(self, enough_frames: int) -> None:
@@ -190,7 +190,7 @@ def _look(
     views = np.full(len(points), UNSEEN)
     rows, columns = depth_mm.shape
     for node in range(len(points)):
-        gone[node] = 0 < enough_frames <= frames[node]
+        gone[node] = enough_frames <= frames[node]
         if _beside_view(
             balls[node], T_camera_world, columns * stride, rows * stride, fx, fy, cx, cy
         ):
@@ -234,5 +234,5 @@ def _look(
                 gone[node] = False
         elif half and through >= DECISIVE_SHARE * visible and not found[node]:
             frames[node] += 1
-            gone[node] = 0 < enough_frames <= frames[node]
+            gone[node] = enough_frames <= frames[node]
     return np.flatnonzero(gone), views

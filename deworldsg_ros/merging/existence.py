@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.merging.absence import VIEWS, WHOLE
+from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.scene.arrays import Float64, Int64
 
 # Another look comes soon where the camera moves, and is waited for this long, so that what it sees
@@ -60,12 +60,14 @@ class Existence:
     is all that was seen of a node from about one place; it found the node if any of its frames did.
 
     Args:
-        config: what it takes to be sure.
+        confirm_observations: detections that confirm a node.
+        limits: further conditions.
     """
 
-    def __init__(self, config: MergingConfig) -> None:
-        self._config = config
-        self._baseline_rad = math.radians(config.baseline_deg)
+    def __init__(self, confirm_observations: int, limits: LifeCycleLimits) -> None:
+        self._confirm_observations = confirm_observations
+        self._limits = limits
+        self._baseline_rad = math.radians(limits.baseline_deg)
         self._nodes = np.zeros(0, RECORD)
         # By view: looks at nodes known for longer than a moment, and those of them that found one.
         self.by_view = np.full((len(VIEWS), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
@@ -73,7 +75,7 @@ class Existence:
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
         place = np.zeros((1, 3))
-        spare = Existence(self._config)
+        spare = Existence(self._confirm_observations, self._limits)
         spare.detected([0], place, np.ones(1), place[0], 0)
         spare.viewed([0], np.ones(1, np.int64))
         spare.missed([0], np.ones(1, np.int64), place, place[0], 0)
@@ -125,15 +127,15 @@ class Existence:
             np.ascontiguousarray(camera_world),
             stamp_ns,
             self._baseline_rad,
-            self._config.min_detection_rate,
+            self._limits.min_detection_rate,
         ).tolist()
         return doubted
 
     def sure(self, owner: int) -> bool:
         """Whether a node was detected often and surely enough, and in more than one look."""
         node = self._nodes[owner]
-        surely = node["best_score"] >= self._config.confirm_score
-        wanted = self._config.confirm_observations * (1 if surely else UNSURE_TIMES)
+        surely = node["best_score"] >= self._limits.confirm_score
+        wanted = self._confirm_observations * (1 if surely else UNSURE_TIMES)
         waited = node["last_ns"] - node["first_ns"] >= WAIT_NS
         again = node["looks"] or not node["moving"] or waited
         return bool(again and node["detections"] >= wanted and not self._doubtful(owner))
@@ -175,7 +177,7 @@ class Existence:
             self._nodes[owner] = np.zeros((), RECORD)
 
     def _doubtful(self, owner: int) -> bool:
-        rate = self._config.min_detection_rate
+        rate = self._limits.min_detection_rate
         return bool(_doubtful(self._nodes, owner, self.by_view, rate))
 
     def _make_room(self, count: int) -> None:
@@ -188,8 +190,6 @@ class Existence:
 def _doubtful(nodes: NDArray[Any], owner: int, by_view: Float64, min_rate: float) -> bool:
     """Whether a node is more likely an error than an object."""
     node = nodes[owner]
-    if min_rate == 0.0:
-        return False
     counts = node.finds or node.best_view == WHOLE
     if node.found + node.finds < min_rate * (node.looks + counts):
         return True

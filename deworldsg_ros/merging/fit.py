@@ -7,12 +7,17 @@ import math
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
 
+# Minimum overlap fraction of a match whose classes differ. Without a match of different classes,
+# labels that flip create nodes of their own (docs/dev/notebook.md).
+OVERLAP_THRESHOLD_OTHER_CLASS = 0.55
+# Maximum size ratio of two matched objects whose classes differ. A book lies wholly on the cells of
+# the table below it.
+SIZE_RATIO_OTHER_CLASS = 5.0
 # Classes agree where two labels drawn from the two distributions are the same this often.
 CLASS_AGREEMENT = 0.3
 # What agreeing classes add to the share of overlap, when several nodes could be the one, and what
@@ -29,7 +34,8 @@ def fit(
     nodes: NodeTable,
     rows: Int64,
     shares: Float64,
-    config: MergingConfig,
+    overlap_threshold: float,
+    cell_m: float,
 ) -> tuple[Float64, Bool]:
     """How well each object fits each node; 0 where they cannot be the same.
 
@@ -38,7 +44,8 @@ def fit(
         nodes: the nodes of the graph.
         rows: (k,) those to compare with.
         shares: (n, k) how far the surfaces coincide.
-        config: thresholds of the shares.
+        overlap_threshold: minimum overlap fraction of a match whose classes agree.
+        cell_m: edge of a cell, metres.
 
     Returns:
         (n, k) float64: share + bonus · Σ p q + bonus · exp(-BD), with the Bhattacharyya distance
@@ -54,11 +61,9 @@ def fit(
         nodes.class_probabilities,
         rows,
         shares,
-        config.overlap_threshold,
-        config.overlap_threshold_other_class,
-        config.size_ratio_other_class**2,
+        overlap_threshold,
         # Variance of a place that is known to be in a cell, along each axis.
-        config.cell_m**2 / 12,
+        cell_m**2 / 12,
     )
     return result
 
@@ -75,7 +80,7 @@ def one_to_one(values: Float64) -> list[int]:
 def warm_up() -> None:
     """Compile the comparison, or load it from the cache."""
     gaussian = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
-    _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 0.5, 1.0, 1.0)
+    _fit(*gaussian, *gaussian, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 1.0)
 
 
 @kernel
@@ -104,8 +109,6 @@ def _fit(
     rows: Int64,
     shares: Float64,
     threshold: float,
-    threshold_other_class: float,
-    variance_ratio_other_class: float,
     blur_m2: float,
 ) -> tuple[Float64, Bool]:
     values = np.zeros(shares.shape)
@@ -122,14 +125,14 @@ def _fit(
                 agreement += classes[index, label] * node_classes[row, label]
             agree = agreement > CLASS_AGREEMENT
             touching[index, column] = agree
-            if share < (threshold if agree else threshold_other_class):
+            if share < (threshold if agree else OVERLAP_THRESHOLD_OTHER_CLASS):
                 continue
             a = covariances[index] + blur
             b = node_covariances[row] + blur
             if not agree:
                 size_a = a[0, 0] + a[1, 1] + a[2, 2]
                 size_b = b[0, 0] + b[1, 1] + b[2, 2]
-                if max(size_a, size_b) > variance_ratio_other_class * min(size_a, size_b):
+                if max(size_a, size_b) > SIZE_RATIO_OTHER_CLASS**2 * min(size_a, size_b):
                     continue
             d0 = means[index, 0] - node_means[row, 0]
             d1 = means[index, 1] - node_means[row, 1]

@@ -17,6 +17,7 @@ from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.fit import fit, one_to_one
 from deworldsg_ros.merging.fit import warm_up as warm_up_fit
 from deworldsg_ros.merging.joint import JointEvidence
+from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.merging.local import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.lost_nodes import LostNodes, alike_elsewhere
 from deworldsg_ros.merging.owners import Owners
@@ -37,24 +38,25 @@ CONTESTED_SHARE = 0.1
 class SurfaceMerging:
     """Merges local graphs into a scene graph by the overlap of surfaces."""
 
-    def __init__(self, config: MergingConfig) -> None:
+    def __init__(self, config: MergingConfig, limits: LifeCycleLimits = LifeCycleLimits()) -> None:
         self._config = config
+        self._limits = limits
         self._owners = Owners()
         # Each of these knows the nodes by their owner indices.
-        self._map = VoxelMap(config.cell_m)
+        self._map = VoxelMap()
         self._joint = JointEvidence()
-        self._existence = Existence(config)
-        self._through = SeenThrough(config.absent_frames)
+        self._existence = Existence(config.confirm_observations, limits)
+        self._through = SeenThrough(limits.absent_frames)
         # Owners whose surface has changed since `_through` took points of it.
         self._changed: set[int] = set()
-        self._lost = LostNodes(config.lost_s)
+        self._lost = LostNodes(limits.lost_s)
         # Nodes that were sure once; they are hidden, and keep their ids until they are found again.
         self._doubted: set[int] = set()
         self._alignment = PoseAlignment()
 
     def warm_up(self) -> None:
         """Compile now what would else be compiled during the first frame."""
-        known = VoxelMap(self._config.cell_m)
+        known = VoxelMap()
         sets = known.cells_of([np.zeros((1, 3), np.float32)])
         known.add([0], sets)
         known.shares(sets)
@@ -83,11 +85,17 @@ class SurfaceMerging:
         cells = self._map.cells_of(local.surface_points_world)
         owners, shares = self._map.shares(cells)
         rows = [graph.nodes.row(self._owners.node(owner)) for owner in owners]
-        values, touching = fit(local, graph.nodes, np.array(rows, np.int64), shares, self._config)
+        values, touching = fit(
+            local,
+            graph.nodes,
+            np.array(rows, np.int64),
+            shares,
+            self._config.overlap_threshold,
+            self._map.cell_m,
+        )
         matched = one_to_one(values)
         places = [owners[column] if column >= 0 else -1 for column in matched]
-        if self._config.contest_cells:
-            self._contest(graph, cells, places)
+        self._contest(graph, cells, places)
         node_ids = self._place(graph, local, cells, places)
         seen = [self._owner(node_id) for node_id in node_ids]
         self._joint.note(seen, owners, values, touching, matched)
@@ -303,7 +311,7 @@ class SurfaceMerging:
     def _expire(self, graph: SceneGraph, stamp_ns: int) -> None:
         """Remove tentative nodes that have not been seen for long, and what was lost for good."""
         nodes = graph.nodes
-        oldest_ns = stamp_ns - int(self._config.expire_tentative_s * 1e9)
+        oldest_ns = stamp_ns - int(self._limits.expire_tentative_s * 1e9)
         old = nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist()
         for node_id in old:
             if node_id not in self._lost and node_id not in self._doubted:

@@ -16,6 +16,9 @@ import numpy as np
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int32, Int64, UInt64
 
+# Edge of a cell. In the rendered rooms, cells of 2 cm lose objects and cells of 5 cm lose relations
+# (docs/dev/notebook.md).
+CELL_M = 0.03
 # An owner of fewer cells than this says too little by lying within a set.
 MIN_REVERSE_CELLS = 4
 _EMPTY = np.int64(-1)
@@ -63,7 +66,7 @@ class VoxelMap:
         cells_per_owner: most cells kept an owner; a surface beyond that is not remembered.
     """
 
-    def __init__(self, cell_m: float, cells_per_owner: int = 8192) -> None:
+    def __init__(self, cell_m: float = CELL_M, cells_per_owner: int = 8192) -> None:
         self.cell_m = cell_m
         self._cells_per_owner = cells_per_owner
         self._allocate(_FIRST_CAPACITY)

@@ -8,7 +8,12 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 
-from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY, RgbdOdometry
+from deworldsg_ros.poses.odometry import (
+    HAS_ODOMETRY,
+    ODOMETRY_FRAME,
+    WITHOUT_ODOMETRY,
+    RgbdOdometry,
+)
 from deworldsg_ros.ros.inputs import (
     POSE_DEPTH,
     listen_camera_info,
@@ -29,9 +34,8 @@ class OdometryNode(JoiningNode[UnposedFrame]):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("odometry_node", "poses", **options)
-        config = self.parameters.odometry
-        self._world_frame = self.parameters.inputs.world_frame or config.frame_id
-        self._odometry = RgbdOdometry(config)
+        self._world_frame = self.parameters.inputs.world_frame or ODOMETRY_FRAME
+        self._odometry = RgbdOdometry()
         if not HAS_ODOMETRY:
             self.get_logger().warning(WITHOUT_ODOMETRY)
         self._newest_ns = 0
@@ -39,7 +43,7 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         self._odometry_output = self.create_publisher(
             Odometry, "camera/odometry", reliable(POSE_DEPTH)
         )
-        self._tf_output = TransformOutput(self) if config.publish_tf else None
+        self._tf_output = TransformOutput(self) if self.parameters.odometry.publish_tf else None
         frames = self._frames = UnposedAssembler(self.parameters.inputs, **self.assembler_options())
         self.join(frames, self._track)
         listen_camera_info(self, self.taking(frames.add_camera_info))
@@ -48,7 +52,7 @@ class OdometryNode(JoiningNode[UnposedFrame]):
 
     def _track(self, frame: UnposedFrame) -> None:
         if frame.stamp_ns < self._newest_ns:  # a recording was restarted
-            self._odometry = RgbdOdometry(self.parameters.odometry)
+            self._odometry = RgbdOdometry()
         self._newest_ns = frame.stamp_ns
         T_world_camera = self._odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)
         self._publish(frame.stamp_ns, T_world_camera)

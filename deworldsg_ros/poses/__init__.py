@@ -1,1 +1,1 @@
-"""Where camera poses come from when a recording's own are missing, replaced or made worse."""
+"""Camera poses: odometry, trajectory files, and perturbation."""

@@ -20,7 +20,7 @@ NORMAL_STEP_PX = 4
 # A point fits where its depth is within this, and this share of it, of what is seen there.
 FIT_M = 0.03
 FIT_SHARE = 0.02
-LEAST_POINTS = 50
+MIN_POINTS = 50
 # Correspondences further apart than this are left out, iteration by iteration.
 REACHES_M = (0.3, 0.3, 0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05)
 # Residuals well beyond this share of it count little (Cauchy): coarse first, then fine.
@@ -39,7 +39,7 @@ def points_of(depth_m: Float32, intrinsics: Intrinsics, step_px: int = POINT_STE
     return np.stack([x, y, z], axis=1)
 
 
-def fit_share(
+def fit_fraction(
     points_a: Float64, depth_b_m: Float32, T_b_a: Float64, intrinsics: Intrinsics
 ) -> float:
     """Share of the points of camera a that lie on depth image b, of those that b sees.
@@ -50,7 +50,7 @@ def fit_share(
     row, column, inside = _project(moved, intrinsics)
     seen_m = depth_b_m[row[inside], column[inside]].astype(np.float64)
     gap_m = np.abs(seen_m - moved[inside, 2])[seen_m > 0]
-    if len(gap_m) < max(LEAST_POINTS, len(points_a) // 8):
+    if len(gap_m) < max(MIN_POINTS, len(points_a) // 8):
         return 0.0
     return float(np.mean(gap_m < FIT_M + FIT_SHARE * seen_m[seen_m > 0]))
 
@@ -114,7 +114,7 @@ def refine(
         # Comparisons with NaN are false: what has no normal is left out.
         near = np.abs(residuals) < reach_m
         near &= np.linalg.norm(gaps, axis=1) < 2 * reach_m
-        if np.count_nonzero(near) < LEAST_POINTS:
+        if np.count_nonzero(near) < MIN_POINTS:
             return T_b_a
         normals, residuals = normals[near], residuals[near]
         jacobian = np.hstack([np.cross(moved[near], normals), normals])

@@ -1,11 +1,10 @@
-"""Streams of posed frames with other poses than they came with."""
+"""Streams of frames whose poses come from odometry."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.odometry import RgbdOdometry
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame
@@ -16,19 +15,17 @@ OnRefusal = Callable[[RefusedInput], None]
 
 def track_poses(
     frames: Iterable[RgbdFrame],
-    config: OdometryConfig,
     T_world_start: Float64 | None = None,
     on_lost: OnRefusal | None = None,
 ) -> Iterator[RgbdFrame]:
-    """The frames with the poses that RGB-D odometry finds; those that it loses are left out.
+    """Replace the poses of frames by those of RGB-D odometry; lost frames are left out.
 
     Args:
-        frames: their own poses are not looked at.
-        config: of the odometry.
+        frames: their own poses are ignored.
         T_world_start: (4, 4) pose of the first frame; None = level, at the origin.
-        on_lost: called with the refusal of each frame that is left out.
+        on_lost: called with the refusal of each lost frame.
     """
-    odometry = RgbdOdometry(config, T_world_start)
+    odometry = RgbdOdometry(T_world_start)
     for frame in frames:
         try:
             T_world_camera = odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)

@@ -12,6 +12,7 @@ import numpy as np
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.poses.frames import OnRefusal, track_poses
+from deworldsg_ros.poses.odometry import ODOMETRY_FRAME
 from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
 from deworldsg_ros.poses.trajectory import Trajectory, read_trajectory
 from deworldsg_ros.recordings.folders.sequence import rotated_pose
@@ -79,24 +80,23 @@ def choose_poses(source: Source, choice: PoseChoice, config: Config) -> Source:
         slop_s = config.inputs.pose_slop_s
         return TrajectorySource(source, trajectory, slop_s, choice.trajectory.name)
     if choice.odometry:
-        return UnposedSource(source, config.inputs.world_frame or config.odometry.frame_id)
+        return UnposedSource(source, config.inputs.world_frame or ODOMETRY_FRAME)
     return source
 
 
 def posed_frames(
-    recording: Recording, choice: PoseChoice, config: Config, on_refusal: OnRefusal
+    recording: Recording, choice: PoseChoice, on_refusal: OnRefusal
 ) -> Iterator[RgbdFrame]:
     """Frames of a recording over `choose_poses`, with odometry and noise as chosen.
 
     Args:
         recording: its source comes from `choose_poses`.
         choice: source of the poses.
-        config: sections ``inputs`` and ``odometry`` are used.
         on_refusal: called for each frame that odometry or the jump gate refuses.
     """
     frames = recording.frames()
     if isinstance(recording.source, UnposedSource):
-        frames = _tracked(frames, recording.source, config, on_refusal)
+        frames = _tracked(frames, recording.source, on_refusal)
     if choice.noise != PoseNoise():
         frames = perturb_poses(frames, choice.noise)
         frames = gate_jumps(frames, on_refusal)
@@ -116,10 +116,10 @@ def gate_jumps(frames: Iterable[RgbdFrame], on_refusal: OnRefusal) -> Iterator[R
 
 
 def _tracked(
-    frames: Iterator[RgbdFrame], source: UnposedSource, config: Config, on_refusal: OnRefusal
+    frames: Iterator[RgbdFrame], source: UnposedSource, on_refusal: OnRefusal
 ) -> Iterator[RgbdFrame]:
     for first in frames:  # reading a frame sets source.T_first
-        yield from track_poses(chain([first], frames), config.odometry, source.T_first, on_refusal)
+        yield from track_poses(chain([first], frames), source.T_first, on_refusal)
 
 
 class PosedSource(ABC):

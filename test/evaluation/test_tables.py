@@ -16,7 +16,7 @@ from support.sequences import write_room
 from typer.testing import CliRunner, Result
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.config import Config, MergingConfig, OdometryConfig
+from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
@@ -70,7 +70,7 @@ def test_a_finished_job_is_taken_from_before(root: Path, tmp_path: Path) -> None
 
 def test_a_job_is_run_again_where_anything_differs(root: Path, tmp_path: Path) -> None:
     run_job(job(root, tmp_path))
-    other = msgspec.structs.replace(Config(), merging=MergingConfig(cell_m=0.04))
+    other = msgspec.structs.replace(Config(), merging=MergingConfig(overlap_threshold=0.4))
     assert not run_job(job(root, tmp_path, config=other)).reused
     assert run_job(job(root, tmp_path, config=other)).reused
     assert not run_job(job(root, tmp_path)).reused
@@ -198,7 +198,14 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
 def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Path) -> None:
     told = evaluate(
         *(root, "ablation", "--workers", 1, "--checkpoints", 0),
-        *("--out", tmp_path, "--json", tmp_path / "t.json", "--set", "a:lifting.min_pixels=20"),
+        *(
+            "--out",
+            tmp_path,
+            "--json",
+            tmp_path / "t.json",
+            "--set",
+            "a:lifting.covariance_ridge_m2=0.5",
+        ),
     )
     assert told.exit_code == 0, told.output
     values = json.loads((tmp_path / "t.json").read_text())
@@ -207,19 +214,17 @@ def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Pat
     assert rows["e"]["failed"]["room_0"]
     assert "failed:" in told.output
     effective = (tmp_path / "a" / "room_0" / "config.yaml").read_text()
-    assert "regions: boxes" in effective
-    assert "min_pixels: 20" in effective
+    assert "pixels: box" in effective
+    assert "covariance_ridge_m2: 0.5" in effective
     effective = (tmp_path / "c" / "room_0" / "config.yaml").read_text()
-    assert "regions: masks" in effective
-    assert "min_pixels: 10" in effective
+    assert "pixels: refined" in effective
+    assert "covariance_ridge_m2: 1.0e-06" in effective
 
 
 def test_the_pose_table(root: Path, tmp_path: Path) -> None:
     told = evaluate(
         *(root, "pose", "--workers", 1, "--checkpoints", 0, "--poses", "slam"),
-        *("--poses", "perturbed", "--pose-noise", "jitter_m=0.001"),
-        # Jitter is movement, and these few frames are too short to be sure of what is seen in it.
-        *("--set", "merging.baseline_deg=0"),
+        *("--poses", "perturbed", "--pose-noise", "jitter_m=0.0001"),
         *("--out", tmp_path, "--json", tmp_path / "t.json"),
     )
     assert told.exit_code == 0, told.output
@@ -230,7 +235,7 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
 
 
 def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
-    for table, name in (("hard", "default-jitter"), ("switches", "cell5-label")):
+    for table, name in (("hard", "default-jitter"), ("switches", "confirm-label")):
         told = evaluate(
             *(root, table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
@@ -335,7 +340,7 @@ def test_slam_poses_begin_where_the_camera_truly_was(tmp_path: Path) -> None:
         np.savetxt(path, moved)
     drops: Counter[str] = Counter()
     frames = Recording(source, Config().inputs).frames()
-    posed = list(repose(frames, PoseSource("slam"), source, OdometryConfig(), drops))
+    posed = list(repose(frames, PoseSource("slam"), source, drops))
     assert drops == {"no_slam_pose": 1}
     np.testing.assert_allclose(posed[0].T_world_camera, true[0], atol=1e-9)
     offset = np.linalg.inv(true[0]) @ posed[2].T_world_camera

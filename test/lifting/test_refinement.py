@@ -1,4 +1,4 @@
-"""Eq. 1-2: the inlier set is exactly that of the reference, whatever the depth looks like."""
+"""Eq. 1-2: the inliers equal those of the reference for every kind of depth."""
 
 from __future__ import annotations
 
@@ -9,39 +9,40 @@ from hypothesis import strategies as st
 from support.reference_lifting import kept_layer, reference_lift
 
 from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.lifting.constants import LiftingConstants
 from deworldsg_ros.lifting.depth_layer import dominant_layer
 from deworldsg_ros.lifting.pixels import valid_depth, valid_pixel_counts
 from deworldsg_ros.lifting.spatial import spatial_inliers
 from deworldsg_ros.scene.camera import Intrinsics
 
-PAPER = LiftingConfig()
+PAPER, PRINTED = LiftingConfig(), LiftingConstants()
 
 
-def kept_by_kernels(instances, depth_m, count, config=PAPER):
-    """Inlier mask of each object, by the compiled path, without the drops."""
+def kept_by_kernels(instances, depth_m, count):
+    """Inlier mask of each object by the compiled kernels, without dropping any object."""
     depth_m = valid_depth(depth_m)
     counts = valid_pixel_counts(depth_m, instances, count)
     masks = []
-    for pixels in spatial_inliers(depth_m, instances, counts, config.tau, config.epsilon_m):
+    for pixels in spatial_inliers(depth_m, instances, counts, PAPER.tau, PRINTED.epsilon_m):
         mask = np.zeros(depth_m.shape, bool)
         if len(pixels):
-            layer = dominant_layer(pixels.depths_m, config.gamma_base_m, config.alpha, config.beta)
+            layer = dominant_layer(pixels.depths_m, PAPER.gamma_base_m, PRINTED.alpha, PRINTED.beta)
             kept = pixels.within(*layer)
             mask[kept.rows, kept.columns] = True
         masks.append(mask)
     return masks
 
 
-def check_inliers(instances, depth_m, count, config=PAPER):
+def check_inliers(instances, depth_m, count):
     height, width = depth_m.shape
     intrinsics = Intrinsics(50.0, 50.0, width / 2, height / 2, width, height)
-    every = LiftingConfig(
-        config.tau, config.epsilon_m, config.gamma_base_m, config.alpha, config.beta, 2
+    few_drops = LiftingConstants(min_pixels=2)
+    references = reference_lift(
+        instances, depth_m, intrinsics, np.eye(4), PAPER, count, constants=few_drops
     )
-    wanted = reference_lift(instances, depth_m, intrinsics, np.eye(4), every, count)
-    seen = kept_by_kernels(instances, depth_m, count, config)
+    masks = kept_by_kernels(instances, depth_m, count)
     compared = 0
-    for reference, mask in zip(wanted, seen):
+    for reference, mask in zip(references, masks):
         if not isinstance(reference, str):
             np.testing.assert_array_equal(mask, reference.inliers)
             compared += 1
@@ -103,8 +104,7 @@ def test_inliers_equal_the_reference(seed, kind, quantised, holes, height, width
 )
 def test_kept_layer_equals_the_reference(data, gamma, alpha, beta):
     depths = np.array(data, np.float32)
-    config = LiftingConfig(gamma_base_m=gamma, alpha=alpha, beta=beta)
-    assert dominant_layer(depths, gamma, alpha, beta) == kept_layer(depths, config)
+    assert dominant_layer(depths, gamma, alpha, beta) == kept_layer(depths, gamma, alpha, beta)
 
 
 @pytest.mark.parametrize("number", [10, 11, 997, 40_000])
@@ -112,29 +112,28 @@ def test_kept_layer_equals_the_reference(data, gamma, alpha, beta):
 def test_kept_layer_of_large_sets(number, spread):
     rng = np.random.default_rng(number)
     depths = (0.5 + spread * rng.beta(0.6, 3.0, number)).astype(np.float32)
-    assert dominant_layer(depths, 0.03, 10.0, 0.02) == kept_layer(depths, PAPER)
+    assert dominant_layer(depths, 0.03, 10.0, 0.02) == kept_layer(depths)
 
 
 def test_median_hidden_in_one_crowded_bucket():
     # One far outlier makes the buckets coarse; nearly all depths fall into the first.
     rng = np.random.default_rng(1)
     depths = np.append(1.0 + 1e-5 * rng.random(30_001), 9.0).astype(np.float32)
-    assert dominant_layer(depths, 0.03, 10.0, 0.02) == kept_layer(depths, PAPER)
+    assert dominant_layer(depths, 0.03, 10.0, 0.02) == kept_layer(depths)
 
 
-def test_two_clusters_whose_means_tie_keep_the_nearer():
+def test_of_two_clusters_with_tied_means_the_nearer_is_kept():
     depths = np.array([1.0] * 8 + [2.0] * 8, np.float32)
     assert dominant_layer(depths, 0.03, 10.0, 0.02) == (1.0, 1.0)
-    assert kept_layer(depths, PAPER) == (1.0, 1.0)
+    assert kept_layer(depths) == (1.0, 1.0)
 
 
-def test_cluster_by_mean_and_not_by_the_median_inside():
+def test_the_cluster_is_chosen_by_its_mean():
     # d_ref 1.5 lies at the far end of the first cluster (mean 0.78); the second is nearer.
     depths = np.array([0.5, 0.52, 0.54, 1.5, 1.62, 1.62], np.float32)
-    config = LiftingConfig(gamma_base_m=0.1, alpha=0.0, beta=0.0)
     depths_one_cluster = np.concatenate([np.linspace(0.1, 1.5, 29), np.full(28, 1.7)])
     for sample in (depths, depths_one_cluster.astype(np.float32)):
-        assert dominant_layer(sample, 0.1, 0.0, 0.0) == kept_layer(sample, config)
+        assert dominant_layer(sample, 0.1, 0.0, 0.0) == kept_layer(sample, 0.1, 0.0, 0.0)
     assert dominant_layer(depths_one_cluster.astype(np.float32), 0.1, 0.0, 0.0)[0] > 1.6
 
 
@@ -170,7 +169,7 @@ def test_spatial_test_is_strict_and_counts_holes_as_zero():
     assert (1, 1) not in set(zip(kept.rows.tolist(), kept.columns.tolist()))
 
 
-def test_flying_pixels_at_an_edge_go():
+def test_flying_pixels_at_an_edge_are_removed():
     depth = np.full((40, 40), 1.0, np.float32)
     depth[:, 20:] = 3.0
     depth[:, 20] = 2.0
@@ -180,7 +179,7 @@ def test_flying_pixels_at_an_edge_go():
     assert check_inliers(instances, depth, 1) == 1
 
 
-def test_valid_depth_leaves_its_argument_alone():
+def test_valid_depth_does_not_change_its_argument():
     depth = np.array([[np.nan, np.inf, -np.inf], [-1.0, 0.0, 1.5]], np.float32)
     before = depth.copy()
     np.testing.assert_array_equal(

@@ -12,6 +12,7 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.absence import HALF, LITTLE, SAMPLED_POINTS, UNSEEN, SeenThrough
 from deworldsg_ros.merging.absence import WHOLE as ALL
+from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.nodes import NodeTable
@@ -22,9 +23,9 @@ THERE = slab((-0.4, -0.1, 0.7), (0.08, 0.08, 0.06))
 class Scene:
     """A graph, its rule, and a clock."""
 
-    def __init__(self, **config: float) -> None:
+    def __init__(self, **limits: float) -> None:
         self.graph = SceneGraph(VOCABULARY, "world")
-        self.merging = SurfaceMerging(MergingConfig(association="surface", **config))
+        self.merging = SurfaceMerging(MergingConfig(), LifeCycleLimits(**limits))
         self.stamp = 0
 
     def see(self, *objects: tuple[np.ndarray, int], grid: DepthGrid | None = None) -> list[int]:
@@ -133,15 +134,6 @@ def test_a_tentative_node_that_is_seen_through_is_removed() -> None:
     for _ in range(6):
         scene.see((WHOLE, TABLE))
     assert scene.graph.nodes.ids.tolist() == [1]
-
-
-def test_zero_frames_turns_negative_evidence_off() -> None:
-    scene = Scene(absent_frames=0)
-    for _ in range(4):
-        scene.see((WHOLE, TABLE), (HERE, CUP))
-    for _ in range(20):
-        scene.see((WHOLE, TABLE))
-    assert scene.told() == {1: "table", 2: "cup"}
 
 
 def watched(points: np.ndarray, enough_frames: int = 1) -> SeenThrough:

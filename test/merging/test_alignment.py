@@ -97,7 +97,7 @@ def drift(config: MergingConfig, frames: int = 60) -> SceneGraph:
 
 
 def test_a_graph_stays_in_place_under_poses_that_drift() -> None:
-    config = MergingConfig(association="surface")
+    config = MergingConfig()
     truth = np.array([points.mean(axis=0) for points, _ in BOXES])
 
     def errors_m(graph: SceneGraph) -> np.ndarray:
@@ -114,7 +114,7 @@ def test_a_graph_stays_in_place_under_poses_that_drift() -> None:
 def test_poses_that_are_right_are_kept() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     alignment = PoseAlignment()
-    merging = SurfaceMerging(MergingConfig(association="surface"))
+    merging = SurfaceMerging(MergingConfig())
     for stamp in range(1, 8):
         merging.merge(graph, frame(stamp, *BOXES))
     local = frame(9, *BOXES)

@@ -14,6 +14,7 @@ from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.absence import HALF, LITTLE
 from deworldsg_ros.merging.absence import WHOLE as ALL
 from deworldsg_ros.merging.existence import Existence
+from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -23,9 +24,9 @@ STEP_M = 0.05  # 4 degrees, seen from the cup
 class Walk:
     """A cup before a wall, and a camera that goes sideways or stands, at 10 frames a second."""
 
-    def __init__(self, **config: float) -> None:
+    def __init__(self, **limits: float) -> None:
         self.graph = SceneGraph(VOCABULARY, "world")
-        self.merging = SurfaceMerging(MergingConfig(association="surface", **config))
+        self.merging = SurfaceMerging(MergingConfig(), LifeCycleLimits(**limits))
         self.stamp = 0
         self.x_m = 0.0
 
@@ -56,7 +57,7 @@ class Walk:
         """Go on with the graph as it was saved, and nothing else."""
         graph_io.save(self.graph, path)
         self.graph = graph_io.load(path)
-        self.merging = SurfaceMerging(MergingConfig(association="surface"))
+        self.merging = SurfaceMerging(MergingConfig())
         self.merging.restore(self.graph, {})
 
     @property
@@ -177,6 +178,10 @@ def test_a_second_error_at_one_place_is_for_a_moment_too():
         assert walk.told == []
 
 
+def new_existence() -> Existence:
+    return Existence(MergingConfig().confirm_observations, LifeCycleLimits())
+
+
 def looked(existence: Existence, owner: int, stamp: int, view: int | None) -> list[int]:
     """Another look at an owner, which finds it (None) or misses it in a view; who is in doubt."""
     camera_world, means_world = np.array([0.1 * stamp, 0, 0]), np.array([[0.1 * stamp, 0, 1.0]])
@@ -190,7 +195,7 @@ def looked(existence: Existence, owner: int, stamp: int, view: int | None) -> li
 
 @pytest.mark.parametrize(("view", "looks"), [(ALL, 2), (HALF, 5), (LITTLE, 5)])
 def test_where_objects_are_found_in_almost_every_look_fewer_misses_tell(view, looks):
-    existence = Existence(MergingConfig())
+    existence = new_existence()
     for stamp in range(50):
         looked(existence, 0, stamp, None)
     for stamp in range(50, 55):
@@ -214,15 +219,6 @@ def test_what_is_in_doubt_and_merged_into_what_was_never_sure_does_not_expire():
     for _ in range(25):
         walk.see(found=False, step_m=0.0)
     assert walk.graph.nodes.ids.tolist() == [1]
-
-
-def test_a_rate_of_zero_turns_it_off():
-    walk = Walk(min_detection_rate=0.0)
-    for _ in range(3):
-        walk.see(found=True)
-    for _ in range(10):
-        walk.see(found=False)
-    assert walk.told == [1]
 
 
 def test_a_loaded_node_is_sure_and_stays_in_what_it_was(tmp_path):
@@ -258,7 +254,7 @@ def test_what_was_known_long_stays_known_under_a_clock_that_is_behind(behind_s: 
         return (10**7 + look) * 10**9
 
     cup = np.zeros((1, 3))
-    earlier, later = Existence(MergingConfig()), Existence(MergingConfig())
+    earlier, later = new_existence(), new_existence()
     for look in range(20):
         earlier.detected([0], cup, np.ones(1), camera(look), stamp_ns(look))
         earlier.viewed([0], np.array([ALL]))

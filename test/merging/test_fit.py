@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from numpy.typing import ArrayLike
 from support.merging import local_graph, random_classes, random_covariances, seeds
 
-from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.fit import (
     CLASS_AGREEMENT,
     CLASS_BONUS,
     GAUSSIAN_BONUS,
     MAX_DEVIATIONS,
+    OVERLAP_THRESHOLD_OTHER_CLASS,
+    SIZE_RATIO_OTHER_CLASS,
     fit,
     one_to_one,
 )
@@ -23,7 +24,8 @@ from deworldsg_ros.merging.joint import APART, JointEvidence
 from deworldsg_ros.scene.gaussian import bhattacharyya_distance
 from deworldsg_ros.scene.nodes import NodeTable
 
-CONFIG = MergingConfig(association="surface")
+OVERLAP_THRESHOLD = 0.3
+CELL_M = 0.03
 
 
 def deviations(difference: np.ndarray, covariance: np.ndarray) -> float:
@@ -43,20 +45,20 @@ def test_values_equal_the_formulas(seed: int) -> None:
         nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
     rows = rng.permutation(5)[:3]
     shares = rng.uniform(0, 1, (4, 3))
-    values, touching = fit(local, nodes, rows, shares, CONFIG)
-    blur = CONFIG.cell_m**2 / 12 * np.eye(3)
+    values, touching = fit(local, nodes, rows, shares, OVERLAP_THRESHOLD, CELL_M)
+    blur = CELL_M**2 / 12 * np.eye(3)
     for (index, column), share in np.ndenumerate(shares):
         row = rows[column]
         agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
         same = agreement > CLASS_AGREEMENT
-        wanted = CONFIG.overlap_threshold if same else CONFIG.overlap_threshold_other_class
+        wanted = OVERLAP_THRESHOLD if same else OVERLAP_THRESHOLD_OTHER_CLASS
         ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
         difference = local.means_world[index] - nodes.means[row]
         apart = min(deviations(difference, ours), deviations(difference, theirs))
         distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
         value = share + CLASS_BONUS * agreement + GAUSSIAN_BONUS * np.exp(-distance)
         sizes = np.sqrt([np.trace(ours), np.trace(theirs)])
-        alike = same or sizes.max() <= CONFIG.size_ratio_other_class * sizes.min()
+        alike = same or sizes.max() <= SIZE_RATIO_OTHER_CLASS * sizes.min()
         fits = share >= wanted and alike and apart <= MAX_DEVIATIONS
         assert values[index, column] == pytest.approx(value if fits else 0.0, abs=1e-9)
         assert touching[index, column] == same
@@ -64,7 +66,9 @@ def test_values_equal_the_formulas(seed: int) -> None:
 
 def test_nothing_to_compare() -> None:
     empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
-    values, touching = fit(empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), CONFIG)
+    values, touching = fit(
+        empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), OVERLAP_THRESHOLD, CELL_M
+    )
     assert values.shape == touching.shape == (0, 0)
     assert one_to_one(values) == []
     assert one_to_one(np.zeros((2, 0))) == [-1, -1]

@@ -9,6 +9,7 @@ from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
+from deworldsg_ros.merging.voxel_map import CELL_M
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
@@ -19,7 +20,7 @@ def graph() -> SceneGraph:
     return SceneGraph(VOCABULARY, "world")
 
 
-CONFIG = MergingConfig(association="surface")
+CONFIG = MergingConfig()
 
 
 @pytest.fixture
@@ -109,9 +110,9 @@ def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
     assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
 
 
-def split_after_one_mask_over_two(graph, **config) -> list[list[int]]:
+def split_after_one_mask_over_two(graph) -> list[list[int]]:
     """Ten frames that take two things for one, six that tell them apart, then each alone."""
-    merging = SurfaceMerging(MergingConfig(association="surface", **config))
+    merging = SurfaceMerging(CONFIG)
     left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.1)), slab((0.06, 0, 1), (0.12, 0.3, 0.1))
     views = [[np.concatenate((left, right))]] * 10 + [[left, right]] * 6 + [[right], [left]]
     return [
@@ -126,13 +127,11 @@ def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart
     assert ids[16:] == [[2], [1]]
     means = graph.nodes.means[:, 0]
     assert means[1] == pytest.approx(0.06, abs=0.005)
-    # Its Gaussian has the ten frames in it, but they count for half.
-    uncorrected = SceneGraph(VOCABULARY, "world")
-    split_after_one_mask_over_two(uncorrected, contest_cells=False)
-    assert means[0] < uncorrected.nodes.means[0, 0] - 0.005
-    # Of its surface nothing is left that lies on the other, but for a border of two cells.
-    assert graph.nodes.surface(0)[:, 0].max() < 2 * CONFIG.cell_m
-    assert uncorrected.nodes.surface(0)[:, 0].max() > 0.1
+    # The ten frames of both objects, with twice the pixels, keep half of their weight.
+    pooled_m = 7 * -0.06 / (2 * 10 + 7)
+    assert means[0] < pooled_m - 0.005
+    # Its surface ends within two cells of the other object, which extends to 0.12 m.
+    assert graph.nodes.surface(0)[:, 0].max() < 2 * CELL_M
 
 
 def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:

@@ -1,4 +1,4 @@
-"""RGB-D odometry on frames whose poses are known exactly."""
+"""RGB-D odometry on frames with exactly known poses."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from support.corner_room import INTRINSICS, LEVEL, corner_frame, turned, walk
 
-from deworldsg_ros.config import OdometryConfig
-from deworldsg_ros.poses import odometry as odometry_module
-from deworldsg_ros.poses.depth_alignment import fit_share, points_of, refine, surface_of
+from deworldsg_ros.poses.depth_alignment import fit_fraction, points_of, refine, surface_of
 from deworldsg_ros.poses.motion import rigid_motion, rotation_angle_deg
-from deworldsg_ros.poses.odometry import LEVEL_CAMERA, RgbdOdometry
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, check_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
-
-CONFIG = OdometryConfig()
 
 
 def track(odometry: RgbdOdometry, frame: RgbdFrame) -> np.ndarray:
@@ -30,17 +26,14 @@ def lose(odometry: RgbdOdometry, frame: RgbdFrame) -> str:
     return str(refused.value)
 
 
-def blind(frame: RgbdFrame) -> RgbdFrame:
+def without_depth(frame: RgbdFrame) -> RgbdFrame:
     return replace(frame, depth_m=np.zeros_like(frame.depth_m))
 
 
-@pytest.mark.parametrize("method", ["rgbd", "depth", "without OpenCV's"])
-def test_a_walk_is_followed(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    if method not in ("rgbd", "depth"):
-        monkeypatch.setattr(odometry_module, "HAS_ODOMETRY", False)
-        method = "rgbd"
+@pytest.mark.parametrize("depth_only", sorted({not HAS_ODOMETRY, True}))
+def test_a_walking_camera_is_tracked(depth_only: bool) -> None:
     poses = walk(15)
-    odometry = RgbdOdometry(OdometryConfig(method=method), poses[0])
+    odometry = RgbdOdometry(poses[0], depth_only=depth_only)
     for T in poses:
         estimate = track(odometry, corner_frame(T))
         check_pose(estimate)
@@ -51,7 +44,7 @@ def test_a_walk_is_followed(method: str, monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_camera_that_stands_still_does_not_drift() -> None:
-    odometry = RgbdOdometry(CONFIG)
+    odometry = RgbdOdometry()
     rng = np.random.default_rng(0)
     frame = corner_frame(LEVEL)
     for _ in range(12):
@@ -61,44 +54,44 @@ def test_a_camera_that_stands_still_does_not_drift() -> None:
     assert rotation_angle_deg(LEVEL_CAMERA[:3, :3].T @ estimate[:3, :3]) < 0.1
 
 
-def test_it_starts_level_or_where_it_is_told() -> None:
-    np.testing.assert_array_equal(track(RgbdOdometry(CONFIG), corner_frame(LEVEL)), LEVEL_CAMERA)
+def test_the_first_pose_is_level_or_the_given_one() -> None:
+    np.testing.assert_array_equal(track(RgbdOdometry(), corner_frame(LEVEL)), LEVEL_CAMERA)
     start = turned(30.0, 1.0, 2.0, 3.0)
-    np.testing.assert_array_equal(track(RgbdOdometry(CONFIG, start), corner_frame(LEVEL)), start)
+    np.testing.assert_array_equal(track(RgbdOdometry(start), corner_frame(LEVEL)), start)
     with pytest.raises(RefusedInput, match="pose"):
-        RgbdOdometry(CONFIG, np.diag([1.0, 2.0, 1.0, 1.0]))
+        RgbdOdometry(np.diag([1.0, 2.0, 1.0, 1.0]))
 
 
-def test_blind_frames_are_lost_and_the_next_one_is_found_again() -> None:
+def test_tracking_continues_after_a_frame_without_depth() -> None:
     poses = walk(6)
-    odometry = RgbdOdometry(CONFIG, poses[0])
+    odometry = RgbdOdometry(poses[0])
     for T in poses[:3]:
         track(odometry, corner_frame(T))
-    assert "depth" in lose(odometry, blind(corner_frame(poses[3])))
+    assert "depth" in lose(odometry, without_depth(corner_frame(poses[3])))
     estimate = track(odometry, corner_frame(poses[4]))
     assert np.linalg.norm(estimate[:3, 3] - poses[4][:3, 3]) < 0.02
     assert (odometry.lost, odometry.restarts) == (1, 0)
 
 
-def test_the_first_frame_has_to_have_depth() -> None:
-    odometry = RgbdOdometry(CONFIG, LEVEL)
-    lose(odometry, blind(corner_frame(LEVEL)))
+def test_the_first_frame_needs_depth() -> None:
+    odometry = RgbdOdometry(LEVEL)
+    lose(odometry, without_depth(corner_frame(LEVEL)))
     np.testing.assert_array_equal(track(odometry, corner_frame(LEVEL)), LEVEL)
 
 
-def test_what_fits_nothing_is_lost_until_it_starts_anew_where_it_was() -> None:
-    odometry = RgbdOdometry(OdometryConfig(restart_after=3), LEVEL)
+def test_tracking_restarts_at_the_last_pose_after_several_lost_frames() -> None:
+    odometry = RgbdOdometry(LEVEL, restart_after=3)
     track(odometry, corner_frame(LEVEL))
     elsewhere = corner_frame(turned(75.0, -0.8))
     for number in (1, 2, 3):
-        assert f"frame {number} in a row" in lose(odometry, elsewhere)
+        assert f"lost frame {number} in a row" in lose(odometry, elsewhere)
     np.testing.assert_array_equal(track(odometry, elsewhere), LEVEL)
     assert (odometry.tracked, odometry.lost, odometry.restarts) == (2, 3, 1)
     np.testing.assert_allclose(track(odometry, elsewhere), LEVEL, atol=5e-3)
 
 
-def test_other_intrinsics_go_on_from_the_last_pose() -> None:
-    odometry = RgbdOdometry(CONFIG, turned(0.0, 1.0))
+def test_new_intrinsics_continue_from_the_last_pose() -> None:
+    odometry = RgbdOdometry(turned(0.0, 1.0))
     track(odometry, corner_frame(LEVEL))
     frame = corner_frame(LEVEL)
     half = Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60)
@@ -107,20 +100,20 @@ def test_other_intrinsics_go_on_from_the_last_pose() -> None:
     assert odometry.restarts == 1
 
 
-def test_depth_fits_itself_and_not_what_is_elsewhere() -> None:
+def test_depth_fits_itself_and_no_other_view() -> None:
     depth_m = corner_frame(LEVEL).depth_m
     points = points_of(depth_m, INTRINSICS)
-    assert fit_share(points, depth_m, np.eye(4), INTRINSICS) == 1.0
+    assert fit_fraction(points, depth_m, np.eye(4), INTRINSICS) == 1.0
     T = turned(3.0, 0.1)
     moved = corner_frame(T).depth_m
-    assert fit_share(points, moved, invert_pose(T) @ LEVEL, INTRINSICS) > 0.95
-    assert fit_share(points, moved, np.eye(4), INTRINSICS) < 0.6
-    assert fit_share(points, np.zeros_like(depth_m), np.eye(4), INTRINSICS) == 0.0
+    assert fit_fraction(points, moved, invert_pose(T) @ LEVEL, INTRINSICS) > 0.95
+    assert fit_fraction(points, moved, np.eye(4), INTRINSICS) < 0.6
+    assert fit_fraction(points, np.zeros_like(depth_m), np.eye(4), INTRINSICS) == 0.0
     behind = np.diag([-1.0, 1.0, -1.0, 1.0])
-    assert fit_share(points, depth_m, behind, INTRINSICS) == 0.0
+    assert fit_fraction(points, depth_m, behind, INTRINSICS) == 0.0
 
 
-def test_a_guess_that_is_off_is_refined_to_the_truth() -> None:
+def test_a_wrong_guess_is_refined() -> None:
     start, T = turned(20.0, 1.2, -0.8), turned(26.0, 1.28, -0.83)
     truth = invert_pose(T) @ start
     points = points_of(corner_frame(start).depth_m, INTRINSICS)
@@ -131,18 +124,18 @@ def test_a_guess_that_is_off_is_refined_to_the_truth() -> None:
     assert rotation_angle_deg(error[:3, :3]) < 0.3
 
 
-def test_a_refinement_without_surfaces_keeps_the_guess() -> None:
+def test_refinement_without_surfaces_keeps_the_guess() -> None:
     depth_m = corner_frame(LEVEL).depth_m
     points = points_of(depth_m, INTRINSICS)
-    nothing = surface_of(np.zeros_like(depth_m), INTRINSICS)
+    no_surface = surface_of(np.zeros_like(depth_m), INTRINSICS)
     guess = turned(2.0, 0.1)
-    np.testing.assert_array_equal(refine(points, nothing, guess, INTRINSICS), guess)
+    np.testing.assert_array_equal(refine(points, no_surface, guess, INTRINSICS), guess)
 
 
-@pytest.mark.skipif(not odometry_module.HAS_ODOMETRY, reason="OpenCV before 5")
-def test_a_camera_that_turns_fast_is_followed() -> None:
+@pytest.mark.skipif(not HAS_ODOMETRY, reason="OpenCV before 5")
+def test_a_fast_rotation_is_tracked() -> None:
     poses = [turned(9.0 * k, 1.2 + 0.03 * k, -0.8 - 0.02 * k) for k in range(5)]
-    odometry = RgbdOdometry(CONFIG, poses[0])
+    odometry = RgbdOdometry(poses[0])
     for T in poses:
         error = invert_pose(T) @ track(odometry, corner_frame(T))
         assert np.linalg.norm(error[:3, 3]) < 0.03

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.corner_room import corner_frame, walk
 
-from deworldsg_ros.config import OdometryConfig
 from deworldsg_ros.poses.frames import track_poses
 from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.poses.perturbation import (
@@ -122,13 +121,13 @@ def test_noise_is_told_in_words() -> None:
             parse_noise(text)
 
 
-def test_tracked_frames_have_the_odometrys_poses_and_lost_ones_are_told() -> None:
+def test_tracked_frames_have_the_poses_of_the_odometry_and_lost_frames_are_reported() -> None:
     path = walk(5)
     frames = [replace(frame, T_world_camera=np.eye(4)) for frame in moving(path)]
     blank = frames[2]
     frames[2] = replace(blank, depth_m=np.zeros_like(blank.depth_m))
     lost: list[RefusedInput] = []
-    tracked = list(track_poses(frames, OdometryConfig(), path[0], lost.append))
+    tracked = list(track_poses(frames, path[0], lost.append))
     assert [frame.stamp_ns for frame in tracked] == [0, 1, 3, 4]
     for frame in tracked:
         error_m = np.linalg.norm(frame.T_world_camera[:3, 3] - path[frame.stamp_ns][:3, 3])

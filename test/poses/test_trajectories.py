@@ -137,7 +137,7 @@ def frames_with(path: Path, choice: PoseChoice, config: Config | None = None):  
     source = open_source(path, need_poses=choice.need_poses)
     recording = Recording(choose_poses(source, choice, config), config.inputs)
     refusals: list[RefusedInput] = []
-    frames = list(posed_frames(recording, choice, config, refusals.append))
+    frames = list(posed_frames(recording, choice, refusals.append))
     source.close()
     return recording, frames, refusals
 

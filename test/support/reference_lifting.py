@@ -1,7 +1,7 @@
-"""Eq. 1-4 as one would write them down: full-frame masks, sorting, np.cov. Clear, and slow.
+"""Plain reference of Eq. 1-4: full-frame masks, sorting, np.cov. Clear and slow.
 
-What the kernels are held against, for the inlier sets exactly; also the baseline of
-bench/lifting.py. Depths are float32; everything that is computed from them is float64.
+The kernels must find exactly the same inliers. bench/lifting.py compares their speed. Depths are
+float32; all other numbers are float64.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.lifting.constants import LiftingConstants
 from deworldsg_ros.scene.camera import Intrinsics
 
 
@@ -29,20 +30,30 @@ def median_3x3(depth_m: np.ndarray) -> np.ndarray:
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, (3, 3)), axis=(2, 3))
 
 
-def depth_layers(depths_m: np.ndarray, config: LiftingConfig) -> list[np.ndarray]:
+PAPER, PRINTED = LiftingConfig(), LiftingConstants()
+
+
+def depth_layers(
+    depths_m: np.ndarray, gamma_base_m: float, alpha: float, beta: float
+) -> list[np.ndarray]:
     """Eq. 2: the sorted depths, cut where a step exceeds the threshold."""
     ordered = np.sort(depths_m.astype(np.float64))
     steps = np.diff(ordered)
     threshold = max(
-        config.gamma_base_m,
-        config.alpha * (np.median(steps) if len(steps) else 0.0),
-        config.beta * np.median(ordered),
+        gamma_base_m,
+        alpha * (np.median(steps) if len(steps) else 0.0),
+        beta * np.median(ordered),
     )
     return np.split(ordered, np.nonzero(steps > threshold)[0] + 1)
 
 
-def kept_layer(depths_m: np.ndarray, config: LiftingConfig) -> tuple[float, float]:
-    layers = depth_layers(depths_m, config)
+def kept_layer(
+    depths_m: np.ndarray,
+    gamma_base_m: float = PAPER.gamma_base_m,
+    alpha: float = PRINTED.alpha,
+    beta: float = PRINTED.beta,
+) -> tuple[float, float]:
+    layers = depth_layers(depths_m, gamma_base_m, alpha, beta)
     reference = np.median(depths_m.astype(np.float64))
     distances = [abs(math.fsum(layer) / len(layer) - reference) for layer in layers]
     kept = layers[int(np.argmin(distances))]
@@ -57,29 +68,30 @@ def reference_lift(
     config: LiftingConfig,
     count: int,
     *,
+    constants: LiftingConstants = PRINTED,
     fast_median: bool = False,
 ) -> list[ReferenceObject | str]:
-    """One entry an object: what was lifted, or the reason for dropping it."""
+    """For each object, the lifted object or the reason for dropping it."""
     valid = np.isfinite(depth_m) & (depth_m > 0)
     depth = np.where(valid, depth_m, np.float32(0))
     median = cv2.medianBlur(depth, 3) if fast_median else median_3x3(depth)
     depth64, median = depth.astype(np.float64), median.astype(np.float64)
-    near_median = np.abs(depth64 - median) < config.tau * median + config.epsilon_m
+    near_median = np.abs(depth64 - median) < config.tau * median + constants.epsilon_m
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
     K_inverse = np.linalg.inv(intrinsics.matrix)
     results: list[ReferenceObject | str] = []
     for k in range(1, count + 1):
         mask = (instances == k) & valid
-        if mask.sum() < config.min_pixels:
+        if mask.sum() < constants.min_pixels:
             results.append("few_mask_pixels")
             continue
         spatial = mask & near_median
-        if spatial.sum() < config.min_pixels:
+        if spatial.sum() < constants.min_pixels:
             results.append("few_spatial_inliers")
             continue
-        low, high = kept_layer(depth[spatial], config)
+        low, high = kept_layer(depth[spatial], config.gamma_base_m, constants.alpha, constants.beta)
         final = spatial & (depth64 >= low) & (depth64 <= high)
-        if final.sum() < config.min_pixels:
+        if final.sum() < constants.min_pixels:
             results.append("few_depth_inliers")
             continue
         z = depth64[final]

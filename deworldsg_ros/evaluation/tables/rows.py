@@ -76,8 +76,8 @@ METHODS = (
 )
 # name, title, settings on config/paper.yaml
 ABLATION = (
-    ("a", "(a) box lifting", ("lifting.regions=boxes", "lifting.refine=false")),
-    ("b", "(b) + masks", ("lifting.refine=false",)),
+    ("a", "(a) box lifting", ("lifting.pixels=box",)),
+    ("b", "(b) + masks", ("lifting.pixels=mask",)),
     ("c", "(c) + depth refinement", ()),
     ("d", "(d) + DINOv2", ("relations.world_model=dinov2",)),
     ("e", "(e) + V-JEPA 2", ("relations.world_model=vjepa2",)),
@@ -105,31 +105,9 @@ HARD = (
 SWITCHES = (
     ("default", "default", ()),
     ("paper", "the paper's association", ("merging.association=paper",)),
-    ("cell2", "cells of 2 cm", ("merging.cell_m=0.02",)),
-    ("cell5", "cells of 5 cm", ("merging.cell_m=0.05",)),
-    ("class", "classes have to agree", ("merging.overlap_threshold_other_class=1.0",)),
-    (
-        "blind",
-        "classes play no part",
-        ("merging.overlap_threshold_other_class=0.3", "merging.size_ratio_other_class=1000.0"),
-    ),
-    ("size", "other class, any size", ("merging.size_ratio_other_class=1000.0",)),
-    ("pooled", "pooled Gaussians shown", ("merging.even_gaussians=false",)),
-    ("align", "frames laid on the graph", ("merging.align_poses=true",)),
-    ("contest", "cells not contested", ("merging.contest_cells=false",)),
-    (
-        "sure",
-        "nodes sure at once",
-        (
-            "merging.confirm_observations=1",
-            "merging.confirm_score=0.0",
-            "merging.baseline_deg=0.0",
-            "merging.min_detection_rate=0.0",
-        ),
-    ),
-    ("rate", "missed looks not counted", ("merging.min_detection_rate=0.0",)),
-    ("absent", "seen through, not lost", ("merging.absent_frames=0",)),
-    ("rough", "no depth refinement", ("lifting.refine=false",)),
+    ("align", "frames aligned with the graph", ("merging.align_poses=true",)),
+    ("confirm", "one observation confirms", ("merging.confirm_observations=1",)),
+    ("rough", "no depth refinement", ("lifting.pixels=mask",)),
     ("belief", "the paper's edge belief", ("relations.edge_belief=paper",)),
 )
 SWITCH_CONDITIONS = (

@@ -1,4 +1,4 @@
-"""Lifting with parts left out: boxes in place of masks, no depth refinement."""
+"""Lifting without depth refinement: masks or boxes."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting.regions import box_pixels, mask_pixels, smooth_pixels, valid_pixels
-from deworldsg_ros.lifting.spatial import spatial_inliers
 from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
 
@@ -44,67 +43,52 @@ def scene() -> tuple[np.ndarray, np.ndarray, list]:
     return depth_m, instances, [[8, 8, 21, 21]]
 
 
-def test_the_paper_is_the_default(scene: tuple) -> None:
+def test_masks_are_refined_by_default(scene: tuple) -> None:
     lifted = lift(*scene)
     assert lifted.pixel_counts.tolist() == [99 - 4]  # the flying pixel, and the mask's corners
     assert lifted.depths_m[0] == pytest.approx(1.0)
 
 
 def test_masks_without_refinement(scene: tuple) -> None:
-    lifted = lift(*scene, refine=False)
+    lifted = lift(*scene, pixels="mask")
     assert lifted.pixel_counts.tolist() == [100]
     assert lifted.depths_m[0] == pytest.approx(1.01)
 
 
-def test_boxes_without_refinement_take_the_wall_too(scene: tuple) -> None:
-    lifted = lift(*scene, regions="boxes", refine=False)
+def test_boxes_without_refinement_contain_the_wall(scene: tuple) -> None:
+    lifted = lift(*scene, pixels="box")
     assert lifted.pixel_counts.tolist() == [14 * 14]
     assert lifted.depths_m[0] == pytest.approx((99 + 2 + 96 * 3) / 196)
 
 
-def test_boxes_with_refinement_keep_one_layer(scene: tuple) -> None:
-    depth_m, instances, _ = scene
-    lifted = lift(depth_m, instances, [[9, 9, 20, 20]], regions="boxes")
-    assert lifted.depths_m[0] == pytest.approx(1.0)
-
-
-def test_boxes_may_overlap_and_reach_out_of_the_image() -> None:
+def test_boxes_may_overlap_and_leave_the_image() -> None:
     depth_m = np.full((30, 40), 2.0, np.float32)
     depth_m[:, 0] = 0.0
     boxes = np.array([[-5, -5, 4.5, 4.5], [2, 2, 4.5, 4.5], [50, 50, 60, 60], [3.2, 3.2, 3.8, 9]])
-    found = box_pixels(depth_m, valid_pixels(depth_m), boxes)
+    found = box_pixels(depth_m, boxes)
     assert [len(pixels) for pixels in found] == [4 * 5, 3 * 3, 0, 0]
     assert (found[1].columns.min(), found[1].rows.max()) == (2, 4)
 
 
-def test_a_box_without_depth_is_dropped_by_its_reason() -> None:
-    nothing = np.zeros((30, 40), np.float32)
+def test_a_box_without_depth_is_dropped_with_a_reason() -> None:
+    no_depth = np.zeros((30, 40), np.float32)
     instances = np.zeros((30, 40), np.uint16)
-    lifted = lift(nothing, instances, [[0, 0, 20, 20]], regions="boxes")
+    lifted = lift(no_depth, instances, [[0, 0, 20, 20]], pixels="box")
     assert (len(lifted), lifted.drops) == (0, {"few_mask_pixels": 1})
-    lifted = lift(nothing, instances, [], regions="boxes", refine=False)
+    lifted = lift(no_depth, instances, [], pixels="box")
     assert len(lifted) == 0
 
 
-def test_regions_are_those_of_the_kernels() -> None:
-    """On a mask that is a box, both ways give the same pixels, refined or not."""
+def test_a_rectangular_mask_has_the_pixels_of_its_box() -> None:
     generator = np.random.default_rng(3)
     depth_m = generator.uniform(1.0, 1.1, (30, 40)).astype(np.float32)
     depth_m[generator.random((30, 40)) < 0.2] = 0.0
     instances = np.zeros((30, 40), np.uint16)
     instances[5:25, 7:33] = 1
-    boxes = np.array([[7, 5, 32, 24]], float)
     counts = np.array([0, np.count_nonzero(depth_m[5:25, 7:33])], np.int64)
-    pairs = (
-        (mask_pixels(depth_m, instances, counts), valid_pixels(depth_m)),
-        (
-            spatial_inliers(depth_m, instances, counts, 0.02, 1e-3),
-            smooth_pixels(depth_m, 0.02, 1e-3),
-        ),
-    )
-    for (mask,), kept in pairs:
-        (box,) = box_pixels(depth_m, kept, boxes)
-        assert len(mask) > 0
-        np.testing.assert_array_equal(mask.columns, box.columns)
-        np.testing.assert_array_equal(mask.rows, box.rows)
-        np.testing.assert_array_equal(mask.depths_m, box.depths_m)
+    (mask,) = mask_pixels(depth_m, instances, counts)
+    (box,) = box_pixels(depth_m, np.array([[7, 5, 32, 24]], float))
+    assert len(mask) > 0
+    np.testing.assert_array_equal(mask.columns, box.columns)
+    np.testing.assert_array_equal(mask.rows, box.rows)
+    np.testing.assert_array_equal(mask.depths_m, box.depths_m)
