@@ -26,16 +26,17 @@ from support.checkpoints import save_dinov2, save_vjepa2
 from support.pair_rooms import CLASSES, PREDICATES, PairClip, render_room
 
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, relative_box_pair
+from deworldsg_ros.checkpoints.probe_network import load_probe
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations import ClassPairPrior, fuse_edges, union_box
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
-from deworldsg_ros.relations.probing.probe_network import load_probe
 from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.training.labelled_clips import LabelledClip
-from deworldsg_ros.training.train import TrainingOptions, train_probe
+from deworldsg_ros.training.options import TrainingOptions
+from deworldsg_ros.training.train import train_probe
 
 VOCABULARY = Vocabulary(CLASSES, PREDICATES)
 DEFAULTS = RelationsConfig()

@@ -1,1 +1,14 @@
-"""Checkpoints: loading, cards, and the import of published files."""
+"""Checkpoints of pretrained networks: import, cards and loading. No stage is imported here.
+
+- `loading`: finds a checkpoint, loads it with `transformers`, chooses device and data type.
+- `card`: `deworldsg.json`, how a detector's checkpoint is read.
+- `architectures`: detector classes by model type, and the file name of the relation head.
+- `egtr_network`: the network of the relation head EGTR.
+- `fross`: imports a published FROSS checkpoint: detector and relation head.
+- `fross_names`: names of its parameters in the published file and in `transformers`.
+- `probe_card`: `config.json` of a probe: its backbone and its predicates.
+- `probe_network`: the probe's network, saved and loaded.
+- `published_probe`: imports the published probe of V-JEPA 2.
+
+The cards need no torch. All other modules are imported only if a network is used.
+"""

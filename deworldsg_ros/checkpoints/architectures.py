@@ -1,4 +1,4 @@
-"""Architectures that checkpoints are read into, and constants of their files."""
+"""Detector classes of `transformers`, and the file name of the relation head."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a detector's checkpoint has to tell besides its weights: `deworldsg.json` in its folder."""
+"""The card of a detector's checkpoint, `deworldsg.json`: how its outputs are read."""
 
 from pathlib import Path
 from typing import Annotated, Literal, Union
@@ -13,22 +13,23 @@ CARD_FILE = "deworldsg.json"
 # Mean and standard deviation of ImageNet, RGB, of values in [0, 1].
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-# The paper's threshold is one for softmax scores; sigmoid scores of RT-DETR are lower.
+# Least detection score by kind of score. The paper's 0.7 is for softmax scores; the sigmoid scores
+# of RT-DETR are lower.
 DEFAULT_SCORE_THRESHOLD = {"softmax": 0.7, "sigmoid": 0.5}
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class CheckpointCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a checkpoint is meant to be read; a checkpoint without a card is a public RT-DETR.
+    """How a checkpoint is read. Without a card it is read as a public RT-DETR.
 
     Attributes:
         class_scores: ``softmax`` over the classes (the paper), or independent ``sigmoid``s.
-        temperature: of the softmax that makes the class distribution; below 1 sharpens.
-        score_threshold: the least score of an object; None = 0.7 for softmax, 0.5 for sigmoid.
-        decoder_layers: layers of the decoder that are run; 0 = all.
+        temperature: of the softmax of the class distribution; below 1 sharpens.
+        score_threshold: least score of an object; None = 0.7 for softmax, 0.5 for sigmoid.
+        decoder_layers: number of decoder layers to run; 0 = all.
         classes: names of the classes; empty = the `id2label` of config.json.
-        predicates: names of the predicates of the relation head beside the detector, if any.
+        predicates: names of the relation head's predicates; empty = no relation head.
         frequency_bias: whether the relation head adds its class-pair statistics.
     """
 
@@ -42,7 +43,7 @@ class CheckpointCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_card(path: Union[Path, None]) -> CheckpointCard:
-    """The card in a file, or the default where there is none; raises ConfigurationError."""
+    """The card in a file; None gives the default card. Raises ConfigurationError."""
     if path is None:
         return CheckpointCard()
     try:
@@ -52,18 +53,18 @@ def read_card(path: Union[Path, None]) -> CheckpointCard:
 
 
 def write_card(path: Path, card: CheckpointCard) -> None:
-    """Write a card, for people to read, too."""
+    """Write a card as indented JSON."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
 
 
 def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:
-    """The predicates that the graph will have, for who runs no perception.
+    """The predicates of the graph, for nodes that do not run perception.
 
     Returns:
-        None where only loading the relation head would tell: its checkpoint is no folder here.
+        None if the predicates are those of a checkpoint that is not a local folder.
 
     Raises:
-        ConfigurationError: the checkpoint's card cannot be read, or names none.
+        ConfigurationError: the checkpoint's card cannot be read, or names no predicates.
     """
     if config.predicate_set != "checkpoint":
         return PREDICATE_SETS[config.predicate_set]

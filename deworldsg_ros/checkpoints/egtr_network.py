@@ -1,8 +1,8 @@
-"""The EGTR relation head: a network that reads the self-attention of a DETR's decoder.
+"""The relation head EGTR: a network on the self-attention of a DETR's decoder.
 
-Im et al., "EGTR: Extracting Graph from Transformer for Scene Graph Generation", 2024, as FROSS
-puts it on RT-DETR. Pairs are independent of each other: the head gives the same for the queries
-that were kept as it gives for them among all 300, at a thousandth of the cost.
+Im et al., "EGTR: Extracting Graph from Transformer for Scene Graph Generation", 2024, in the
+version of FROSS for RT-DETR. Pairs are independent of each other. The head therefore runs on the
+kept queries only, with the same result as on all 300, at a thousandth of the cost.
 """
 
 from __future__ import annotations
@@ -12,20 +12,21 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
+from deworldsg_ros.checkpoints.loading import check_names
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
 class EgtrNetwork(nn.Module):
     """Relation and connectivity logits of all ordered pairs of queries.
 
-    The names of the parameters are those of the published checkpoints.
+    The parameters have the names of the published checkpoints.
 
     Args:
         width: d, features of a query.
-        layers: L, layers of the decoder that the head was trained on.
-        predicates: R.
-        frequency_shape: (C', C', R) of the class-pair statistics; None = it has none. C' is the
-            number of classes, or one more where training counted a background.
+        layers: L, layers of the decoder in training.
+        predicates: R, number of predicates.
+        frequency_shape: (C', C', R), shape of the class-pair statistics; None = no statistics. C'
+            is the number of classes, or one more if training had a background class.
     """
 
     def __init__(
@@ -50,14 +51,14 @@ class EgtrNetwork(nn.Module):
 
     @staticmethod
     def for_parameters(parameters: Mapping[str, torch.Tensor], where: str) -> EgtrNetwork:
-        """The network that such parameters belong to, holding them.
+        """A network of the sizes of these parameters, with their values.
 
         Args:
             parameters: by name.
-            where: they come from, for messages.
+            where: origin of the parameters, for messages.
 
         Raises:
-            ConfigurationError: parameters that are missing or unknown, by name, or of other sizes.
+            ConfigurationError: parameters are missing or unknown, or have other sizes.
         """
         width = _rows(parameters, "final_sub_proj.weight", where)
         predicates = _rows(parameters, "rel_predictor.layers.2.weight", where)
@@ -66,7 +67,8 @@ class EgtrNetwork(nn.Module):
         shape = None if frequencies is None else tuple(frequencies.shape)
         if shape is not None and (len(shape) != 3 or shape[2] != predicates):
             raise ConfigurationError(
-                f"{where}: triplet_dist has shape {shape}: wanted (classes, classes, {predicates})"
+                f"{where}: triplet_dist has shape {shape}, "
+                f"expected (classes, classes, {predicates})"
             )
         network = EgtrNetwork(width, layers, predicates, shape)  # type: ignore[arg-type]
         check_names(parameters, network.state_dict(), where)
@@ -74,7 +76,7 @@ class EgtrNetwork(nn.Module):
             network.load_state_dict(parameters)
         except RuntimeError as error:
             reason = str(error).splitlines()[-1].strip()
-            raise ConfigurationError(f"{where} is no EGTR head: {reason}") from error
+            raise ConfigurationError(f"{where} is not an EGTR head: {reason}") from error
         return network.eval().requires_grad_(False)
 
     def forward(
@@ -83,18 +85,19 @@ class EgtrNetwork(nn.Module):
         """Relation logits (n, n, R) and connectivity logits (n, n), subject first.
 
         Args:
-            features: (n, 2 l + 1, d): the projected queries of the first l <= L layers of the
-                decoder, their projected keys, the last hidden state.
-            classes: (n,) likeliest class of each query: the class-pair statistics are added.
+            features: (n, 2 l + 1, d): projected queries of the first l <= L layers of the
+                decoder, projected keys of the same layers, and the last hidden state.
+            classes: (n,) most probable class of each query, to add the class-pair statistics;
+                None = without them.
         """
         used = (features.shape[1] - 1) // 2
-        # One more slot beside the layers', from the last hidden state.
+        # One slot per layer, and one more for the last hidden state.
         subjects = [self.proj_q[layer](features[:, layer]) for layer in range(used)]
         subjects.append(self.final_sub_proj(features[:, -1]))
         objects = [self.proj_k[layer](features[:, used + layer]) for layer in range(used)]
         objects.append(self.final_obj_proj(features[:, -1]))
         q, k = torch.stack(subjects, dim=1), torch.stack(objects, dim=1)  # (n, l + 1, d)
-        # The gate is linear in [q_i; k_j]: a part of the subject and a part of the object.
+        # The gate is linear in [q_i; k_j]: the sum of a subject part and an object part.
         width = q.shape[-1]
         weight, bias = self.rel_predictor_gate.weight[0], self.rel_predictor_gate.bias
         gate_q, gate_k = q @ weight[:width], k @ weight[width:]
@@ -124,21 +127,7 @@ class Perceptron(nn.Module):
         return result
 
 
-def check_names(
-    found: Mapping[str, object], wanted: Mapping[str, object], where: str, most: int = 5
-) -> None:
-    """Raise ConfigurationError where names are missing or unknown, and say which."""
-    missing, unknown = sorted(wanted.keys() - found.keys()), sorted(found.keys() - wanted.keys())
-    if missing or unknown:
-        parts = [
-            f"{len(names)} {kind}: {', '.join(names[:most])}{', …' if len(names) > most else ''}"
-            for kind, names in (("missing", missing), ("unknown", unknown))
-            if names
-        ]
-        raise ConfigurationError(f"{where} has other parameters than wanted; {'; '.join(parts)}")
-
-
 def _rows(parameters: Mapping[str, torch.Tensor], name: str, where: str) -> int:
     if name not in parameters:
-        raise ConfigurationError(f"{where} has other parameters than wanted; 1 missing: {name}")
+        raise ConfigurationError(f"{where} has unexpected parameters: 1 missing ({name})")
     return len(parameters[name])

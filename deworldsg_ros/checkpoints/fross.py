@@ -1,4 +1,4 @@
-"""A published FROSS checkpoint (RT-DETR with EGTR, by Lightning) → a folder that loads by name."""
+"""Import of a published FROSS checkpoint: RT-DETR with EGTR, saved by Lightning."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from deworldsg_ros.checkpoints.card import (
     CheckpointCard,
     write_card,
 )
-from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork, check_names
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.checkpoints.fross_names import (
     DERIVED,
     canonical_name,
@@ -30,6 +30,7 @@ from deworldsg_ros.checkpoints.fross_names import (
     public_name,
     published_name,
 )
+from deworldsg_ros.checkpoints.loading import check_names, read_tensors
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import (
     REPLICA_SSG_PREDICATES,
@@ -40,11 +41,12 @@ from deworldsg_ros.scene.vocabularies import (
 
 DETECTOR_PREFIX = "model.obj_det_model."
 HEAD_PREFIX = "model.egtr_head."
-INPUT_SIZE = 640
-# What FROSS's own config.json does not say, it takes from its defaults.
+# Edge of the square input image of FROSS, pixels.
+INPUT_SIZE_PX = 640
+# FROSS's defaults for settings that its config.json does not contain: attention heads, queries.
 HEADS = 8
 QUERIES = 300
-# Index of the last layer that is run, of six.
+# Index of the last decoder layer that FROSS runs, of six.
 EVALUATED_LAYER = 2
 VOCABULARIES = (
     (VISUAL_GENOME_CLASSES, REPLICA_SSG_PREDICATES),
@@ -55,7 +57,7 @@ Tensors = Mapping[str, torch.Tensor]
 
 
 class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names of the outputs, in their order."""
+    """Names of the outputs, in order."""
 
     classes: tuple[str, ...]
     predicates: tuple[str, ...]
@@ -63,13 +65,13 @@ class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Imported:
-    """What an import made.
+    """Result of an import.
 
     Attributes:
         architecture: ``rt_detr`` or ``rt_detr_v2``.
         parameters: number of values in detector and head.
-        card: how the folder is read.
-        layers: of the decoder.
+        card: the card in the new folder.
+        layers: number of decoder layers.
     """
 
     architecture: str
@@ -85,22 +87,22 @@ def import_checkpoint(
     names: Names | None = None,
     frequency_bias: bool | None = None,
 ) -> Imported:
-    """Write detector, relation head, names and preprocessing into `out`.
+    """Convert a checkpoint to a folder with detector, relation head, names and preprocessing.
 
     Args:
-        checkpoint: the .ckpt file, or the folder that holds ``checkpoints/epoch=….ckpt``. A
-            config.json beside it or above it is read for what the weights do not tell.
-        out: folder to make; must not hold a checkpoint yet.
-        names: of classes and predicates; None = by their numbers, Visual Genome's or 3DSSG's.
-        frequency_bias: whether the class-pair statistics are added; None = as config.json says,
-            and without one not.
+        checkpoint: the .ckpt file, or the folder that contains ``checkpoints/epoch=….ckpt``.
+            Settings that the weights do not determine come from a config.json beside the file or
+            one folder above.
+        out: folder to write; it must not contain a checkpoint.
+        names: of classes and predicates; None = those of Visual Genome or 3DSSG, by their numbers.
+        frequency_bias: whether the class-pair statistics are added; None = the value in
+            config.json, false without one.
 
     Raises:
-        ConfigurationError: a file that is no such checkpoint, with the parameters that are
-            missing or unknown, by name.
+        ConfigurationError: not such a checkpoint, with the missing or unknown parameters.
     """
     path = _checkpoint_file(checkpoint)
-    detector, head = split(read_state(path), str(path))
+    detector, head = split(read_tensors(path, "state_dict"), str(path))
     settings = _settings_beside(path)
     config = infer_config(detector, settings, str(path))
     model = DETECTORS[config.model_type](config)
@@ -108,8 +110,8 @@ def import_checkpoint(
     network = EgtrNetwork.for_parameters(head, f"{path} ({HEAD_PREFIX}…)")
     if network.final_sub_proj.in_features != config.d_model:
         raise ConfigurationError(
-            f"{path}: the relation head reads {network.final_sub_proj.in_features} features and "
-            f"the detector has {config.d_model}: wanted one checkpoint of both"
+            f"{path}: the relation head has {network.final_sub_proj.in_features} input features "
+            f"and the detector {config.d_model}: expected equal numbers"
         )
     names = names or _known_names(config.num_labels, network.predicates, str(path))
     _check_counts(names, config.num_labels, network.predicates, str(path))
@@ -132,28 +134,8 @@ def import_checkpoint(
     return Imported(config.model_type, sum(v.numel() for v in values), card, config.decoder_layers)
 
 
-def read_state(path: Path) -> Tensors:
-    """The parameters of a Lightning checkpoint; nothing in the file is executed.
-
-    Raises:
-        ConfigurationError: no such file, or none that holds tensors alone.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # pickle, zip and torch each have errors of their own
-        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ConfigurationError(
-            f"checkpoint {path} cannot be read ({first_line}): wanted the .ckpt file that Lightning"
-            " wrote; where it holds more than tensors, keep its `state_dict` alone"
-        ) from error
-    state = content.get("state_dict") if isinstance(content, dict) else None
-    if not isinstance(state, dict) or not all(map(torch.is_tensor, state.values())):
-        raise ConfigurationError(f"checkpoint {path} has no `state_dict` of tensors: wanted one")
-    return state
-
-
 def split(state: Tensors, where: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-    """Parameters of the detector and of the relation head, without their prefixes."""
+    """Parameters of detector and relation head, without prefixes; raises ConfigurationError."""
     detector: dict[str, torch.Tensor] = {}
     head: dict[str, torch.Tensor] = {}
     unknown = []
@@ -165,57 +147,54 @@ def split(state: Tensors, where: str) -> tuple[dict[str, torch.Tensor], dict[str
         else:
             unknown.append(name)
     if unknown or not detector or not head:
-        example = f", and not {sorted(unknown)[0]}" if unknown else ""
+        example = f", found {sorted(unknown)[0]}" if unknown else ""
         raise ConfigurationError(
-            f"{where} is no checkpoint of RT-DETR with EGTR: wanted parameters named "
-            f"{DETECTOR_PREFIX}… and {HEAD_PREFIX}… alone{example} (EGTR's own checkpoints are of "
+            f"{where} is not a checkpoint of RT-DETR with EGTR: expected only parameters named "
+            f"{DETECTOR_PREFIX}… and {HEAD_PREFIX}…{example} (EGTR's own checkpoints are of "
             "another detector, Deformable DETR)"
         )
     return detector, head
 
 
-def infer_config(detector: Tensors, settings: Mapping[str, Any], where: str) -> Any:
-    """The architecture that published parameters belong to.
+@dataclass(frozen=True)
+class _Shapes:
+    """Sizes of a network, read from the shapes and names of its parameters."""
 
-    Args:
-        detector: canonical names.
-        settings: FROSS's config.json, or nothing.
-        where: the parameters come from, for messages.
+    parameters: Tensors
+    where: str
 
-    Raises:
-        ConfigurationError: a parameter that tells a size is missing.
-    """
+    def shape(self, name: str) -> torch.Size:
+        """The shape of a parameter; raises ConfigurationError if it is missing."""
+        if name not in self.parameters:
+            raise ConfigurationError(
+                f"{self.where} lacks {DETECTOR_PREFIX}{name}: expected an RT-DETR"
+            )
+        return self.parameters[name].shape
 
-    def shape(name: str) -> torch.Size:
-        if name not in detector:
-            raise ConfigurationError(f"{where} lacks {DETECTOR_PREFIX}{name}: wanted it")
-        return detector[name].shape
-
-    def count(pattern: str) -> int:
-        found = [re.match(pattern, name) for name in detector]
+    def count(self, pattern: str) -> int:
+        """One more than the greatest number that a pattern finds in the names; 0 if none."""
+        found = [re.match(pattern, name) for name in self.parameters]
         return 1 + max((int(match[1]) for match in found if match), default=-1)
 
-    bottleneck = "backbone.res_layers.0.blocks.0.branch2c.conv.weight" in detector
-    last_branch = "c" if bottleneck else "b"
-    stages = range(count(r"backbone\.res_layers\.(\d+)\."))
-    make_backbone: Any = RTDetrResNetConfig
-    backbone = make_backbone(
-        embedding_size=shape("backbone.conv1.conv1_3.conv.weight")[0],
-        hidden_sizes=[
-            shape(f"backbone.res_layers.{stage}.blocks.0.branch2{last_branch}.conv.weight")[0]
-            for stage in stages
-        ],
-        depths=[count(rf"backbone\.res_layers\.{stage}\.blocks\.(\d+)\.") for stage in stages],
-        layer_type="bottleneck" if bottleneck else "basic",
-        out_features=[f"stage{stage + 1}" for stage in stages][-3:],
-    )
+
+def infer_config(detector: Tensors, settings: Mapping[str, Any], where: str) -> Any:
+    """The configuration of the detector with these published parameters.
+
+    Args:
+        detector: parameters by canonical name.
+        settings: FROSS's config.json; may be empty.
+        where: origin of the parameters, for messages.
+
+    Raises:
+        ConfigurationError: a parameter that determines a size is missing.
+    """
+    shapes = _Shapes(detector, where)
+    shape, count = shapes.shape, shapes.count
+    backbone = _backbone_config(shapes)
     levels = count(r"decoder\.input_proj\.(\d+)\.")
     projections = range(count(r"encoder\.input_proj\.(\d+)\."))
     hidden = shape("encoder.input_proj.0.conv.weight")[0]
     attention = "decoder.decoder.layers.0.cross_attn."
-    second = f"{attention}num_points_scale" in detector
-    heads = int(settings.get("hybrid_encoder_nhead", HEADS))
-    points = shape(f"{attention}attention_weights.weight")[0] // (HEADS * max(levels, 1))
     sizes: dict[str, Any] = {
         "encoder_hidden_dim": hidden,
         "encoder_in_channels": [
@@ -223,7 +202,7 @@ def infer_config(detector: Tensors, settings: Mapping[str, Any], where: str) -> 
         ],
         "encoder_layers": count(r"encoder\.encoder\.0\.layers\.(\d+)\."),
         "encoder_ffn_dim": shape("encoder.encoder.0.layers.0.linear1.weight")[0],
-        "encoder_attention_heads": heads,
+        "encoder_attention_heads": int(settings.get("hybrid_encoder_nhead", HEADS)),
         "hidden_expansion": shape("encoder.fpn_blocks.0.conv1.conv.weight")[0] / hidden,
         "d_model": shape("decoder.input_proj.0.conv.weight")[0],
         "decoder_in_channels": [
@@ -233,19 +212,41 @@ def infer_config(detector: Tensors, settings: Mapping[str, Any], where: str) -> 
         "decoder_layers": count(r"decoder\.decoder\.layers\.(\d+)\."),
         "decoder_ffn_dim": shape("decoder.decoder.layers.0.linear1.weight")[0],
         "decoder_attention_heads": HEADS,
-        "decoder_n_points": points,
+        "decoder_n_points": shape(f"{attention}attention_weights.weight")[0]
+        // (HEADS * max(levels, 1)),
         "num_queries": int(settings.get("num_queries", QUERIES)),
         "num_denoising": 100 if "decoder.denoising_class_embed.weight" in detector else 0,
         "learn_initial_query": "decoder.tgt_embed.weight" in detector,
         "num_labels": shape("decoder.dec_score_head.0.weight")[0],
     }
-    if second:
+    if f"{attention}num_points_scale" in detector:
         return RTDetrV2Config(backbone_config=backbone, decoder_n_levels=levels, **sizes)
     return RTDetrConfig(backbone_config=backbone, **sizes)
 
 
+def _backbone_config(shapes: _Shapes) -> Any:
+    bottleneck = "backbone.res_layers.0.blocks.0.branch2c.conv.weight" in shapes.parameters
+    last_branch = "c" if bottleneck else "b"
+    stages = range(shapes.count(r"backbone\.res_layers\.(\d+)\."))
+    make_config: Any = RTDetrResNetConfig
+    return make_config(
+        embedding_size=shapes.shape("backbone.conv1.conv1_3.conv.weight")[0],
+        hidden_sizes=[
+            shapes.shape(f"backbone.res_layers.{stage}.blocks.0.branch2{last_branch}.conv.weight")[
+                0
+            ]
+            for stage in stages
+        ],
+        depths=[
+            shapes.count(rf"backbone\.res_layers\.{stage}\.blocks\.(\d+)\.") for stage in stages
+        ],
+        layer_type="bottleneck" if bottleneck else "basic",
+        out_features=[f"stage{stage + 1}" for stage in stages][-3:],
+    )
+
+
 def _fill(model: Any, detector: Tensors, where: str) -> None:
-    """Put published parameters into the model: each has to find its place, and the reverse."""
+    """Copy published parameters into the model; every name must have its counterpart."""
     wanted = {name: published_name(name) for name in model.state_dict()}
     expected: dict[str, None] = {}
     found: dict[str, torch.Tensor] = {}
@@ -266,16 +267,16 @@ def _fill(model: Any, detector: Tensors, where: str) -> None:
         model.load_state_dict(filled)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
-        raise ConfigurationError(f"{where} is no RT-DETR of one kind: {reason}") from error
+        raise ConfigurationError(f"{where} is not a consistent RT-DETR: {reason}") from error
 
 
 def _is_counter(name: str) -> bool:
-    """Batches that a normalisation saw in training: there or not, nothing depends on them."""
+    """Whether a parameter only counts training batches; checkpoints may lack these."""
     return name.endswith("num_batches_tracked")
 
 
 def _packed(name: str) -> str:
-    """torch's own attention keeps the rows of q, k and v in one parameter."""
+    """The name in torch's attention, which stores the rows of q, k and v in one parameter."""
     return re.sub(r"\.self_attn\.[qkv]_proj\.(weight|bias)$", r".self_attn.in_proj_\1", name)
 
 
@@ -294,7 +295,7 @@ def _known_names(classes: int, predicates: int, where: str) -> Names:
             return Names(known_classes, known_predicates)
     raise ConfigurationError(
         f"{where} has {classes} classes and {predicates} predicates, neither Visual Genome's 150 "
-        "and 50 nor 3DSSG's 20 and 7: name them in a JSON file and pass it with --names"
+        "and 50 nor 3DSSG's 20 and 7: name them in a JSON file and give it with --names"
     )
 
 
@@ -303,21 +304,21 @@ def _check_counts(names: Names, classes: int, predicates: int, where: str) -> No
     if found != (classes, predicates):
         raise ConfigurationError(
             f"{where} has {classes} classes and {predicates} predicates, and {found[0]} and "
-            f"{found[1]} are named: wanted a name for each"
+            f"{found[1]} are named: give a name for each"
         )
 
 
 def _checkpoint_file(path: Path) -> Path:
     if path.is_file():
         return path
-    # The last epoch, as FROSS itself chooses.
+    # The last epoch, the choice of FROSS itself.
     found = sorted(
         path.glob("checkpoints/epoch=*.ckpt"),
         key=lambda file: int(re.findall(r"epoch=(\d+)", file.name)[0]),
     )
     if not found:
         raise ConfigurationError(
-            f"checkpoint {path}: wanted a .ckpt file, or a folder with checkpoints/epoch=….ckpt"
+            f"checkpoint {path}: expected a .ckpt file, or a folder with checkpoints/epoch=….ckpt"
         )
     return found[-1]
 
@@ -329,17 +330,19 @@ def _settings_beside(path: Path) -> Mapping[str, Any]:
             try:
                 settings: Mapping[str, Any] = json.loads(file.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
-                raise ConfigurationError(f"{file}: {error}; wanted FROSS's settings") from error
+                raise ConfigurationError(f"{file}: {error}; expected FROSS's settings") from error
             return settings
     return {}
 
 
 def _write(out: Path, model: Any, network: EgtrNetwork, card: CheckpointCard) -> None:
     if (out / "config.json").exists():
-        raise ConfigurationError(f"{out} holds a checkpoint already: wanted an empty or new folder")
+        raise ConfigurationError(
+            f"{out} contains a checkpoint already: give an empty or new folder"
+        )
     preprocessing = {
         "image_processor_type": "RTDetrImageProcessor",
-        "size": {"height": INPUT_SIZE, "width": INPUT_SIZE},
+        "size": {"height": INPUT_SIZE_PX, "width": INPUT_SIZE_PX},
         "do_resize": True,
         "do_rescale": True,
         "do_normalize": True,

@@ -1,7 +1,7 @@
-"""Names of RT-DETR's parameters in published checkpoints, and in transformers.
+"""Names of RT-DETR's parameters in published checkpoints and in `transformers`.
 
-A rule is a pair of patterns, `{i}`, `{j}`, … for numbers and `{p}` for what is left: one reads
-both ways.
+A rule is a pair of patterns. `{i}`, `{j}`, … stand for numbers and `{p}` for the rest of the name.
+A rule translates in both directions.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-# Published pattern, pattern of the public transformers checkpoints; the first that fits counts.
+# Published pattern, pattern of the public transformers checkpoints; the first match is used.
 RULES: tuple[tuple[str, str], ...] = (
     # Backbone
     (
@@ -107,44 +107,44 @@ RULES: tuple[tuple[str, str], ...] = (
     ("decoder.denoising_class_embed.{p}", "model.denoising_class_embed.{p}"),
     ("decoder.tgt_embed.{p}", "model.weight_embedding.{p}"),
 )
-# Older sources number these where newer ones name them.
+# Older sources number these layers; newer sources name them.
 SPELLINGS = (
     (re.compile(r"^((?:en|de)coder\.input_proj\.\d+)\.0\."), r"\1.conv."),
     (re.compile(r"^((?:en|de)coder\.input_proj\.\d+)\.1\."), r"\1.norm."),
     (re.compile(r"^(decoder\.enc_output)\.0\."), r"\1.proj."),
     (re.compile(r"^(decoder\.enc_output)\.1\."), r"\1.norm."),
 )
-# What later versions of transformers call what is above.
+# Names in later versions of transformers, and the names used above.
 LATER_NAMES = (
     (re.compile(r"\.self_attn\.o_proj\."), ".self_attn.out_proj."),
     (re.compile(r"\.mlp\.(fc[12])\."), r".\1."),
     (re.compile(r"^model\.encoder\.aifi\."), "model.encoder.encoder."),
-    # RT-DETRv2 names the heads that its decoder holds once more.
+    # RT-DETRv2 lists the heads of its decoder a second time.
     (re.compile(r"^(class_embed|bbox_embed)\."), r"model.decoder.\1."),
 )
-# Made anew from the sizes.
+# Computed from the sizes, not loaded.
 DERIVED = ("decoder.anchors", "decoder.valid_mask")
 
 
 def canonical_name(published: str) -> str:
-    """One spelling for each published parameter."""
+    """The newest published name of a parameter."""
     for pattern, replacement in SPELLINGS:
         published = pattern.sub(replacement, published)
     return published
 
 
 def public_name(published: str) -> str | None:
-    """Name of a published parameter in public transformers checkpoints; None = unknown."""
+    """The name of a published parameter in public checkpoints; None = unknown."""
     return _translate(published, _FORWARD)
 
 
 def published_name(module_name: str) -> str | None:
-    """Published name of a parameter of the model in transformers; None = it has none."""
+    """The published name of a parameter of the `transformers` model; None = it has none."""
     return _translate(earlier_name(module_name), _BACKWARD)
 
 
 def earlier_name(module_name: str) -> str:
-    """A parameter's name in the model as it is in public checkpoints."""
+    """The name in public checkpoints of a parameter of the `transformers` model."""
     for pattern, replacement in LATER_NAMES:
         module_name = pattern.sub(replacement, module_name)
     return module_name
@@ -164,7 +164,7 @@ def _compiled(source: str, target: str) -> tuple[re.Pattern[str], str]:
 
 
 _FORWARD = [_compiled(published, public) for published, public in RULES]
-# The catch-all of the decoder's own would take its heads, too: it comes last on the way back.
+# Backwards, the general rules also match the decoder's heads: they come last.
 _BACKWARD = sorted(
     (_compiled(public, published) for published, public in RULES),
     key=lambda rule: rule[1] in ("encoder.{p}", "decoder.decoder.{p}"),

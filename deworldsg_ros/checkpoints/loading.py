@@ -1,6 +1,6 @@
-"""Pretrained networks on torch: where they are, what they are, and on which device they run.
+"""Pretrained networks on torch: find a checkpoint, load it, choose device and data type.
 
-Imported by a backend that needs torch, and only when it is chosen.
+Only backends that need torch import this module, and only when they are chosen.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class CheckpointSource:
-    """Where a checkpoint comes from.
+    """The folder or hub id of a checkpoint.
 
     Attributes:
-        parameter: the parameter that names it, for messages.
+        parameter: configuration option with this value, for messages.
         name: folder, or hub id.
-        local_files_only: whether a hub id is looked for in the local cache only.
+        local_files_only: whether a hub id is only searched in the local cache.
     """
 
     parameter: str
@@ -33,24 +33,24 @@ class CheckpointSource:
 
     @staticmethod
     def find(parameter: str, name: str, *, local_files_only: bool = True) -> CheckpointSource:
-        """The source that a parameter names; raises ConfigurationError where there is none."""
+        """The source with this folder or hub id; raises ConfigurationError if there is none."""
         if not name:
             raise ConfigurationError(
                 f"{parameter} is empty: set it to the folder or hub id of a checkpoint; "
-                "docs/models.md tells where to get one"
+                "docs/models.md lists sources"
             )
         folder = Path(name).expanduser()
         if folder.is_dir():
             return CheckpointSource(parameter, str(folder), local_files_only)
         if name.startswith(("/", "~", ".")) or name.count("/") != 1:
             raise ConfigurationError(
-                f"{parameter} '{name}': there is no such folder; wanted one with config.json and "
-                "model.safetensors, or a hub id"
+                f"{parameter} '{name}': there is no such folder; expected a folder with "
+                "config.json and model.safetensors, or a hub id"
             )
         return CheckpointSource(parameter, name, local_files_only)
 
     def file(self, name: str) -> Path | None:
-        """A file of the checkpoint beside its weights; None where it has none of that name."""
+        """The path of a file of the checkpoint; None if it has no file of this name."""
         if Path(self.name).is_dir():
             path = Path(self.name) / name
             return path if path.is_file() else None
@@ -71,34 +71,34 @@ class CheckpointSource:
         """The checkpoint's own configuration.
 
         Args:
-            families: the model types that will do.
+            families: accepted model types.
 
         Raises:
-            ConfigurationError: nothing there, or another architecture.
+            ConfigurationError: no checkpoint, or one of another model type.
         """
         try:
             found = transformers.AutoConfig.from_pretrained(
                 self.name, local_files_only=self.local_files_only
             )
-        except Exception as error:  # transformers raises whatever its parts raise
+        except Exception as error:  # transformers raises errors of many types
             raise ConfigurationError(self._cannot_load(error)) from error
         if found.model_type not in families:
             raise ConfigurationError(
-                f"{self.parameter} '{self.name}' is a checkpoint of {found.model_type}: wanted "
+                f"{self.parameter} '{self.name}' is a checkpoint of {found.model_type}: expected "
                 f"{' or '.join(sorted(families))}"
             )
         return found
 
     def load(self, model_class: Any, config: Any, unused: Sequence[str] = ()) -> Any:
-        """The network, whole, frozen, in float32 on the CPU.
+        """The network, complete and frozen, in float32 on the CPU.
 
         Args:
-            model_class: of transformers.
-            config: the checkpoint's, from `config`.
-            unused: prefixes of parameters that need not be there.
+            model_class: class of `transformers` to load it into.
+            config: configuration of the checkpoint, from `config`.
+            unused: prefixes of parameters that the checkpoint may lack.
 
         Raises:
-            ConfigurationError: it cannot be read, or is not whole.
+            ConfigurationError: the checkpoint cannot be read, or lacks parameters.
         """
         logging: Any = transformers.utils.logging
         logging.disable_progress_bar()
@@ -119,14 +119,13 @@ class CheckpointSource:
         if missing:
             raise ConfigurationError(
                 f"{self.parameter} '{self.name}' lacks {len(missing)} parameters of "
-                f"{model_class.__name__}, first '{missing[0]}': get the checkpoint again, or the "
-                "one of the whole network"
+                f"{model_class.__name__}, first '{missing[0]}': download the checkpoint again, or "
+                "choose one of the complete network"
             )
         return model.eval().requires_grad_(False)
 
     def _cannot_load(self, error: Exception) -> str:
-        first_line = (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
-        reason = f"{self.parameter} '{self.name}' cannot be loaded ({first_line})"
+        reason = f"{self.parameter} '{self.name}' cannot be loaded ({first_line(error)})"
         folder = "a folder with config.json and model.safetensors of transformers' format"
         if Path(self.name).is_dir():
             return f"{reason}, expected {folder}: download the checkpoint again"
@@ -135,28 +134,89 @@ class CheckpointSource:
         return f"{reason}: check the id and the network, or name {folder}"
 
 
-def choose_device(parameter: str, wanted: str) -> torch.device:
-    """`auto`, `cpu` or `cuda` as a device; raises ConfigurationError where there is no CUDA."""
-    there = torch.cuda.is_available()
-    if wanted == "cuda" and not there:
+def read_tensors(path: Path, key: str = "") -> dict[str, torch.Tensor]:
+    """A dictionary of tensors that torch saved; code in the file is not executed.
+
+    Args:
+        path: the file.
+        key: entry of the saved dictionary that holds the tensors; empty = the dictionary itself.
+
+    Raises:
+        ConfigurationError: no such file, or its content is not a dictionary of tensors.
+    """
+    if not path.is_file():
+        raise ConfigurationError(f"checkpoint {path}: no such file")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip and torch each have errors of their own
+        raise ConfigurationError(
+            f"checkpoint {path} cannot be read ({first_line(error)}): expected a file that torch "
+            "saved; if it contains more than tensors, save its tensors alone"
+        ) from error
+    if key:
+        content = content.get(key) if isinstance(content, dict) else None
+    if not isinstance(content, dict) or not all(map(torch.is_tensor, content.values())):
+        expected = (
+            f"an entry `{key}`, a dictionary of tensors" if key else "a dictionary of tensors"
+        )
+        raise ConfigurationError(f"checkpoint {path} has other content: expected {expected}")
+    return content
+
+
+def check_names(
+    found: Collection[str], expected: Collection[str], where: str, most: int = 5
+) -> None:
+    """Compare names of parameters.
+
+    Args:
+        found: names in a file.
+        expected: names of the network.
+        where: origin of the parameters, for messages.
+        most: missing and unknown names listed in the message.
+
+    Raises:
+        ConfigurationError: names are missing or unknown.
+    """
+    differences = {
+        "missing": sorted(set(expected) - set(found)),
+        "unknown": sorted(set(found) - set(expected)),
+    }
+    parts = [
+        f"{len(names)} {kind} ({', '.join(names[:most])}{', …' if len(names) > most else ''})"
+        for kind, names in differences.items()
+        if names
+    ]
+    if parts:
+        raise ConfigurationError(f"{where} has unexpected parameters: {', '.join(parts)}")
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, or the name of its type."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(".")
+
+
+def choose_device(parameter: str, choice: str) -> torch.device:
+    """The device for `auto`, `cpu` or `cuda`; raises ConfigurationError without a CUDA device."""
+    available = torch.cuda.is_available()
+    if choice == "cuda" and not available:
         raise ConfigurationError(
             f"{parameter} is 'cuda' and torch {torch.__version__} finds no CUDA device: set it to "
             "'auto' or 'cpu', or install a CUDA build of torch and its driver"
         )
-    return torch.device("cuda" if there and wanted != "cpu" else "cpu")
+    return torch.device("cuda" if available and choice != "cpu" else "cpu")
 
 
 def choose_dtype(device: torch.device) -> torch.dtype:
     """float16 on CUDA, float32 on a CPU, for every network.
 
-    Of the two half precisions float16 has the finer numbers, which boxes and masks need, and every
-    CUDA device computes with it; bfloat16 is emulated before Ampere.
+    float16 has more mantissa bits than bfloat16, which boxes and masks need. All CUDA devices
+    support it; bfloat16 is emulated before Ampere.
     """
     return torch.float16 if device.type == "cuda" else torch.float32
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Whether an error says that a device has too little memory."""
+    """Whether an error means that a device has too little memory."""
     text = str(error)
     return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or (
         isinstance(error, RuntimeError)
@@ -166,11 +226,16 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 @contextmanager
 def enough_memory(what: str, remedy: str = "") -> Iterator[None]:
-    """Turn running out of memory, of whichever device, into a ConfigurationError."""
+    """Raise ConfigurationError if the block runs out of memory, on the CPU or a GPU.
+
+    Args:
+        what: the action, for the message.
+        remedy: the advice in the message.
+    """
     try:
         yield
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise
-        remedy = remedy or "choose a smaller checkpoint, or free the device"
+        remedy = remedy or "choose a smaller checkpoint, or free memory of the device"
         raise ConfigurationError(f"out of memory while {what}: {remedy}") from error

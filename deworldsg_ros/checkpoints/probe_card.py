@@ -1,7 +1,7 @@
-"""What a probe was trained for; it refuses to be used for anything else.
+"""The card of a probe: the backbone and the predicates for which it was trained.
 
-A probe is a folder: `config.json` (a `ProbeCard`), `model.safetensors`, and, where it was trained
-here, `metrics.json` and `confusion.png`.
+A probe is a folder with `config.json` (a `ProbeCard`) and `model.safetensors`. `deworldsg
+train-probe` also writes `metrics.json` and `confusion.png`.
 """
 
 from pathlib import Path
@@ -16,19 +16,19 @@ from deworldsg_ros.scene.errors import ConfigurationError
 CARD_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
-# Both boxes of a pair, corners as shares of the crop.
+# Inputs for the two boxes of a pair: four corner coordinates each, as fractions of the crop.
 BOX_INPUTS = 8
 
 
 class BackboneIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A frozen backbone and how clips are given to it.
+    """A frozen backbone and the size of its clips.
 
     Attributes:
         family: name of the world model, e.g. ``vjepa2``.
         feature_dim: d, length of a clip's feature.
-        image_size: edge of the square that a frame is made into, pixels.
+        image_size: edge of the square input, pixels.
         clip_length: T, frames of a clip.
-        fingerprint: of the weights; empty where the origin of a probe does not tell.
+        fingerprint: hash of the weights; empty = not known.
     """
 
     family: str
@@ -46,18 +46,19 @@ class BackboneIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a probe is and what it was trained for.
+    """Architecture and training of a probe.
 
     Attributes:
-        backbone: whose features it reads.
+        backbone: the backbone of its input features.
         predicates: R names, in the order of its outputs.
-        layout: ``two_layer`` is the paper's, Linear-ReLU-Linear; ``batch_norm`` that of the
-            published probe, with batch normalisation before both and dropout before the last.
-        inputs: ``clip`` is the paper's: the clip's feature alone, and so one answer for both
-            directions of a pair; ``clip_and_boxes`` adds the subject's and the object's box.
-        hidden_dim: width of the layer between.
-        training: how it was trained, plain values.
-        schema, version: of this file.
+        layout: ``two_layer`` is the paper's, Linear-ReLU-Linear. ``batch_norm`` is the published
+            probe's, with batch normalisation before both linear layers and dropout before the
+            last.
+        inputs: ``clip`` is the paper's: only the clip's feature, so that both directions of a pair
+            get the same prediction. ``clip_and_boxes`` adds the boxes of subject and object.
+        hidden_dim: width of the hidden layer.
+        training: record of the training, plain values.
+        schema, version: of the file format.
     """
 
     backbone: BackboneIdentity
@@ -71,23 +72,23 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def input_dim(self) -> int:
-        """Numbers that the probe reads of one pair."""
+        """Number of inputs per pair."""
         return self.backbone.feature_dim + (BOX_INPUTS if self.inputs == "clip_and_boxes" else 0)
 
     def require_backbone(self, backbone: BackboneIdentity) -> None:
         """Raise ConfigurationError unless the probe was trained on this backbone."""
-        wanted = self.backbone
-        if not wanted.fingerprint or not backbone.fingerprint:
-            wanted = msgspec.structs.replace(wanted, fingerprint=backbone.fingerprint)
-        if wanted != backbone:
+        expected = self.backbone
+        if not expected.fingerprint or not backbone.fingerprint:
+            expected = msgspec.structs.replace(expected, fingerprint=backbone.fingerprint)
+        if expected != backbone:
             raise ConfigurationError(
                 f"the probe was trained on {self.backbone}, and the backbone is {backbone}: "
-                "choose the checkpoint and the image size that it was trained on, or train a "
-                "probe for this one with `deworldsg train-probe`"
+                "choose the backbone of the probe, or train a probe for this backbone with "
+                "`deworldsg train-probe`"
             )
 
     def require_predicates(self, predicates: tuple[str, ...]) -> None:
-        """Raise ConfigurationError unless the probe answers over just these predicates."""
+        """Raise ConfigurationError unless the probe has exactly these predicates, in this order."""
         if self.predicates == predicates:
             return
         missing = [name for name in predicates if name not in self.predicates]
@@ -96,7 +97,7 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         raise ConfigurationError(
             f"the probe was trained for {len(self.predicates)} predicates and the graph has "
             f"{len(predicates)}: it {' and '.join(parts) or 'has them in another order'}; choose "
-            "the predicate set that it was trained for, or train one for this set"
+            "the predicate set of the probe, or train a probe for this set"
         )
 
 
@@ -104,12 +105,12 @@ def read_card(folder: Path) -> ProbeCard:
     """Read `config.json` of a probe's folder.
 
     Raises:
-        ConfigurationError: where it is missing, or is no probe's.
+        ConfigurationError: the file is missing, or is not a probe's.
     """
     path = folder / CARD_FILE
     if not path.is_file():
         raise ConfigurationError(
-            f"probe '{folder}' has no {CARD_FILE}: wanted a folder made by `deworldsg train-probe` "
+            f"probe '{folder}' has no {CARD_FILE}: expected a folder from `deworldsg train-probe` "
             "or `deworldsg import-probe`"
         )
     try:
@@ -117,7 +118,7 @@ def read_card(folder: Path) -> ProbeCard:
     except (OSError, msgspec.MsgspecError) as error:
         raise ConfigurationError(f"probe {path}: {error}") from error
     if not card.predicates or len(set(card.predicates)) != len(card.predicates):
-        raise ConfigurationError(f"probe {path}: wanted predicates, each named once")
+        raise ConfigurationError(f"probe {path}: expected predicates, each name once")
     return card
 
 
@@ -130,12 +131,19 @@ def write_card(folder: Path, card: ProbeCard) -> None:
 def relative_box_pair(
     subject_box_xyxy: Float64, object_box_xyxy: Float64, width: int, height: int
 ) -> Float32:
-    """(8,) float32: corners of both boxes as shares of a crop's width and height."""
+    """(8,) float32: corners of both boxes as fractions of a crop's width and height.
+
+    Args:
+        subject_box_xyxy: (4,) float64 pixels of the crop.
+        object_box_xyxy: likewise.
+        width: of the crop, pixels.
+        height: of the crop, pixels.
+    """
     both = np.concatenate([subject_box_xyxy, object_box_xyxy])
-    shares: Float32 = np.clip(both / np.array([width, height] * 4), 0, 1).astype(np.float32)
-    return shares
+    fractions: Float32 = np.clip(both / np.array([width, height] * 4), 0, 1).astype(np.float32)
+    return fractions
 
 
 def _some(names: list[str], most: int = 5) -> str:
-    told = ", ".join(f"'{name}'" for name in names[:most])
-    return told if len(names) <= most else f"{told} and {len(names) - most} more"
+    listed = ", ".join(f"'{name}'" for name in names[:most])
+    return listed if len(names) <= most else f"{listed} and {len(names) - most} more"

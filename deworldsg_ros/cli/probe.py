@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -11,149 +12,210 @@ import typer
 from rich.console import Console
 
 from deworldsg_ros.checkpoints.card import CARD_FILE, read_card
+from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.config import RelationsConfig, from_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
+from deworldsg_ros.training.options import FitOptions, TrainingOptions
 
+# Options of the command by the configuration fields that they set, for error messages.
 OPTION_OF = {
     "world_model_path": "--model",
     "clip_length": "--clip-length",
     "device": "--device",
 }
 
+# Options of the commands. typer evaluates these annotations at run time.
+ClipSource = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CLIPS", help="folder of clips, or data set in the layout of ReplicaSSG or 3RScan"
+    ),
+]
+ProbeFolder = Annotated[Path, typer.Option("--out", help="folder to write the probe to")]
+WorldModelName = Annotated[str, typer.Option("--world-model", help="vjepa2 or dinov2")]
+ModelPath = Annotated[
+    str, typer.Option("--model", metavar="PATH", help="checkpoint of the world model")
+]
 PredicateSet = Annotated[
     str,
     typer.Option(
         "--predicates",
         metavar="SET",
-        help="replica_ssg, 3dssg, a file with a name a line, or the folder of an imported FROSS",
+        help="replica_ssg, 3dssg, a file with one name per line, or a folder of an imported FROSS",
     ),
 ]
+Layout = Annotated[
+    str,
+    typer.Option("--layout", help="two_layer (the paper), or batch_norm (the published probe)"),
+]
+Inputs = Annotated[
+    str,
+    typer.Option(
+        "--inputs", help="clip (the paper), or clip_and_boxes, which distinguishes directions"
+    ),
+]
+HeldOut = Annotated[
+    Optional[list[str]],
+    typer.Option("--held-out", metavar="GROUP", help="hold out this room; may be repeated"),
+]
+HeldOutShare = Annotated[
+    float,
+    typer.Option(
+        "--held-out-share", min=0, max=0.9, help="fraction of the rooms to hold out instead"
+    ),
+]
+ClipsPerPair = Annotated[
+    int, typer.Option("--clips-per-pair", min=1, help="clips per related pair of a data set")
+]
+ClipLength = Annotated[int, typer.Option("--clip-length", min=1, help="frames per clip")]
+Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda")]
+BatchSize = Annotated[int, typer.Option("--batch-size", min=1, help="clips encoded at once")]
+Epochs = Annotated[int, typer.Option("--epochs", min=1, help="maximum number of passes")]
+Patience = Annotated[
+    int,
+    typer.Option(
+        "--patience", min=1, help="passes without a lower validation loss before the training stops"
+    ),
+]
+LearningRate = Annotated[float, typer.Option("--learning-rate", min=0, help="of AdamW")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="of the weights and the split")]
+Cache = Annotated[
+    Optional[Path],
+    typer.Option("--cache", help="folder for the features of clips; default OUT/features"),
+]
+Download = Annotated[bool, typer.Option("--download", help="download a checkpoint by its hub id")]
+
+
+@dataclass(frozen=True)
+class ProbeTraining:
+    """Options of `deworldsg train-probe`.
+
+    Attributes:
+        source: folder of clips, or data set.
+        out: folder of the probe.
+        relations: world model, checkpoint, clip length and device.
+        download: whether the checkpoint may be downloaded.
+        predicates: names of the probe's outputs.
+        clips_per_pair: clips per related pair of a data set.
+        training: architecture, split and fit.
+        cache: folder for the features; None = `out`/features.
+    """
+
+    source: Path
+    out: Path
+    relations: RelationsConfig
+    download: bool
+    predicates: tuple[str, ...]
+    clips_per_pair: int
+    training: TrainingOptions
+    cache: Path | None
 
 
 def train_probe(
-    source: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CLIPS",
-            help="folder of clips, or a data set in ReplicaSSG's or 3RScan's layout",
-        ),
-    ],
-    out: Annotated[Path, typer.Option("--out", help="folder of the probe")],
-    world_model: Annotated[str, typer.Option("--world-model", help="vjepa2 or dinov2")] = "vjepa2",
-    model: Annotated[
-        str, typer.Option("--model", metavar="PATH", help="its checkpoint: folder or hub id")
-    ] = "",
+    source: ClipSource,
+    out: ProbeFolder,
+    world_model: WorldModelName = "vjepa2",
+    model: ModelPath = "",
     predicates: PredicateSet = "replica_ssg",
-    layout: Annotated[
-        str, typer.Option("--layout", help="two_layer (the paper's) or batch_norm (the published)")
-    ] = "two_layer",
-    inputs: Annotated[
-        str,
-        typer.Option(
-            "--inputs", help="clip (the paper's), or clip_and_boxes, which tells the directions"
-        ),
-    ] = "clip",
-    held_out: Annotated[
-        Optional[list[str]],
-        typer.Option("--held-out", metavar="GROUP", help="keep this room aside; may be repeated"),
-    ] = None,
-    held_out_share: Annotated[
-        float, typer.Option("--held-out-share", min=0, max=0.9, help="share of the rooms instead")
-    ] = 0.2,
-    clips_per_pair: Annotated[
-        int, typer.Option("--clips-per-pair", min=1, help="clips cut of each related pair")
-    ] = 4,
-    clip_length: Annotated[int, typer.Option("--clip-length", min=1, help="frames")] = 16,
-    device: Annotated[str, typer.Option("--device", help="auto, cpu or cuda")] = "auto",
-    batch_size: Annotated[
-        int, typer.Option("--batch-size", min=1, help="clips encoded at once")
-    ] = 1,
-    epochs: Annotated[int, typer.Option("--epochs", min=1, help="most passes")] = 200,
-    patience: Annotated[
-        int, typer.Option("--patience", min=1, help="passes without a better validation loss")
-    ] = 20,
-    learning_rate: Annotated[float, typer.Option("--learning-rate", min=0)] = 1e-3,
-    seed: Annotated[int, typer.Option("--seed", min=0)] = 0,
-    cache: Annotated[
-        Optional[Path],
-        typer.Option("--cache", help="folder of the extracted features; default OUT/features"),
-    ] = None,
-    download: Annotated[
-        bool, typer.Option("--download", help="let a hub id be fetched from the network")
-    ] = False,
+    layout: Layout = "two_layer",
+    inputs: Inputs = "clip",
+    held_out: HeldOut = None,
+    held_out_share: HeldOutShare = 0.2,
+    clips_per_pair: ClipsPerPair = 4,
+    clip_length: ClipLength = 16,
+    device: Device = "auto",
+    batch_size: BatchSize = 1,
+    epochs: Epochs = 200,
+    patience: Patience = 20,
+    learning_rate: LearningRate = 1e-3,
+    seed: Seed = 0,
+    cache: Cache = None,
+    download: Download = False,
 ) -> None:
-    """Train the world model's probe; an interrupted run goes on where it stopped."""
-    from deworldsg_ros.cli.progress import frame_progress
-
+    """Train a probe for a world model; an interrupted training continues where it stopped."""
     choice = {
         "world_model": world_model,
         "world_model_path": model,
         "clip_length": clip_length,
         "device": device,
     }
-    config = from_mapping({"relations": choice}, "train-probe").relations
-    names = read_predicates(predicates)
-    console = Console(highlight=False, soft_wrap=True)
+    training = TrainingOptions(
+        layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
+        inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
+        held_out_share=held_out_share,
+        held_out_groups=tuple(held_out or ()),
+        batch_size=batch_size,
+        fit=FitOptions(epochs, patience, learning_rate=learning_rate, seed=seed),
+    )
+    options = ProbeTraining(
+        source=source,
+        out=out,
+        relations=from_mapping({"relations": choice}, "train-probe").relations,
+        download=download,
+        predicates=read_predicates(predicates),
+        clips_per_pair=clips_per_pair,
+        training=training,
+        cache=cache,
+    )
     with _needing_torch():
-        from deworldsg_ros.training.dataset_clips import read_clips
-        from deworldsg_ros.training.fit import FitOptions
-        from deworldsg_ros.training.train import Progress, TrainingOptions
-        from deworldsg_ros.training.train import train_probe as train
+        run_training(options, Console(highlight=False, soft_wrap=True))
 
-        clips = read_clips(source, clip_length, clips_per_pair)
-        options = TrainingOptions(
-            layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
-            inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
-            held_out_share=held_out_share,
-            held_out_groups=tuple(held_out or ()),
-            batch_size=batch_size,
-            fit=FitOptions(epochs, patience, learning_rate=learning_rate, seed=seed),
+
+def run_training(options: ProbeTraining, console: Console) -> None:
+    """Train and save a probe, and print its accuracy; raises DeWorldSGError."""
+    from deworldsg_ros.training.dataset_clips import read_clips
+    from deworldsg_ros.training.train import Progress
+    from deworldsg_ros.training.train import train_probe as train
+
+    clips = read_clips(options.source, options.relations.clip_length, options.clips_per_pair)
+    backbone = _load_backbone(options.relations, options.download)
+    with frame_progress(console) as bar:
+        encoding = bar.add_task("features", total=len(clips), note="")
+        fitting = bar.add_task("epochs", total=options.training.fit.epochs, note="")
+
+        def epoch(train_loss: float, validation_loss: float) -> None:
+            note = f"loss {train_loss:.3f}, validation {validation_loss:.3f}"
+            bar.update(fitting, advance=1, note=note)
+
+        metrics = train(
+            backbone,
+            clips,
+            options.predicates,
+            options.out,
+            options.training,
+            cache=options.cache,
+            source=options.source.name,
+            progress=Progress(lambda count: bar.update(encoding, advance=count), epoch),
         )
-        backbone = _load_backbone(config, download)
-        with frame_progress(console) as bar:
-            encoding = bar.add_task("features", total=len(clips), note="")
-            fitting = bar.add_task("epochs", total=epochs, note="")
-
-            def epoch(train_loss: float, validation_loss: float) -> None:
-                note = f"loss {train_loss:.3f}, validation {validation_loss:.3f}"
-                bar.update(fitting, advance=1, note=note)
-
-            metrics = train(
-                backbone,
-                clips,
-                names,
-                out,
-                options,
-                cache=cache,
-                source=source.name,
-                progress=Progress(lambda count: bar.update(encoding, advance=count), epoch),
-            )
     held = metrics["held_out"]
     console.print(
-        f"{out}: best epoch {metrics['best_epoch'] + 1}; {held['clips']} clips of held-out rooms: "
-        f"macro accuracy {held['macro_accuracy']:.3f} (chance {held['chance_macro']:.3f}), micro "
-        f"{held['micro_accuracy']:.3f} (most frequent {held['majority_micro']:.3f})",
+        f"{options.out}: best epoch {metrics['best_epoch'] + 1}; {held['clips']} clips of held-out "
+        f"rooms: macro accuracy {held['macro_accuracy']:.3f} (chance {held['chance_macro']:.3f}), "
+        f"micro {held['micro_accuracy']:.3f} (most frequent {held['majority_micro']:.3f})",
         markup=False,
     )
+    relations = options.relations
     console.print(
-        f"use it: --set relations.world_model={world_model} "
-        f"--set relations.world_model_path={model} --set relations.probe_path={out}",
+        f"use it: --set relations.world_model={relations.world_model} "
+        f"--set relations.world_model_path={relations.world_model_path} "
+        f"--set relations.probe_path={options.out}",
         markup=False,
     )
 
 
 def import_probe(
     checkpoint: Annotated[
-        Path, typer.Argument(metavar="CHECKPOINT", help="published vjepa_probe_mlp.pt")
+        Path, typer.Argument(metavar="CHECKPOINT", help="the published vjepa_probe_mlp.pt")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write")],
     predicates: PredicateSet = "replica_ssg",
 ) -> None:
-    """Turn the published probe of V-JEPA 2 ViT-g 384 into a folder that loads by name."""
+    """Convert the published probe of V-JEPA 2 ViT-g 384 to a folder for relations.probe_path."""
     names = read_predicates(predicates)
     with _needing_torch():
-        from deworldsg_ros.relations.probing.probe_network import import_published, save_probe
+        from deworldsg_ros.checkpoints.probe_network import save_probe
+        from deworldsg_ros.checkpoints.published_probe import import_published
 
         probe = import_published(checkpoint, names)
         save_probe(out, probe)
@@ -163,7 +225,7 @@ def import_probe(
 
 
 def read_predicates(choice: str) -> tuple[str, ...]:
-    """Names of a set, of a file, or of a checkpoint's card; raises ConfigurationError."""
+    """Predicates of a named set, a file or a checkpoint's card; raises ConfigurationError."""
     if choice in PREDICATE_SETS:
         return PREDICATE_SETS[choice]
     card_path = Path(choice) / CARD_FILE
@@ -173,12 +235,12 @@ def read_predicates(choice: str) -> tuple[str, ...]:
         lines = Path(choice).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(
-            f"--predicates '{choice}': wanted {', '.join(PREDICATE_SETS)}, a file with a name a "
-            f"line, or the folder of an imported checkpoint with a relation head ({error})"
+            f"--predicates '{choice}': expected {', '.join(PREDICATE_SETS)}, a file with one name "
+            f"per line, or the folder of an imported checkpoint with a relation head ({error})"
         ) from error
     names = tuple(line.strip() for line in lines if line.strip())
     if not names or len(set(names)) != len(names):
-        raise ConfigurationError(f"--predicates {choice}: wanted names, each of them once")
+        raise ConfigurationError(f"--predicates {choice}: expected names, each once")
     return names
 
 
@@ -191,15 +253,15 @@ def _load_backbone(config: RelationsConfig, download: bool) -> Any:
         return load(config, download=download)
     except ConfigurationError as error:
         # The user typed options of the command, not configuration fields.
-        told = str(error).replace(": run `hf", ": give --download, run `hf")
+        message = str(error).replace(": run `hf", ": give --download, run `hf")
         for name, option in OPTION_OF.items():
-            told = told.replace(f"relations.{name}", option)
-        raise ConfigurationError(told) from error
+            message = message.replace(f"relations.{name}", option)
+        raise ConfigurationError(message) from error
 
 
 def _one_of(option: str, value: str, choices: tuple[str, ...]) -> Any:
     if value not in choices:
-        raise ConfigurationError(f"--{option} '{value}': wanted {' or '.join(choices)}")
+        raise ConfigurationError(f"--{option} '{value}': expected {' or '.join(choices)}")
     return value
 
 

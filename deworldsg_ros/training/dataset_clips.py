@@ -1,4 +1,4 @@
-"""Clips that a probe is trained on: of a folder, or cut out of a data set with annotations."""
+"""Training clips of a probe, from a folder or from an annotated data set."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.training.labelled_clips import LabelledClip, read_clip_folder
 from deworldsg_ros.training.scan_clips import Boxes, cut_clips, read_boxes
 
-# Where boxes have to be made of the annotated points: every so many frames, of points whose depth
-# is that of their pixel, and so many of them.
+# 3RScan has no boxes. They are computed from the annotated surface points in every 8th frame, ...
 BOXES_EVERY_FRAMES = 8
+# ... from points whose depth is within 5 cm of the depth image (others are hidden), ...
 MAX_DEPTH_GAP_M = 0.05
+# ... for objects with at least 20 such points.
 MIN_POINTS = 20
 
 
 def read_clips(source: Path, clip_length: int, clips_per_pair: int) -> list[LabelledClip]:
-    """The clips of a folder or of a data set; raises DeWorldSGError where there are none."""
+    """The clips of a folder or a data set; raises DeWorldSGError if there are none."""
     found = [name for name, layout in LAYOUTS.items() if (source / layout.relations).is_file()]
     if not found:
         return read_clip_folder(source)
@@ -43,29 +44,29 @@ def read_clips(source: Path, clip_length: int, clips_per_pair: int) -> list[Labe
     clips: list[LabelledClip] = []
     for folder in sorted(path for path in (source / "data").iterdir() if path.is_dir()):
         scan = folder.name
-        turned = found[0] == "3rscan"
-        frames = list(_rio_frames(annotations, scan) if turned else _replica_frames(folder))
+        rotated = found[0] == "3rscan"
+        frames = list(_rio_frames(annotations, scan) if rotated else _replica_frames(folder))
         if not frames:
             continue
         width, height = image_size(frames[0][0])
         clips += cut_clips(
             scan,
             frames,
-            (height, width) if turned else (width, height),
+            (height, width) if rotated else (width, height),
             [
-                (subject, object_, names[place])
-                for subject, object_, place in annotations.scan(scan).relations
-                if place >= 0
+                (subject, object_, names[index])
+                for subject, object_, index in annotations.scan(scan).relations
+                if index >= 0
             ],
             clip_length=clip_length,
             clips_per_pair=clips_per_pair,
-            turned=turned,
+            rotated=rotated,
         )
     if not clips:
         raise ConfigurationError(
-            f"data set '{source}': no related pair is seen in a frame; wanted "
-            "data/SCAN/sequence/frame-NNNNNN.color.jpg, and beside it .bb.txt (ReplicaSSG) or "
-            "depth and pose (3RScan)"
+            f"data set '{source}': no frame shows a related pair; expected "
+            "data/SCAN/sequence/frame-NNNNNN.color.jpg with .bb.txt (ReplicaSSG) or with depth and "
+            "pose (3RScan)"
         )
     return clips
 
@@ -76,17 +77,17 @@ def _replica_frames(folder: Path) -> Iterator[tuple[Path, Boxes]]:
 
 
 def _rio_frames(annotations: Annotations, scan: str) -> Iterator[tuple[Path, Boxes]]:
-    """Image of each frame and, now and then, boxes in the image as it is turned upright."""
+    """Each image, with boxes in the upright (rotated) image in every 8th frame."""
     source = RioScan(annotations.scan_folder(scan), DatasetOptions())
     points = annotations.points(scan)
     height = source.info.color.height
-    for place, number in enumerate(source.frame_numbers.values()):
+    for index, number in enumerate(source.frame_numbers.values()):
         boxes: Boxes = {}
-        if place % BOXES_EVERY_FRAMES == 0:
-            # A frame whose files are missing or damaged shows nothing.
+        if index % BOXES_EVERY_FRAMES == 0:
+            # A frame with missing or damaged files has no boxes.
             with contextlib.suppress(RecordingError, RefusedInput):
                 boxes = _boxes_of_frame(source, number, points)
-        # By 90 degrees clockwise, as RioScan turns the images.
+        # Rotated by 90 degrees clockwise, like the images of RioScan.
         yield (
             source.file(number, ".color.jpg"),
             {
@@ -115,7 +116,7 @@ def visible_boxes(
     depth_camera: Intrinsics,
     color_camera: Intrinsics,
 ) -> Mapping[int, Float64]:
-    """Boxes (4,) xyxy, pixels of the colour image, of the annotated objects that are to be seen.
+    """Boxes (4,) xyxy of the visible annotated objects, pixels of the colour image.
 
     Args:
         points: annotated surface points, world frame.

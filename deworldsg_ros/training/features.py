@@ -1,4 +1,4 @@
-"""Features of clips, extracted once: a cache on disk from which an interrupted run goes on."""
+"""Features of clips, with a cache on disk: an interrupted training continues from it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.training.labelled_clips import LabelledClip, of_length
 
-# Features in one file: what an interruption costs at most.
+# Features per file. An interruption loses at most this many clips.
 SHARD_SIZE = 32
 
 
 class FeatureCache:
-    """Features by clip, of one backbone and preprocessing; others have other folders.
+    """Features of clips, for one backbone and preprocessing; each has its own folder.
 
     Args:
         root: folder of all caches.
-        description: everything that the features depend on besides the clip.
+        description: everything besides the clip that changes a feature.
     """
 
     def __init__(self, root: Path, description: str) -> None:
@@ -39,11 +39,11 @@ class FeatureCache:
         return len(self._features)
 
     def get(self, key: str) -> Float32 | None:
-        """The feature of a clip, (d,) float32; None where it was not extracted yet."""
+        """The feature of a clip, (d,) float32; None if it was not extracted yet."""
         return self._features.get(_digest(key))
 
     def add(self, key: str, feature: Float32) -> None:
-        """Keep a feature; it is written with the next full file, or by `save`."""
+        """Keep a feature; the next full file or `save` writes it."""
         digest = _digest(key)
         self._features[digest] = feature
         self._unsaved.append(digest)
@@ -51,7 +51,7 @@ class FeatureCache:
             self.save()
 
     def save(self) -> None:
-        """Write what was not written yet, as one whole file or not at all."""
+        """Write all unsaved features to one new file, completely or not at all."""
         if not self._unsaved:
             return
         digests = self._unsaved
@@ -68,7 +68,7 @@ class FeatureCache:
                 rows = zip(content["digests"].tolist(), content["features"])
                 self._features.update((digest, np.asarray(row, np.float32)) for digest, row in rows)
         except (OSError, KeyError, ValueError, zipfile.BadZipFile):
-            # Extracted again, and then replaced.
+            # A damaged file: its features are extracted again.
             path.unlink()
 
 
@@ -80,14 +80,14 @@ def extract_features(
     batch_size: int,
     advance: Callable[[int], None] = lambda _: None,
 ) -> Float32:
-    """Features of clips, (n, d) float32; only those that the cache lacks are encoded.
+    """Features of clips, (n, d) float32; only clips that are not in the cache are encoded.
 
     Args:
-        backbone: the frozen network.
+        backbone: encodes the clips.
         clips: labelled clips.
-        cache: of that backbone.
+        cache: of this backbone.
         batch_size: clips encoded at once.
-        advance: told how many more are done.
+        advance: called with the number of further clips that are done.
     """
     missing = [clip for clip in clips if cache.get(clip.key) is None]
     advance(len(clips) - len(missing))

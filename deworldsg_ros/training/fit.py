@@ -1,4 +1,4 @@
-"""Fit of a probe on features: weighted cross-entropy, early stopping, one seed."""
+"""Fit of a probe on features: weighted cross-entropy, early stopping, one random seed."""
 
 from __future__ import annotations
 
@@ -10,33 +10,14 @@ import numpy as np
 import torch
 
 from deworldsg_ros.checkpoints.probe_card import ProbeCard
-from deworldsg_ros.relations.probing.probe_network import Probe, build_network
+from deworldsg_ros.checkpoints.probe_network import Probe, build_network
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
-
-
-@dataclass(frozen=True)
-class FitOptions:
-    """How a probe is trained.
-
-    Attributes:
-        epochs: most passes over the training clips.
-        patience: passes without a better validation loss after which it stops.
-        batch_size: clips of a step.
-        learning_rate, weight_decay: of AdamW.
-        seed: of the initial weights and the order of the clips.
-    """
-
-    epochs: int = 200
-    patience: int = 20
-    batch_size: int = 64
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-2
-    seed: int = 0
+from deworldsg_ros.training.options import FitOptions
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A trained probe, with the losses of each epoch and the one whose weights were kept."""
+    """A trained probe, the losses of each epoch, and the epoch of the kept weights."""
 
     probe: Probe
     train_losses: list[float]
@@ -45,9 +26,9 @@ class Fit:
 
 
 def class_weights(labels: Int64, count: int) -> Float32:
-    """Weight of each predicate in the loss, (count,): inverse to how often it occurs.
+    """Weight of each predicate in the loss, (count,) float32, inverse to its frequency.
 
-    The mean weight of a clip is one; predicates without a clip weigh nothing.
+    The mean weight of a clip is one. Predicates without a clip have weight zero.
     """
     occurrences = np.bincount(labels, minlength=count)
     present = occurrences > 0
@@ -68,59 +49,38 @@ def fit_probe(
     """Train a probe.
 
     Args:
-        card: what to build.
+        card: architecture of the probe.
         inputs: (n, input_dim) float32.
-        labels: (n,) int64, places in the card's predicates.
-        train: rows to learn from.
-        validation: rows whose loss decides when to stop.
-        options: how.
-        advance: told the two losses after each epoch.
+        labels: (n,) int64, indices of the card's predicates.
+        train: rows to train on.
+        validation: rows whose loss stops the fit.
+        options: of the fit.
+        advance: called with the training and the validation loss after each epoch.
     """
     torch.manual_seed(options.seed)
-    generator = torch.Generator().manual_seed(options.seed)
-    # Features of a random direction differ by orders of magnitude; what is learnt on standardised
-    # ones is folded into the first layer afterwards, so that the probe reads them as they are.
+    # Features of different dimensions differ by orders of magnitude. The network is trained on
+    # standardised inputs; the standardisation is then folded into its first layer.
     mean, std = inputs[train].mean(axis=0), inputs[train].std(axis=0) + 1e-6
-    values = torch.from_numpy((inputs - mean) / std)
-    targets = torch.from_numpy(labels)
-    network = build_network(card)
     weights = torch.from_numpy(class_weights(labels[train], len(card.predicates)))
-    loss_of = torch.nn.CrossEntropyLoss(weight=weights)
-    optimiser = torch.optim.AdamW(
-        network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
-    )
+    values, targets = torch.from_numpy((inputs - mean) / std), torch.from_numpy(labels)
+    network = build_network(card)
+    optimisation = _Optimisation(network, values, targets, weights, options)
     rows, judged = torch.from_numpy(train), torch.from_numpy(validation)
-    # Predicates that occur in the validation clips alone cannot be learnt nor judged.
+    # A predicate without training clips cannot be learnt: its validation clips do not count.
     judged = judged[weights[targets[judged]] > 0]
     train_losses: list[float] = []
     validation_losses: list[float] = []
     best = copy.deepcopy(network.state_dict())
     best_epoch, lowest = 0, float("inf")
     for epoch in range(options.epochs):
-        network.train()
-        total = 0.0
-        order = rows[torch.randperm(len(rows), generator=generator)]
-        for start in range(0, len(order), options.batch_size):
-            batch = order[start : start + options.batch_size]
-            if len(batch) < 2 and card.layout == "batch_norm":
-                continue  # a batch of one has no deviation
-            optimiser.zero_grad()
-            loss = loss_of(network(values[batch]), targets[batch])
-            loss.backward()
-            optimiser.step()
-            total += float(loss.detach()) * len(batch)
-        train_losses.append(total / max(len(rows), 1))
-        network.eval()
-        with torch.inference_mode():
-            judged_loss = (
-                float(loss_of(network(values[judged]), targets[judged]))
-                if len(judged)
-                else train_losses[-1]
-            )
-        validation_losses.append(judged_loss)
-        advance(train_losses[-1], judged_loss)
-        if judged_loss < lowest:
-            lowest, best_epoch = judged_loss, epoch
+        # Batch normalisation has no deviation over a batch of one.
+        least_batch = 2 if card.layout == "batch_norm" else 1
+        train_losses.append(optimisation.train_epoch(rows, least_batch))
+        loss = optimisation.loss(judged) if len(judged) else train_losses[-1]
+        validation_losses.append(loss)
+        advance(train_losses[-1], loss)
+        if loss < lowest:
+            lowest, best_epoch = loss, epoch
             best = copy.deepcopy(network.state_dict())
         elif epoch - best_epoch >= options.patience:
             break
@@ -130,17 +90,61 @@ def fit_probe(
     return Fit(probe, train_losses, validation_losses, best_epoch)
 
 
+class _Optimisation:
+    """A network with its data, its weighted cross-entropy and AdamW."""
+
+    def __init__(
+        self,
+        network: torch.nn.Sequential,
+        values: torch.Tensor,
+        targets: torch.Tensor,
+        weights: torch.Tensor,
+        options: FitOptions,
+    ) -> None:
+        self._network = network
+        self._values = values
+        self._targets = targets
+        self._batch_size = options.batch_size
+        self._generator = torch.Generator().manual_seed(options.seed)
+        self._loss_of = torch.nn.CrossEntropyLoss(weight=weights)
+        self._optimiser = torch.optim.AdamW(
+            network.parameters(), lr=options.learning_rate, weight_decay=options.weight_decay
+        )
+
+    def train_epoch(self, rows: torch.Tensor, least_batch: int) -> float:
+        """One pass over the rows in random order; returns the mean loss."""
+        self._network.train()
+        total = 0.0
+        order = rows[torch.randperm(len(rows), generator=self._generator)]
+        for start in range(0, len(order), self._batch_size):
+            batch = order[start : start + self._batch_size]
+            if len(batch) < least_batch:
+                continue
+            self._optimiser.zero_grad()
+            loss = self._loss_of(self._network(self._values[batch]), self._targets[batch])
+            loss.backward()
+            self._optimiser.step()
+            total += float(loss.detach()) * len(batch)
+        return total / max(len(rows), 1)
+
+    def loss(self, rows: torch.Tensor) -> float:
+        """The loss on some rows, without training."""
+        self._network.eval()
+        with torch.inference_mode():
+            return float(self._loss_of(self._network(self._values[rows]), self._targets[rows]))
+
+
 def _fold_standardisation(
     network: torch.nn.Sequential, card: ProbeCard, mean: Float32, std: Float32
 ) -> None:
-    """Make a network of standardised inputs one of the inputs themselves."""
+    """Change the first layer of a network for standardised inputs, so that it takes raw inputs."""
     layers: torch.nn.Module = network.get_submodule("net")
     first = layers.get_submodule("0")
     state = first.state_dict()
     shift, scale = torch.from_numpy(mean).double(), torch.from_numpy(std).double()
     if card.layout == "batch_norm":
-        # (x - m) / s normalised by (mu, v) is x normalised by (m + s mu, s² v); the ridge that
-        # the layer adds to v is scaled along.
+        # (x - m) / s normalised by (mu, v) equals x normalised by (m + s mu, s² v). The layer adds
+        # its ridge of 1e-5 to the variance in both.
         state["running_mean"] = (shift + scale * state["running_mean"].double()).float()
         ridge = 1e-5
         variance = scale**2 * (state["running_var"].double() + ridge) - ridge
@@ -154,15 +158,15 @@ def _fold_standardisation(
 
 @dataclass(frozen=True)
 class Scores:
-    """How a probe does on some clips.
+    """Accuracy of a probe on some clips.
 
     Attributes:
-        clips: how many.
-        micro_accuracy: share that is right.
-        macro_accuracy: mean over the predicates that occur of the share that is right.
-        chance_macro: what guessing among the predicates that occur in training gives.
-        majority_micro: what always saying the most frequent predicate of training gives.
-        confusion: (R, R) int64, true predicate by answer.
+        clips: number of clips.
+        micro_accuracy: fraction of correct clips.
+        macro_accuracy: mean over the predicates that occur of their fraction of correct clips.
+        chance_macro: macro accuracy of guessing among the predicates of the training clips.
+        majority_micro: micro accuracy of always predicting the most frequent training predicate.
+        confusion: (R, R) int64, counts by true and predicted predicate.
     """
 
     clips: int
@@ -173,19 +177,19 @@ class Scores:
     confusion: Int64
 
 
-def score(answers: Float64, labels: Int64, train_labels: Int64) -> Scores:
-    """Compare distributions (n, R) with labels (n,)."""
-    count = answers.shape[1]
+def score(distributions: Float64, labels: Int64, train_labels: Int64) -> Scores:
+    """Compare predicted distributions (n, R) with labels (n,)."""
+    count = distributions.shape[1]
     confusion = np.zeros((count, count), np.int64)
-    np.add.at(confusion, (labels, answers.argmax(axis=1)), 1)
+    np.add.at(confusion, (labels, distributions.argmax(axis=1)), 1)
     totals = confusion.sum(axis=1)
     present = totals > 0
-    shares = confusion.diagonal()[present] / totals[present]
+    fractions = confusion.diagonal()[present] / totals[present]
     majority = int(np.bincount(train_labels, minlength=count).argmax()) if len(train_labels) else 0
     return Scores(
         clips=len(labels),
         micro_accuracy=float(confusion.trace() / max(len(labels), 1)),
-        macro_accuracy=float(shares.mean()) if present.any() else 0.0,
+        macro_accuracy=float(fractions.mean()) if present.any() else 0.0,
         chance_macro=1 / max(len(np.unique(train_labels)), 1),
         majority_micro=float(totals[majority] / max(len(labels), 1)),
         confusion=confusion,

@@ -1,7 +1,7 @@
 """Clips of pairs with their predicates, from a folder.
 
-Two layouts, told in docs/models.md: `FOLDER/PREDICATE/[GROUP__]NAME.npz|mp4|avi`, or
-`FOLDER/index.jsonl` with a line for each clip.
+Two layouts (docs/models.md): `FOLDER/PREDICATE/[GROUP__]NAME.npz|mp4|avi`, or `FOLDER/index.jsonl`
+with one line per clip.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ from deworldsg_ros.relations.clips import Rgb
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
-Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
-Box = tuple[Share, Share, Share, Share]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Box = tuple[Fraction, Fraction, Fraction, Fraction]
 
 INDEX_FILE = "index.jsonl"
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mkv", ".webm")
@@ -28,16 +28,16 @@ GROUP_MARK = "__"
 
 @dataclass(frozen=True)
 class LabelledClip:
-    """A clip of an ordered pair; its pixels are read when they are asked for.
+    """A clip of an ordered pair; `read` loads its pixels.
 
     Attributes:
-        key: tells this clip from every other, and changes with its content.
-        group: what must not be split between training and test: a room, a scan.
-        pair: what must not be split between training and validation: an object pair of a group.
+        key: unique name, which changes with the content.
+        group: room or scan; never split between training and test.
+        pair: pair of objects in a group; never split between training and validation.
         predicate: of subject to object.
-        boxes: (8,) float32, corners of subject and object as shares of the clip's width and
-            height; None where unknown.
-        read: its frames, (T, h, w, 3) uint8 RGB, oldest first.
+        boxes: (8,) float32, corners of subject and object as fractions of the clip's width and
+            height; None = unknown.
+        read: loads the frames, (T, h, w, 3) uint8 RGB, oldest first.
     """
 
     key: str
@@ -58,25 +58,27 @@ class _Line(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_clip_folder(folder: Path) -> list[LabelledClip]:
-    """The clips of a folder, in order of their paths.
+    """The clips of a folder, ordered by path.
 
     Raises:
-        ConfigurationError: where it holds none, or its index is wrong, by line.
+        ConfigurationError: no clips, or an invalid line in the index.
     """
     if not folder.is_dir():
-        raise ConfigurationError(f"'{folder}' is no folder: wanted one of clips, or a data set")
+        raise ConfigurationError(
+            f"'{folder}' is not a folder: expected a folder of clips, or a data set"
+        )
     index = folder / INDEX_FILE
     clips = _read_index(index) if index.is_file() else _read_tree(folder)
     if not clips:
         raise ConfigurationError(
-            f"'{folder}' holds no clips: wanted {INDEX_FILE}, or PREDICATE/[GROUP__]NAME with one "
-            f"of {', '.join((ARRAY_SUFFIX, *VIDEO_SUFFIXES))}"
+            f"'{folder}' contains no clips: expected {INDEX_FILE}, or PREDICATE/[GROUP__]NAME with "
+            f"one of {', '.join((ARRAY_SUFFIX, *VIDEO_SUFFIXES))}"
         )
     return clips
 
 
 def of_length(frames: Rgb, length: int) -> Rgb:
-    """The last `length` frames; where there are fewer, the last is repeated at the end."""
+    """The last `length` frames; if there are fewer, the last one is repeated at the end."""
     frames = frames[-length:]
     missing = length - len(frames)
     return np.concatenate([frames, np.repeat(frames[-1:], missing, axis=0)]) if missing else frames
@@ -95,19 +97,19 @@ def read_frames(path: Path) -> Rgb:
                 frames = np.asarray(content["frames"])
         except (OSError, KeyError, ValueError) as error:
             raise RefusedInput(
-                "unreadable_clip", f"{path}: wanted an array 'frames' ({error})"
+                "unreadable_clip", f"{path}: expected an array 'frames' ({error})"
             ) from error
         if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or not frames.size:
             raise RefusedInput(
                 "unreadable_clip",
-                f"{path}: frames are {frames.dtype} {frames.shape}: wanted uint8 (T, h, w, 3)",
+                f"{path}: frames are {frames.dtype} {frames.shape}: expected uint8 (T, h, w, 3)",
             )
         return frames
     video = cv2.VideoCapture(str(path))
     images = []
     while True:
-        there, image = video.read()
-        if not there:
+        decoded, image = video.read()
+        if not decoded:
             break
         images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     video.release()

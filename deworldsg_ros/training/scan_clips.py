@@ -1,4 +1,4 @@
-"""Clips of annotated pairs, cut out of the frames of a scan as the stage cuts them."""
+"""Clips of annotated pairs, cropped from the frames of a scan in the same way as at run time."""
 
 from __future__ import annotations
 
@@ -27,34 +27,34 @@ def cut_clips(
     clip_length: int,
     clips_per_pair: int,
     min_side_px: float = 10.0,
-    turned: bool = False,
+    rotated: bool = False,
 ) -> list[LabelledClip]:
-    """Clips of each related pair, at frames spread evenly over those in which both are seen.
+    """Clips of each related pair, spread evenly over the frames in which both are visible.
 
     Args:
-        scan: its id; the clips' group.
+        scan: id of the scan, the group of its clips.
         frames: image file and boxes by object id, in order of time.
         image_size: width and height of all images.
         relations: subject id, object id, predicate.
         clip_length: T.
-        clips_per_pair: at most so many of each.
-        min_side_px: shortest side of a box that counts as seen.
-        turned: whether boxes and sizes are of the images turned by 90 degrees clockwise.
+        clips_per_pair: maximum number of clips per pair.
+        min_side_px: least side of the box of a visible object, pixels.
+        rotated: whether boxes and sizes are those of the images rotated by 90 degrees clockwise.
     """
     width, height = image_size
     clips = []
     for subject, object_, predicate in relations:
-        seen = [
-            place
-            for place, (_, boxes) in enumerate(frames)
-            if all(_is_seen(boxes.get(end), min_side_px) for end in (subject, object_))
+        visible = [
+            index
+            for index, (_, boxes) in enumerate(frames)
+            if all(_is_visible(boxes.get(end), min_side_px) for end in (subject, object_))
         ]
-        for place in _spread(seen, clips_per_pair):
-            boxes = frames[place][1]
+        for index in _spread(visible, clips_per_pair):
+            boxes = frames[index][1]
             crop = union_box(boxes[subject], boxes[object_], width, height)
             x1, y1, x2, y2 = crop
             corner = np.array([x1, y1, x1, y1], np.float64)
-            paths = [path for path, _ in frames[max(0, place - clip_length + 1) : place + 1]]
+            paths = [path for path, _ in frames[max(0, index - clip_length + 1) : index + 1]]
             modified = paths[-1].stat().st_mtime_ns
             clips.append(
                 LabelledClip(
@@ -65,14 +65,14 @@ def cut_clips(
                     boxes=relative_box_pair(
                         boxes[subject] - corner, boxes[object_] - corner, x2 - x1, y2 - y1
                     ),
-                    read=_reader(paths, crop, clip_length, turned),
+                    read=_reader(paths, crop, clip_length, rotated),
                 )
             )
     return clips
 
 
 def read_boxes(path: Path) -> dict[int, Float64]:
-    """Boxes by object id out of a `bb.txt`: id x1 y1 x2 y2 a line; empty where there is no file.
+    """Boxes by object id from a `bb.txt` with lines `id x1 y1 x2 y2`; empty without the file.
 
     Raises:
         RefusedInput: ``unreadable_boxes``.
@@ -89,25 +89,25 @@ def read_boxes(path: Path) -> dict[int, Float64]:
                 boxes[int(identity)] = np.array([x1, y1, x2, y2])
         except ValueError as error:
             raise RefusedInput(
-                "unreadable_boxes", f"{path}, line {number}: wanted id x1 y1 x2 y2, saw '{line}'"
+                "unreadable_boxes", f"{path}, line {number}: '{line}', expected id x1 y1 x2 y2"
             ) from error
     return boxes
 
 
-def _is_seen(box_xyxy: Float64 | None, min_side_px: float) -> bool:
+def _is_visible(box_xyxy: Float64 | None, min_side_px: float) -> bool:
     return box_xyxy is not None and bool((box_xyxy[2:] - box_xyxy[:2]).min() >= min_side_px)
 
 
-def _spread(places: list[int], count: int) -> list[int]:
-    """At most `count` of them, evenly spread, never the very ends of a long run."""
-    if len(places) <= count:
-        return places
-    steps = (np.arange(count) + 0.5) * len(places) / count
-    return [places[int(step)] for step in steps]
+def _spread(indices: list[int], count: int) -> list[int]:
+    """At most `count` of the indices, evenly spread, without the first and last of many."""
+    if len(indices) <= count:
+        return indices
+    steps = (np.arange(count) + 0.5) * len(indices) / count
+    return [indices[int(step)] for step in steps]
 
 
 def _reader(
-    paths: Sequence[Path], crop: CropBox, clip_length: int, turned: bool
+    paths: Sequence[Path], crop: CropBox, clip_length: int, rotated: bool
 ) -> Callable[[], Rgb]:
     def read() -> Rgb:
         images = []
@@ -115,7 +115,7 @@ def _reader(
             image = cv2.imread(str(path), cv2.IMREAD_COLOR)
             if image is None:
                 raise RefusedInput("unreadable_clip", f"{path} cannot be decoded")
-            if turned:
+            if rotated:
                 image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
             images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8))
         return crop_clip(images, crop, clip_length)

@@ -1,4 +1,4 @@
-"""Training, validation and held-out clips, by room: no room is on two sides."""
+"""Training, validation and held-out clips. The clips of one room stay together."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Split:
-    """Rows of each part, and how they were parted.
+    """Rows of the clips in each part.
 
     Attributes:
-        train, validation, held_out: (n,) int64.
-        held_out_groups: names of the rooms that were kept aside.
-        validation_by: ``group``, or ``pair`` where one room is left to train on.
+        train, validation, held_out: (n,) int64 rows.
+        held_out_groups: names of the held-out rooms.
+        validation_by: ``group``, or ``pair`` if only one room is left to train on.
     """
 
     train: Int64
@@ -26,6 +26,10 @@ class Split:
     held_out: Int64
     held_out_groups: tuple[str, ...]
     validation_by: str
+
+    def parts(self) -> dict[str, Int64]:
+        """The rows of each part by its name."""
+        return {"train": self.train, "validation": self.validation, "held_out": self.held_out}
 
 
 def split_by_group(
@@ -37,29 +41,30 @@ def split_by_group(
     validation_share: float = 0.15,
     seed: int = 0,
 ) -> Split:
-    """Part clips so that early stopping sees no held-out room.
+    """Split clips so that early stopping uses no held-out room.
 
     Args:
-        groups: of each clip, e.g. its room.
-        pairs: of each clip, its pair of objects.
-        held_out_share: share of the groups to keep aside, at least one.
-        held_out_groups: these and no others, where given.
-        validation_share: share of the rest that decides when to stop.
-        seed: of the choice.
+        groups: group of each clip, e.g. its room.
+        pairs: pair of objects of each clip.
+        held_out_share: fraction of the groups to hold out, at least one group.
+        held_out_groups: hold out exactly these groups instead.
+        validation_share: fraction of the rest for validation.
+        seed: of the random choice.
 
     Raises:
-        ConfigurationError: where there are fewer than two groups, or unknown ones are named.
+        ConfigurationError: fewer than two groups, or an unknown held-out group.
     """
     names = sorted(set(groups))
     unknown = sorted(set(held_out_groups) - set(names))
     if unknown:
         raise ConfigurationError(
-            f"held-out groups {', '.join(unknown)} are none of the clips': {', '.join(names)}"
+            f"held-out groups {', '.join(unknown)} have no clips: "
+            f"expected some of {', '.join(names)}"
         )
     if len(names) < 2 or len(set(held_out_groups)) == len(names):
         raise ConfigurationError(
-            f"the clips are of {len(names)} group(s), {len(set(held_out_groups))} of them held "
-            "out: wanted at least one to train on and one to hold out"
+            f"the clips have {len(names)} group(s), {len(set(held_out_groups))} of them held out: "
+            "expected at least one to train on and one to hold out"
         )
     generator = np.random.default_rng(seed)
     chosen = set(held_out_groups) or _choose(generator, names, held_out_share)
@@ -69,7 +74,9 @@ def split_by_group(
     units = np.array(groups if by_group else pairs)
     candidates = sorted(set(units[~held_out].tolist()))
     if len(candidates) < 2:
-        raise ConfigurationError("the clips to train on are of one pair: wanted at least two")
+        raise ConfigurationError(
+            "the training clips have one pair of objects: expected at least two pairs"
+        )
     validating = np.isin(units, sorted(_choose(generator, candidates, validation_share)))
     validating &= ~held_out
     return Split(
@@ -82,6 +89,6 @@ def split_by_group(
 
 
 def _choose(generator: np.random.Generator, names: Sequence[str], share: float) -> set[str]:
-    """A share of the names, at least one and never all."""
+    """A fraction of the names, at least one and never all."""
     count = min(max(1, round(share * len(names))), len(names) - 1)
-    return {names[place] for place in generator.permutation(len(names))[:count].tolist()}
+    return {names[index] for index in generator.permutation(len(names))[:count].tolist()}

@@ -17,9 +17,9 @@ from support.pair_rooms import render_room  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
 from deworldsg_ros.checkpoints.card import CheckpointCard, write_card  # noqa: E402
+from deworldsg_ros.checkpoints.probe_network import load_probe  # noqa: E402
 from deworldsg_ros.cli.app import app  # noqa: E402
 from deworldsg_ros.cli.probe import read_predicates  # noqa: E402
-from deworldsg_ros.relations.probing.probe_network import load_probe  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES  # noqa: E402
 
@@ -82,21 +82,21 @@ def test_a_probe_from_a_data_set(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "changes, told",
+    "changes, message",
     [
         ({"device": "cuda"}, "--device is 'cuda'"),
         ({"model": "/absent"}, "--model '/absent': there is no such folder"),
-        ({"world-model": "fake"}, "wanted vjepa2 or dinov2"),
-        ({"layout": "three"}, "wanted two_layer or batch_norm"),
-        ({"predicates": "/absent"}, "wanted replica_ssg, 3dssg, a file"),
-        ({"predicates": "3dssg"}, "which is none of the 7 of the chosen set"),
+        ({"world-model": "fake"}, "expected vjepa2 or dinov2"),
+        ({"layout": "three"}, "expected two_layer or batch_norm"),
+        ({"predicates": "/absent"}, "expected replica_ssg, 3dssg, a file"),
+        ({"predicates": "3dssg"}, "which is not one of the 7 of the chosen set"),
     ],
 )
-def test_errors_are_one_sentence(tmp_path, changes, told, monkeypatch):
+def test_errors_are_one_sentence(tmp_path, changes, message, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     data = write_data_set(tmp_path / "data_set", scans=2, frames=4)
     result = run("train-probe", data, *options(tmp_path, **changes))
-    assert result.exit_code == 2 and told in result.output and "Traceback" not in result.output
+    assert result.exit_code == 2 and message in result.output and "Traceback" not in result.output
 
 
 def test_a_published_probe_is_imported(tmp_path):

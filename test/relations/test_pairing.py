@@ -46,9 +46,9 @@ def test_too_few_objects_have_no_pairs(count):
 def test_equals_the_loop_over_all_pairs(count, seed):
     boxes, depths = random_objects(count, seed)
     pairs, costs = neighbour_pairs(boxes, depths, WIDTH, HEIGHT, 0.45)
-    wanted = reference(boxes, depths, 0.45)
-    assert [tuple(pair) for pair in pairs.tolist()] == sorted(wanted)
-    np.testing.assert_allclose(costs, [wanted[key] for key in sorted(wanted)], rtol=1e-12)
+    expected = reference(boxes, depths, 0.45)
+    assert [tuple(pair) for pair in pairs.tolist()] == sorted(expected)
+    np.testing.assert_allclose(costs, [expected[key] for key in sorted(expected)], rtol=1e-12)
 
 
 def test_costs_are_symmetric_and_both_directions_are_given():

@@ -1,4 +1,4 @@
-"""Clips to train a probe on are cut out of data sets as the stage cuts them."""
+"""Training clips are cropped from data sets as at run time."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COLOURS = {1: (250, 10, 10), 2: (10, 250, 10), 3: (10, 10, 250)}
 
 @pytest.fixture
 def rio(tmp_path):
-    """3RScan's layout: one scan of three blocks in a row, whose images lie on their side."""
+    """3RScan's layout: one scan of three blocks in a row, whose images are rotated."""
     objects = [(name, number) for number, name, _, _ in BLOCKS]
     root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
     write_surface(write_sequence(root / "data" / "a", frames=10))
@@ -38,15 +38,15 @@ def rio(tmp_path):
     return root
 
 
-def test_clips_of_3rscan_are_upright_and_of_what_is_seen(rio):
+def test_clips_of_3rscan_are_upright_and_show_visible_objects(rio):
     clips = read_clips(rio, clip_length=4, clips_per_pair=2)
-    # Boxes are looked for in every eighth frame: the first and the ninth.
+    # Boxes are computed in every eighth frame: the first and the ninth.
     assert [clip.predicate for clip in clips] == ["near", "near", "on", "on"]
     assert {clip.group for clip in clips} == {"a"}
     clip = clips[0].read()
     height, width = clip.shape[1:3]
     assert clip.shape[0] == 4
-    # Turned by 90 degrees the columns are rows; within a pixel, as points are pixels' centres.
+    # Rotated by 90 degrees, columns are rows. Points are pixel centres: one pixel of tolerance.
     assert (
         abs(width - (ROWS[1] - ROWS[0])) <= 2 and abs(height - (BLOCKS[1][3] - BLOCKS[0][2])) <= 2
     )
@@ -56,16 +56,16 @@ def test_clips_of_3rscan_are_upright_and_of_what_is_seen(rio):
         assert np.abs(middle[::-1].astype(int) - COLOURS[object_id]).max() < 60
 
 
-def test_what_is_hidden_is_not_seen(rio):
+def test_hidden_objects_have_no_boxes(rio):
     for path in (rio / "data" / "a" / "sequence").glob("*.depth.pgm"):
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         depth[:, BLOCKS[1][2] :] = 1000  # something else is in front of the table and the book
         cv2.imwrite(str(path), depth)
-    with pytest.raises(ConfigurationError, match="no related pair is seen"):
+    with pytest.raises(ConfigurationError, match="no frame shows a related pair"):
         read_clips(rio, clip_length=4, clips_per_pair=2)
 
 
-def test_a_frame_that_cannot_be_read_shows_nothing(rio):
+def test_an_unreadable_frame_has_no_boxes(rio):
     sequence = rio / "data" / "a" / "sequence"
     (sequence / "frame-000000.pose.txt").write_text("no matrix")
     clips = read_clips(rio, clip_length=4, clips_per_pair=2)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from deworldsg_ros.checkpoints.probe_card import relative_box_pair
+from deworldsg_ros.checkpoints.probe_network import Probe, load_probe
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
-from deworldsg_ros.relations.probing.probe_network import Probe, load_probe
 from deworldsg_ros.relations.world_model import ClipRequest
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError

@@ -176,7 +176,7 @@ def test_a_folder_of_another_architecture_is_named(tmp_path):
     from support.torch_models import save_sam
 
     with pytest.raises(
-        ConfigurationError, match="is a checkpoint of sam: wanted rt_detr or rt_detr_v2"
+        ConfigurationError, match="is a checkpoint of sam: expected rt_detr or rt_detr_v2"
     ):
         detector(save_sam(tmp_path))
 
@@ -185,7 +185,7 @@ def test_a_folder_of_another_architecture_is_named(tmp_path):
     ("path", "message"),
     [
         ("", "detector_path is empty: set it to the folder or hub id"),
-        ("/no/such/folder", "there is no such folder; wanted one with config.json"),
+        ("/no/such/folder", "there is no such folder; expected a folder with config.json"),
         ("nobody/nothing-of-that-name", "run `hf download nobody/nothing-of-that-name`, or name a"),
     ],
 )

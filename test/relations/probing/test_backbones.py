@@ -127,15 +127,15 @@ def test_the_stage_publishes_the_predictions_of_backbone_and_probe(checkpoints, 
 
 
 @pytest.mark.parametrize(
-    "path, told",
+    "path, message",
     [
         ("", "relations.world_model_path is empty"),
         ("/no/such/folder", "there is no such folder"),
         ("nobody/no-such-model", "run `hf download nobody/no-such-model`"),
     ],
 )
-def test_missing_checkpoint_is_one_sentence(path, told):
-    with pytest.raises(ConfigurationError, match=told) as refusal:
+def test_missing_checkpoint_is_one_sentence(path, message):
+    with pytest.raises(ConfigurationError, match=message) as refusal:
         vjepa2.load_backbone(config_of("vjepa2", path))
     assert "\n" not in str(refusal.value)
 
@@ -147,7 +147,7 @@ def test_folder_without_a_model_is_refused(tmp_path):
 
 @pytest.mark.parametrize("family, other", [("vjepa2", "dinov2"), ("dinov2", "vjepa2")])
 def test_other_architecture_is_refused_by_name(checkpoints, family, other):
-    with pytest.raises(ConfigurationError, match=f"a checkpoint of {other}: wanted {family}"):
+    with pytest.raises(ConfigurationError, match=f"a checkpoint of {other}: expected {family}"):
         load(family, checkpoints[other])
 
 
@@ -186,7 +186,7 @@ def test_a_clip_length_that_the_encoder_cannot_split_is_refused(checkpoints):
 
 def test_cuda_asked_for_and_absent(checkpoints, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    chosen = {choose_device("relations.device", wanted) for wanted in ("auto", "cpu")}
+    chosen = {choose_device("relations.device", choice) for choice in ("auto", "cpu")}
     assert chosen == {torch.device("cpu")}
     with pytest.raises(ConfigurationError, match="finds no CUDA device: set it to 'auto' or 'cpu'"):
         load("vjepa2", checkpoints["vjepa2"], device="cuda")
@@ -206,8 +206,8 @@ def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
     identity = load("vjepa2", checkpoints["vjepa2"]).identity
     save_random_probe(tmp_path, identity)
     config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path))
-    told = []
-    stage = RelationReasoner(config, build_world_model(config), told.append)
+    reports = []
+    stage = RelationReasoner(config, build_world_model(config), reports.append)
 
     def fail(*_, **__):
         raise error
@@ -218,4 +218,4 @@ def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
         assert len(evidence.pairs) == 2
     assert stage.drain() == []
     assert stage.counters().dropped == {"world_model_error": 2}
-    assert "out of memory while encoding 1 clip(s): choose a smaller checkpoint" in told[0]
+    assert "out of memory while encoding 1 clip(s): choose a smaller checkpoint" in reports[0]

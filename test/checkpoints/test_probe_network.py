@@ -1,4 +1,4 @@
-"""The probe: saved and loaded, taken over from the published layout, and what it refuses."""
+"""The probe: saved, loaded, imported from the published file; misfits are refused."""
 
 from __future__ import annotations
 
@@ -21,15 +21,17 @@ from support.checkpoints import (  # noqa: E402  after the guards
 from support.relations import VOCABULARY  # noqa: E402
 
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, read_card  # noqa: E402
-from deworldsg_ros.relations import build_world_model  # noqa: E402
-from deworldsg_ros.relations.probing.probe_network import (  # noqa: E402
-    PUBLISHED_BACKBONE,
+from deworldsg_ros.checkpoints.probe_network import (  # noqa: E402
     Probe,
     build_network,
-    import_published,
     load_probe,
     save_probe,
 )
+from deworldsg_ros.checkpoints.published_probe import (  # noqa: E402
+    PUBLISHED_BACKBONE,
+    import_published,
+)
+from deworldsg_ros.relations import build_world_model  # noqa: E402
 from deworldsg_ros.relations.world_model import require_predicates  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
@@ -55,7 +57,7 @@ def published_state(feature_dim=1408, hidden_dim=512, predicate_count=7, seed=0)
 
 @pytest.mark.parametrize("layout", ["two_layer", "batch_norm"])
 @pytest.mark.parametrize("inputs, input_dim", [("clip", 48), ("clip_and_boxes", 56)])
-def test_saved_and_loaded_it_answers_the_same(tmp_path, layout, inputs, input_dim):
+def test_a_probe_predicts_the_same_after_saving_and_loading(tmp_path, layout, inputs, input_dim):
     card = ProbeCard(BACKBONE, PREDICATES, layout, inputs, training={"seed": 3})
     assert card.input_dim == input_dim
     probe = Probe(card, build_network(card).eval())
@@ -65,10 +67,10 @@ def test_saved_and_loaded_it_answers_the_same(tmp_path, layout, inputs, input_di
     generator = np.random.default_rng(0)
     features = generator.normal(size=(5, 48)).astype(np.float32)
     boxes = generator.random((5, 8)).astype(np.float32)
-    answer = loaded.predict(features, boxes)
-    assert answer.shape == (5, 7) and answer.dtype == np.float64
-    np.testing.assert_allclose(answer.sum(axis=1), 1)
-    assert (answer == probe.predict(features, boxes)).all()
+    predicted = loaded.predict(features, boxes)
+    assert predicted.shape == (5, 7) and predicted.dtype == np.float64
+    np.testing.assert_allclose(predicted.sum(axis=1), 1)
+    assert (predicted == probe.predict(features, boxes)).all()
     assert loaded.predict(features[:0], boxes[:0]).shape == (0, 7)
 
 
@@ -83,7 +85,7 @@ def test_the_papers_probe_is_two_fully_connected_layers():
     }
 
 
-def test_published_file_is_taken_over_by_name(tmp_path):
+def test_the_published_file_is_imported(tmp_path):
     network, state = published_state()
     torch.save(state, tmp_path / "vjepa_probe_mlp.pt")
     probe = import_published(tmp_path / "vjepa_probe_mlp.pt", PREDICATES)
@@ -92,46 +94,49 @@ def test_published_file_is_taken_over_by_name(tmp_path):
     features = np.random.default_rng(0).normal(size=(3, 1408)).astype(np.float32)
     with torch.inference_mode():
         expected = torch.softmax(network(torch.from_numpy(features)), dim=1)
-    answer = load_probe(tmp_path / "probe").predict(features, np.zeros((3, 8), np.float32))
-    np.testing.assert_allclose(answer, expected, atol=1e-6)
+    predicted = load_probe(tmp_path / "probe").predict(features, np.zeros((3, 8), np.float32))
+    np.testing.assert_allclose(predicted, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    "change, told",
+    "change, message",
     [
-        (lambda state: state.pop("net.3.running_var"), "lacks net.3.running_var"),
-        (lambda state: state.update({"net.6.weight": torch.zeros(2)}), "unknown net.6.weight"),
+        (lambda state: state.pop("net.3.running_var"), r"1 missing \(net.3.running_var\)"),
+        (
+            lambda state: state.update({"net.6.weight": torch.zeros(2)}),
+            r"1 unknown \(net.6.weight\)",
+        ),
         (lambda state: state.update({"net.5.bias": torch.zeros(9)}), r"net.5.bias has shape \(9,"),
-        (lambda state: state.update({"net.0.weight": 3}), "state dictionary of tensors"),
+        (lambda state: state.update({"net.0.weight": 3}), "expected a dictionary of tensors"),
     ],
 )
-def test_published_file_with_other_keys_is_refused_by_name(tmp_path, change, told):
+def test_a_published_file_with_other_parameters_is_refused_by_name(tmp_path, change, message):
     _, state = published_state()
     change(state)
     torch.save(state, tmp_path / "probe.pt")
-    with pytest.raises(ConfigurationError, match=told):
+    with pytest.raises(ConfigurationError, match=message):
         import_published(tmp_path / "probe.pt", PREDICATES)
 
 
-def test_published_file_for_other_predicates_or_features_is_refused(tmp_path):
+def test_a_published_file_for_other_predicates_or_features_is_refused(tmp_path):
     torch.save(published_state(feature_dim=1024)[1], tmp_path / "probe.pt")
-    with pytest.raises(ConfigurationError, match=r"shape \(1024,\), wanted \(1408,\)"):
+    with pytest.raises(ConfigurationError, match=r"shape \(1024,\), expected \(1408,\)"):
         import_published(tmp_path / "probe.pt", PREDICATES)
     torch.save(published_state(predicate_count=50)[1], tmp_path / "probe.pt")
     with pytest.raises(ConfigurationError, match="7 predicates"):
         import_published(tmp_path / "probe.pt", PREDICATES)
 
 
-def test_a_file_that_would_run_code_is_not_run(tmp_path):
+def test_code_in_a_published_file_is_not_executed(tmp_path):
     class Trap:
         def __reduce__(self):
             return (open, (str(tmp_path / "trapped"), "w"))
 
     torch.save({"net.0.weight": Trap()}, tmp_path / "probe.pt")
-    with pytest.raises(ConfigurationError, match="no file of tensors"):
+    with pytest.raises(ConfigurationError, match="save its tensors alone"):
         import_published(tmp_path / "probe.pt", PREDICATES)
     assert not (tmp_path / "trapped").exists()
-    with pytest.raises(ConfigurationError, match="is no file"):
+    with pytest.raises(ConfigurationError, match="no such file"):
         import_published(tmp_path / "absent.pt", PREDICATES)
 
 
@@ -139,7 +144,7 @@ def test_a_file_that_would_run_code_is_not_run(tmp_path):
     "changes, fits",
     [
         ({}, True),
-        ({"fingerprint": ""}, True),  # nothing is known of its weights
+        ({"fingerprint": ""}, True),  # unknown weights
         ({"fingerprint": "fedcba9876543210"}, False),
         ({"family": "dinov2"}, False),
         ({"feature_dim": 64}, False),
@@ -147,7 +152,7 @@ def test_a_file_that_would_run_code_is_not_run(tmp_path):
         ({"clip_length": 16}, False),
     ],
 )
-def test_only_the_backbone_that_it_was_trained_on_fits(changes, fits):
+def test_a_probe_accepts_only_the_backbone_of_its_training(changes, fits):
     card = ProbeCard(BACKBONE, PREDICATES)
     other = msgspec.structs.replace(BACKBONE, **changes)
     if fits:
@@ -159,7 +164,7 @@ def test_only_the_backbone_that_it_was_trained_on_fits(changes, fits):
 
 
 @pytest.mark.parametrize(
-    "predicates, told",
+    "predicates, message",
     [
         (("on", "near"), "lacks 'on', 'near' and has 'predicate 0', "),
         ((*PREDICATES, "on"), "lacks 'on';"),
@@ -167,10 +172,10 @@ def test_only_the_backbone_that_it_was_trained_on_fits(changes, fits):
         (PREDICATES[::-1], "another order"),
     ],
 )
-def test_only_the_predicates_that_it_was_trained_for_fit(predicates, told):
+def test_a_probe_accepts_only_the_predicates_of_its_training(predicates, message):
     card = ProbeCard(BACKBONE, PREDICATES)
     card.require_predicates(PREDICATES)
-    with pytest.raises(ConfigurationError, match=told):
+    with pytest.raises(ConfigurationError, match=message):
         card.require_predicates(predicates)
 
 
@@ -191,7 +196,7 @@ def test_incomplete_folders_are_refused(tmp_path):
         load_probe(tmp_path)
 
 
-def test_a_world_model_refuses_what_does_not_fit(tmp_path):
+def test_a_world_model_refuses_a_probe_of_another_backbone(tmp_path):
     folder = save_vjepa2(tmp_path / "backbone")
     config = config_of("vjepa2", folder)
     with pytest.raises(ConfigurationError, match="probe_path is empty.*train-probe"):
@@ -204,7 +209,7 @@ def test_a_world_model_refuses_what_does_not_fit(tmp_path):
         build_world_model(config_of("dinov2", folder, probe_path=str(probe_folder)))
 
 
-def test_other_predicates_are_refused_at_the_start_and_in_the_middle_of_a_run(tmp_path):
+def test_other_predicates_are_refused_at_the_start_and_during_a_run(tmp_path):
     folder = save_vjepa2(tmp_path / "backbone")
     unknown = msgspec.structs.replace(BACKBONE, fingerprint="")
     probe_folder = save_random_probe(tmp_path / "probe", unknown)

@@ -1,0 +1,46 @@
+"""Options of a training; without torch, so that the command line can check them first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of the fit.
+
+    Attributes:
+        epochs: maximum number of passes over the training clips.
+        patience: passes without a lower validation loss after which the fit stops.
+        batch_size: clips per step.
+        learning_rate, weight_decay: of AdamW.
+        seed: of the initial weights and the order of the clips.
+    """
+
+    epochs: int = 200
+    patience: int = 20
+    batch_size: int = 64
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-2
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Options of a training.
+
+    Attributes:
+        layout, inputs: of the probe, see `ProbeCard`.
+        held_out_share: fraction of the groups that is kept for the final scores.
+        held_out_groups: keep these groups instead.
+        batch_size: clips encoded at once.
+        fit: options of the fit.
+    """
+
+    layout: Literal["two_layer", "batch_norm"] = "two_layer"
+    inputs: Literal["clip", "clip_and_boxes"] = "clip"
+    held_out_share: float = 0.2
+    held_out_groups: tuple[str, ...] = ()
+    batch_size: int = 1
+    fit: FitOptions = field(default_factory=FitOptions)
