@@ -12,14 +12,12 @@ from rich.console import Console
 from rich.markup import escape
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import EXIT_INTERRUPTED, models, probe
+from deworldsg_ros.cli import models, probe
 from deworldsg_ros.cli.evaluate import commands as evaluate
+from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import DeWorldSGError
-
-# Bad usage, a bad configuration, or a recording that cannot be used.
-EXIT_USAGE = 2
 
 app = typer.Typer(
     name="deworldsg",

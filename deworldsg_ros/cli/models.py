@@ -9,9 +9,8 @@ import msgspec
 import typer
 from rich.console import Console
 
+from deworldsg_ros.cli.exit_codes import EXIT_USAGE
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
-
-EXIT_USAGE = 2
 
 app = typer.Typer(name="models", help="Make published checkpoints ready for use.")
 

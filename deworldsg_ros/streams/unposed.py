@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,7 @@ from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.arrays import Float32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.assembler import OnDrop
 from deworldsg_ros.streams.images import rgb_from_message
 from deworldsg_ros.streams.posed import PosedAssembler
 
@@ -31,11 +33,18 @@ class UnposedFrame:
 
 
 class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
-    """RGB images with depth and camera_info, in stamp order."""
+    """RGB images with depth and camera_info, in stamp order; arguments as `FrameAssembler`."""
 
-    def __init__(self, inputs: InputsConfig, **options: Any) -> None:
-        values = {"topics": None, "capacity": 64, "max_wait_s": 2.0, "on_drop": None, **options}
-        super().__init__("rgb", (), inputs, **values)
+    def __init__(
+        self,
+        inputs: InputsConfig,
+        *,
+        topics: Mapping[str, str] | None = None,
+        capacity: int = 64,
+        max_wait_s: float = 2.0,
+        on_drop: OnDrop | None = None,
+    ) -> None:
+        super().__init__("rgb", (), inputs, topics, capacity, max_wait_s, on_drop)
         self._streams.remove(self._pose)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:

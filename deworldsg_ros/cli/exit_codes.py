@@ -1,0 +1,6 @@
+"""Exit codes of the `deworldsg` program, besides 0."""
+
+# Bad usage, a bad configuration, or a recording that cannot be used.
+EXIT_USAGE = 2
+# Ctrl-C: 128 + SIGINT, as shells report it.
+EXIT_INTERRUPTED = 130
