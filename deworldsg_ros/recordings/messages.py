@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.camera import Intrinsics, quaternion_from_rotation
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -146,3 +146,9 @@ def pose_stamped(
         ),
     )
     return RoleMessage(Role.POSE, POSE_STAMPED, stamp_ns, message)
+
+
+def pose_stamped_from_matrix(stamp_ns: int, frame_id: str, T_world_camera: Float64) -> RoleMessage:
+    """PoseStamped of the RGB optical frame, from its pose (4, 4) in the world frame `frame_id`."""
+    quat_xyzw = quaternion_from_rotation(T_world_camera[:3, :3])
+    return pose_stamped(stamp_ns, frame_id, T_world_camera[:3, 3], quat_xyzw)

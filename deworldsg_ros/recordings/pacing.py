@@ -10,7 +10,6 @@ from collections.abc import Collection
 
 from deworldsg_ros.recordings.messages import Role
 
-NANOSECONDS = 10**9
 # Frames that may be published before their poses or depth: half of the nodes' buffers (64 images).
 MAX_UNDECIDED = 32
 
@@ -33,7 +32,7 @@ class Pace:
             return now_s
         if self._log_zero_ns is None:
             self._log_zero_ns, self._zero_s = log_time_ns, now_s
-        return self._zero_s + (log_time_ns - self._log_zero_ns) / NANOSECONDS / self._rate
+        return self._zero_s + (log_time_ns - self._log_zero_ns) / 10**9 / self._rate
 
     def late(self, by_s: float) -> None:
         """Delay all later messages: after a pause the replay keeps its rate."""

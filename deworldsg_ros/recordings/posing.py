@@ -20,13 +20,12 @@ from deworldsg_ros.recordings.messages import (
     POSE_STAMPED,
     Role,
     RoleMessage,
-    encode,
-    pose_stamped,
+    pose_stamped_from_matrix,
 )
 from deworldsg_ros.recordings.recording import Recording
-from deworldsg_ros.recordings.source import RawRoleMessage, Source, UsedTopic
+from deworldsg_ros.recordings.source import RawRoleMessage, Source, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import RgbdFrame, quaternion_from_rotation
+from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.streams.jump_gate import JumpGate
 from deworldsg_ros.streams.poses import pose_from_message
@@ -174,19 +173,13 @@ class PosedSource(ABC):
                 if T is None:
                     self.drops["no_pose"] += 1
                     continue
-                yield pose_stamped(
-                    item.stamp_ns,
-                    self._frame_id or TRAJECTORY_FRAME,
-                    T[:3, 3],
-                    quaternion_from_rotation(T[:3, :3]),
-                )
+                frame_id = self._frame_id or TRAJECTORY_FRAME
+                yield pose_stamped_from_matrix(item.stamp_ns, frame_id, T)
             yield item
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """The same messages, serialized."""
-        for item in self.messages():
-            data = encode(item.message, item.msgtype)
-            yield RawRoleMessage(item.role, item.msgtype, item.stamp_ns, item.stamp_ns, data)
+        return map(serialize, self.messages())
 
     def close(self) -> None:
         """Close the files."""

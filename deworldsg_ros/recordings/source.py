@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from deworldsg_ros.recordings.messages import Role, RoleMessage
+from deworldsg_ros.recordings.messages import Role, RoleMessage, encode
 
 
 class RawRoleMessage(NamedTuple):
@@ -21,6 +21,13 @@ class RawRoleMessage(NamedTuple):
     stamp_ns: int
     log_time_ns: int
     data: bytes
+
+
+def serialize(item: RoleMessage, log_time_ns: int | None = None) -> RawRoleMessage:
+    """A message as CDR bytes; without a time of recording, its stamp is used."""
+    data = encode(item.message, item.msgtype)
+    log_time_ns = item.stamp_ns if log_time_ns is None else log_time_ns
+    return RawRoleMessage(item.role, item.msgtype, item.stamp_ns, log_time_ns, data)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,6 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import interpolate_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
 
-NANOSECONDS = 10**9
 # If neither the configuration nor the message names the world frame.
 UNNAMED_FRAME = "world"
 
@@ -19,12 +18,12 @@ UNNAMED_FRAME = "world"
 def stamp_ns_of(message: Any) -> int:
     """Time of a message's header, nanoseconds."""
     stamp = message.header.stamp
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def set_stamp(message: Any, stamp_ns: int) -> None:
     """Set the time of a message's header."""
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NANOSECONDS)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
 
 
 def pose_from_message(message: Any) -> tuple[Float64, str]:

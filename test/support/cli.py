@@ -1,4 +1,4 @@
-"""The command line as a user has it: a process of its own."""
+"""Run the command line in its own process, as a user does."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def environment(folder: Path) -> dict[str, str]:
 def deworldsg(
     folder: Path, *arguments: object, limit_s: float = 60.0
 ) -> subprocess.CompletedProcess[str]:
-    """Run it to its end; INT and not KILL at the limit, so that the demo can end its nodes."""
+    """Run it to its end; SIGINT at the time limit, so that the demo can end its nodes."""
     process = start(folder, *arguments)
     try:
         out, err = process.communicate(timeout=limit_s)

@@ -1,4 +1,4 @@
-"""Small recordings for tests: a camera that moves, in whatever form a bag or folder has it."""
+"""Small recordings of a moving camera, in every form that bags and folders have."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def stamp_ns(index: int) -> int:
 
 
 def rgb_pixels(index: int) -> np.ndarray:
-    """Smooth, so that JPEG keeps it nearly."""
+    """Smooth, so that JPEG changes it little."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([rows * 4, columns * 3, np.full_like(rows, 40 + index)], axis=2).astype(
         np.uint8
@@ -106,7 +106,7 @@ Item = tuple[str, str, int, Any]
 
 
 def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True) -> list[Item]:
-    """(topic, type, log time, message) of a camera; depth in metres where not compressed."""
+    """(topic, type, log time, message) of a camera; raw depth is in metres."""
     items: list[Item] = []
     for index in range(count):
         time_ns = stamp_ns(index)
@@ -132,7 +132,7 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
 
 
 def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
-    """A rosbag2 folder of the items, messages or the bytes of them."""
+    """Write a rosbag2 folder with the items: messages, or their bytes."""
     plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
     connections: dict[str, Any] = {}
     with Writer(folder, version=9, storage_plugin=plugin) as writer:

@@ -1,4 +1,4 @@
-"""Tiny scans in 3RScan's layout, made by the tests: a camera that looks at coloured blocks."""
+"""Tiny scans in the layout of 3RScan: a camera in front of coloured blocks."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def write_sequence(
     depth: Intrinsics = CAMERA,
     depth_image: np.ndarray | None = None,
 ) -> Path:
-    """Frames of a camera that moves 1 cm a frame along x."""
+    """Frames of a camera that moves along x by 1 cm per frame."""
     sequence = scan / "sequence"
     write_info(sequence / "_info.txt", color, depth)
     picture = np.full((color.height, color.width, 3), 90, np.uint8)

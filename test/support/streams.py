@@ -1,4 +1,4 @@
-"""Messages by attributes alone, as bags and ROS both give them."""
+"""Messages as plain objects with the attributes of ROS messages."""
 
 from __future__ import annotations
 

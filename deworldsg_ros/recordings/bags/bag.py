@@ -19,13 +19,11 @@ from deworldsg_ros.recordings.messages import (
     Role,
     RoleMessage,
     decode,
-    encode,
-    pose_stamped,
+    pose_stamped_from_matrix,
     stamp_ns_of_cdr,
 )
-from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import pose_from_message
 from deworldsg_ros.streams.transforms import TransformTree
@@ -95,7 +93,7 @@ class BagSource:
             if role is Role.RGB and poses is not None:
                 pose = poses.at(stamp_ns, decode(raw.data, raw.msgtype).header.frame_id)
                 if pose is not None:
-                    yield _serialized(pose, raw.log_time_ns)
+                    yield serialize(pose, raw.log_time_ns)
             if role is Role.POSE and self._T_child_camera is not None:
                 yield from self._at_camera(raw, self._T_child_camera)
                 continue
@@ -152,9 +150,8 @@ class BagSource:
             self.drops["invalid_message"] += 1
             return
         T = T_world_child @ T_child_camera
-        quat_xyzw = quaternion_from_rotation(T[:3, :3])
-        pose = pose_stamped(stamp_ns_of_cdr(raw.data), frame_id, T[:3, 3], quat_xyzw)
-        yield _serialized(pose, raw.log_time_ns)
+        pose = pose_stamped_from_matrix(stamp_ns_of_cdr(raw.data), frame_id, T)
+        yield serialize(pose, raw.log_time_ns)
 
     def _first(self, topic: Topic) -> Any:
         """The first message that can be decoded; None if there is none."""
@@ -162,11 +159,6 @@ class BagSource:
             with contextlib.suppress(Exception):  # whatever rosbags raises on a broken message
                 return decode(raw.data, raw.msgtype)
         return None
-
-
-def _serialized(item: RoleMessage, log_time_ns: int) -> RawRoleMessage:
-    data = encode(item.message, item.msgtype)
-    return RawRoleMessage(item.role, item.msgtype, item.stamp_ns, log_time_ns, data)
 
 
 class _TfPoses:
@@ -198,7 +190,7 @@ class _TfPoses:
             self.refusal = f"poses from TF: {refusal}"
             return None
         self._tree.forget_before(stamp_ns)
-        return pose_stamped(stamp_ns, world_frame, T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+        return pose_stamped_from_matrix(stamp_ns, world_frame, T)
 
     def _add(self, raw: RawMessage, *, is_static: bool) -> None:
         try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import Role, RoleMessage, encode
-from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.recordings.messages import Role, RoleMessage
+from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import UInt8, UInt16
 
 CAMERA_FRAME = "camera_rgb_optical_frame"
@@ -98,22 +98,10 @@ class Dataset(ABC):
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """The same messages, serialized."""
-        return serialized(self.messages())
+        return map(serialize, self.messages())
 
     def close(self) -> None:  # noqa: B027
         """Nothing to close: files are open only while they are read."""
-
-
-def serialized(messages: Iterable[RoleMessage]) -> Iterator[RawRoleMessage]:
-    """Messages as CDR bytes; their time of recording is their stamp."""
-    for item in messages:
-        yield RawRoleMessage(
-            item.role,
-            item.msgtype,
-            item.stamp_ns,
-            item.stamp_ns,
-            encode(item.message, item.msgtype),
-        )
 
 
 def read_file(path: Path) -> bytes:

@@ -15,9 +15,9 @@ import numpy as np
 
 from deworldsg_ros.recordings import messages as ros
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, serialized
+from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset
 from deworldsg_ros.recordings.messages import Role, RoleMessage
-from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic
+from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
     Intrinsics,
@@ -94,7 +94,7 @@ class FrameFiles(Dataset):
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """The same messages, serialized; their images are compressed."""
-        return serialized(self._messages(stored=False))
+        return map(serialize, self._messages(stored=False))
 
     def _messages(self, *, stored: bool) -> Iterator[RoleMessage]:
         for stamp_ns, number in self.frame_numbers.items():
@@ -111,8 +111,7 @@ class FrameFiles(Dataset):
             pose = []
             try:
                 T = self._camera_pose(read_pose(pose_path))
-                quat_xyzw = quaternion_from_rotation(T[:3, :3])
-                pose = [ros.pose_stamped(stamp_ns, WORLD_FRAME, T[:3, 3], quat_xyzw)]
+                pose = [ros.pose_stamped_from_matrix(stamp_ns, WORLD_FRAME, T)]
             except RefusedInput as refusal:
                 if self.options.poses_needed:
                     self.drops[refusal.reason] += 1
