@@ -108,11 +108,11 @@ class Perception:
         intrinsics = frame.intrinsics
         self._up.observe(frame.T_world_camera)
         self._failures = {}
-        found = self._detect(frame)
+        found = self.detect(frame)
         strong = found.scores >= self.score_threshold
         objects, drops = self._select(found.take(strong), intrinsics.width, intrinsics.height)
         weak, _ = self._select(found.take(~strong), intrinsics.width, intrinsics.height)
-        masks = self._segment(frame, objects, in_front_of(objects, weak))
+        masks = self.segment(frame, objects, in_front_of(objects, weak))
         if masks is None:
             drops["segmenter_error"] = len(objects)
             objects, masks = objects.take(slice(0)), []
@@ -127,7 +127,7 @@ class Perception:
             objects.scores,
             (intrinsics.height, intrinsics.width),
         )
-        relations = self._relate(frame, objects, instances)
+        relations = self.relate(frame, objects, instances)
         if relations is None:
             drops["relation_head_error"] = len(objects)
             relations = Relations.none(len(self.vocabulary.predicates))
@@ -144,7 +144,7 @@ class Perception:
         )
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
-    def _detect(self, frame: RgbdFrame) -> Detections:
+    def detect(self, frame: RgbdFrame) -> Detections:
         """Objects and, if detections are refined, weak boxes; raises ``detector_error``."""
         fraction = WEAK_SCORE_FRACTION if self._refine else 1.0
         try:
@@ -153,7 +153,7 @@ class Perception:
             message = self._note_failure("detector", "detector_error", error)
             raise RefusedInput("detector_error", message) from error
 
-    def _segment(
+    def segment(
         self, frame: RgbdFrame, objects: Detections, weak: Detections
     ) -> list[MaskPatch] | None:
         """A mask of each object, without the pixels of `weak`; None if the segmenter failed."""
@@ -161,11 +161,11 @@ class Perception:
         try:
             masks = self._segmenter.segment(frame.rgb, frame.depth_m, frame.intrinsics, boxes_xyxy)
             return masks[: len(objects)]
-        except Exception as error:  # see _detect
+        except Exception as error:  # see detect
             self._note_failure("segmenter", "segmenter_error", error)
             return None
 
-    def _relate(self, frame: RgbdFrame, objects: Detections, instances: UInt16) -> Relations | None:
+    def relate(self, frame: RgbdFrame, objects: Detections, instances: UInt16) -> Relations | None:
         """The best relations between the objects; None if the relation head failed."""
         if len(objects) < 2 or not self._max_relations:
             return Relations.none(len(self.vocabulary.predicates))
@@ -182,7 +182,7 @@ class Perception:
         )
         try:
             return self._relation_head.relate(segmented, self._max_relations)
-        except Exception as error:  # see _detect
+        except Exception as error:  # see detect
             self._note_failure("relation head", "relation_head_error", error)
             return None
 
