@@ -32,7 +32,7 @@ MIN_BOX_SIDE_PX = 2.0
 # Masks and pairs of objects cost time and memory. A frame of an indoor scene has about 12 objects.
 MAX_OBJECTS = 50
 # A weak box inside a larger object keeps its pixels from this fraction of the score threshold on.
-# docs/evaluation.md compares 0.5, 0.75 and 1.
+# docs/dev/notebook.md compares 0.5, 0.75 and 1.
 WEAK_SCORE_FRACTION = 0.5
 # A box reaches a border of the image if it is nearer than this fraction of the image's side.
 # Detectors end their boxes a few pixels before the border.

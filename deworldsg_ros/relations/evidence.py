@@ -15,7 +15,7 @@ PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
 _VISUAL, _PRIOR, _FUSED = range(3)
 
 # Fraction of frames whose relation logits are outliers (`edge_belief: robust`). Relation heads are
-# wrong in 10 to 20 % of the frames (docs/evaluation.md, Edges). From 0.2 on, one confident frame
+# wrong in 10 to 20 % of the frames (docs/dev/notebook.md). From 0.2 on, one confident frame
 # would leave more than 1 nat of entropy among 50 predicates, and the prior would enter every pair
 # that was seen once.
 OUTLIER_RATE = 0.1
