@@ -28,6 +28,7 @@ from deworldsg_ros.recordings.messages import ODOMETRY, Role
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 ODOMETRY_NODE = "odometry_node"
@@ -91,14 +92,14 @@ def run_demo(
     # Opened first, so that a problem of the recording is reported before any process starts.
     recording = _check_recording(path or _shipped(), config, options)
     outputs.prepare_folder(out, config)
-    (out / outputs.GRAPH_FILE).unlink(missing_ok=True)
+    (out / GRAPH_FILE).unlink(missing_ok=True)
     started_s = time.perf_counter()
     with one_interrupt(), ending(console) as processes:
         _start(processes, recording, out, options)
         *nodes, replay = processes
         finished = ReplayProgress(replay, nodes, recording.frames, console).follow()
     wall_s = time.perf_counter() - started_s
-    graph = outputs.read_graph(out)
+    graph = read_graph(out)
     poses = [np.array(values).reshape(4, 4) for values in finished.poses]
     outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
     _write_report(out, recording, graph, finished, wall_s)
@@ -161,7 +162,7 @@ def _start(
     logs.mkdir(exist_ok=True)
     environment = dds_environment()
     common = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]
-    save_path = str((out / outputs.GRAPH_FILE).absolute())
+    save_path = str((out / GRAPH_FILE).absolute())
     for node in (*NODES, ODOMETRY_NODE) if options.odometry else NODES:
         values = {"inputs.pose_source": recording.pose_source, "save_path": _quoted(save_path)}
         command = [*node_command(node), *common, *_parameters(values)]

@@ -15,9 +15,9 @@ from deworldsg_ros.ros.health import UNMATCHED_PREFIX
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.scene.up import UpEstimator
 
-GRAPH_FILE = "scene_graph.json"
 PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
 CONFIG_FILE = "config.yaml"
@@ -37,16 +37,6 @@ def prepare_folder(out: Path, config: Config) -> None:
         raise ConfigurationError(
             f"--out {out}: cannot be written ({error.strerror}); give a writable folder"
         ) from error
-
-
-def write_graph(out: Path, graph: wire.SceneGraphMessage) -> None:
-    """Write scene_graph.json."""
-    (out / GRAPH_FILE).write_text(wire.encode(graph), encoding="utf-8")
-
-
-def read_graph(out: Path) -> wire.SceneGraphMessage:
-    """Read scene_graph.json."""
-    return wire.decode((out / GRAPH_FILE).read_bytes(), wire.SceneGraphMessage)
 
 
 def show_graph(

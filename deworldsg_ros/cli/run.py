@@ -32,6 +32,7 @@ from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import STAGES, device_name, total_ms
 
 LOADING = "loading the models … (the first run compiles kernels, which takes a minute or two)"
@@ -195,7 +196,7 @@ def _write_results(
 ) -> None:
     """Write the graph, its views, the trajectory and the map; print the graph's tables."""
     T_world_cameras = list(processed.poses.values())
-    outputs.write_graph(options.out, graph)
+    write_graph(options.out, graph)
     world_up = pipeline.config.inputs.world_up
     outputs.show_graph(options.out, graph, console, T_world_cameras, world_up)
     if options.trajectory_out is not None:

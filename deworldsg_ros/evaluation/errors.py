@@ -6,4 +6,4 @@ from deworldsg_ros.scene.errors import DeWorldSGError
 
 
 class EvaluationError(DeWorldSGError):
-    """Predictions or options cannot be used: the text says what was seen and what was wanted."""
+    """Predictions or options cannot be used. The message states the value and what was expected."""

@@ -1,4 +1,4 @@
-"""Where the poses of an evaluation come from, as plain values that travel to another process."""
+"""Sources of the camera poses of an evaluation, as picklable values."""
 
 from __future__ import annotations
 
@@ -19,18 +19,21 @@ from deworldsg_ros.scene.errors import RefusedInput
 
 Kind = Literal["ground-truth", "slam", "odometry", "perturbed"]
 KINDS: tuple[Kind, ...] = ("ground-truth", "slam", "odometry", "perturbed")
-# A drift of 2 % and 1 degree a metre with the tremble of a hand: worse than good SLAM.
+# Drift of 2 % and 1 degree per metre, and jitter of a hand-held camera: worse than good SLAM.
 PERTURBATION = PoseNoise(jitter_m=0.005, jitter_deg=0.2, drift_m_per_m=0.02, drift_deg_per_m=1.0)
 
 
 @dataclass(frozen=True)
 class PoseSource:
-    """Poses of the data set, estimated ones, or the data set's made worse.
+    """A source of poses. All sources start at the first ground-truth pose.
 
     Attributes:
-        kind: ``ground-truth`` as the data set has them; ``slam`` of the frames' .slam.pose.txt;
-            ``odometry`` of the images; ``worse``. All begin at the first true pose.
-        noise: of ``worse``.
+        kind: ``ground-truth`` of the data set, ``slam`` from the .slam.pose.txt of the frames,
+            ``odometry`` from the images, or ``perturbed`` ground truth.
+        noise: noise of ``perturbed``.
+
+    Raises:
+        EvaluationError: an unknown kind.
     """
 
     kind: Kind = "ground-truth"
@@ -38,31 +41,33 @@ class PoseSource:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise EvaluationError(f"--poses {self.kind}: wanted {', '.join(KINDS)}")
+            raise EvaluationError(f"--poses {self.kind}: expected {', '.join(KINDS)}")
 
 
 def repose(
     frames: Iterator[RgbdFrame],
-    choice: PoseSource,
+    poses: PoseSource,
     source: Source,
     drops: Counter[str],
 ) -> Iterator[RgbdFrame]:
-    """The frames with the chosen poses; those without one are left out and counted in `drops`.
+    """The frames with the chosen poses. Frames without a pose are dropped and counted in `drops`.
 
     Raises:
-        DeWorldSGError: where a trajectory cannot be read.
+        DeWorldSGError: a trajectory cannot be read.
     """
-    if choice.kind == "ground-truth":
+    if poses.kind == "ground-truth":
         return frames
-    if choice.kind == "perturbed":
-        return perturb_poses(frames, choice.noise)
+    if poses.kind == "perturbed":
+        return perturb_poses(frames, poses.noise)
     first = next(frames, None)
     if first is None:
         return frames
     again = chain([first], frames)
-    if choice.kind == "slam":
+    if poses.kind == "slam":
         if not isinstance(source, SequenceDataset):
-            raise EvaluationError("--poses slam: this recording has no frame-NNNNNN.slam.pose.txt")
+            raise EvaluationError(
+                "--poses slam: the recording has no frame-NNNNNN.slam.pose.txt; use other poses"
+            )
         return _of_slam(again, source, drops)
 
     def lost(refusal: RefusedInput) -> None:
@@ -82,9 +87,9 @@ def _of_slam(
         if T_slam_camera is None:
             drops["no_slam_pose"] += 1
             continue
-        # Trackers see the images as they are stored.
+        # Trackers process the images as stored; `rotated` data sets rotate them when they are read.
         T_slam_camera = rotated_pose(T_slam_camera) if dataset.rotated else T_slam_camera
         if T_truth_slam is None:
-            # Its world is where it began: that is put where the camera truly was.
+            # The SLAM world starts at its first camera: align that pose with the ground truth.
             T_truth_slam = frame.T_world_camera @ invert_pose(T_slam_camera)
         yield replace(frame, T_world_camera=T_truth_slam @ T_slam_camera)

@@ -1,8 +1,7 @@
-"""A recording with its ground truth beside it, as a data set of one scan.
+"""A recording with ground truth, as a data set of one scan.
 
-The recording ``NAME`` (a bag) has ``NAME.gt.json`` and ``NAME.instances.npz`` beside it, as
-bags/README.md describes them. Classes are COCO's words; what counts are the objects that can be
-detected, and the relations between those.
+The files ``NAME.gt.json`` and ``NAME.instances.npz`` are beside the bag ``NAME`` (bags/README.md).
+Classes are those of COCO. Only objects that can be detected, and relations between them, count.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ from deworldsg_ros.scene.arrays import UInt8, UInt16
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
-LAYOUT = Layout("recording", "", "", "", "", "", "", "", "bags/README.md says what belongs to it")
-# Older spellings of COCO's words, which ground truth may have.
+LAYOUT = Layout("recording", "", "", "", "", "", "", "", "bags/README.md describes the files")
+# Older names of COCO classes, which ground truth may contain.
 SPELLINGS = {
     "aeroplane": "airplane",
     "diningtable": "dining table",
@@ -40,25 +39,27 @@ SPELLINGS = {
     "sofa": "couch",
     "tvmonitor": "tv",
 }
-# Annotated surface: cells of the seen surface, hit by so many of the pixels looked at.
+# Annotated surface: one point per cell, from every fourth row and column of the images. Cells with
+# fewer pixels are noise of the depth at edges.
 CELL_M = 0.02
 PIXEL_STRIDE = 4
-LEAST_HITS = 3
-MARGIN_M = 0.05
+MIN_PIXELS = 3
+# Surface this far outside the box of its object is noise.
+BOX_MARGIN_M = 0.05
 
 
 class RecordedRoom(Annotations):
-    """Ground truth of one recording; its only scan is the recording's name.
+    """Ground truth of one recording. The id of its only scan is the name of the recording.
 
     Args:
-        root: the recording.
+        root: path of the recording.
 
     Attributes:
-        frame_numbers: place of each frame by its stamp in nanoseconds.
-        boxes: lowest and highest corner of every object by id, metres, world.
+        frame_numbers: number of each frame by its stamp in nanoseconds.
+        boxes: minimum and maximum corner of each object by id, metres, world.
 
     Raises:
-        RecordingError: for ground truth that is missing or lacks something.
+        RecordingError: ground truth is missing or invalid.
     """
 
     def __init__(self, root: Path) -> None:
@@ -85,7 +86,7 @@ class RecordedRoom(Annotations):
             relations = [(s, o, REPLICA_SSG_PREDICATES.index(name)) for s, o, name in self._named]
             first_ns, rate_hz = int(content["first_stamp_ns"]), float(content["rate_hz"])
             if not rate_hz > 0:
-                raise ValueError(f"rate_hz is {rate_hz}: wanted more than 0")
+                raise ValueError(f"rate_hz is {rate_hz}: expected more than 0")
             self.frame_numbers = {
                 first_ns + round(number * 1e9 / rate_hz): number
                 for number in range(int(content["frames"]))
@@ -96,33 +97,35 @@ class RecordedRoom(Annotations):
         self._annotation = ScanAnnotation(root.resolve().stem, known, relations, related)
 
     def scans(self, split: str = "test") -> list[str]:
-        """The recording's name, whatever the split."""
+        """The name of the recording, for every split."""
         return [self._annotation.scan]
 
     def scan(self, scan: str) -> ScanAnnotation:
-        """What is annotated; raises RecordingError for the name of another recording."""
+        """The annotation; raises RecordingError if `scan` is not the name of the recording."""
         if scan != self._annotation.scan:
-            raise RecordingError(f"scan {scan}: {self.root} is {self._annotation.scan}")
+            raise RecordingError(
+                f"scan {scan} is not in {self.root}: expected {self._annotation.scan}"
+            )
         return self._annotation
 
     def points(self, scan: str, *, aligned: bool = False) -> ScanPoints:
-        """The surfaces that the frames show with their own poses, once a cell of 2 cm."""
+        """Points on the surfaces that the frames show, one per cell of 2 cm."""
         self.scan(scan)
         return _seen_surface(self.root.resolve())
 
     def scan_folder(self, scan: str) -> Path:
-        """The recording itself."""
+        """Path of the recording."""
         return self.root
 
     def ground_truth(self, scan: str) -> dict[str, Any]:
-        """Objects and relations in the form of a rendered room's gt.json."""
+        """Objects and relations in the format of gt.json of a rendered room."""
         return {
             "objects": self._detectable,
             "relationships": [(s, o, 0, name) for s, o, name in self._named],
         }
 
     def instances(self, stamp_ns: int) -> UInt16 | None:
-        """Object ids of a frame's pixels, (H, W); None for a stamp that is no frame's."""
+        """Instance image (H, W) of a frame: object ids; None if no frame has this stamp."""
         number = self.frame_numbers.get(stamp_ns)
         if number is None:
             return None
@@ -130,16 +133,16 @@ class RecordedRoom(Annotations):
 
 
 def open_annotations(root: Path, layout: str) -> Annotations:
-    """Annotations of a data set, or of a recording (layout ``recording``); see there."""
+    """Annotations of a data set; of a recording if `layout` is ``recording``."""
     return RecordedRoom(root) if layout == LAYOUT.name else Annotations(root, layout)
 
 
 def _beside(recording: Path, suffix: str) -> Path:
-    """File of the same name beside a recording; raises RecordingError."""
+    """The file of the same name beside a recording; raises RecordingError if it is missing."""
     whole = recording.resolve()
     path = whole.with_name(f"{whole.stem}{suffix}")
     if not path.exists():
-        raise RecordingError(f"recording {recording}: {path} is missing: it has no ground truth")
+        raise RecordingError(f"recording {recording} has no ground truth: {path} is missing")
     return path
 
 
@@ -152,13 +155,13 @@ def _read_instances(path: Path) -> UInt8:
             return pixels.reshape(packed["shape"])
     except (KeyError, ValueError, lzma.LZMAError, zipfile.BadZipFile) as error:
         raise RecordingError(
-            f"{path}: {type(error).__name__}: {error}; wanted lzma and shape"
+            f"{path}: {type(error).__name__}: {error}; expected lzma and shape"
         ) from error
 
 
 @functools.lru_cache(maxsize=1)
 def _seen_surface(recording: Path) -> ScanPoints:
-    """Centres of the cells of each object's surface; a cell belongs to whom it was seen of most."""
+    """Centres of the surface cells; a cell belongs to the object with most pixels in it."""
     room = RecordedRoom(recording)
     source = open_source(recording)
     hits = []
@@ -182,16 +185,16 @@ def _seen_surface(recording: Path) -> ScanPoints:
     if not hits:
         raise RecordingError(f"recording {recording}: no frame has the stamp of an instance image")
     found, counts = np.unique(np.concatenate(hits), axis=0, return_counts=True)
-    # The most often hit id of each cell comes first.
+    # The id with most pixels comes first in each cell.
     order = np.lexsort((-counts, found[:, 2], found[:, 1], found[:, 0]))
     found, counts = found[order], counts[order]
     first = np.ones(len(found), bool)
     first[1:] = (found[1:, :3] != found[:-1, :3]).any(axis=1)
-    kept = found[first & (counts >= LEAST_HITS)]
+    kept = found[first & (counts >= MIN_PIXELS)]
     points, object_ids = (kept[:, :3] + 0.5) * CELL_M, np.asarray(kept[:, 3], np.int64)
-    # Depth at an edge may lie anywhere between two surfaces; an object is in its box.
+    # Depth at an edge may lie anywhere between two surfaces: keep points in the box of the object.
     inside = np.zeros(len(object_ids), bool)
     for number, (low, high) in room.boxes.items():
-        within = (points > np.subtract(low, MARGIN_M)) & (points < np.add(high, MARGIN_M))
+        within = (points > np.subtract(low, BOX_MARGIN_M)) & (points < np.add(high, BOX_MARGIN_M))
         inside |= (object_ids == number) & within.all(axis=1)
     return ScanPoints(points[inside], object_ids[inside])

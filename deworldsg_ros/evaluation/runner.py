@@ -1,7 +1,7 @@
-"""One scan of a data set through the pipeline and against its annotations.
+"""Run of the pipeline on one scan, and evaluation of its graph.
 
-`evaluate_scan` is a pure function of a picklable task, so that scans can be mapped over processes
-or a cluster. Its only effect is the folder of its results.
+`evaluate_scan` is a function of a picklable task, so that scans can run in other processes or on a
+cluster. Its only side effect is the folder of its results.
 """
 
 from __future__ import annotations
@@ -35,31 +35,31 @@ from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import device_name, total_ms
 
-GRAPH_FILE = "scene_graph.json"
 CONFIG_FILE = "config.yaml"
 PIPELINE = "deworldsg"
 
 
 @dataclass(frozen=True)
 class ScanTask:
-    """What `evaluate_scan` needs to know.
+    """Input of `evaluate_scan`.
 
     Attributes:
         root: folder of the data set.
         layout: ``replica``, ``3rscan`` or ``recording``.
         scan: id of the scan.
-        out: folder of all results; the scan's own is below it.
-        config: of the pipeline.
-        front_end: where detections come from.
-        options: of the protocol.
-        dataset: of the data set folder.
-        every: take every so manieth frame.
-        max_frames: stop after so many; 0 = take all.
-        checkpoints: how many times, evenly over the frames, the graph so far is measured.
-        method: the pipeline, or a baseline by its name.
-        poses: where they come from.
+        out: folder of all results; those of the scan are in ``out/SCAN``.
+        config: configuration of the pipeline.
+        front_end: source of detections.
+        options: options of the protocol.
+        dataset: options of the data set folder.
+        every: process every N-th frame.
+        max_frames: stop after this many frames; 0 = no limit.
+        checkpoints: number of evaluations of the graph during the run, evenly spaced.
+        method: the pipeline, or the name of a baseline.
+        poses: source of poses.
     """
 
     root: Path
@@ -79,7 +79,7 @@ class ScanTask:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Right items after so many frames."""
+    """Recalls of the graph after a number of frames, and after a time since the first."""
 
     frames: int
     stamp_s: float
@@ -91,20 +91,20 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class ScanOutcome:
-    """What became of a scan.
+    """Output of `evaluate_scan`.
 
     Attributes:
-        scan: its id.
-        result: the protocol's items.
-        measures: what the protocol leaves out.
-        frames: processed.
-        nodes, edges: of the graph.
+        scan: id of the scan.
+        result: ranks of the protocol.
+        measures: measures beside the protocol.
+        frames: number of frames processed.
+        nodes, edges: size of the graph.
         times_ms: median milliseconds of each stage.
-        total_ms: milliseconds of each stage in all frames together.
-        device: that they were taken on.
-        drops: frames and objects left out, by reason.
-        over_time: the graph as it became right.
-        graph_path: the graph.
+        total_ms: milliseconds of each stage, sum over all frames.
+        device: device of the measured times.
+        drops: number of frames and objects left out, by reason.
+        over_time: checkpoints.
+        graph_path: file of the graph.
     """
 
     scan: str
@@ -122,10 +122,10 @@ class ScanOutcome:
 
 
 def evaluate_scan(task: ScanTask) -> ScanOutcome:
-    """Run one scan and measure its graph; the graph is left in ``out/SCAN/scene_graph.json``.
+    """Run one scan and evaluate its graph, which is written to ``out/SCAN/scene_graph.json``.
 
     Raises:
-        DeWorldSGError: where the scan cannot be read or evaluated.
+        DeWorldSGError: the scan cannot be read or evaluated.
     """
     with ExitStack() as opened:
         return _evaluate(task, opened)
@@ -170,7 +170,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
             result = score(pipeline.graph())
             over_time.append(_checkpoint(frames, 1e-9 * (frame.stamp_ns - started_ns), result))
     if not frames:
-        raise EvaluationError(f"scan {task.scan}: not one frame could be used: {refused}")
+        raise EvaluationError(f"scan {task.scan}: all frames were refused: {dict(refused)}")
     graph = pipeline.graph()
     path = _write(task, graph)
     return ScanOutcome(
@@ -194,7 +194,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
 
 
 def build_method(method: str, config: Config, front_end: Perceiver) -> Pipeline | BaselinePipeline:
-    """The pipeline, or a baseline on the same detections; raises EvaluationError."""
+    """The pipeline or a baseline, on the detections of the front end; raises EvaluationError."""
     if method == PIPELINE:
         return Pipeline(config, front_end)
     return BaselinePipeline(build_baseline(method), front_end)
@@ -203,7 +203,7 @@ def build_method(method: str, config: Config, front_end: Perceiver) -> Pipeline 
 def evaluate_graph(
     annotations: Annotations, scan: str, graph: wire.SceneGraphMessage, options: ProtocolOptions
 ) -> tuple[ScanResult, Measures]:
-    """Measure a graph that was made before."""
+    """Score and measure a graph."""
     points = annotations.points(scan, aligned=options.aligned_ply)
     graph = translate(graph, annotations)
     prediction = to_prediction(graph, annotations.vocabulary)
@@ -230,16 +230,7 @@ def _write(task: ScanTask, graph: wire.SceneGraphMessage) -> Path:
     folder = task.out / task.scan
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / GRAPH_FILE).write_text(wire.encode(graph), encoding="utf-8")
         (folder / CONFIG_FILE).write_text(to_yaml(task.config), encoding="utf-8")
+        return write_graph(folder, graph)
     except OSError as error:
         raise EvaluationError(f"--out {task.out}: cannot be written ({error.strerror})") from error
-    return folder / GRAPH_FILE
-
-
-def read_graph(path: Path) -> wire.SceneGraphMessage:
-    """Read a scene graph's file; raises EvaluationError, RefusedInput."""
-    try:
-        return wire.decode(path.read_bytes(), wire.SceneGraphMessage)
-    except OSError as error:
-        raise EvaluationError(f"scene graph {path} cannot be read ({error.strerror})") from error

@@ -359,5 +359,5 @@ def test_a_still_camera_sees_each_object_once(name: str) -> None:
 
 
 def test_a_baseline_of_another_name_is_named() -> None:
-    with pytest.raises(EvaluationError, match=r"'frost': wanted one of fross, kim"):
+    with pytest.raises(EvaluationError, match=r"'frost': expected one of fross, kim"):
         build_baseline("frost")

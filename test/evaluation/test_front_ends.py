@@ -57,7 +57,7 @@ def test_recorded_flips(tmp_path: Path) -> None:
     root = write_room(tmp_path)
     graph = perceived(root, FrontEndChoice("recorded", flip=0.1))[0].frame_graph
     assert graph.class_probabilities.argmax(axis=1).tolist() == [2, 0, 1]
-    with pytest.raises(EvaluationError, match="not recorded: wanted 0, 0.1"):
+    with pytest.raises(EvaluationError, match="not recorded: expected 0, 0.1"):
         perceived(root, FrontEndChoice("recorded", flip=0.2))
 
 
@@ -81,9 +81,9 @@ def test_perfect_ground_truth(tmp_path: Path, with_images: bool) -> None:
     graph = first.frame_graph
     assert graph.class_probabilities.argmax(axis=1).tolist() == [1, 2, 0]
     for row, (object_id, _, left, right) in enumerate(BLOCKS):
-        wanted = [left, ROWS[0], right - 1, ROWS[1] - 1]
+        expected = [left, ROWS[0], right - 1, ROWS[1] - 1]
         # Without instance images every other pixel is looked at.
-        np.testing.assert_allclose(graph.boxes_xyxy[row], wanted, atol=0 if with_images else 1)
+        np.testing.assert_allclose(graph.boxes_xyxy[row], expected, atol=0 if with_images else 1)
         agree = (first.instances == row + 1) == (instance_image() == object_id)
         assert agree.mean() > (0.999 if with_images else 0.97)
     pairs = {tuple(pair) for pair in graph.relations.pairs.tolist()}
@@ -130,5 +130,5 @@ def test_what_is_too_small_is_not_detected() -> None:
     "faults", [{"kind": "video"}, {"flip": -0.1}, {"miss": 1.1}, {"jitter_px": -1.0}]
 )
 def test_bad_choices_are_refused(faults: dict[str, object]) -> None:
-    with pytest.raises(EvaluationError, match="wanted"):
+    with pytest.raises(EvaluationError, match="expected"):
         FrontEndChoice(**faults)  # type: ignore[arg-type]

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.evaluation import one_hot
+from support.evaluation import one_hot, write_predictions
 
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.predictions import (
     ScanPrediction,
     read_predictions,
-    write_predictions,
 )
 
 
@@ -39,14 +38,14 @@ def write_json(path: Path, scans: Any) -> Path:
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int8])
 def test_pickles_of_every_protocol(tmp_path: Path, protocol: int, dtype: Any) -> None:
     path = tmp_path / "p.pkl"
-    wanted = official(dtype)
-    path.write_bytes(pickle.dumps({"a": wanted}, protocol))
+    expected = official(dtype)
+    path.write_bytes(pickle.dumps({"a": expected}, protocol))
     read = read_predictions(path)["a"]
     assert read.class_scores.dtype == dtype
-    assert (read.class_scores == wanted["cls"]).all()
-    assert (read.edges == wanted["edge_index"].T).all()
-    assert (read.edge_scores == wanted["edge_cls"]).all()
-    for points, segment in zip(read.points_world, wanted["pcd"]):
+    assert (read.class_scores == expected["cls"]).all()
+    assert (read.edges == expected["edge_index"].T).all()
+    assert (read.edge_scores == expected["edge_cls"]).all()
+    for points, segment in zip(read.points_world, expected["pcd"]):
         assert points.shape == segment.shape
         assert (points == segment).all()
 
@@ -127,7 +126,7 @@ def test_an_array_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> Non
     content = pickle.dumps({"a": official()}, 2).replace(b"K\x02K\x03\x86", b"K\x7fK\x03\x86")
     path = tmp_path / "p.pkl"
     path.write_bytes(content)
-    with pytest.raises(EvaluationError, match="wanted"):
+    with pytest.raises(EvaluationError, match="expected"):
         read_predictions(path)
 
 
@@ -152,21 +151,21 @@ def test_open_format(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("node", "edge", "wanted"),
+    ("node", "edge", "expected"),
     [
         ({"class_index": 3, "points": []}, None, "from 0 to 2"),
-        ({"class_probabilities": [1.0], "points": []}, None, "wanted 3"),
+        ({"class_probabilities": [1.0], "points": []}, None, "expected 3"),
         ({"points": []}, None, "class_index"),
         ({"class_index": 0, "points": [[1, 2]]}, None, r"\(n, 3\)"),
-        ({"class_index": 0, "points": []}, {"subject": -1, "object": 0}, "wanted 0 or more"),
+        ({"class_index": 0, "points": []}, {"subject": -1, "object": 0}, "expected 0 or more"),
     ],
 )
 def test_open_format_errors_say_what_was_wanted(
-    tmp_path: Path, node: Any, edge: Any, wanted: str
+    tmp_path: Path, node: Any, edge: Any, expected: str
 ) -> None:
     edges = [{**edge, "predicate_probabilities": [1.0, 0.0]}] if edge else []
     path = write_json(tmp_path / "p.json", {"scan 7": {"nodes": [node], "edges": edges}})
-    with pytest.raises(EvaluationError, match=wanted) as error:
+    with pytest.raises(EvaluationError, match=expected) as error:
         read_predictions(path)
     assert "scan 7" in str(error.value)
 
@@ -176,22 +175,22 @@ def test_negative_nodes_of_a_pickle_are_refused(tmp_path: Path) -> None:
     path.write_bytes(
         pickle.dumps({"a": {**official(), "edge_index": np.array([[-1, 0], [-1, 1]])}})
     )
-    with pytest.raises(EvaluationError, match="wanted 0 or more"):
+    with pytest.raises(EvaluationError, match="expected 0 or more"):
         read_predictions(path)
 
 
 def test_round_trip(tmp_path: Path) -> None:
     generator = np.random.default_rng(1)
-    wanted = ScanPrediction(
+    expected = ScanPrediction(
         (generator.normal(size=(4, 3)), np.zeros((0, 3))),
         generator.random((2, 3)),
         np.array([[1, 0]]),
         generator.random((1, 2)),
     )
     path = tmp_path / "p.json"
-    write_predictions(path, {"a": wanted}, 3, 2)
+    write_predictions(path, {"a": expected}, 3, 2)
     read = read_predictions(path)["a"]
-    assert (read.class_scores == wanted.class_scores).all()
-    assert (read.edge_scores == wanted.edge_scores).all()
-    assert (read.edges == wanted.edges).all()
-    assert (read.points_world[0] == wanted.points_world[0]).all()
+    assert (read.class_scores == expected.class_scores).all()
+    assert (read.edge_scores == expected.edge_scores).all()
+    assert (read.edges == expected.edges).all()
+    assert (read.points_world[0] == expected.points_world[0]).all()

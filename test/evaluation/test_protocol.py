@@ -53,8 +53,8 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
             (result.object_classes, "object_per_class"),
             (result.predicate_classes, "predicate_per_class"),
         ):
-            wanted = {name: (item["hits"], item["gt"]) for name, item in run[key].items()}
-            assert {name: tuple(count) for name, count in counts.items()} == wanted
+            expected = {name: (item["hits"], item["gt"]) for name, item in run[key].items()}
+            assert {name: tuple(count) for name, count in counts.items()} == expected
         assert len(result.scans) == len(run["scans"])
         for scan, official in zip(result.scans, run["scans"]):
             assert scan.scan == official["scan"]
@@ -73,7 +73,7 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
 
 # Scores, place, rank: of equals the last comes first, NaN before every number.
 @pytest.mark.parametrize(
-    ("scores", "place", "wanted"),
+    ("scores", "place", "expected"),
     [
         ([], 0, NO_RANK),
         ([1.0], 0, 0),
@@ -88,8 +88,8 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
         ([math.inf, math.nan], 0, 1),
     ],
 )
-def test_rank(scores: list[float], place: int, wanted: int) -> None:
-    assert rank(np.array(scores), place) == wanted
+def test_rank(scores: list[float], place: int, expected: int) -> None:
+    assert rank(np.array(scores), place) == expected
 
 
 def test_rank_is_that_of_a_flipped_stable_sort() -> None:
@@ -371,13 +371,13 @@ def test_ply_flavours(tmp_path: Path, form: str, dtype: str) -> None:
     ids = np.array([1, 1, 2, 65535, 0])
     write_ply(root / "data/a/labels.instances.annotated.v2.ply", points, ids, form, dtype)
     read = Annotations(root, "replica").points("a")
-    wanted = points.astype(np.float32).astype(np.float64) if dtype == "float" else points
-    assert (read.points_world == wanted).all()
+    expected = points.astype(np.float32).astype(np.float64) if dtype == "float" else points
+    assert (read.points_world == expected).all()
     assert (read.object_ids == ids).all()
 
 
 @pytest.mark.parametrize(
-    ("content", "wanted"),
+    ("content", "expected"),
     [
         (b"", "no PLY file"),
         (b"ply\nformat ascii 1.0\nend_header\n", "element vertex"),
@@ -385,11 +385,11 @@ def test_ply_flavours(tmp_path: Path, form: str, dtype: str) -> None:
         (b"ply\nformat strange 1.0\nend_header\n", "not understood"),
     ],
 )
-def test_a_bad_ply_is_named(tmp_path: Path, content: bytes, wanted: str) -> None:
+def test_a_bad_ply_is_named(tmp_path: Path, content: bytes, expected: str) -> None:
     root = write_dataset(tmp_path, {"a": ROOM})
     path = root / "data/a/labels.instances.annotated.v2.ply"
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match=wanted):
+    with pytest.raises(RecordingError, match=expected):
         Annotations(root, "replica").points("a")
 
 

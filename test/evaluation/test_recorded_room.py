@@ -13,9 +13,9 @@ from typer.testing import CliRunner, Result
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.evaluation.measures.graph_measures import read_reference
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom, open_annotations
-from deworldsg_ros.evaluation.runner import read_graph
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.scene.graph_file import read_graph
 from deworldsg_ros.scene.wire import ns_from_stamp
 
 RECORDING = Path(__file__).resolve().parents[2] / "bags" / "demo_room"
@@ -66,7 +66,7 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
     values = json.loads((tmp_path / "n.json").read_text())
     assert values["scans"][0]["frames"] == 10
     assert values["measures"]["found"] >= 10
-    graph = read_graph(tmp_path / "demo_room" / "scene_graph.json")
+    graph = read_graph(tmp_path / "demo_room")
     # Ten frames, eight tenths of a second apart.
     assert ns_from_stamp(graph.stamp) == 1_750_000_000_000_000_000 + 9 * 800_000_000
 
@@ -76,8 +76,8 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
     [
         (("--front-end", "recorded"), "no recorded detections"),
         (("--front-end", "ground-truth", "--poses", "slam"), "no frame-NNNNNN.slam.pose.txt"),
-        (("--front-end", "ground-truth", "--faults", "cut=2"), "fault cut=2: wanted 0 to 1"),
-        (("--front-end", "backend", "--faults", "cut=0.1"), "backend with cut 0.1: wanted"),
+        (("--front-end", "ground-truth", "--faults", "cut=2"), "fault cut=2: expected 0 to 1"),
+        (("--front-end", "backend", "--faults", "cut=0.1"), "backend with cut 0.1: faults need"),
         (
             ("--front-end", "ground-truth", "--poses", "odometry", "--pose-noise", "jitter_m=1"),
             "only --poses perturbed has noise",
@@ -105,14 +105,14 @@ def test_a_recording_without_ground_truth_says_what_is_missing(tmp_path: Path) -
     (tmp_path / "room.instances.npz").write_bytes(b"nothing")
     room = open_annotations(tmp_path / "room", "recording")
     assert isinstance(room, RecordedRoom)
-    with pytest.raises(RecordingError, match="wanted lzma and shape"):
+    with pytest.raises(RecordingError, match="expected lzma and shape"):
         room.instances(1_750_000_000_000_000_000)
     (tmp_path / "room.gt.json").write_text('{"objects": [{}]}')
     with pytest.raises(RecordingError, match=r"room\.gt\.json: KeyError"):
         open_annotations(tmp_path / "room", "recording")
     truth = {"objects": [], "relations": [], "first_stamp_ns": 0, "rate_hz": 0, "frames": 1}
     (tmp_path / "room.gt.json").write_text(json.dumps(truth))
-    with pytest.raises(RecordingError, match=r"rate_hz is 0.0: wanted more than 0"):
+    with pytest.raises(RecordingError, match=r"rate_hz is 0.0: expected more than 0"):
         open_annotations(tmp_path / "room", "recording")
 
 

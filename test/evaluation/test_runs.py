@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.evaluation import write_dataset, write_json
+from support.evaluation import write_dataset, write_json, write_predictions
 from support.sequences import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
 from typer.testing import CliRunner
 
@@ -17,7 +17,7 @@ from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.protocol.labels import translate, translation
-from deworldsg_ros.evaluation.protocol.predictions import read_predictions, write_predictions
+from deworldsg_ros.evaluation.protocol.predictions import read_predictions
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
 from deworldsg_ros.evaluation.reports.csv_latex import latex_rows, latex_text
@@ -26,10 +26,10 @@ from deworldsg_ros.evaluation.runner import (
     ScanTask,
     evaluate_graph,
     evaluate_scan,
-    read_graph,
 )
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.graph_file import read_graph
 from deworldsg_ros.scene.wire import Belief
 
 
@@ -58,7 +58,7 @@ def test_a_scan_travels_to_another_process_and_back(tmp_path: Path) -> None:
     assert outcome.over_time[-1].object_recall == 1.0
     # The graph that was left gives the same numbers, and so do its predictions as a file.
     annotations = Annotations(root, "replica")
-    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    graph = read_graph(tmp_path / "out" / "room_0")
     result, measures = evaluate_graph(annotations, "room_0", graph, ProtocolOptions())
     assert result == outcome.result
     assert measures == outcome.measures
@@ -83,8 +83,8 @@ def test_two_runs_leave_the_same_graph(tmp_path: Path) -> None:
 def test_a_graph_of_another_vocabulary_is_refused(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     evaluate_scan(task(root, tmp_path / "out"))
-    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
-    with pytest.raises(EvaluationError, match="another vocabulary"):
+    graph = read_graph(tmp_path / "out" / "room_0")
+    with pytest.raises(EvaluationError, match="class 'book', which is not in the data set"):
         to_prediction(graph, Vocabulary(("bed",), ("near",)))
 
 
@@ -98,7 +98,7 @@ def test_labels_of_a_detector_become_classes(tmp_path: Path) -> None:
     names = translation(annotations)
     assert names == {"stool": "chair", "sofa": "chair", "couch": "chair", "dining table": "table"}
     evaluate_scan(task(root, tmp_path / "out"))
-    graph = read_graph(tmp_path / "out" / "room_0" / "scene_graph.json")
+    graph = read_graph(tmp_path / "out" / "room_0")
     beliefs = [Belief("couch", 0.3), Belief("mat", 0.3), Belief("stool", 0.2), Belief("book", 0.1)]
     node = msgspec.structs.replace(graph.nodes[0], classes=beliefs, label="couch")
     foreign = msgspec.structs.replace(graph, nodes=[node], edges=[])

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from support.evaluation import write_predictions
 from support.sequences import write_room
 from typer.testing import CliRunner, Result
 
@@ -20,10 +21,9 @@ from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
-from deworldsg_ros.evaluation.protocol.predictions import write_predictions
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
-from deworldsg_ros.evaluation.runner import ScanTask, read_graph
+from deworldsg_ros.evaluation.runner import ScanTask
 from deworldsg_ros.evaluation.tables import parallel
 from deworldsg_ros.evaluation.tables.jobs import Job, fingerprint, run_job
 from deworldsg_ros.evaluation.tables.paper_numbers import RUNTIME_MS, printed_rows
@@ -32,6 +32,7 @@ from deworldsg_ros.evaluation.tables.row_results import total_ms
 from deworldsg_ros.evaluation.tables.rows import SWITCHES, TABLES, table_rows
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.graph_file import read_graph
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +126,10 @@ def test_processes_give_the_same_results_and_may_die(
     jobs = [job(root, tmp_path / "fross", method="fross"), deadly, job(root, tmp_path / "kim")]
     results = {result.scan: result for result in run_jobs(jobs, workers=2)}
     assert results["deadly"].failure == parallel.DIED
-    wanted = run_job(job(root, tmp_path / "here"))
+    expected = run_job(job(root, tmp_path / "here"))
     assert results["room_0"].outcome is not None
-    assert wanted.outcome is not None
-    assert results["room_0"].outcome.result.object_ranks == wanted.outcome.result.object_ranks
+    assert expected.outcome is not None
+    assert results["room_0"].outcome.result.object_ranks == expected.outcome.result.object_ranks
     graphs = [tmp_path / name / "room_0" / "scene_graph.json" for name in ("kim", "here")]
     assert graphs[0].read_bytes() == graphs[1].read_bytes()
     assert "OMP_NUM_THREADS" not in os.environ or os.environ["OMP_NUM_THREADS"] != "1"
@@ -160,7 +161,7 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     # One of the methods' graphs, as if it were another method's predictions.
     run_job(job(root, tmp_path / "before"))
-    graph = read_graph(tmp_path / "before" / "room_0" / "scene_graph.json")
+    graph = read_graph(tmp_path / "before" / "room_0")
     vocabulary = Vocabulary(("book", "chair", "table"), ("near", "on", "under"))
     write_predictions(tmp_path / "p.json", {"room_0": to_prediction(graph, vocabulary)}, 3, 3)
     arguments = (
@@ -181,7 +182,7 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
     for name in ("fross", "kim", "paper", "default"):
         assert rows[name]["scan_count"] == 1
         assert not rows[name]["failed"]
-        assert read_graph(out / name / "room_0" / "scene_graph.json").nodes
+        assert read_graph(out / name / "room_0").nodes
     assert rows["default"]["object_recall"] == 1.0
     assert rows["default"]["nodes_per_object"] == 1.0
     assert rows["SGFN"]["object_recall"] == 1.0
@@ -235,7 +236,7 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
 
 
 def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
-    for table, name in (("hard", "default-jitter"), ("switches", "confirm-label")):
+    for table, name in (("hard", "default-jitter"), ("switches", "confirmed-label")):
         told = evaluate(
             *(root, table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),

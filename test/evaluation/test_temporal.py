@@ -134,7 +134,7 @@ def test_edges_that_change_are_flips(parts: list[dict], flips: int) -> None:  # 
 
 
 def test_frames_whose_rows_do_not_match_are_an_error() -> None:
-    with pytest.raises(ValueError, match="2 objects of the ground truth and 1 associations"):
+    with pytest.raises(ValueError, match="2 true objects and 1 associations"):
         measure_stream(stream({"at": [1]}), truth([7, 8]))
 
 

@@ -7,7 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+
+from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 
 CLASSES = ("book", "chair", "table")
 PREDICATES = ("near", "on", "under")
@@ -114,3 +117,36 @@ def segment(object_id: int, count: int = 10, offset: Sequence[float] = (0, 0, 0)
 
 def one_hot(place: int, count: int = 3) -> list[float]:
     return [float(index == place) for index in range(count)]
+
+
+def write_predictions(
+    path: Path,
+    predictions: Mapping[str, ScanPrediction],
+    class_count: int,
+    predicate_count: int,
+) -> None:
+    """Write predictions in the open format."""
+    scans = {
+        scan: {
+            "nodes": [
+                {"id": row, "class_probabilities": scores, "points": points.tolist()}
+                for row, (scores, points) in enumerate(
+                    zip(prediction.class_scores.tolist(), prediction.points_world)
+                )
+            ],
+            "edges": [
+                {"subject": subject, "object": object_, "predicate_probabilities": scores}
+                for (subject, object_), scores in zip(
+                    prediction.edges.tolist(), prediction.edge_scores.tolist()
+                )
+            ],
+        }
+        for scan, prediction in predictions.items()
+    }
+    content = {
+        "format": "scene graph predictions 1",
+        "num_classes": class_count,
+        "num_predicates": predicate_count,
+        "scans": scans,
+    }
+    path.write_bytes(msgspec.json.encode(content))

@@ -1,4 +1,4 @@
-"""Methods that the pipeline is compared with, on the same detections, in our own code."""
+"""Baselines: other methods on the same detections, reimplemented here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BASELINES: dict[str, type[Fross] | type[Kim]] = {"fross": Fross, "kim": Kim}
 
 
 def build_baseline(name: str) -> Baseline:
-    """A baseline by its name; raises EvaluationError."""
+    """The baseline of this name; raises EvaluationError."""
     if name not in BASELINES:
-        raise EvaluationError(f"baseline '{name}': wanted one of {', '.join(BASELINES)}")
+        raise EvaluationError(f"baseline '{name}': expected one of {', '.join(BASELINES)}")
     return BASELINES[name]()

@@ -1,6 +1,6 @@
 """FROSS (Hou et al., ICCV 2025): boxes lifted at their centre, merged by class and distance.
 
-Written from the published description, with its open choices (docs/evaluation/protocol.md).
+Implemented from the published description; docs/evaluation/protocol.md lists the open choices.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
 from deworldsg_ros.scene.gaussian import hellinger_distance, transform
 
-HELLINGER_THRESHOLD = 0.85
-# Evaluation points: a grid so wide, in the central half of the box.
+# Below this distance two nodes of one class merge (FROSS).
+MAX_HELLINGER_DISTANCE = 0.85
+# Spacing of the grid of evaluation points in the central half of the box (FROSS).
 GRID_PX = 50
 
 
@@ -35,9 +36,9 @@ class Fross:
         intrinsics: Intrinsics,
         T_world_camera: Float64,
     ) -> Lifted:
-        """The objects that have depth at the centre of their box.
+        """Nodes of the objects that have depth at the centre of their box.
 
-        Drops: ``no_centre_depth``, ``empty_box`` where a side is shorter than a pixel.
+        Drops: ``no_centre_depth``, or ``empty_box`` if a side is shorter than a pixel.
         """
         nodes, rows, drops = [], [], Counter[str]()
         for row, box in enumerate(frame_graph.boxes_xyxy):
@@ -69,9 +70,9 @@ class Fross:
         return Lifted(nodes, rows, drops)
 
     def choose(self, node: BaselineNode, others: Sequence[BaselineNode]) -> int | None:
-        """The nearest by Hellinger distance of those with the same best class, if near enough.
+        """Index of the nearest node of the same class by Hellinger distance; None if too far.
 
-        As released, two equal Gaussians give NaN and never merge; here the Bhattacharyya
+        In the released code two equal Gaussians give NaN and never merge. Here the Bhattacharyya
         distance is clamped at 0 (`scene.gaussian`).
         """
         places = [place for place, other in enumerate(others) if other.label == node.label]
@@ -84,10 +85,10 @@ class Fross:
             np.array([others[place].covariance_world for place in places]),
         )
         nearest = int(distances.argmin())
-        return places[nearest] if distances[nearest] < HELLINGER_THRESHOLD else None
+        return places[nearest] if distances[nearest] < MAX_HELLINGER_DISTANCE else None
 
     def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
-        """Moments and class distributions weighted by the numbers of evaluation points."""
+        """Both nodes in one, weighted by their numbers of evaluation points."""
         weights = np.array([keeper.weight, other.weight])
         weights = weights / weights.sum() if weights.sum() > 0 else np.array([0.5, 0.5])
         scores = weights[0] * keeper.class_scores + weights[1] * other.class_scores
@@ -95,7 +96,7 @@ class Fross:
 
 
 def whole_box(box_xyxy: Float64) -> tuple[int, int, int, int]:
-    """Centre column, centre row, width and height, each cut to whole pixels."""
+    """Centre column, centre row, width and height of a box, truncated to whole pixels."""
     x1, y1, x2, y2 = box_xyxy.tolist()
     return int((x1 + x2) / 2), int((y1 + y2) / 2), int(x2 - x1), int(y2 - y1)
 
@@ -105,9 +106,10 @@ def box_covariance(
 ) -> Float64:
     """Covariance of a box's object in the camera frame, (3, 3) square metres.
 
-    The box as a uniform distribution, diag(w², h²) / 12, through the pseudo-inverse of the
-    projection's Jacobian J = [[fx/Z, 0, -x fx/Z²], [0, fy/Z, -y fy/Z²]] with x, y the normalised
-    image coordinates, as released; z gets the mean of the other two variances on top.
+    The box is a uniform distribution with covariance diag(w², h²) / 12. The pseudo-inverse of the
+    Jacobian of the projection, J = [[fx/Z, 0, -x fx/Z²], [0, fy/Z, -y fy/Z²]], maps it to 3D, with
+    x, y in normalised image coordinates as in the released code. The mean of the variances of x and
+    y is added to that of z.
     """
     x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
     fx, fy = intrinsics.fx / depth_m, intrinsics.fy / depth_m

@@ -1,7 +1,7 @@
-"""What both baselines share: nodes on a stack absorb one another, relations are counted.
+"""The graph of the baselines: nodes absorb one another, relations are counted.
 
-New nodes are added to the graph and put on a stack. The popped one is held against all other
-nodes: the best that the baseline accepts absorbs it, and goes on the stack in turn.
+New nodes are added to the graph and pushed on a stack. The popped node is compared with all other
+nodes. The best node that the baseline accepts absorbs it and is pushed on the stack.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.frame_graph import Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import fuse
 
-# Classes and predicates that a message tells of each node and edge.
-TOLD = 5
+# Number of classes and predicates of each node and edge in the message.
+TOP_K = 5
 
 
 @dataclass(frozen=True)
 class BaselineNode:
-    """One object as a baseline knows it.
+    """One object of a baseline.
 
     Attributes:
         mean_world: (3,) float64, metres.
         covariance_world: (3, 3) float64, square metres.
         class_scores: (C,) float64, not negative.
-        weight: what it counts in a fusion.
-        points_world: (n, 3) float64, metres: the points that the protocol judges it by.
-        first_ns, last_ns: stamps of the first and last frame that saw it.
-        observations: frames that saw it.
-        colours: histogram of its colours, any length; empty where the baseline has none.
+        weight: weight in a fusion.
+        points_world: (n, 3) float64, metres, points for the protocol.
+        first_ns, last_ns: stamps of the first and last observation.
+        observations: number of observations.
+        colours: colour histogram of any length; empty if the baseline has none.
     """
 
     mean_world: Float64
@@ -55,7 +55,7 @@ Choose = Callable[[BaselineNode, Sequence[BaselineNode]], "int | None"]
 
 
 def fuse_nodes(keeper: BaselineNode, other: BaselineNode, class_scores: Float64) -> BaselineNode:
-    """Two nodes in one, moments weighted as in Eq. 7; two weights of 0 count as 1 and 1."""
+    """Both nodes in one, moments fused by Eq. 7. Two weights of 0 count as 1 and 1."""
     weights = (keeper.weight, other.weight)
     weights = weights if sum(weights) > 0 else (1.0, 1.0)
     mean, covariance = fuse(
@@ -81,17 +81,17 @@ def fuse_nodes(keeper: BaselineNode, other: BaselineNode, class_scores: Float64)
 
 
 class BaselineGraph:
-    """A graph that grows by absorption.
+    """A graph whose nodes absorb one another.
 
     Args:
-        vocabulary: of all nodes and relations.
+        vocabulary: classes and predicates.
         frame_id: world frame.
-        choose: place of the node that absorbs a given one, among the others; None = none does.
-        fuse: the keeper and the absorbed node in one.
+        choose: returns the index of the other node that absorbs a node, or None.
+        fuse: returns the keeper and the absorbed node in one.
 
     Attributes:
-        nodes: by id, in order of creation.
-        counts: how often each predicate was predicted of an ordered pair, (R,) int64.
+        nodes: nodes by id, in order of creation.
+        counts: (R,) int64 by ordered pair, number of predictions of each predicate.
     """
 
     def __init__(
@@ -113,22 +113,22 @@ class BaselineGraph:
     def integrate(
         self, nodes: Sequence[BaselineNode], relations: Relations, stamp_ns: int
     ) -> list[int]:
-        """Take in the nodes of a frame and the relations between them.
+        """Integrate the nodes of a frame and the relations between them.
 
         Args:
-            nodes: what was lifted.
-            relations: pairs are places in `nodes`; of each pair the best predicate counts once.
-            stamp_ns: of the frame.
+            nodes: nodes of the frame.
+            relations: pairs of indices into `nodes`; the best predicate of each pair counts once.
+            stamp_ns: stamp of the frame.
 
         Returns:
-            Id of the node that each became.
+            Id of the node of the graph for each node of the frame.
         """
         self._newest_ns = stamp_ns
-        founded = list(range(self._next_id, self._next_id + len(nodes)))
+        created = list(range(self._next_id, self._next_id + len(nodes)))
         self._next_id += len(nodes)
-        self.nodes.update(zip(founded, nodes))
+        self.nodes.update(zip(created, nodes))
         merged_into: dict[int, int] = {}
-        stack = list(founded)
+        stack = list(created)
         while stack:
             node_id = stack.pop()
             if node_id not in self.nodes:
@@ -137,7 +137,7 @@ class BaselineGraph:
             if keeper_id is not None:
                 merged_into[node_id] = keeper_id
                 stack.append(keeper_id)
-        node_ids = [_resolve(node_id, merged_into) for node_id in founded]
+        node_ids = [_resolve(node_id, merged_into) for node_id in created]
         for (subject, object_), logits in zip(relations.pairs.tolist(), relations.logits):
             pair = (node_ids[subject], node_ids[object_])
             if pair[0] != pair[1]:
@@ -146,7 +146,7 @@ class BaselineGraph:
         return node_ids
 
     def _absorb(self, node_id: int) -> int | None:
-        """Merge a node into the best other; returns that one's id, None where there is none."""
+        """Merge a node into the best other node; returns the id of that node, or None."""
         node = self.nodes[node_id]
         other_ids = [other for other in self.nodes if other != node_id]
         chosen = self._choose(node, [self.nodes[other] for other in other_ids])
@@ -166,7 +166,7 @@ class BaselineGraph:
         return keeper_id
 
     def message(self) -> wire.SceneGraphMessage:
-        """The graph, its points as surface points."""
+        """The graph as a message, with the points of the nodes as surface points."""
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=wire.stamp_from_ns(self._newest_ns),
@@ -177,7 +177,7 @@ class BaselineGraph:
         )
 
     def _node_state(self, node_id: int, node: BaselineNode) -> wire.NodeState:
-        beliefs = _beliefs(_shares(node.class_scores), self.vocabulary.classes)
+        beliefs = _beliefs(_fractions(node.class_scores), self.vocabulary.classes)
         return wire.NodeState(
             id=node_id,
             label=beliefs[0].label,
@@ -191,9 +191,9 @@ class BaselineGraph:
         )
 
     def _edge_state(self, pair: tuple[int, int]) -> wire.EdgeState:
-        shares = _shares(self.counts[pair])
-        beliefs = _beliefs(shares, self.vocabulary.predicates)
-        certain = shares[shares > 0]
+        fractions = _fractions(self.counts[pair])
+        beliefs = _beliefs(fractions, self.vocabulary.predicates)
+        positive = fractions[fractions > 0]
         return wire.EdgeState(
             subject=pair[0],
             object=pair[1],
@@ -201,7 +201,7 @@ class BaselineGraph:
             probability=beliefs[0].probability,
             predicates=beliefs,
             provenance="visual",
-            entropy_nats=max(0.0, float(-(certain * np.log(certain)).sum())),
+            entropy_nats=max(0.0, float(-(positive * np.log(positive)).sum())),
             observations=int(self.counts[pair].sum()),
         )
 
@@ -212,10 +212,12 @@ def _resolve(node_id: int, merged_into: dict[int, int]) -> int:
     return node_id
 
 
-def _shares(scores: Float64 | Int64) -> Float64:
+def _fractions(scores: Float64 | Int64) -> Float64:
     return np.asarray(scores / scores.sum(), np.float64)
 
 
-def _beliefs(shares: Float64, names: Sequence[str]) -> list[wire.Belief]:
-    best = np.argsort(-shares, kind="stable")[:TOLD].tolist()
-    return [wire.Belief(names[place], float(shares[place])) for place in best if shares[place] > 0]
+def _beliefs(fractions: Float64, names: Sequence[str]) -> list[wire.Belief]:
+    best = np.argsort(-fractions, kind="stable")[:TOP_K].tolist()
+    return [
+        wire.Belief(names[place], float(fractions[place])) for place in best if fractions[place] > 0
+    ]

@@ -1,6 +1,6 @@
-"""Kim et al. (3-D Scene Graph, 2019), as it is compared with: box windows, three similarities.
+"""Kim et al. (3-D Scene Graph, 2019): windows of boxes, merged by three similarities.
 
-Written from the published description, with its open choices (docs/evaluation/protocol.md).
+Implemented from the published description; docs/evaluation/protocol.md lists the open choices.
 """
 
 from __future__ import annotations
@@ -19,35 +19,43 @@ from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
 
-# The window around the centre of the box, as a share of the box: of sides shorter than
-# SHORT_SIDE_PX, and of others.
+# Constants of Kim et al., where no other source is given.
+# Side of the window at the centre of a box, as a fraction of the side of the box: for sides shorter
+# than SHORT_SIDE_PX, and for others.
 SHORT_SIDE_PX = 30
-SHORT_SHARE, SHARE = 0.4, 0.2
-FARTHEST_M = 10.0
+SHORT_SIDE_FRACTION, SIDE_FRACTION = 0.4, 0.2
+# Points farther away along any axis are dropped.
+MAX_COORDINATE_M = 10.0
+# A point is an outlier if its mean distance to its neighbours is more than this many standard
+# deviations above the mean of all points.
 NEIGHBOURS = 10
 OUTLIER_SIGMAS = 1.0
-MORE_POINTS_THAN = 10
-# Evaluation points kept of an observation: every n-th of the window's.
+# An object with fewer points in its window is dropped.
+MIN_POINTS = 11
+# Points per observation for the protocol, evenly sampled from the window; the pipeline has as many.
 EVALUATION_POINTS = 64
 
+# Bins per colour channel.
 COLOUR_BINS = 8
 CLASS_WEIGHT, POSITION_WEIGHT, COLOUR_WEIGHT = 0.5, 0.4, 0.1
+# Class similarity by the number of common classes among the best three.
 CLASS_SIMILARITIES = (0.0, 0.8, 0.9, 1.0)
+# Distances are divided by the first; the position similarity is 1 up to the second (0.56 m).
 POSITION_SCALE_M, POSITION_REACH = 5.0, 0.112
-# The description does not give it; see docs/evaluation/protocol.md.
-SIMILARITY_THRESHOLD = 0.9
+# Kim et al. do not state it; docs/evaluation/protocol.md gives the reason for this value.
+MIN_SIMILARITY = 0.9
 
 
 class Kim:
     """Stages b and c of Kim et al.
 
     Args:
-        similarity_threshold: above it the most similar node absorbs.
+        similarity_threshold: the most similar node absorbs a node if it exceeds this.
     """
 
     name = "Kim et al."
 
-    def __init__(self, similarity_threshold: float = SIMILARITY_THRESHOLD) -> None:
+    def __init__(self, similarity_threshold: float = MIN_SIMILARITY) -> None:
         self.similarity_threshold = similarity_threshold
 
     def lift(
@@ -58,11 +66,11 @@ class Kim:
         intrinsics: Intrinsics,
         T_world_camera: Float64,
     ) -> Lifted:
-        """The objects with enough points in the window; drops: ``few_window_points``."""
+        """Nodes of the objects with enough points in their window; drops: ``few_window_points``."""
         nodes, rows, drops = [], [], Counter[str]()
         for row, box in enumerate(frame_graph.boxes_xyxy):
             points_camera = without_outliers(window_points(box, depth_m, intrinsics))
-            if len(points_camera) <= MORE_POINTS_THAN:
+            if len(points_camera) < MIN_POINTS:
                 drops["few_window_points"] += 1
                 continue
             points = points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
@@ -83,7 +91,7 @@ class Kim:
         return Lifted(nodes, rows, drops)
 
     def choose(self, node: BaselineNode, others: Sequence[BaselineNode]) -> int | None:
-        """The most similar node, if similar enough; the first of those that tie."""
+        """Index of the most similar node, of equal ones the first; None if not similar enough."""
         if not others:
             return None
         similarities = self.similarities(node, others)
@@ -91,7 +99,7 @@ class Kim:
         return best if similarities[best] > self.similarity_threshold else None
 
     def similarities(self, node: BaselineNode, others: Sequence[BaselineNode]) -> Float64:
-        """0.5 class + 0.4 position + 0.1 colour of each other node, (n,)."""
+        """0.5 class + 0.4 position + 0.1 colour similarity to each other node, (n,)."""
         top = top_classes(node.class_scores)
         classes = np.array([class_similarity(top, top_classes(o.class_scores)) for o in others])
         means = np.array([other.mean_world for other in others])
@@ -105,12 +113,12 @@ class Kim:
         )
 
     def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
-        """Class vectors and colour histograms are added, moments weighted by points."""
+        """Both nodes in one: sums of class scores and colours, moments weighted by points."""
         return fuse_nodes(keeper, other, keeper.class_scores + other.class_scores)
 
 
 def window_points(box_xyxy: Float64, depth_m: Float32, intrinsics: Intrinsics) -> Float64:
-    """Points (n, 3) of the window around the box's centre, camera frame."""
+    """Points (n, 3) in the window at the centre of the box, metres, camera frame."""
     x1, y1, x2, y2 = box_xyxy.tolist()
     columns = _window(x1, x2, intrinsics.width)
     rows = _window(y1, y2, intrinsics.height)
@@ -118,19 +126,19 @@ def window_points(box_xyxy: Float64, depth_m: Float32, intrinsics: Intrinsics) -
     depths = depth_m[pixels[:, 1], pixels[:, 0]]
     valid = (depths > 0) & np.isfinite(depths)
     points = back_project(pixels[valid], depths[valid], intrinsics)
-    return np.asarray(points[(np.abs(points) <= FARTHEST_M).all(axis=1)])
+    return np.asarray(points[(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)])
 
 
 def _window(low: float, high: float, size: int) -> Int64:
     side = high - low
-    share = SHORT_SHARE if side < SHORT_SIDE_PX else SHARE
-    first = int(low + side * (1 - share) / 2)
-    last = int(low + side * (1 + share) / 2)
+    fraction = SHORT_SIDE_FRACTION if side < SHORT_SIDE_PX else SIDE_FRACTION
+    first = int(low + side * (1 - fraction) / 2)
+    last = int(low + side * (1 + fraction) / 2)
     return np.arange(max(first, 0), min(last + 1, size), dtype=np.int64)
 
 
 def without_outliers(points: Float64) -> Float64:
-    """Points whose mean distance to their 10 neighbours is within 1 σ above the mean of all."""
+    """Points (m, 3) without outliers: mean distance to 10 neighbours at most 1 σ above average."""
     if len(points) <= NEIGHBOURS:
         return points
     distances, _ = cKDTree(points).query(points, NEIGHBOURS + 1)
@@ -139,26 +147,26 @@ def without_outliers(points: Float64) -> Float64:
 
 
 def top_classes(class_scores: Float64) -> frozenset[int]:
-    """The three best classes; not those that only an even spread of the rest put there."""
+    """The three best classes, without classes that tie with the fourth (an evenly spread rest)."""
     order = np.argsort(-class_scores, kind="stable").tolist()
     fourth = class_scores[order[3]] if len(order) > 3 else 0.0
     return frozenset(place for place in order[:3] if class_scores[place] > fourth)
 
 
 def class_similarity(a: frozenset[int], b: frozenset[int]) -> float:
-    """By the number of common members; what neither list names counts as common."""
+    """Similarity by the number of common classes; entries missing in both count as common."""
     common = len(a & b)
     return CLASS_SIMILARITIES[common + 3 - max(len(a), len(b)) if common else 0]
 
 
 def position_similarities(mean: Float64, means: Float64) -> Float64:
-    """Mean over the axes of 1 within 0.56 m, and of 0.56 m / distance beyond, (n,)."""
+    """Mean over the axes of min(1, 0.56 m / distance), (n,)."""
     scaled = np.abs(means - mean) / POSITION_SCALE_M
     return np.asarray((POSITION_REACH / np.maximum(scaled, POSITION_REACH)).mean(axis=1))
 
 
 def colour_histogram(rgb: UInt8, box_xyxy: Float64) -> Int64:
-    """Colours in a box, (512,): 8 bins a channel."""
+    """Colour histogram of a box, (512,): 8 bins per channel."""
     x1, y1, x2, y2 = (int(value) for value in box_xyxy)
     bins = (rgb[y1 : y2 + 1, x1 : x2 + 1].reshape(-1, 3) // (256 // COLOUR_BINS)).astype(np.int64)
     flat = (bins[:, 0] * COLOUR_BINS + bins[:, 1]) * COLOUR_BINS + bins[:, 2]
@@ -166,7 +174,7 @@ def colour_histogram(rgb: UInt8, box_xyxy: Float64) -> Int64:
 
 
 def densest_colour(histogram: Int64) -> tuple[int, int, int]:
-    """RGB of the CSS colour that names a histogram's densest bin."""
+    """RGB of the CSS colour nearest to the densest bin of a histogram."""
     return _named_colour(int(histogram.argmax()))
 
 

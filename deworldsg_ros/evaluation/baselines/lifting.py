@@ -1,4 +1,4 @@
-"""What the baselines' lifting hands on, and the back-projection that they share."""
+"""The output of a baseline's lifting, and the back-projection of the baselines."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Lifted:
     """Nodes of one frame.
 
     Attributes:
-        nodes: what could be lifted.
-        rows: the row of the frame graph that each came from.
-        drops: objects left out, by reason.
+        nodes: lifted nodes.
+        rows: row of the frame graph of each node.
+        drops: number of objects left out, by reason.
     """
 
     nodes: list[BaselineNode]
@@ -29,7 +29,7 @@ class Lifted:
 
 
 def back_project(pixels: Int64, depths_m: NDArray[np.floating], intrinsics: Intrinsics) -> Float64:
-    """Points (n, 3) in the camera frame of pixels (n, 2) column, row, at their depths (n,)."""
+    """Points (n, 3) in the camera frame of pixels (n, 2), column and row, with depths (n,)."""
     depths = np.asarray(depths_m, np.float64)
     x = (pixels[:, 0] - intrinsics.cx) / intrinsics.fx * depths
     y = (pixels[:, 1] - intrinsics.cy) / intrinsics.fy * depths

@@ -1,4 +1,4 @@
-"""A baseline in place of the pipeline: the same detections, depth and poses in, a graph out."""
+"""A baseline in place of the pipeline: same detections, depth and poses in, a graph out."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ class Baseline(Protocol):
         ...
 
     def choose(self, node: BaselineNode, others: Sequence[BaselineNode]) -> int | None:
-        """Place of the node that absorbs `node`; None = none does."""
+        """Index of the node that absorbs `node`, or None."""
         ...
 
     def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
-        """Both in one."""
+        """Both nodes in one."""
         ...
 
 
 class BaselinePipeline:
-    """perceive → lift → merge, a frame at a time.
+    """perceive → lift → merge, one frame at a time.
 
     Args:
-        baseline: how to lift and merge.
-        perceiver: where detections and relations come from.
+        baseline: lifts and merges.
+        perceiver: source of detections and relations.
 
     Attributes:
-        drops: what was left out so far, by reason.
-        times_s: seconds spent in each stage, a list entry a frame.
+        drops: number of objects left out so far, by reason.
+        times_s: seconds of each stage, one entry per frame.
     """
 
     def __init__(self, baseline: Baseline, perceiver: Perceiver) -> None:
@@ -67,35 +67,35 @@ class BaselinePipeline:
         self._graph: BaselineGraph | None = None
 
     def process(self, frame: RgbdFrame) -> list[int]:
-        """Take one frame into the graph; returns the node id of each lifted object."""
+        """Integrate a frame into the graph; returns the node id of each lifted object."""
         with timed(self.times_s["perception"]):
             perceived = self._perceiver.perceive(frame)
-        seen = perceived.frame_graph
+        frame_graph = perceived.frame_graph
         with timed(self.times_s["lifting"]):
             lifted = self._baseline.lift(
-                seen, frame.rgb, frame.depth_m, frame.intrinsics, frame.T_world_camera
+                frame_graph, frame.rgb, frame.depth_m, frame.intrinsics, frame.T_world_camera
             )
         if self._graph is None:
             self._graph = BaselineGraph(
-                seen.vocabulary, frame.frame_id, self._baseline.choose, self._baseline.fuse
+                frame_graph.vocabulary, frame.frame_id, self._baseline.choose, self._baseline.fuse
             )
         with timed(self.times_s["merging"]):
             node_ids = self._graph.integrate(
-                lifted.nodes, between(seen.relations, lifted.rows), frame.stamp_ns
+                lifted.nodes, between(frame_graph.relations, lifted.rows), frame.stamp_ns
             )
         self.drops.update(perceived.drops)
         self.drops.update(lifted.drops)
         return node_ids
 
     def graph(self) -> wire.SceneGraphMessage:
-        """The whole graph so far; raises RefusedInput ``no_frames`` before the first frame."""
+        """The graph so far; raises RefusedInput ``no_frames`` before the first frame."""
         if self._graph is None:
-            raise RefusedInput("no_frames", "no frame was processed: there is no graph")
+            raise RefusedInput("no_frames", "no frame was processed: the graph does not exist yet")
         return self._graph.message()
 
 
 def between(relations: Relations, rows: Sequence[int]) -> Relations:
-    """Relations whose ends are both among these rows, with places in place of rows."""
+    """Relations between these rows of the frame graph, with indices into `rows` as pairs."""
     place_of = {row: place for place, row in enumerate(rows)}
     kept = [
         number

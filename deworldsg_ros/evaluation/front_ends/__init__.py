@@ -1,6 +1,6 @@
-"""Stage a from something else than a network: recorded, or from ground truth.
+"""Front ends: detections and relations from a backend, a recording, or the ground truth.
 
-Each is a `pipeline.Perceiver`, so that lifting and merging are compared on identical input.
+Each is a `pipeline.Perceiver`. Methods of lifting and merging are compared on identical detections.
 """
 
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end

@@ -1,4 +1,4 @@
-"""Detections put together into what stage a hands on."""
+"""Assembly of detections into the output of perception."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from deworldsg_ros.scene.arrays import Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
-# Probabilities are kept this far from 0 and 1 before they become logits.
+# Probabilities are clipped this far from 0 and 1: the logits stay finite (within ±13.8).
 LOGIT_MARGIN = 1e-6
-# An object is there to be detected with so many visible pixels, in a box with sides so long.
-MIN_PIXELS = 200
+# An object is detected from this size on: visible pixels, and both sides of its box.
+# bags/README.md counts an object as visible from the same number of pixels on.
+MIN_VISIBLE_PX = 200
 MIN_BOX_SIDE_PX = 10
 
 
@@ -28,8 +29,8 @@ class Detection:
     Attributes:
         box_xyxy: (4,) pixels.
         class_probabilities: (C,) float64, sums to one.
-        score: the detector's.
-        instance: its value in the frame's instance image.
+        score: confidence of the detector.
+        instance: value of the object in the instance image of the frame.
     """
 
     box_xyxy: Float64
@@ -40,10 +41,12 @@ class Detection:
 
 @dataclass(frozen=True)
 class Relation:
-    """One relation between two detections, by their place.
+    """One relation between two detections.
 
     Attributes:
-        probabilities: (R,) float64 of every predicate.
+        subject, object: indices of the detections.
+        score: confidence of the relation.
+        probabilities: (R,) float64, of every predicate.
     """
 
     subject: int
@@ -53,12 +56,13 @@ class Relation:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What was seen in one frame.
+class FrameDetections:
+    """Detections and relations of one frame.
 
     Attributes:
-        detections, relations: see there; relations name detections by their place.
-        instance_image: (H, W) uint16: the value of each pixel's object.
+        detections: the detections.
+        relations: relations between them, by index.
+        instance_image: (H, W) uint16, value of the object of each pixel.
     """
 
     detections: Sequence[Detection]
@@ -67,13 +71,13 @@ class Seen:
 
 
 def logits(probabilities: Float64) -> Float64:
-    """log(p / (1 - p)) of each, with p kept `LOGIT_MARGIN` away from 0 and 1."""
+    """log(p / (1 - p)) of each probability, clipped to [`LOGIT_MARGIN`, 1 - `LOGIT_MARGIN`]."""
     inside = np.clip(probabilities, LOGIT_MARGIN, 1.0 - LOGIT_MARGIN)
     return np.asarray(np.log(inside / (1.0 - inside)))
 
 
 def spread(stated: Mapping[int, float], count: int) -> Float64:
-    """Distribution (count,) with stated probabilities; what they leave is spread evenly."""
+    """Distribution (count,) with the stated probabilities; the rest is spread evenly."""
     others = count - len(stated)
     left = max(0.0, 1.0 - sum(stated.values()))
     distribution = np.full(count, left / others if others else 0.0)
@@ -83,20 +87,22 @@ def spread(stated: Mapping[int, float], count: int) -> Float64:
 
 
 def visible_box(instances: UInt16, object_id: int) -> Float64 | None:
-    """Corners x1, y1, x2, y2 of an object's pixels; None where too little is visible."""
+    """Box x1, y1, x2, y2 of an object's pixels; None if too few of them are visible."""
     mask = instances == object_id
-    if int(np.count_nonzero(mask)) < MIN_PIXELS:
+    if int(np.count_nonzero(mask)) < MIN_VISIBLE_PX:
         return None
     columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
     box = np.array([columns[0], rows[0], columns[-1], rows[-1]], np.float64)
     return None if (box[2:] - box[:2] < MIN_BOX_SIDE_PX).any() else box
 
 
-def assemble(frame: RgbdFrame, vocabulary: Vocabulary, seen: Seen, top_relations: int) -> Perceived:
-    """A frame graph and its label image.
+def assemble(
+    frame: RgbdFrame, vocabulary: Vocabulary, seen: FrameDetections, top_relations: int
+) -> Perceived:
+    """The frame graph and label image of a frame.
 
-    A mask is the pixels of the instance image with the object's value, cut to the box. Detections
-    are ordered by score, and of the relations the best `top_relations` are kept.
+    A mask is the pixels of the instance image with the value of the object, inside the box.
+    Detections are ordered by score. The `top_relations` relations with the highest score are kept.
     """
     detections, relations = seen.detections, seen.relations
     order = sorted(range(len(detections)), key=lambda place: -detections[place].score)
@@ -133,7 +139,7 @@ def assemble(frame: RgbdFrame, vocabulary: Vocabulary, seen: Seen, top_relations
 
 
 def _cut(instance_image: UInt16, value: int, box_xyxy: Float64) -> MaskPatch:
-    # Every pixel that the box touches.
+    # All pixels that the box touches.
     left, top = np.floor(box_xyxy[:2]).astype(int).tolist()
     right, bottom = np.ceil(box_xyxy[2:]).astype(int).tolist()
     patch = instance_image[top : bottom + 1, left : right + 1]

@@ -1,7 +1,8 @@
-"""Which front end, as plain values that travel to another process."""
+"""The choice of a front end, as picklable values, and the front end that it builds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,16 +34,16 @@ class FrontEndChoice:
     """A front end and its faults.
 
     Attributes:
-        kind: the configured backend, what was recorded, or made from ground truth.
-        flip: share of labels that are wrong.
-        miss: share of detections that are missing.
+        kind: the configured ``backend``, ``recorded`` detections, or ``ground-truth``.
+        flip: fraction of labels that are wrong.
+        miss: fraction of detections that are dropped.
         jitter_px: standard deviation of each box edge, pixels.
-        seed: of the faults.
-        faults: that persist over frames.
+        seed: random seed of the faults.
+        faults: faults that persist over frames.
 
     Raises:
-        EvaluationError: for an unknown kind, what is no share, or faults of a backend, whose
-            detections cannot be told apart.
+        EvaluationError: an unknown kind, a value out of range, or faults of a backend, whose
+            detections have no known objects.
     """
 
     kind: Kind = "backend"
@@ -54,26 +55,26 @@ class FrontEndChoice:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise EvaluationError(f"--front-end {self.kind}: wanted {', '.join(KINDS)}")
-        for name, share in (("--flip", self.flip), ("--miss", self.miss)):
-            if not 0.0 <= share <= 1.0:
-                raise EvaluationError(f"{name} {share:g}: wanted a share from 0 to 1")
+            raise EvaluationError(f"--front-end {self.kind}: expected {', '.join(KINDS)}")
+        for name, fraction in (("--flip", self.flip), ("--miss", self.miss)):
+            if not 0.0 <= fraction <= 1.0:
+                raise EvaluationError(f"{name} {fraction:g}: expected a fraction from 0 to 1")
         if self.jitter_px < 0:
-            raise EvaluationError(f"--jitter {self.jitter_px:g}: wanted 0 or more pixels")
+            raise EvaluationError(f"--jitter {self.jitter_px:g}: expected 0 or more pixels")
         if self.kind == "backend" and self.stated():
             raise EvaluationError(
-                f"--front-end backend with {self.stated()}: wanted recorded or ground-truth, "
-                "which know what each detection is of"
+                f"--front-end backend with {self.stated()}: faults need recorded or ground-truth, "
+                "whose detections have known objects"
             )
 
     def stated(self) -> str:
-        """Its faults in a few words; empty for none."""
+        """The faults, e.g. ``flip 0.1 miss 0.1``; empty without faults."""
         chosen = (("flip", self.flip), ("miss", self.miss), ("jitter", self.jitter_px))
         words = [f"{name} {value:g}" for name, value in chosen if value]
         return " ".join(filter(None, [*words, self.faults.describe()]))
 
     def describe(self) -> str:
-        """In a few words."""
+        """Kind and faults, e.g. ``recorded flip 0.1``."""
         return f"{self.kind} {self.stated()}".rstrip()
 
 
@@ -84,44 +85,32 @@ def build_front_end(
     source: Source,
     config: Config,
 ) -> Perceiver:
-    """The chosen front end for one scan; raises EvaluationError, RecordingError."""
+    """The front end of one scan; raises EvaluationError, RecordingError."""
     if choice.kind == "backend":
-        # Predicates are the data set's, whatever the configuration says.
-        names = {predicates: name for name, predicates in PREDICATE_SETS.items()}
-        predicate_set = names.get(annotations.vocabulary.predicates)
-        perception = config.perception
-        if predicate_set is not None:
-            perception = msgspec.structs.replace(perception, predicate_set=predicate_set)
-        return build_perception(perception, world_up=config.inputs.world_up)
+        return _backend(annotations, config)
     annotation = annotations.scan(scan)
+    frame_numbers = _frame_numbers(annotations, scan, source)
     recorded = choice.kind == "recorded"
     injection = Injection(
         annotations.vocabulary,
         list(annotation.objects.values()),
-        # Flips of a recording are recorded.
+        # Recorded detections have their flipped labels in the file.
         FrameFaults(0.0 if recorded else choice.flip, choice.miss, choice.jitter_px),
         choice.faults,
         choice.seed,
     )
-    top_relations = config.perception.max_relations
-    if isinstance(annotations, RecordedRoom):
-        frame_numbers = annotations.frame_numbers
-    elif isinstance(source, SequenceDataset):
-        frame_numbers = source.frame_numbers
-    else:
-        raise EvaluationError(f"{annotations.scan_folder(scan)}: wanted a scan in 3RScan's layout")
     if recorded:
         if not isinstance(source, SequenceDataset):
             raise EvaluationError(
-                "--front-end recorded: this recording has no recorded detections; wanted backend "
-                "or ground-truth"
+                f"--front-end recorded: {annotations.scan_folder(scan)} has no recorded "
+                "detections; expected backend or ground-truth"
             )
         return RecordedFrontEnd(
             source.sequence,
             frame_numbers,
             annotations.vocabulary,
             flip=choice.flip,
-            top_relations=top_relations,
+            top_relations=config.perception.max_relations,
             injection=injection,
         )
 
@@ -137,6 +126,27 @@ def build_front_end(
         annotations.points(scan),
         annotations.vocabulary,
         seed=choice.seed,
-        top_relations=top_relations,
+        top_relations=config.perception.max_relations,
         injection=injection,
+    )
+
+
+def _backend(annotations: Annotations, config: Config) -> Perceiver:
+    """The configured backend with the predicates of the data set, whatever is configured."""
+    names = {predicates: name for name, predicates in PREDICATE_SETS.items()}
+    predicate_set = names.get(annotations.vocabulary.predicates)
+    perception = config.perception
+    if predicate_set is not None:
+        perception = msgspec.structs.replace(perception, predicate_set=predicate_set)
+    return build_perception(perception, world_up=config.inputs.world_up)
+
+
+def _frame_numbers(annotations: Annotations, scan: str, source: Source) -> Mapping[int, int]:
+    """Number of each frame by its stamp in nanoseconds; raises EvaluationError."""
+    if isinstance(annotations, RecordedRoom):
+        return annotations.frame_numbers
+    if isinstance(source, SequenceDataset):
+        return source.frame_numbers
+    raise EvaluationError(
+        f"{annotations.scan_folder(scan)} is a {source.kind}: expected a scan in 3RScan's layout"
     )

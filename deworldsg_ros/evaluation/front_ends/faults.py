@@ -1,4 +1,4 @@
-"""Faults of detections that persist over frames, made on purpose, as plain values."""
+"""Faults of detections that persist over frames, as picklable values."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from dataclasses import dataclass, fields
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.poses.perturbation import parse_numbers
 
-SHARES = ("label", "bleed", "merge", "cut")
-# False boxes that can be in view at once.
-MOST_FALSE_BOXES = 8
+FRACTIONS = ("label", "bleed", "merge", "cut")
+# Maximum number of false detections at once.
+MAX_FALSE_BOXES = 8
 
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes on being wrong with detections for a while, and how often.
+    """Persistent faults of detections, and their rates.
 
-    Time is cut into spells, for each object and fault at other moments, and a share of them is
-    affected from end to end.
+    Time is divided into spells of equal length, whose start depends on object and fault. A fault
+    affects an object during whole spells.
 
     Attributes:
-        label: share of spells in which an object is called the same other class throughout.
-        false: mean number of boxes in view on what is no object; half of them stay at a place of
-            the room, half move through the image.
-        bleed: share of spells in which a mask takes in a strip of whatever is beside it.
-        merge: share of spells in which a mask takes in all of the neighbour with which it shares
-            the longest border, which is then not detected.
-        cut: share of spells in which a mask covers a part of its object only.
+        label: fraction of spells in which an object has the same wrong class throughout.
+        false: mean number of false boxes in view. Half of them stay at a position in the room, half
+            move through the image.
+        bleed: fraction of spells in which a mask includes a strip around the object.
+        merge: fraction of spells in which a mask includes the neighbour with the longest common
+            border, which is then not detected.
+        cut: fraction of spells in which a mask covers only a part of its object.
         spell_s: length of a spell, seconds.
-        false_s: how long a false box is there, seconds.
+        false_s: duration of a false box, seconds.
 
     Raises:
-        EvaluationError: for what is no share, negative or not finite.
+        EvaluationError: a value is out of range.
     """
 
     label: float = 0.0
@@ -44,18 +44,20 @@ class Faults:
     false_s: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in SHARES:
+        for name in FRACTIONS:
             if not 0.0 <= getattr(self, name) <= 1.0:
-                raise EvaluationError(f"fault {name}={getattr(self, name):g}: wanted 0 to 1")
-        if not 0.0 <= self.false <= MOST_FALSE_BOXES:
-            raise EvaluationError(f"fault false={self.false:g}: wanted 0 to {MOST_FALSE_BOXES}")
+                raise EvaluationError(f"fault {name}={getattr(self, name):g}: expected 0 to 1")
+        if not 0.0 <= self.false <= MAX_FALSE_BOXES:
+            raise EvaluationError(f"fault false={self.false:g}: expected 0 to {MAX_FALSE_BOXES}")
         for name in ("spell_s", "false_s"):
-            # Shorter than a millisecond is shorter than any camera's frame.
+            # A shorter spell is shorter than a frame of any camera.
             if not 1e-3 <= getattr(self, name) < math.inf:
-                raise EvaluationError(f"fault {name}={getattr(self, name):g}: wanted seconds > 0")
+                raise EvaluationError(
+                    f"fault {name}={getattr(self, name):g}: expected at least 0.001 seconds"
+                )
 
     def describe(self) -> str:
-        """What is not as by default: ``label 0.1 spell_s 1``; empty without faults."""
+        """Values other than the defaults, e.g. ``label 0.1 spell_s 1``; empty without faults."""
         names = [field.name for field in fields(self)]
         changed = [name for name in names if getattr(self, name) != getattr(Faults, name)]
         return " ".join(f"{name} {getattr(self, name):g}" for name in changed)

@@ -1,7 +1,7 @@
-"""Detections and relations made from the annotation: perfect, until faults are put in.
+"""Detections and relations from the annotation; perfect without injected faults.
 
-Which pixels are whose comes from the frame's instance image where the data set has one, else from
-the annotated surface point nearest to each depth pixel.
+The masks come from the instance image of the frame. If the data set has none, each depth pixel
+belongs to the object of the nearest annotated surface point.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.assembly import (
     Detection,
+    FrameDetections,
     Relation,
-    Seen,
     assemble,
     spread,
     visible_box,
@@ -27,27 +27,29 @@ from deworldsg_ros.scene.arrays import UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
-# What a detection and a relation are sure of; the rest is spread evenly.
-CERTAINTY = 0.9
-# Relations are ranked by scores drawn from this range, so that all get their turn.
+# Probability of the true class and predicate; the rest is spread evenly.
+TRUE_PROBABILITY = 0.9
+# Range of random relation scores: only the best relations of a frame are kept, and random scores
+# give each relation its turn.
 RELATION_SCORES = (0.8, 1.0)
-# Without instance images: pixels looked at, and how far the nearest annotated point may be.
+# Without instance images: step between the pixels that are looked up, for speed, and maximum
+# distance of the annotated point of a pixel.
 PIXEL_STRIDE = 2
 MAX_DISTANCE_M = 0.05
 
 
 class GroundTruthFrontEnd:
-    """Sees what is annotated.
+    """Detects the annotated objects and relations.
 
     Args:
         frame_numbers: number of each frame by its stamp in nanoseconds.
-        instances: instance image (H, W) of a frame; None where there is none.
-        annotation: the objects and relations.
-        points: the annotated surface points.
-        vocabulary: of the data set.
-        seed: of the scores by which relations are ranked.
-        top_relations: relations kept a frame.
-        injection: puts faults into what is seen; None = none.
+        instances: returns the instance image (H, W) of a frame, or None.
+        annotation: annotated objects and relations of the scan.
+        points: annotated surface points of the scan.
+        vocabulary: classes and predicates of the data set.
+        seed: random seed of the relation scores.
+        top_relations: number of relations kept per frame.
+        injection: injects faults; None = no faults.
     """
 
     def __init__(
@@ -75,10 +77,10 @@ class GroundTruthFrontEnd:
         self._point_ids = points.object_ids[usable]
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
-        """What is annotated of this frame, with the faults."""
+        """Detections and relations of a frame, with faults; raises EvaluationError."""
         number = self._frame_numbers.get(frame.stamp_ns)
         if number is None:
-            raise EvaluationError(f"frame of {frame.stamp_ns} ns is not of this scan")
+            raise EvaluationError(f"frame with the stamp {frame.stamp_ns} ns is not in this scan")
         instances = self._instances(frame)
         if instances is None:
             instances = self._nearest_objects(frame)
@@ -88,9 +90,9 @@ class GroundTruthFrontEnd:
             box = visible_box(instances, object_id)
             if box is not None:
                 places[object_id] = len(detections)
-                scores = spread({class_place: CERTAINTY}, len(self.vocabulary.classes))
-                detections.append(Detection(box, scores, CERTAINTY, object_id))
-        seen = Seen(detections, self._relate(number, places), instances)
+                scores = spread({class_place: TRUE_PROBABILITY}, len(self.vocabulary.classes))
+                detections.append(Detection(box, scores, TRUE_PROBABILITY, object_id))
+        seen = FrameDetections(detections, self._relate(number, places), instances)
         if self._injection is not None:
             seen = self._injection.apply(seen, frame, number)
         return assemble(frame, self.vocabulary, seen, self._top_relations)
@@ -99,7 +101,7 @@ class GroundTruthFrontEnd:
         stated: dict[tuple[int, int], dict[int, float]] = {}
         for subject, object_, predicate in self._annotation.relations:
             if subject in places and object_ in places and subject != object_ and predicate >= 0:
-                stated.setdefault((subject, object_), {})[predicate] = CERTAINTY
+                stated.setdefault((subject, object_), {})[predicate] = TRUE_PROBABILITY
         relations = []
         for (subject, object_), probabilities in stated.items():
             generator = np.random.default_rng([self._seed, 1, number, subject, object_])
@@ -114,7 +116,7 @@ class GroundTruthFrontEnd:
         return relations
 
     def _nearest_objects(self, frame: RgbdFrame) -> UInt16:
-        """Instance image from the annotated point nearest to each depth pixel."""
+        """Instance image (H, W) from the annotated point nearest to each depth pixel."""
         labels = np.zeros(frame.depth_m.shape, np.uint16)
         depth_m = frame.depth_m[::PIXEL_STRIDE, ::PIXEL_STRIDE]
         rows, columns = np.nonzero(depth_m > 0)

@@ -1,8 +1,8 @@
-"""Faults put into detections: those of single frames, and those that persist.
+"""Injection of faults into detections: faults of single frames, and faults that persist.
 
-Every fault is drawn from a generator that is seeded with the seed, the object and the frame or the
-spell, so that a run does not depend on the order of anything, one fault does not change another,
-and two rates of a fault share their draws.
+Each fault has its own random generator, seeded with the seed, the object and the frame or spell.
+Runs are therefore independent of the order of objects, faults are independent of each other, and
+a higher rate of a fault affects a superset of the objects.
 """
 
 from __future__ import annotations
@@ -15,39 +15,41 @@ import numpy as np
 
 from deworldsg_ros.evaluation.front_ends.assembly import (
     Detection,
+    FrameDetections,
     Relation,
-    Seen,
     spread,
     visible_box,
 )
-from deworldsg_ros.evaluation.front_ends.faults import MOST_FALSE_BOXES, Faults
+from deworldsg_ros.evaluation.front_ends.faults import MAX_FALSE_BOXES, Faults
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
-# Draws of one kind do not repeat those of another.
+# Part of the seed: different faults have independent random numbers.
 FRAME, LABEL, BLEED, MERGE, CUT, FALSE = 0, 2, 3, 4, 5, 6
-# Width of the strip that a bleeding mask takes in, and how near a neighbour's pixels are.
+# Width of the strip that a bleeding mask includes.
 BLEED_PX = 10
+# Two objects have a common border if their pixels are this near: masks may have gaps between them.
 BORDER_PX = 3
-# What is left of an object that is cut, along one side of its box.
-CUT_LEAVES = (0.4, 0.7)
-# A false box: certainty, size in the room or in the image, and pixels a second where it moves.
-FALSE_CERTAINTY = (0.70, 0.97)
+# Range of the fraction that a cut mask keeps of the width or height of its object.
+CUT_KEEPS = (0.4, 0.7)
+# False boxes: ranges of the score, of the side in the room and in the image, and speed per second.
+# They are as large as household objects and as confident as true detections.
+FALSE_SCORE = (0.70, 0.97)
 FALSE_SIZE_M = (0.15, 0.6)
 FALSE_SIZE_PX = (40.0, 160.0)
-FALSE_SPEED_PX = 150.0
-# Values of false boxes in an instance image: the last ones that 16 bits have.
-FIRST_FALSE = np.iinfo(np.uint16).max - MOST_FALSE_BOXES + 1
+FALSE_SPEED_PX_PER_S = 150.0
+# Values of false boxes in an instance image: the highest values of 16 bits, unused by objects.
+FIRST_FALSE = np.iinfo(np.uint16).max - MAX_FALSE_BOXES + 1
 
 
 @dataclass(frozen=True)
 class FrameFaults:
-    """Faults that are drawn anew in each frame.
+    """Faults that are independent from frame to frame.
 
     Attributes:
-        flip: share of labels that are wrong.
-        miss: share of detections that are missing.
+        flip: fraction of labels that are wrong.
+        miss: fraction of detections that are dropped.
         jitter_px: standard deviation of each box edge, pixels.
     """
 
@@ -57,15 +59,15 @@ class FrameFaults:
 
 
 class Injection:
-    """Makes what was seen in one frame after another worse.
+    """Injects faults into the detections of one frame after another.
 
     Args:
-        vocabulary: of the detections.
-        room_classes: places of the classes that occur in the room: what a false box, or an object
-            whose detection names no look-alikes, may be called.
-        frame_faults: of single frames.
-        faults: that persist.
-        seed: of all of them.
+        vocabulary: classes of the detections.
+        room_classes: indices of the classes that occur in the room. They are the labels of false
+            boxes, and the wrong labels of detections without second choices.
+        frame_faults: faults of single frames.
+        faults: faults that persist.
+        seed: random seed of all faults.
     """
 
     def __init__(
@@ -83,31 +85,31 @@ class Injection:
         self._seed = seed
         self._anchors: dict[tuple[int, int], Float64] = {}
 
-    def apply(self, seen: Seen, frame: RgbdFrame, number: int) -> Seen:
-        """What is seen of the frame with this number, with all faults."""
+    def apply(self, seen: FrameDetections, frame: RgbdFrame, number: int) -> FrameDetections:
+        """The detections of a frame with all faults; `number` is the number of the frame."""
         stamp_s = 1e-9 * frame.stamp_ns
         seen = self._spoil_masks(seen, stamp_s)
         detections: list[Detection | None] = []
         for item in seen.detections:
-            called = self._mislabel(item, stamp_s)
-            detections.append(self._disturb(called, number, frame))
+            labelled = self._mislabel(item, stamp_s)
+            detections.append(self._disturb(labelled, number, frame))
         seen = keep(seen, detections)
         return self._add_false(seen, frame, stamp_s) if self._faults.false else seen
 
     def _spell(self, kind: int, object_id: int, stamp_s: float, length_s: float) -> int:
-        """Number of the spell at this time; each object's begin at moments of their own."""
+        """Number of the spell at this time; the start of spells depends on object and fault."""
         phase = np.random.default_rng([self._seed, kind, object_id]).random()
         return int(stamp_s / length_s + phase)
 
     def _affected(
-        self, kind: int, share: float, object_id: int, stamp_s: float
+        self, kind: int, fraction: float, object_id: int, stamp_s: float
     ) -> np.random.Generator | None:
-        """The generator of the object's spell, where the fault is in it."""
-        if not share:
+        """The generator of the spell if the fault affects the object in it, else None."""
+        if not fraction:
             return None
         spell = self._spell(kind, object_id, stamp_s, self._faults.spell_s)
         generator = np.random.default_rng([self._seed, kind, object_id, spell])
-        return generator if generator.random() < share else None
+        return generator if generator.random() < fraction else None
 
     def _mislabel(self, item: Detection, stamp_s: float) -> Detection:
         generator = self._affected(LABEL, self._faults.label, item.instance, stamp_s)
@@ -115,15 +117,15 @@ class Injection:
             return item
         probabilities = item.class_probabilities
         best = int(probabilities.argmax())
-        # A detector that names look-alikes gives them more than what is left for all the others.
+        # Second choices of the detector: classes above the evenly spread rest of the probability.
         others = np.flatnonzero(probabilities > 1.001 * probabilities.min())
         others = others[others != best]
         if not len(others):
             others = np.array([place for place in self._room_classes if place != best], np.int64)
-        return item if not len(others) else called(item, int(generator.choice(others)))
+        return item if not len(others) else relabelled(item, int(generator.choice(others)))
 
     def _disturb(self, item: Detection, number: int, frame: RgbdFrame) -> Detection | None:
-        """The faults of a single frame; None where the object is missed."""
+        """The detection with the faults of a single frame; None if it is dropped."""
         generator = np.random.default_rng([self._seed, FRAME, number, item.instance])
         missed, flipped = generator.random(2)
         edges = generator.normal(size=4)
@@ -132,15 +134,15 @@ class Injection:
         if flipped < self._frame_faults.flip and self._class_count > 1:
             best = int(item.class_probabilities.argmax())
             other = int(generator.integers(self._class_count - 1))
-            item = called(item, other + (other >= best))
+            item = relabelled(item, other + (other >= best))
         if not self._frame_faults.jitter_px:
             return item
         size = [frame.intrinsics.width - 1.0, frame.intrinsics.height - 1.0] * 2
         box = np.clip(item.box_xyxy + self._frame_faults.jitter_px * edges, 0.0, size)
         return None if (box[2:] - box[:2] < 1.0).any() else replace(item, box_xyxy=box)
 
-    def _spoil_masks(self, seen: Seen, stamp_s: float) -> Seen:
-        """Masks that take in a neighbour, are cut, or bleed."""
+    def _spoil_masks(self, seen: FrameDetections, stamp_s: float) -> FrameDetections:
+        """Merge, cut and bleed masks."""
         faults = self._faults
         if not (faults.merge or faults.cut or faults.bleed):
             return seen
@@ -153,7 +155,7 @@ class Injection:
         for object_id in sorted(ids):
             generator = self._affected(CUT, faults.cut, object_id, stamp_s)
             if generator is not None:
-                _cut(image, object_id, int(generator.integers(4)), generator.uniform(*CUT_LEAVES))
+                _cut(image, object_id, int(generator.integers(4)), generator.uniform(*CUT_KEEPS))
         before = image.copy()
         for object_id in sorted(ids):
             if self._affected(BLEED, faults.bleed, object_id, stamp_s) is not None:
@@ -166,22 +168,24 @@ class Injection:
             detections.append(None if box is None else replace(item, box_xyxy=box))
         return keep(replace(seen, instance_image=image), detections)
 
-    def _add_false(self, seen: Seen, frame: RgbdFrame, stamp_s: float) -> Seen:
-        """Boxes on what belongs to no detection."""
+    def _add_false(
+        self, seen: FrameDetections, frame: RgbdFrame, stamp_s: float
+    ) -> FrameDetections:
+        """Add false boxes on the background."""
         if not self._room_classes:
             return seen
         image = seen.instance_image.copy()
         background = ~np.isin(image, [item.instance for item in seen.detections])
         background &= frame.depth_m > 0
         detections = list(seen.detections)
-        for place in range(MOST_FALSE_BOXES):
+        for place in range(MAX_FALSE_BOXES):
             length_s = self._faults.false_s
             spell = self._spell(FALSE, place, stamp_s, length_s)
             generator = np.random.default_rng([self._seed, FALSE, place, spell])
-            if generator.random() * MOST_FALSE_BOXES >= self._faults.false:
+            if generator.random() * MAX_FALSE_BOXES >= self._faults.false:
                 continue
             class_place = int(generator.choice(self._room_classes))
-            certainty = float(generator.uniform(*FALSE_CERTAINTY))
+            certainty = float(generator.uniform(*FALSE_SCORE))
             age_s = stamp_s - (spell - self._phase(place)) * length_s
             region = (
                 self._staying(generator, (place, spell), frame, background)
@@ -211,7 +215,7 @@ class Injection:
         frame: RgbdFrame,
         background: Bool,
     ) -> Bool | None:
-        """A cube of the room around what the first frame of the spell showed at some pixel."""
+        """Pixels of a cube fixed in the room, at a surface point of the spell's first frame."""
         camera = frame.intrinsics
         half_m = generator.uniform(*FALSE_SIZE_M) / 2
         rows, columns = np.nonzero(background)
@@ -235,16 +239,16 @@ class Injection:
         return region & (np.abs(frame.depth_m - z) < half_m)
 
 
-def called(item: Detection, class_place: int) -> Detection:
-    """The detection with its likeliest class and another one exchanged."""
+def relabelled(item: Detection, class_place: int) -> Detection:
+    """The detection with the probabilities of its best class and of another class swapped."""
     probabilities = item.class_probabilities.copy()
     best = int(probabilities.argmax())
     probabilities[[best, class_place]] = probabilities[[class_place, best]]
     return replace(item, class_probabilities=probabilities)
 
 
-def keep(seen: Seen, detections: Sequence[Detection | None]) -> Seen:
-    """What was seen with other detections in place of its own; None leaves one out."""
+def keep(seen: FrameDetections, detections: Sequence[Detection | None]) -> FrameDetections:
+    """The frame with these detections instead of its own, in the same order; None drops one."""
     kept = [place for place, item in enumerate(detections) if item is not None]
     new_place = {place: new for new, place in enumerate(kept)}
     relations = [
@@ -252,11 +256,13 @@ def keep(seen: Seen, detections: Sequence[Detection | None]) -> Seen:
         for item in seen.relations
         if item.subject in new_place and item.object in new_place
     ]
-    return Seen([item for item in detections if item is not None], relations, seen.instance_image)
+    return FrameDetections(
+        [item for item in detections if item is not None], relations, seen.instance_image
+    )
 
 
 def _neighbour(image: UInt16, object_id: int, ids: Sequence[int]) -> int:
-    """The detected object with most pixels beside this one; itself where there is none."""
+    """The detected object with most pixels at the border of this one; itself if there is none."""
     beside = image[_grown(image == object_id, BORDER_PX)]
     values, counts = np.unique(beside, return_counts=True)
     others = np.isin(values, ids) & (values != object_id)
@@ -268,26 +274,26 @@ def _grown(mask: Bool, by_px: int) -> Bool:
     return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
-def _cut(image: UInt16, object_id: int, side: int, left_over: float) -> None:
-    """Leave of an object's pixels a share of its extent: the left, right, upper or lower part."""
+def _cut(image: UInt16, object_id: int, side: int, kept_fraction: float) -> None:
+    """Keep the left, right, upper or lower part of an object's pixels in the image."""
     rows, columns = np.nonzero(image == object_id)
     if not len(rows):
         return
     along = columns if side < 2 else rows
     if side % 2:
         along = -along
-    edge = along.min() + left_over * (along.max() - along.min())
-    gone = along > edge
-    image[rows[gone], columns[gone]] = 0
+    edge = along.min() + kept_fraction * (along.max() - along.min())
+    removed = along > edge
+    image[rows[removed], columns[removed]] = 0
 
 
 def _moving(generator: np.random.Generator, age_s: float, frame: RgbdFrame) -> Bool | None:
-    """A box that moves through the image, begun anywhere in it."""
+    """Pixels of a box that moves through the image at constant speed; None outside the image."""
     height, width = frame.depth_m.shape
     centre = generator.random(2) * (width, height)
     heading = 2 * np.pi * generator.random()
     half = generator.uniform(*FALSE_SIZE_PX, size=2) / 2
-    centre = centre + FALSE_SPEED_PX * age_s * np.array([np.cos(heading), np.sin(heading)])
+    centre = centre + FALSE_SPEED_PX_PER_S * age_s * np.array([np.cos(heading), np.sin(heading)])
     (left, top), (right, bottom) = centre - half, centre + half
     region = np.zeros((height, width), bool)
     region[_span(top, bottom, height), _span(left, right, width)] = True

@@ -1,14 +1,16 @@
-"""What recall leaves out: precision, duplicates, position, extent, edges, calibration.
+"""Measures beside recall: precision, duplicates, position, extent, edges, calibration.
 
-docs/evaluation/protocol.md defines every measure. Counts are kept, so that scans can be pooled.
+docs/evaluation/protocol.md defines every measure. `Measures` stores counts, so that several scans
+can be pooled.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,15 +22,17 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 
 __all__ = ["Measures", "ReferenceScene", "measure", "measure_prediction", "pool", "read_reference"]
 
-# A node belongs to an object when its mean is in the object's box, grown by this on every side.
+# A node is in the box of an object if its mean is; the box is this much larger on every side,
+# because the mean of a visible surface may lie on the box.
 BOX_MARGIN_M = 0.05
-# A node's extent is between these quantiles of its surface points: single stray points are not it.
+# The extent of a node lies between these quantiles of its surface points: single outliers in depth
+# do not count.
 EXTENT_QUANTILES = (0.02, 0.98)
 CALIBRATION_BINS = 10
 
 
 class NodeView(NamedTuple):
-    """What the measures look at in a node; `weight` decides which of several is the main one."""
+    """A node as the measures see it; the main node of an object has the largest `weight`."""
 
     id: int
     label: str
@@ -39,7 +43,7 @@ class NodeView(NamedTuple):
 
 
 class EdgeView(NamedTuple):
-    """What the measures look at in an edge: ends by node id, best predicate and its probability."""
+    """An edge as the measures see it: node ids, best predicate and its probability."""
 
     subject: int
     object: int
@@ -48,7 +52,7 @@ class EdgeView(NamedTuple):
 
 
 class Calibrated(NamedTuple):
-    """A stated probability and whether it came true."""
+    """A predicted probability and whether the prediction is right."""
 
     probability: float
     right: bool
@@ -59,23 +63,24 @@ class Measures:
     """Counts and samples of one scan or of several.
 
     Attributes:
-        objects: annotated objects that a perfect run finds.
+        objects: annotated objects that can be detected.
         nodes: of the graph.
         found: objects with at least one node.
-        matched: nodes of the class of an object whose box their mean is in.
-        wrong_class: nodes in the box of an object, but of none of their class.
-        stray: nodes in no box.
+        matched: nodes whose mean is in the box of an object of their class.
+        wrong_class: nodes whose mean is only in boxes of objects of other classes.
+        stray: nodes whose mean is in no box.
         edges: of the graph.
         edges_between: edges whose ends are matched to two objects.
         edges_right: of those, the ones whose best predicate is annotated.
-        relations: annotated relations between objects that a perfect run finds.
+        relations: annotated relations between objects that can be detected.
         relations_found: of those, the ones that a right edge states.
-        best_errors_m, main_errors_m: distance of mean and visible centroid, of each object found.
-        extent_errors_m: mean over the axes of the difference of extents, main nodes.
-        box_ious: overlap of the boxes, main nodes.
-        edge_beliefs, node_beliefs: probabilities of best predicates of edges between objects and
-            of best classes of nodes in a box.
-        confusion: (annotated class, predicted class) of nodes that are in one object's box.
+        best_errors_m, main_errors_m: distance of node mean and visible centroid, metres, of the
+            nearest and of the main node of each object found.
+        extent_errors_m: absolute difference of extents, mean over the axes, of main nodes.
+        box_ious: intersection over union of boxes, of main nodes.
+        edge_beliefs, node_beliefs: probability of the best predicate of edges between objects, and
+            of the best class of nodes in a box; with whether it is right.
+        confusion: (annotated class, predicted class) of nodes in a box.
     """
 
     objects: int = 0
@@ -136,7 +141,7 @@ class Measures:
 
 
 def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measures:
-    """Hold a scene graph against the objects of its scan."""
+    """Measures of a scene graph against the objects of its scan."""
     nodes = [
         NodeView(
             node.id,
@@ -144,7 +149,7 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
             node.classes[0].probability,
             np.array(node.mean_m),
             np.array(node.surface_points_m, np.float64).reshape(-1, 3),
-            # Of equally often seen nodes the one with more points.
+            # Between nodes with equal numbers of observations, the points decide.
             node.observations + 1e-6 * len(node.surface_points_m),
         )
         for node in graph.nodes
@@ -159,10 +164,10 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
 def measure_prediction(
     prediction: ScanPrediction, vocabulary: Vocabulary, reference: ReferenceScene
 ) -> Measures:
-    """The same for a prediction: a node is at the median of its points, its weight their number.
+    """Measures of a prediction against the objects of its scan.
 
-    The median, because a few wild points among them are common and must not move it.
-    Nodes without a finite point are nowhere: they count, as stray ones.
+    The position of a node is the median of its points, because predictions often have outliers. Its
+    weight is the number of its points. A node without a finite point counts as stray.
     """
     nodes = []
     for place, points in enumerate(prediction.points_world):
@@ -180,25 +185,63 @@ def measure_prediction(
 def measure_views(
     nodes: Sequence[NodeView], edges: Sequence[EdgeView], reference: ReferenceScene
 ) -> Measures:
-    """The measures of nodes and edges, see the module."""
-    nodes_of: dict[int, list[NodeView]] = {}
-    object_of: dict[int, int] = {}
-    confusion: list[tuple[str, str]] = []
-    node_beliefs: list[Calibrated] = []
-    counts = {"matched": 0, "wrong_class": 0, "stray": 0}
+    """Measures of nodes and edges against the objects of a scan."""
+    assignment = _assign(nodes, reference)
+    return Measures(
+        objects=len(reference),
+        nodes=len(nodes),
+        found=len(assignment.nodes_of),
+        matched=assignment.counts["matched"],
+        wrong_class=assignment.counts["wrong_class"],
+        stray=assignment.counts["stray"],
+        **_edge_measures(edges, assignment.object_of, reference),
+        **_geometric_errors(assignment.nodes_of, reference),
+        node_beliefs=assignment.beliefs,
+        confusion=assignment.confusion,
+    )
+
+
+@dataclass
+class _Assignment:
+    """Nodes assigned to objects.
+
+    Attributes:
+        nodes_of: nodes of the right class by row of their object.
+        object_of: id of the object by id of its node.
+        counts: nodes that are matched, of a wrong class, or stray.
+        beliefs: probability of the best class of each node in a box, and whether it is right.
+        confusion: (annotated class, predicted class) of each node in a box.
+    """
+
+    nodes_of: dict[int, list[NodeView]] = field(default_factory=dict)
+    object_of: dict[int, int] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    beliefs: list[Calibrated] = field(default_factory=list)
+    confusion: list[tuple[str, str]] = field(default_factory=list)
+
+
+def _assign(nodes: Sequence[NodeView], reference: ReferenceScene) -> _Assignment:
+    """Assign each node to the nearest object whose box it is in, of its own class if possible."""
+    result = _Assignment()
     for node in nodes:
         inside = _objects_around(node.mean_m, reference)
         own = [row for row in inside if reference.labels[row] == node.label]
-        counts["matched" if own else "wrong_class" if inside else "stray"] += 1
+        result.counts["matched" if own else "wrong_class" if inside else "stray"] += 1
         if not inside:
             continue
-        node_beliefs.append(Calibrated(node.probability, bool(own)))
+        result.beliefs.append(Calibrated(node.probability, bool(own)))
         row = _nearest(node.mean_m, own or inside, reference)
-        confusion.append((reference.labels[row], node.label))
+        result.confusion.append((reference.labels[row], node.label))
         if own:
-            nodes_of.setdefault(row, []).append(node)
-            object_of[node.id] = reference.ids[row]
+            result.nodes_of.setdefault(row, []).append(node)
+            result.object_of[node.id] = reference.ids[row]
+    return result
 
+
+def _geometric_errors(
+    nodes_of: Mapping[int, Sequence[NodeView]], reference: ReferenceScene
+) -> dict[str, Any]:
+    """Errors of position and extent, and box overlaps, by name of the measure."""
     best_errors, main_errors, extent_errors, ious = [], [], [], []
     for row, matched in sorted(nodes_of.items()):
         errors = [float(np.linalg.norm(n.mean_m - reference.centroids[row])) for n in matched]
@@ -210,42 +253,42 @@ def measure_views(
             box = reference.boxes_min[row], reference.boxes_max[row]
             extent_errors.append(float(np.abs((high - low) - (box[1] - box[0])).mean()))
             ious.append(_box_iou((low, high), box))
+    return {
+        "best_errors_m": best_errors,
+        "main_errors_m": main_errors,
+        "extent_errors_m": extent_errors,
+        "box_ious": ious,
+    }
 
-    between = [
-        (object_of[edge.subject], object_of[edge.object], edge)
+
+def _edge_measures(
+    edges: Sequence[EdgeView], object_of: Mapping[int, int], reference: ReferenceScene
+) -> dict[str, Any]:
+    """Counts and beliefs of edges by name of the measure."""
+    judged = [
+        ((object_of[edge.subject], object_of[edge.object], edge.predicate), edge.probability)
         for edge in edges
         if edge.subject in object_of
         and edge.object in object_of
         and object_of[edge.subject] != object_of[edge.object]
     ]
-    judged = [((s, o, edge.predicate), edge.probability) for s, o, edge in between]
     known = set(reference.ids)
-    wanted = {item for item in reference.relations if {item[0], item[1]} <= known}
+    expected = {item for item in reference.relations if {item[0], item[1]} <= known}
     right = [triple for triple, _ in judged if triple in reference.relations]
-    return Measures(
-        objects=len(reference),
-        nodes=len(nodes),
-        found=len(nodes_of),
-        **counts,
-        edges=len(edges),
-        edges_between=len(between),
-        edges_right=len(right),
-        relations=len(wanted),
-        relations_found=len(wanted & set(right)),
-        best_errors_m=best_errors,
-        main_errors_m=main_errors,
-        extent_errors_m=extent_errors,
-        box_ious=ious,
-        edge_beliefs=[
+    return {
+        "edges": len(edges),
+        "edges_between": len(judged),
+        "edges_right": len(right),
+        "relations": len(expected),
+        "relations_found": len(expected & set(right)),
+        "edge_beliefs": [
             Calibrated(probability, triple in reference.relations) for triple, probability in judged
         ],
-        node_beliefs=node_beliefs,
-        confusion=confusion,
-    )
+    }
 
 
 def pool(measures: Iterable[Measures]) -> Measures:
-    """The measures of all scans together: counts are added, samples joined."""
+    """Measures over all scans: sums of counts, concatenated samples."""
     totals = Measures()
     for item in measures:
         totals = Measures(
@@ -255,7 +298,7 @@ def pool(measures: Iterable[Measures]) -> Measures:
 
 
 def calibration_error(beliefs: Sequence[Calibrated]) -> float:
-    """Expected calibration error over ten equal bins of probability; NaN without beliefs."""
+    """Expected calibration error, Σ |right - probability| by bin / n; NaN without beliefs."""
     if not beliefs:
         return math.nan
     probabilities = np.array([item.probability for item in beliefs])
@@ -289,7 +332,7 @@ def _box_iou(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:
 
 
 def _top(scores: Float64, names: Sequence[str]) -> tuple[str, float]:
-    """The best label, the last of equals, and its share of all scores."""
+    """The label of the highest score (of equal ones the last), and its fraction of the sum."""
     if not len(scores):
         return "", 0.0
     place = len(scores) - 1 - int(np.argmax(scores[::-1]))

@@ -1,4 +1,4 @@
-"""Where the annotated objects of a scan are: for the measures beside the protocol."""
+"""Annotated positions of the objects of a scan, for the measures beside the protocol."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from deworldsg_ros.scene.arrays import Float64
 
 @dataclass(frozen=True)
 class ReferenceScene:
-    """The objects of a scan that a perfect run would find (n objects), and their relations.
+    """The n objects of a scan that can be detected, and their relations.
 
     Attributes:
-        ids: of the annotation.
+        ids: ids of the annotation.
         labels: class names.
         boxes_min, boxes_max: (n, 3) float64, metres, world: axis-aligned boxes.
-        centroids: (n, 3) float64, metres, world: of the surface, the visible one where known.
-        relations: (subject id, object id, predicate name), all that hold.
-        exact: whether boxes and centroids come from the objects themselves rather than from
-            annotated surface points.
+        centroids: (n, 3) float64, metres, world: centroid of the visible surface, or of the whole
+            surface if the visible part is unknown.
+        relations: (subject id, object id, predicate name) of every true relation.
+        exact: True if boxes and centroids come from the ground truth of a rendered room, False if
+            they come from annotated surface points.
     """
 
     ids: list[int]
@@ -39,12 +40,12 @@ class ReferenceScene:
 
 
 def read_reference(annotations: Annotations, scan: str, points: ScanPoints) -> ReferenceScene:
-    """From the room's gt.json where there is one, else from the annotated surface points.
+    """The reference of a scan: from its gt.json, or else from the annotated surface points.
 
-    An object without a surface point cannot be placed and is left out.
+    An object without surface points is left out.
 
     Raises:
-        RecordingError: for a gt.json that lacks something.
+        RecordingError: a field of gt.json is missing or invalid.
     """
     content = annotations.ground_truth(scan)
     if content is None:

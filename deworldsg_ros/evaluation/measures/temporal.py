@@ -1,10 +1,10 @@
-"""How steady the graph is over time: what a client of /scene_graph/updates has to put up with.
+"""Stability of the graph over time, as a client of /scene_graph/updates sees it.
 
 * An *id switch*: an object of the ground truth is associated with another node than before, and
-  no update has said that the one became the other.
-* A *label flip*: a node shows another label than the update before.
-* An *edge flip*: two nodes that were related are related by another predicate, or the other way
-  round; also after a time without an edge.
+  no update reports that the two nodes were merged.
+* A *label flip*: a node has another label than in the previous update.
+* An *edge flip*: two related nodes have another predicate or direction than before, also after a
+  time without an edge.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from deworldsg_ros.recordings.folders.instances import read_instances
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import UInt16
 
-# Pixels that a detection and an object of the ground truth have to share, of the detection's.
-LEAST_SHARE = 0.5
+# A detection shows an object of the ground truth if at least half of its pixels do.
+MIN_PIXEL_FRACTION = 0.5
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class TemporalQuality:
     """Counts over a stream of updates.
 
     Attributes:
-        duration_s: from the first to the last stamp.
-        updates: their number.
-        associations: detections with a known object of the ground truth; 0 where there is none.
-        id_switches: None without ground truth.
+        duration_s: time from the first to the last stamp.
+        updates: number of updates.
+        associations: detections with a known object of the ground truth.
+        id_switches: see the module; None without ground truth.
         label_flips, edge_flips: see the module.
-        merges: nodes that went into others, as told by updates.
-        removals: nodes that went without a successor.
+        merges: nodes that were merged into others.
+        removals: nodes that were removed without a merge.
     """
 
     duration_s: float
@@ -49,7 +49,7 @@ class TemporalQuality:
     removals: int
 
     def per_minute(self, count: int | None) -> float | None:
-        """A count a minute of the stream; None where it is unknown or the stream has no length."""
+        """A count per minute; None if the count is unknown or the stream has no duration."""
         return None if count is None or self.duration_s <= 0 else 60.0 * count / self.duration_s
 
     def numbers(self) -> dict[str, Any]:
@@ -79,12 +79,12 @@ def measure_stream(
     """Count switches and flips.
 
     Args:
-        updates: in order.
-        true_ids: by the stamp of a frame, nanoseconds, the object of the ground truth that each
-            row of its local graph is; 0 = none.
+        updates: updates in order of time.
+        true_ids: by stamp of a frame in nanoseconds, the ids of the true objects of the rows of
+            its local graph; 0 = none.
 
     Raises:
-        ValueError: where a frame's rows are not as many as its associations.
+        ValueError: a frame has different numbers of rows and associations.
     """
     stream = _Stream(true_ids or {})
     for update in updates:
@@ -97,7 +97,7 @@ class _Stream:
         self._true_ids = true_ids
         self._labels: dict[int, str] = {}
         self._edges: dict[tuple[int, int], str] = {}
-        # What each pair was last related by, also when it is no longer.
+        # The last relations of each pair, kept after its edges are removed.
         self._related: dict[tuple[int, int], Triples] = {}
         self._successors: dict[int, int] = {}
         self._node_of: dict[int, int] = {}
@@ -107,7 +107,7 @@ class _Stream:
         self._label_flips = self._edge_flips = self._merges = self._removals = 0
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
-        """Take the next update."""
+        """Count the changes of the next update."""
         self._updates += 1
         self._last_ns = wire.ns_from_stamp(update.stamp)
         if self._first_ns is None:
@@ -150,8 +150,7 @@ class _Stream:
             if len(objects) != len(item.nodes):
                 raise ValueError(
                     f"frame of {item.stamp.sec}.{item.stamp.nanosec:09d} s has {len(objects)} "
-                    f"objects of the ground truth and {len(item.nodes)} associations: wanted as "
-                    "many"
+                    f"true objects and {len(item.nodes)} associations: expected equal numbers"
                 )
             for object_id, node_id in zip(objects, item.nodes):
                 if object_id and node_id:
@@ -168,9 +167,9 @@ class _Stream:
 
     def _relate(self, update: wire.SceneGraphUpdateMessage) -> None:
         touched = set()
-        for gone in update.removed_edges:
-            self._edges.pop((gone.subject, gone.object), None)
-            touched.add(_pair(gone.subject, gone.object))
+        for removed in update.removed_edges:
+            self._edges.pop((removed.subject, removed.object), None)
+            touched.add(_pair(removed.subject, removed.object))
         for edge in update.edges:
             self._edges[edge.subject, edge.object] = edge.predicate
             touched.add(_pair(edge.subject, edge.object))
@@ -188,28 +187,28 @@ def _pair(a: int, b: int) -> tuple[int, int]:
 
 
 def true_objects(instance_ids: Sequence[int], instances: UInt16, truth: UInt16) -> list[int]:
-    """The object of the ground truth that most pixels of each detection show; 0 = none does.
+    """The true object that most pixels of each detection show; 0 = none.
 
     Args:
         instance_ids: values of the detections in the instance image.
-        instances: (H, W) uint16, what was detected.
-        truth: (H, W) uint16, what is there; 0 = nothing.
+        instances: (H, W) uint16, instance image of the detections.
+        truth: (H, W) uint16, instance image of the ground truth; 0 = no object.
     """
     objects = []
     for instance in instance_ids:
         shown = truth[instances == instance]
         values, counts = np.unique(shown, return_counts=True)
         best = int(np.argmax(counts)) if len(counts) else -1
-        is_clear = best >= 0 and counts[best] >= LEAST_SHARE * len(shown)
+        is_clear = best >= 0 and counts[best] >= MIN_PIXEL_FRACTION * len(shown)
         objects.append(int(values[best]) if is_clear else 0)
     return objects
 
 
 class UpdateLog:
-    """Takes the updates of a run at their rate, as the graph node would, and what they are about.
+    """Records the updates of a run, at the rate at which the graph node publishes them.
 
     Args:
-        rate_hz: updates a second of recorded time.
+        rate_hz: updates per second of recorded time.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -220,7 +219,7 @@ class UpdateLog:
         self._builder: GraphBuilder | None = None
 
     def note(self, builder: GraphBuilder, source: object, result: FrameResult) -> None:
-        """Take a frame's part; the source's instance images are the ground truth, if it has any."""
+        """Record a frame. Instance images of the source are the ground truth, if it has any."""
         self._builder = builder
         stamp_ns = result.local.stamp_ns
         truth = read_instances(source, stamp_ns)
@@ -233,7 +232,7 @@ class UpdateLog:
             self._due_ns = stamp_ns + self._period_ns
 
     def quality(self) -> TemporalQuality:
-        """What was measured."""
+        """Stability over all recorded frames."""
         self._take()
         return measure_stream(self._updates, self._true_ids or None)
 

@@ -1,9 +1,8 @@
-"""Labels of a detector in the words of a data set.
+"""Translation of detector labels to the classes of a data set.
 
-The protocol counts classes of the data set. A detector that was trained on others (COCO) is
-translated: a label that is a class stays; else the data set's own mapping from labels to classes
-is asked; else the synonyms below. A label without a counterpart stays what it is, and its
-probability is on no class.
+The protocol scores classes of the data set. A label that is a class stays. Other labels (of COCO)
+are translated by the data set's own mapping, else by the synonyms below. A label without a
+translation stays, and its probability counts for no class.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import msgspec
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.scene import wire
 
-# COCO's names to labels that the mappings of the data sets know, or to their classes.
+# COCO classes to labels or classes of the data sets, the first known one counts.
 SYNONYMS: dict[str, tuple[str, ...]] = {
     "apple": ("fruit",),
     "bicycle": ("bike",),
@@ -30,7 +29,7 @@ SYNONYMS: dict[str, tuple[str, ...]] = {
 
 
 def translation(annotations: Annotations) -> dict[str, str]:
-    """Class of every label that has one but is none itself."""
+    """Class by label, for labels that are not classes themselves."""
     classes = set(annotations.vocabulary.classes)
     known = {label: name for label, name in annotations.class_of_label.items() if name in classes}
     for label, names in SYNONYMS.items():
@@ -42,7 +41,7 @@ def translation(annotations: Annotations) -> dict[str, str]:
 
 
 def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.SceneGraphMessage:
-    """The graph with the class labels of the data set; probabilities of one class are added."""
+    """The graph with classes of the data set; probabilities of labels of one class are added."""
     names = translation(annotations)
     if not any(belief.label in names for node in graph.nodes for belief in node.classes):
         return graph
@@ -52,7 +51,7 @@ def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.S
         for belief in node.classes:
             label = names.get(belief.label, belief.label)
             sums[label] = sums.get(label, 0.0) + belief.probability
-        # Stable: of equals the one that came first.
+        # A stable sort: labels with equal probability keep their order.
         beliefs = [
             wire.Belief(label, min(probability, 1.0))
             for label, probability in sorted(sums.items(), key=lambda item: -item[1])

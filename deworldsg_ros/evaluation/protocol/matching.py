@@ -1,4 +1,4 @@
-"""Which prediction stands for which annotated object: the official vote of nearest points."""
+"""Matching of predictions to annotated objects by the official vote of nearest points."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from scipy.spatial import cKDTree
 
 from deworldsg_ros.scene.arrays import Float64, Int64
 
+# The limits of the official program (FROSS, Merging/evaluate.py): distance to the nearest annotated
+# point, fraction of votes of the best object, and ratio of the second best to the best.
 OVERLAP_THRESHOLD_M = 0.1
-MIN_SHARE = 0.5
-MAX_SECOND_SHARE = 0.75
+MIN_VOTE_FRACTION = 0.5
+MAX_SECOND_TO_BEST = 0.75
 
 
 @dataclass(frozen=True)
 class Support:
-    """The object that a prediction supports, and with how many points."""
+    """The object that a prediction supports, and its number of votes."""
 
     object_id: int
     points: int
@@ -30,9 +32,9 @@ class Matching:
     """Result of the vote.
 
     Attributes:
-        supports: of each prediction; None for a void one.
-        prediction_of: prediction that was taken for each object that was found.
-        skipped_points: predicted or annotated points with NaN or infinity, which cannot vote.
+        supports: the object that each prediction supports; None = void prediction.
+        prediction_of: row of the prediction by id of the object, for each object that is found.
+        skipped_points: number of points with NaN or infinity, which have no vote.
     """
 
     supports: tuple[Support | None, ...]
@@ -50,12 +52,12 @@ def match(
     """Match predictions to objects (docs/evaluation/protocol.md, "Matching").
 
     Args:
-        object_ids: the annotated objects; points of no other id are looked at.
+        object_ids: ids of the annotated objects; annotated points of other ids are ignored.
         points_world: (n, 3) float64, metres, annotated surface points.
-        point_objects: (n,) object id of each.
-        segments: points (n_i, 3) of each prediction.
-        threshold_m: a point votes for the object of its nearest neighbour if that is strictly
-            nearer than this.
+        point_objects: (n,) int64, object id of each annotated point.
+        segments: points (n_i, 3) of each prediction, metres.
+        threshold_m: a point votes for the object of its nearest annotated point if the distance is
+            strictly less.
     """
     ids = np.array(sorted(set(object_ids)), np.int64)
     kept = np.isin(point_objects, ids)
@@ -75,7 +77,7 @@ def match(
             votes = _votes(tree, surface, rows, finite, len(ids), threshold_m)
         best = _supported(votes, len(points))
         supports.append(None if best is None else Support(int(ids[best]), int(votes[best])))
-    return Matching(tuple(supports), _take(supports), skipped)
+    return Matching(tuple(supports), _best_predictions(supports), skipped)
 
 
 def _votes(
@@ -88,28 +90,28 @@ def _votes(
 ) -> Int64:
     _, nearest = tree.query(points)
     delta = points - surface[nearest]
-    # The tree's own distances went through a square root: 1 nm decides, and so does one rounding.
+    # The distances of the tree went through a square root, whose rounding can change a vote.
     squared = delta[:, 0] * delta[:, 0] + delta[:, 1] * delta[:, 1] + delta[:, 2] * delta[:, 2]
     inside = squared < threshold_m * threshold_m
     return np.bincount(rows[nearest[inside]], minlength=object_count).astype(np.int64)
 
 
 def _supported(votes: Int64, point_count: int) -> int | None:
-    """Place of the object that these votes support; None for a void prediction."""
+    """Index of the object that the votes support; None = void prediction."""
     if point_count == 0 or not votes.any():
         return None
     best = int(votes.argmax())
     others = np.delete(votes, best)
-    # Quotients of rounded quotients, in this form: 9/22 over 12/22 is a little above 0.75.
-    share = int(votes[best]) / point_count
-    second_share = (int(others.max()) if len(others) else 0) / point_count
-    if share < MIN_SHARE or second_share / share > MAX_SECOND_SHARE:
+    # A ratio of rounded fractions, as in the official program: 9/22 over 12/22 exceeds 0.75.
+    fraction = int(votes[best]) / point_count
+    second = (int(others.max()) if len(others) else 0) / point_count
+    if fraction < MIN_VOTE_FRACTION or second / fraction > MAX_SECOND_TO_BEST:
         return None
     return best
 
 
-def _take(supports: Sequence[Support | None]) -> dict[int, int]:
-    """Each object takes the prediction with most points; of equals the first."""
+def _best_predictions(supports: Sequence[Support | None]) -> dict[int, int]:
+    """Row of the prediction with most votes for each object; of equal ones the first."""
     taken: dict[int, int] = {}
     for row, support in enumerate(supports):
         if support is None:

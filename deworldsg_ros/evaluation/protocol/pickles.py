@@ -1,8 +1,8 @@
-"""Official prediction pickles, read without executing anything in them.
+"""Official prediction pickles, read without executing their code.
 
-A pickle is a program that names the functions it wants called. Here each known name of numpy is
-answered with a stand-in that only remembers what it was given, and every other name is refused;
-the arrays are made afterwards, from numbers whose type, shape and length were checked.
+A pickle is a program that names the functions to call. Here each known numpy name resolves to a
+placeholder that only stores its arguments, and every other name is refused. The arrays are built
+afterwards, after a check of type, shape and length.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _KINDS = frozenset("?biuf")
 
 
 class _Dtype:
-    """Stands in for numpy.dtype."""
+    """Placeholder of numpy.dtype."""
 
     __slots__ = ("text",)
 
@@ -30,7 +30,7 @@ class _Dtype:
         if isinstance(text, bytes):
             text = text.decode("ascii", errors="replace")
         if not isinstance(text, str):
-            raise EvaluationError(f"pickle has a dtype {text!r}: wanted a plain number's")
+            raise EvaluationError(f"pickle has a dtype {text!r}: expected the dtype of a number")
         self.text = text
 
     def __setstate__(self, state: Any) -> None:
@@ -46,12 +46,12 @@ class _Dtype:
         except TypeError as error:
             raise EvaluationError(f"pickle has a dtype '{self.text}': unknown") from error
         if made.kind not in _KINDS and made.kind != "b":
-            raise EvaluationError(f"pickle has a dtype '{self.text}': wanted numbers")
+            raise EvaluationError(f"pickle has a dtype '{self.text}': expected numbers")
         return made
 
 
 class _Array:
-    """Stands in for an ndarray: built by the constructor, or filled by __setstate__."""
+    """Placeholder of an ndarray, filled by the constructor or by __setstate__."""
 
     __slots__ = ("buffer", "dtype", "fortran", "shape", "strided")
 
@@ -60,7 +60,7 @@ class _Array:
         self.dtype = dtype
         self.buffer = buffer
         self.fortran = False
-        # Offsets and strides into somebody's buffer are not part of what such files hold.
+        # Prediction files have no offsets or strides into a shared buffer.
         self.strided = any(item is not None and item != 0 and item != "C" for item in rest)
         if rest[-1:] == ("F",):
             self.fortran, self.strided = True, False
@@ -84,10 +84,10 @@ class _Array:
         if isinstance(data, pickle.PickleBuffer):
             data = bytes(data)
         if not isinstance(data, bytes | bytearray):
-            raise EvaluationError(f"pickle has an array of {type(data).__name__}: wanted bytes")
+            raise EvaluationError(f"pickle has an array of {type(data).__name__}: expected bytes")
         if len(data) != math.prod(shape) * dtype.itemsize:
             raise EvaluationError(
-                f"pickle has an array of shape {shape} and {len(data)} bytes: wanted "
+                f"pickle has an array of shape {shape} and {len(data)} bytes: expected "
                 f"{math.prod(shape) * dtype.itemsize}"
             )
         made = np.frombuffer(data, dtype).reshape(shape, order="F" if self.fortran else "C")
@@ -95,7 +95,7 @@ class _Array:
 
 
 class _Callable:
-    """A name that a pickle may call; it has no state that a pickle could change."""
+    """A function that a pickle may call. It has no state that a pickle could change."""
 
     __slots__ = ()
 
@@ -104,7 +104,7 @@ class _Callable:
 
 
 class _NumpyClass(_Callable):
-    """Names an array or number class of numpy; ndarray itself may be called."""
+    """An array or number class of numpy; only ndarray and dtype may be called freely."""
 
     __slots__ = ("name",)
 
@@ -127,7 +127,7 @@ class _NumpyClass(_Callable):
 
 
 class _Reconstruct(_Callable):
-    """numpy's _reconstruct(class, shape, type code): an array to be filled."""
+    """numpy's _reconstruct(class, shape, type code): an array that __setstate__ fills."""
 
     __slots__ = ()
 
@@ -156,7 +156,7 @@ class _Scalar(_Callable):
 
 
 class _Encode(_Callable):
-    """_codecs.encode, by which old protocols spell bytes."""
+    """_codecs.encode: bytes in old pickle protocols."""
 
     __slots__ = ()
 
@@ -167,7 +167,7 @@ class _Encode(_Callable):
 
 
 class _EmptyBytes(_Callable):
-    """bytes(), by which old protocols spell no bytes at all."""
+    """bytes(): empty bytes in old pickle protocols."""
 
     __slots__ = ()
 
@@ -176,7 +176,7 @@ class _EmptyBytes(_Callable):
 
 
 class _EmptyDict(_Callable):
-    """collections.OrderedDict, by which some keep the order."""
+    """collections.OrderedDict as a plain dictionary."""
 
     __slots__ = ()
 
@@ -209,12 +209,12 @@ class _Unpickler(pickle.Unpickler):
             return _NAMES[module, name]
         except KeyError:
             raise EvaluationError(
-                f"pickle asks for {module}.{name}: refused, it may only hold dictionaries, lists, "
+                f"pickle names {module}.{name}: refused; expected only dictionaries, lists, "
                 "numbers, text and numpy arrays"
             ) from None
 
     def persistent_load(self, pid: Any) -> Any:
-        raise EvaluationError("pickle refers to something outside itself: refused")
+        raise EvaluationError("pickle refers to an object outside the file: refused")
 
 
 def load_pickle(content: bytes, source: str) -> Any:
@@ -222,10 +222,10 @@ def load_pickle(content: bytes, source: str) -> Any:
 
     Args:
         content: the file.
-        source: what to call it in errors.
+        source: name of the file in errors.
 
     Raises:
-        EvaluationError: where it names anything else than plain data, or is damaged.
+        EvaluationError: the pickle names anything but plain data, or is damaged.
     """
     try:
         return _resolve(_Unpickler(io.BytesIO(content)).load(), {})

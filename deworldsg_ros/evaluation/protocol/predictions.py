@@ -1,4 +1,4 @@
-"""Predicted scene graphs as the protocol takes them: two formats in, one format out.
+"""Predicted scene graphs of the protocol, and the two formats that they are read from.
 
 The open format (JSON) and the official pickle are described in docs/evaluation/protocol.md.
 """
@@ -19,19 +19,19 @@ from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.pickles import load_pickle
 from deworldsg_ros.scene.arrays import Float64, Int64
 
-FORMAT = "scene graph predictions 1"
-
 
 @dataclass(frozen=True)
 class ScanPrediction:
-    """The predicted graph of one scan (N nodes, E edges); the order of both decides ties.
+    """The predicted graph of one scan: N nodes, E edges, C classes, P predicates.
+
+    The order of nodes and edges decides ties.
 
     Attributes:
         points_world: N arrays (n_i, 3), metres.
         class_scores: (N, C), any number type.
-        edges: (E, 2) int64, subject and object, places among the nodes.
+        edges: (E, 2) int64, rows of subject and object among the nodes.
         edge_scores: (E, P), any number type.
-        notes: what the official program would have stopped at, and what was done instead.
+        notes: input on which the official program would stop, and how it was handled.
     """
 
     points_world: tuple[NDArray[np.floating[Any]], ...]
@@ -45,7 +45,7 @@ class ScanPrediction:
 
     @staticmethod
     def empty(class_count: int, predicate_count: int) -> ScanPrediction:
-        """Nothing found."""
+        """A prediction without nodes."""
         return ScanPrediction(
             (),
             np.zeros((0, class_count)),
@@ -58,7 +58,7 @@ def read_predictions(path: Path) -> dict[str, ScanPrediction]:
     """Predictions of a ``.json`` or ``.pkl`` file, by scan.
 
     Raises:
-        EvaluationError: with what was seen and what was wanted.
+        EvaluationError: the file cannot be read or has another format.
     """
     try:
         content = path.read_bytes()
@@ -69,49 +69,16 @@ def read_predictions(path: Path) -> dict[str, ScanPrediction]:
     return _from_open(_parse_json(content, path), path)
 
 
-def write_predictions(
-    path: Path,
-    predictions: Mapping[str, ScanPrediction],
-    class_count: int,
-    predicate_count: int,
-) -> None:
-    """Write the open format."""
-    scans = {
-        scan: {
-            "nodes": [
-                {"id": row, "class_probabilities": scores, "points": points.tolist()}
-                for row, (scores, points) in enumerate(
-                    zip(prediction.class_scores.tolist(), prediction.points_world)
-                )
-            ],
-            "edges": [
-                {"subject": subject, "object": object_, "predicate_probabilities": scores}
-                for (subject, object_), scores in zip(
-                    prediction.edges.tolist(), prediction.edge_scores.tolist()
-                )
-            ],
-        }
-        for scan, prediction in predictions.items()
-    }
-    content = {
-        "format": FORMAT,
-        "num_classes": class_count,
-        "num_predicates": predicate_count,
-        "scans": scans,
-    }
-    path.write_bytes(msgspec.json.encode(content))
-
-
 def _parse_json(content: bytes, path: Path) -> Any:
     try:
         return msgspec.json.decode(content)
     except msgspec.DecodeError:
         pass
     try:
-        # Slower, but knows NaN and Infinity, which Python's own writer writes.
+        # Slower, but it reads NaN and Infinity, which Python's json module writes.
         return json.loads(content)
     except ValueError as error:
-        raise EvaluationError(f"predictions {path} are no JSON: {error}") from error
+        raise EvaluationError(f"predictions {path} are not JSON: {error}") from error
 
 
 def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
@@ -120,7 +87,7 @@ def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
         scans = dict(content["scans"])
     except (KeyError, TypeError, ValueError) as error:
         raise EvaluationError(
-            f"predictions {path}: wanted num_classes, num_predicates and scans at the top"
+            f"predictions {path}: expected num_classes, num_predicates and scans at the top"
         ) from error
     predictions = {}
     for scan, graph in scans.items():
@@ -128,7 +95,7 @@ def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
             predictions[scan] = _open_scan(graph, class_count, predicate_count)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise EvaluationError(
-                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; wanted nodes "
+                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; expected nodes "
                 "with class_index or class_probabilities and points, and edges with subject, "
                 "object and predicate_probabilities"
             ) from error
@@ -157,7 +124,7 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
         ids = (int(edge["subject"]), int(edge["object"]))
         _refuse_negative(min(ids))
         if not places.keys() >= set(ids):
-            notes.append(f"edge {ids} names a node that there is not: it relates nothing")
+            notes.append(f"edge {ids} names a node that does not exist: the edge is ignored")
         ends[row] = [places.get(end, len(nodes)) for end in ids]
         if edge.get("predicate_probabilities") is not None:
             edge_scores[row] = _vector(edge["predicate_probabilities"], predicate_count)
@@ -169,38 +136,38 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
 
 def _one_hot(index: Any, count: int) -> Float64:
     if not isinstance(index, int) or not 0 <= index < count:
-        raise EvaluationError(f"index {index!r}: wanted a whole number from 0 to {count - 1}")
+        raise EvaluationError(f"index {index!r}: expected a whole number from 0 to {count - 1}")
     return np.eye(count)[index]
 
 
 def _vector(values: Any, count: int) -> Float64:
-    # null is how strict writers spell NaN; numpy reads it so.
+    # Strict JSON writers write NaN as null, which numpy reads as NaN.
     vector = np.array(values, np.float64)
     if vector.shape != (count,):
-        raise EvaluationError(f"vector of {vector.size} scores: wanted {count}")
+        raise EvaluationError(f"vector of {vector.size} scores: expected {count}")
     return vector
 
 
 def _segment(values: Any) -> NDArray[np.floating[Any]]:
-    """Points (n, 3); float32 arrays stay what they are."""
+    """Points (n, 3); float32 arrays stay float32."""
     points = np.array(values, np.float64) if isinstance(values, list) else np.asarray(values)
     if points.size == 0:
         return np.zeros((0, 3))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
-        raise EvaluationError(f"segment of shape {points.shape}: wanted (n, 3) numbers")
+        raise EvaluationError(f"segment of shape {points.shape}: expected (n, 3) numbers")
     return points if points.dtype.kind == "f" else points.astype(np.float64)
 
 
 def _from_official(content: Any, path: Path) -> dict[str, ScanPrediction]:
     if not isinstance(content, dict):
-        raise EvaluationError(f"predictions {path}: wanted a dictionary by scan")
+        raise EvaluationError(f"predictions {path}: expected a dictionary by scan")
     predictions = {}
     for scan, graph in content.items():
         try:
             predictions[str(scan)] = _official_scan(graph)
         except (KeyError, TypeError, ValueError) as error:
             raise EvaluationError(
-                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; wanted pcd, "
+                f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; expected pcd, "
                 "cls, edge_index and edge_cls"
             ) from error
         except EvaluationError as error:
@@ -215,16 +182,16 @@ def _official_scan(graph: Mapping[str, Any]) -> ScanPrediction:
     if edges.size == 0:
         edges = np.zeros((2, 0), np.int64)
     if edges.ndim != 2 or edges.shape[0] != 2:
-        raise EvaluationError(f"edge_index of shape {edges.shape}: wanted (2, E)")
+        raise EvaluationError(f"edge_index of shape {edges.shape}: expected (2, E)")
     if edges.dtype.kind == "f" and not (edges == np.floor(edges)).all():
-        raise EvaluationError("edge_index holds fractions: wanted whole numbers")
+        raise EvaluationError("edge_index contains fractions: expected whole numbers")
     edges = edges.T.astype(np.int64)
     if len(edges):
         _refuse_negative(int(edges.min()))
     notes = []
     if (edges >= len(points)).any():
         notes.append(
-            f"edge_index names node {int(edges.max())} of {len(points)}: such edges relate nothing"
+            f"edge_index names node {int(edges.max())} of {len(points)}: such edges are ignored"
         )
     return ScanPrediction(
         points, class_scores, edges, _table(graph["edge_cls"], len(edges), "edge_cls"), notes
@@ -232,12 +199,12 @@ def _official_scan(graph: Mapping[str, Any]) -> ScanPrediction:
 
 
 def _table(values: Any, rows: int, name: str) -> NDArray[Any]:
-    """Scores (rows, columns) in their own number type."""
+    """Scores (rows, columns) in the number type of the file."""
     table = np.asarray(values) if not isinstance(values, Sequence) else _stack(values)
     if table.size == 0 and rows == 0:
         return np.zeros((0, table.shape[1] if table.ndim == 2 else 0))
     if table.ndim != 2 or len(table) != rows or table.dtype.kind not in "?biuf":
-        raise EvaluationError(f"{name} has the shape {table.shape}: wanted {rows} rows of scores")
+        raise EvaluationError(f"{name} has the shape {table.shape}: expected {rows} rows of scores")
     return table
 
 
@@ -247,4 +214,4 @@ def _stack(values: Sequence[Any]) -> NDArray[Any]:
 
 def _refuse_negative(smallest: int) -> None:
     if smallest < 0:
-        raise EvaluationError(f"an edge names node {smallest}: wanted 0 or more")
+        raise EvaluationError(f"an edge names node {smallest}: expected 0 or more")

@@ -1,4 +1,4 @@
-"""Ranks of scores in the official order: ties go to the last position, NaN above every number."""
+"""Ranks of scores in the official order: the last of equal scores first, NaN above all numbers."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Stored for an item without a match or an edge.
+# Rank of an item without a match or an edge, as in the official program.
 NO_RANK = 99999
 
 
 def rank(scores: NDArray[Any], place: int) -> int:
-    """Number of scores (n,) that come before the one at `place`; 0 = it is the top.
+    """Number of scores (n,) that rank before the one at index `place`; 0 = the top.
 
-    A place beyond the scores has the rank `NO_RANK`, or their number where that is larger.
+    An index outside the scores has the rank `NO_RANK`, or n if that is larger.
     """
     if not 0 <= place < len(scores):
         return max(NO_RANK, len(scores))
@@ -37,12 +37,12 @@ def triple_rank(
     """Rank of (subject class, object class, predicate) among all triples.
 
     The score of a triple is (subject * object) * predicate, multiplied in this order and in the
-    arrays' own type; triples count in row-major order, the predicate fastest.
+    number type of the arrays. Ties follow the row-major order of triples, the predicate fastest.
     """
     sizes = (len(subject_scores), len(object_scores), len(predicate_scores))
     if not all(0 <= place < size for place, size in zip(triple, sizes)):
         return max(NO_RANK, sizes[0] * sizes[1] * sizes[2])
-    # Overflow and NaN are the predictor's own business.
+    # Predictions may overflow or contain NaN: the ranking defines both.
     with np.errstate(all="ignore"):
         ends = subject_scores[:, None] * object_scores[None, :]
         table = ends[:, :, None] * predicate_scores[None, None, :]

@@ -1,4 +1,4 @@
-"""Scene graphs of this package as predictions of the protocol."""
+"""Conversion of scene graphs of this package to predictions of the protocol."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
-# About what one frame adds to the surface of a node.
+# About the number of surface points that one observation adds to a node.
 POINTS_PER_OBSERVATION = 64
 
 
@@ -21,16 +21,20 @@ def to_prediction(
 ) -> ScanPrediction:
     """Nodes with their surface points, edges with their predicate distributions, in graph order.
 
-    The protocol prefers the prediction with more points, so that of several nodes on one object
-    the one that was seen most stands for it. A graph keeps a bounded sample of the surface: the
-    first `POINTS_PER_OBSERVATION` of it count once for each frame in which the node was seen.
-    Where the points are not `sampled` but all that there are, each counts once.
+    Of several predictions for one object the protocol takes the one with most points. A graph
+    stores a bounded sample of each surface; therefore the first `POINTS_PER_OBSERVATION` points
+    count once per observation of the node.
 
-    A graph tells the k most probable labels: the rest of the probability is spread evenly over
-    the other labels. Classes outside the vocabulary (see `labels`) are left out.
+    A graph contains the k most probable labels. The rest of the probability is spread evenly over
+    the other labels. Classes outside the vocabulary are left out (see `labels`).
+
+    Args:
+        graph: scene graph with surface points.
+        vocabulary: classes and predicates of the data set.
+        sampled: False if the graph contains all points of a node; then each point counts once.
 
     Raises:
-        EvaluationError: where no class, or some predicate, is in the vocabulary.
+        EvaluationError: all classes, or some predicate, are outside the vocabulary.
     """
     classes = {name: place for place, name in enumerate(vocabulary.classes)}
     predicates = {name: place for place, name in enumerate(vocabulary.predicates)}
@@ -50,7 +54,7 @@ def to_prediction(
         np.array(class_scores).reshape(-1, len(classes)),
         np.array(edges, np.int64).reshape(-1, 2),
         np.array(edge_scores).reshape(-1, len(predicates)),
-        [] if all(map(len, points)) else ["a node has no surface points: it supports nothing"],
+        [] if all(map(len, points)) else ["a node has no surface points: it supports no object"],
     )
 
 
@@ -59,7 +63,7 @@ def _points(node: wire.NodeState) -> Float64:
 
 
 def _segment(node: wire.NodeState) -> Float64:
-    """Points (n, 3) of a node; the sample is in random order, so its beginning is a sample too."""
+    """Points (n, 3) of a node. The stored sample is in random order, so its start is random too."""
     return np.tile(_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
 
 
@@ -75,6 +79,6 @@ def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int]) -> Float64:
 
 def _foreign(kind: str, labels: set[str]) -> EvaluationError:
     return EvaluationError(
-        f"scene graph has the {kind} '{min(labels)}', which the data set does not: was it made "
-        "with another vocabulary?"
+        f"scene graph has the {kind} '{min(labels)}', which is not in the data set: make the graph "
+        "with the vocabulary of the data set"
     )

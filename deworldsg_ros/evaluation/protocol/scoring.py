@@ -1,7 +1,7 @@
 """The official protocol: recall of objects, predicates and relationships.
 
-Every decision is that of the program by which the field reports its numbers (FROSS,
-``Merging/evaluate.py``); docs/evaluation/protocol.md states the rules.
+The rules are those of the program behind the published numbers (FROSS, ``Merging/evaluate.py``).
+docs/evaluation/protocol.md states them.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class ProtocolOptions:
 
     Attributes:
         split: train, validation (val) or test.
-        skip_no_rel_objects: only objects that occur in the scan's relations count.
-        overlap_threshold_m: a predicted point nearer than this to an object's is a vote for it.
-        aligned_ply: take the aligned point cloud (3RScan layout).
+        skip_no_rel_objects: count only objects that occur in the relations of the scan.
+        overlap_threshold_m: maximum distance from a predicted point to its annotated point.
+        aligned_ply: use the aligned point cloud (3RScan layout).
     """
 
     split: str = "test"
@@ -37,15 +37,16 @@ class ProtocolOptions:
 
 @dataclass(frozen=True)
 class ScanResult:
-    """What became of one scan's items; ranks in the order of the annotation.
+    """Ranks of the annotated items of one scan, in the order of the annotation.
 
     Attributes:
-        object_ids, object_classes: the annotated objects that count.
+        scan: id of the scan.
+        object_ids, object_classes: annotated objects that count.
         relations: annotated (subject, object, predicate).
-        matching: who stands for whom.
-        object_ranks, predicate_ranks, relationship_ranks: of the annotated class, predicate and
-            triple; 0 = right.
-        notes: what the official program would have stopped at, and what was done instead.
+        matching: predictions matched to objects.
+        object_ranks, predicate_ranks, relationship_ranks: rank of the annotated class, predicate
+            and triple; 0 = right.
+        notes: input on which the official program would stop, and how it was handled.
     """
 
     scan: str
@@ -60,26 +61,26 @@ class ScanResult:
 
 
 class Count(NamedTuple):
-    """Right items of all items."""
+    """Number of right items and of all items."""
 
     hits: int
     total: int
 
     @property
     def recall(self) -> float:
-        """Fraction; NaN where there is no item."""
+        """Fraction of right items; NaN without items."""
         return self.hits / self.total if self.total else math.nan
 
 
 @dataclass(frozen=True)
 class ProtocolResult:
-    """The numbers of a split.
+    """Scores over several scans.
 
     Attributes:
-        objects, predicates, relationships: pooled over all scans.
-        object_classes, predicate_classes: the same by annotated class or predicate, in the order
-            of the vocabulary, those with items only.
-        scans: in the order of the split.
+        objects, predicates, relationships: counts over all scans.
+        object_classes, predicate_classes: counts by annotated class or predicate, in the order of
+            the vocabulary; without those that have no item.
+        scans: results of the scans, in the order of the split.
     """
 
     objects: Count
@@ -91,21 +92,21 @@ class ProtocolResult:
 
     @property
     def object_mean_recall(self) -> float:
-        """Mean of the recalls of the classes that occur; NaN where none does."""
+        """Mean recall over classes with items; NaN without any."""
         return _mean(self.object_classes.values())
 
     @property
     def predicate_mean_recall(self) -> float:
-        """Mean of the recalls of the predicates that occur; NaN where none does."""
+        """Mean recall over predicates with items; NaN without any."""
         return _mean(self.predicate_classes.values())
 
     @property
     def notes(self) -> list[str]:
-        """Where the official program would have stopped."""
+        """Notes of all scans."""
         return [note for scan in self.scans for note in scan.notes]
 
     def numbers(self) -> dict[str, float]:
-        """The five numbers by name, as fractions."""
+        """The five scores by name, as fractions."""
         return {
             "object_recall": self.objects.recall,
             "predicate_recall": self.predicates.recall,
@@ -124,7 +125,7 @@ def evaluate_predictions(
     """Score predictions by scan against the annotations of `scans`; None = of the split.
 
     Raises:
-        RecordingError: where a file of the data set is absent or unreadable.
+        RecordingError: a file of the data set is missing or cannot be read.
     """
     options = options or ProtocolOptions()
     vocabulary = annotations.vocabulary
@@ -132,7 +133,9 @@ def evaluate_predictions(
     for scan in scans or annotations.scans(options.split):
         prediction = predictions.get(scan)
         notes = (
-            [] if prediction is not None else [f"{scan} has no prediction: nothing of it is found"]
+            []
+            if prediction is not None
+            else [f"{scan} has no prediction: all its items count as wrong"]
         )
         if prediction is None:
             prediction = ScanPrediction.empty(len(vocabulary.classes), len(vocabulary.predicates))
@@ -148,7 +151,7 @@ def score_scan(
     prediction: ScanPrediction,
     options: ProtocolOptions,
 ) -> ScanResult:
-    """Match one scan and rank its items."""
+    """Match the predictions of one scan to its objects, and rank its items."""
     objects = annotation.objects
     if options.skip_no_rel_objects:
         related = annotation.related_ids or frozenset()
@@ -171,8 +174,7 @@ def score_scan(
     notes = [*annotation.notes, *prediction.notes]
     if matching.skipped_points:
         notes.append(
-            f"{annotation.scan}: {matching.skipped_points} points are not finite: they vote for "
-            "nothing"
+            f"{annotation.scan}: {matching.skipped_points} points are not finite: they have no vote"
         )
     return ScanResult(
         annotation.scan,
@@ -193,7 +195,7 @@ def _rank_relations(
     matching: Matching,
     prediction: ScanPrediction,
 ) -> tuple[list[int], list[int]]:
-    # Of a pair that is predicted twice the first entry counts.
+    # If a pair is predicted twice, the first entry counts.
     edge_rows: dict[tuple[int, int], int] = {}
     for row, (subject, object_) in enumerate(prediction.edges.tolist()):
         edge_rows.setdefault((subject, object_), row)
@@ -221,7 +223,7 @@ def _rank_relations(
 
 
 def pool(scans: Sequence[ScanResult], vocabulary: Vocabulary) -> ProtocolResult:
-    """The numbers over all items of all scans."""
+    """Scores over the items of all scans."""
     objects = [
         (place, ranked == 0)
         for scan in scans

@@ -1,1 +1,1 @@
-"""Results as tables, files and plots."""
+"""Reports of an evaluation: JSON values, CSV and LaTeX files, plots, terminal tables."""

@@ -1,4 +1,4 @@
-"""Results as files: CSV for programs, LaTeX rows for papers."""
+"""Numbers as CSV files for programs and as LaTeX rows for papers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LATEX_SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"}
 
 
 def write_rows(path: Path, rows: Mapping[str, Mapping[str, float]], heading: str) -> None:
-    """One CSV line a row, a column a number by name; what is undefined is left empty."""
+    """Write one CSV line per row, one column per number; undefined numbers stay empty."""
     columns = list(dict.fromkeys(name for row in rows.values() for name in row))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -31,7 +31,7 @@ def write_rows(path: Path, rows: Mapping[str, Mapping[str, float]], heading: str
 
 
 def write_classes(path: Path, result: ProtocolResult) -> None:
-    """CSV of the recall by class and by predicate."""
+    """Write a CSV file of the recall of each class and predicate."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["kind", "class", "items", "right", "recall"])
@@ -44,7 +44,7 @@ def write_classes(path: Path, result: ProtocolResult) -> None:
 
 
 def latex_rows(methods: Mapping[str, Mapping[str, float]]) -> str:
-    """Rows of the paper's tables: method & Rel. & Obj. & Pred. & mObj. & mPred., in percent."""
+    """LaTeX rows: method & Rel. & Obj. & Pred. & mObj. & mPred., recalls in percent."""
     lines = []
     for method, numbers in methods.items():
         cells = [_percent(numbers.get(name, math.nan)) for name in LATEX_COLUMNS]
@@ -53,7 +53,7 @@ def latex_rows(methods: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def latex_text(text: str) -> str:
-    """Text with LaTeX's special characters escaped."""
+    """Text with the special characters of LaTeX escaped."""
     return "".join(_LATEX_SPECIAL.get(character, character) for character in text)
 
 

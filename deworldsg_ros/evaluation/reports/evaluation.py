@@ -17,14 +17,13 @@ from deworldsg_ros.evaluation.protocol.scoring import (
     pool,
 )
 from deworldsg_ros.evaluation.runner import (
-    GRAPH_FILE,
     Checkpoint,
     ScanOutcome,
     evaluate_graph,
-    read_graph,
 )
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.graph_file import read_graph
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def evaluate_saved_graphs(
     """Evaluate ``folder/SCAN/scene_graph.json`` of each scan; arguments and errors as above."""
     chosen = scans or annotations.scans(options.split)
     evaluated = {
-        scan: evaluate_graph(annotations, scan, read_graph(folder / scan / GRAPH_FILE), options)
+        scan: evaluate_graph(annotations, scan, read_graph(folder / scan), options)
         for scan in dict.fromkeys(chosen)
     }
     return Evaluation(

@@ -1,4 +1,4 @@
-"""Results as plain values for JSON, with every number by name."""
+"""Numbers as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from deworldsg_ros.evaluation.runner import ScanOutcome
 
 
 def protocol_values(result: ProtocolResult) -> dict[str, Any]:
-    """Plain values of the protocol's numbers: recalls as fractions, NaN where undefined."""
+    """Plain values of the official scores: recalls as fractions, NaN if undefined."""
     return {
         **result.numbers(),
         "counts": {
@@ -32,7 +32,7 @@ def protocol_values(result: ProtocolResult) -> dict[str, Any]:
 
 
 def scan_values(scan: ScanResult) -> dict[str, Any]:
-    """Plain values of one scan's share."""
+    """Plain values of the scores of one scan."""
     return {
         "scan": scan.scan,
         "objects": {
@@ -48,7 +48,7 @@ def scan_values(scan: ScanResult) -> dict[str, Any]:
 
 
 def outcome_values(outcome: ScanOutcome) -> dict[str, Any]:
-    """Plain values of one scan's run: what it cost, what was dropped, how it became right."""
+    """Plain values of the run of one scan: scores, times, drops, measures, checkpoints."""
     return {
         **scan_values(outcome.result),
         "frames": outcome.frames,
@@ -77,7 +77,7 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
 
 
 def finite_or_none(value: Any) -> Any:
-    """`value` with None in place of every float that JSON cannot hold."""
+    """`value` with NaN and infinity replaced by None, which JSON can represent."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Results as PNG plots: recall by class, confusion, recall over time."""
+"""PNG plots: recall by class, confusion, recall over time."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from deworldsg_ros.evaluation.runner import Checkpoint
 DPI = 130
 RIGHT, ALL = "#2f6f8f", "#d5dde3"
 COLOURS = ("#2f6f8f", "#b8562f", "#5c8a3a")
-MOST_CLASSES = 40
+MAX_CLASSES = 40
 
 
 def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
-    """Bars of items and right items by class, most items first."""
-    items = class_items(counts)[:MOST_CLASSES]
+    """Bars of items and of right items by class, most items first."""
+    items = class_items(counts)[:MAX_CLASSES]
     figure, axes = _figure(10.0, 1.2 + 0.24 * max(len(items), 3))
     places = np.arange(len(items))
     axes.barh(places, [count.total for _, count in items], color=ALL, label="annotated")
@@ -41,29 +41,29 @@ def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
 
 
 def plot_confusion(path: Path, pairs: Sequence[tuple[str, str]], title: str) -> None:
-    """Annotated class against predicted class of nodes, each row a share of its nodes."""
+    """Confusion matrix of annotated and predicted classes of nodes; each row sums to one."""
     counts = Counter(pairs)
-    rows = [name for name, _ in Counter(pair[0] for pair in pairs).most_common(MOST_CLASSES)]
+    rows = [name for name, _ in Counter(pair[0] for pair in pairs).most_common(MAX_CLASSES)]
     others = Counter(pair[1] for pair in pairs if pair[1] not in rows)
-    columns = rows + [name for name, _ in others.most_common(max(0, MOST_CLASSES - len(rows)))]
+    columns = rows + [name for name, _ in others.most_common(max(0, MAX_CLASSES - len(rows)))]
     table = np.array([[counts[row, column] for column in columns] for row in rows], float)
     table = table.reshape(len(rows), len(columns))
-    shares = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
+    fractions = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
     side = 2.5 + 0.24 * max(len(columns), 4)
     figure, axes = _figure(side, 2.0 + 0.24 * max(len(rows), 4))
     if len(rows):
-        image = axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
-        figure.colorbar(image, ax=axes, fraction=0.035, label="share of the nodes of a row")
+        image = axes.imshow(fractions, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+        figure.colorbar(image, ax=axes, fraction=0.035, label="fraction of the nodes of a row")
     axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize=8)
     axes.set_yticks(range(len(rows)), rows, fontsize=8)
     axes.set_xlabel("predicted class of the node")
-    axes.set_ylabel("annotated class of the object it is in")
+    axes.set_ylabel("annotated class of the object")
     axes.set_title(title)
     _save(figure, path)
 
 
 def plot_over_time(path: Path, runs: Mapping[str, Sequence[Checkpoint]], title: str) -> None:
-    """How fast each scan's graph becomes right: recall over the time of the recording."""
+    """Recall of each scan over the time of the recording."""
     figure, axes = _figure(9.0, 5.0)
     kinds = ("object_recall", "predicate_recall", "relationship_recall")
     for run, checkpoints in enumerate(runs.values()):
@@ -97,5 +97,5 @@ def _figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    # No date or version in the file: the same results, the same bytes.
+    # Without date and version: equal results give equal bytes.
     figure.savefig(path, metadata={"Software": None})

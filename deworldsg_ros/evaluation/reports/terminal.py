@@ -1,4 +1,4 @@
-"""Results as tables on the terminal."""
+"""Terminal tables of one evaluation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 
 
 def percent(fraction: float) -> str:
-    """A fraction in percent with one decimal; a dash where it is undefined."""
+    """A fraction in percent with one decimal; a dash if it is undefined."""
     return "–" if math.isnan(fraction) else f"{100 * fraction:.1f}"
 
 
@@ -25,7 +25,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
-    """The five numbers, the tables by class, and the notes."""
+    """Print the five scores, the scores by class, and the notes."""
     table = Table(title=title)
     for heading in ("recall at 1, %", "items", "right", "recall", "mean over classes"):
         table.add_column(heading, justify="left" if heading.startswith("recall at") else "right")
@@ -43,7 +43,7 @@ def print_protocol(console: Console, result: ProtocolResult, title: str) -> None
         console.print(f"[yellow]note:[/] {note}", highlight=False, soft_wrap=True)
 
 
-# What is printed of the measures: heading, name, factor (0 = a count).
+# Printed measures: heading, name, factor (0 = a count).
 MEASURE_ROWS = (
     ("objects", "objects", 0),
     ("nodes", "nodes", 0),
@@ -59,14 +59,14 @@ MEASURE_ROWS = (
     ("edge precision, %", "edge_precision", 100),
     ("edge calibration error, %", "edge_calibration_error", 100),
 )
-# More columns than this do not fit a terminal; the files have all.
-MOST_COLUMNS = 4
+# A terminal has space for this many scans; the files contain all.
+MAX_COLUMNS = 4
 
 
 def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
-    """What recall leaves out, a column a scan; of many scans only the last column, their pool."""
-    shown = dict(list(measures.items())[-1:]) if len(measures) > MOST_COLUMNS else measures
-    table = Table(title="beside recall")
+    """Print the measures, one column per scan; with many scans only the last column, all scans."""
+    shown = dict(list(measures.items())[-1:]) if len(measures) > MAX_COLUMNS else measures
+    table = Table(title="precision, geometry, edges")
     table.add_column("")
     for name in shown:
         table.add_column(name, justify="right", overflow="fold")

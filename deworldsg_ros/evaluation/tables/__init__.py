@@ -1,1 +1,1 @@
-"""Tables of methods: rows, jobs, the map over them, and what comes out."""
+"""Tables that compare methods: rows, jobs, parallel runs, results."""

@@ -1,4 +1,4 @@
-"""One scan of one row: run, or taken from an earlier run of the very same task."""
+"""Jobs: one scan of one row each, run or reused from an earlier run of the same task."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import Any
 import msgspec
 
 from deworldsg_ros import __version__
-from deworldsg_ros.evaluation.runner import GRAPH_FILE, ScanOutcome, ScanTask, evaluate_scan
+from deworldsg_ros.evaluation.runner import ScanOutcome, ScanTask, evaluate_scan
 from deworldsg_ros.evaluation.tables.rows import Row
 from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.scene.graph_file import GRAPH_FILE
 
 OUTCOME_FILE = "outcome.json"
 ERROR_FILE = "error.txt"
@@ -23,7 +24,7 @@ ERROR_FILE = "error.txt"
 
 @dataclass(frozen=True)
 class Job:
-    """A scan of a row; `fresh` = do not look for an earlier result."""
+    """One scan of a row; `fresh` ignores an earlier result."""
 
     row: str
     task: ScanTask
@@ -32,7 +33,7 @@ class Job:
 
 @dataclass(frozen=True)
 class JobResult:
-    """What became of a job: an outcome, or why there is none."""
+    """The outcome of a job, or the reason of its failure."""
 
     row: str
     scan: str
@@ -42,8 +43,8 @@ class JobResult:
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """The file of a finished job."""
+class _Saved:
+    """Content of the file of a finished job."""
 
     fingerprint: str
     outcome: ScanOutcome
@@ -70,56 +71,56 @@ def jobs_of(rows: Sequence[Row], tasks: Sequence[ScanTask], *, fresh: bool) -> l
 
 
 def run_job(job: Job) -> JobResult:
-    """Run a job, or reuse its result; never raises but for an interruption.
+    """Run a job, or reuse its saved result. Errors become failures; interruptions are raised.
 
-    The result is kept beside the graph with the task's fingerprint. What an unexpected error tells
-    goes to ``error.txt`` there.
+    The outcome is saved beside the graph with the fingerprint of the task. The traceback of an
+    unexpected error is written to ``error.txt`` there.
     """
     task = job.task
     folder = task.out / task.scan
-    kept = None if job.fresh else read_kept(folder, fingerprint(task))
-    if kept is not None:
-        return JobResult(job.row, task.scan, kept, reused=True)
+    saved = None if job.fresh else read_saved(folder, fingerprint(task))
+    if saved is not None:
+        return JobResult(job.row, task.scan, saved, reused=True)
     try:
         outcome = evaluate_scan(task)
-        _keep(folder, _Kept(fingerprint(task), outcome))
+        _save(folder, _Saved(fingerprint(task), outcome))
     except DeWorldSGError as error:
         return JobResult(job.row, task.scan, None, str(error))
-    except Exception as error:  # one scan must not take the others with it
+    except Exception as error:  # a failed scan must not stop the others
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
-        failure = f"{type(error).__name__}: {error} (all of it in {folder / ERROR_FILE})"
+        failure = f"{type(error).__name__}: {error} (traceback in {folder / ERROR_FILE})"
         return JobResult(job.row, task.scan, None, failure)
     return JobResult(job.row, task.scan, outcome)
 
 
 def fingerprint(task: ScanTask) -> str:
-    """Of everything that a result depends on but the content of the data set."""
-    place = replace(task, root=task.root.resolve(), out=Path())
-    content = msgspec.json.encode({"version": __version__, "task": place}, enc_hook=_as_text)
+    """Hash of all inputs of a task except the content of the data set."""
+    portable = replace(task, root=task.root.resolve(), out=Path())
+    content = msgspec.json.encode({"version": __version__, "task": portable}, enc_hook=_as_text)
     return hashlib.sha256(content).hexdigest()
 
 
-def read_kept(folder: Path, wanted: str) -> ScanOutcome | None:
-    """The outcome that is kept in a scan's folder; None where it is of another task, or damaged."""
+def read_saved(folder: Path, expected: str) -> ScanOutcome | None:
+    """The saved outcome in the folder of a scan; None if it is damaged or of another task."""
     try:
         content = (folder / OUTCOME_FILE).read_bytes()
-        kept = msgspec.json.decode(content, type=_Kept, dec_hook=_from_text)
+        saved = msgspec.json.decode(content, type=_Saved, dec_hook=_from_text)
     except (OSError, msgspec.MsgspecError):
         return None
-    usable = kept.fingerprint == wanted and (folder / GRAPH_FILE).exists()
-    return kept.outcome if usable else None
+    usable = saved.fingerprint == expected and (folder / GRAPH_FILE).exists()
+    return saved.outcome if usable else None
 
 
-def _keep(folder: Path, kept: _Kept) -> None:
+def _save(folder: Path, saved: _Saved) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / OUTCOME_FILE, msgspec.json.encode(kept, enc_hook=_as_text))
+    write_atomically(folder / OUTCOME_FILE, msgspec.json.encode(saved, enc_hook=_as_text))
 
 
 def _as_text(value: Any) -> str:
     if isinstance(value, Path):
         return str(value)
-    raise TypeError(f"{type(value).__name__} cannot be kept as JSON")
+    raise TypeError(f"{type(value).__name__} cannot be saved as JSON")
 
 
 def _from_text(kind: type, value: Any) -> Any:

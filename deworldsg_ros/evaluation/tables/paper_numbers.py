@@ -1,6 +1,6 @@
-"""Numbers as printed in the paper's tables, to stand beside ours; percent.
+"""Numbers printed in the tables of the paper, percent, for comparison.
 
-The paper's abstract and text state others here and there: these are the tables'.
+Some numbers in the abstract and text of the paper differ: these are from its tables.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class PrintedRow:
-    """A row of the paper.
+    """A row of a table of the paper.
 
     Attributes:
-        title: as printed.
-        dataset: that the numbers are of.
-        percents: in the order of `COLUMNS`.
+        title: title as printed.
+        dataset: name of the data set.
+        percents: numbers in the order of `COLUMNS`.
     """
 
     title: str
@@ -31,7 +31,7 @@ class PrintedRow:
     percents: tuple[float, float, float, float, float]
 
     def numbers(self) -> dict[str, float]:
-        """The recalls by name, as fractions."""
+        """Recalls by name, as fractions."""
         return {
             name: round(value / 100, 6) for name, value in zip(COLUMNS, self.percents, strict=True)
         }
@@ -69,7 +69,7 @@ ABLATION_3DSSG = _rows(
     ("(d) + DINOv2", (49.5, 74.6, 56.6, 69.5, 33.7)),
     ("(e) + V-JEPA 2", (50.2, 75.0, 57.3, 70.6, 36.0)),
 )
-# Average milliseconds a frame on an RTX A6000, ReplicaSSG; its parts add up to 108.58.
+# Mean milliseconds per frame on ReplicaSSG, as printed; the parts add up to 108.58, not 108.53.
 RUNTIME_DEVICE = "NVIDIA RTX A6000"
 RUNTIME_MS = {
     "detection": 4.42,
@@ -82,7 +82,7 @@ RUNTIME_MS = {
 
 
 def printed_rows(table: str, layout: str) -> list[PrintedRow]:
-    """What the paper prints for a table, best fitting the layout's data set."""
+    """Rows of the paper for a table, of the data set of the layout if the paper has it."""
     if table == "main":
         return MAIN_3DSSG if layout == "3rscan" else POSE_REPLICA[:2]
     return {"pose": POSE_REPLICA, "ablation": ABLATION_3DSSG}.get(table, [])

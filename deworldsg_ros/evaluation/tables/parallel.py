@@ -1,4 +1,4 @@
-"""The same function over many jobs: in this process, over the cores, or over a cluster."""
+"""Execution of jobs: in this process, in parallel on the cores, or on a cluster."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from concurrent.futures.process import BrokenProcessPool
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.tables.jobs import Job, JobResult, run_job
 
-# Libraries that would each take all cores; read when they are first imported.
+# Thread limits of libraries that otherwise use all cores each; read at their first import.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 DIED = "its process died (out of memory?)"
 
 
 def run_jobs(jobs: Sequence[Job], *, workers: int = 0, scheduler: str = "") -> Iterator[JobResult]:
-    """Results as they come.
+    """Run jobs; yields results in the order in which they finish.
 
     Args:
-        jobs: what to run.
-        workers: processes; 1 = in this one, 0 = as many as there are cores.
-        scheduler: address of a dask scheduler, whose workers see the same folders; empty = none.
+        jobs: jobs to run.
+        workers: number of processes; 1 = this process, 0 = one per core.
+        scheduler: address of a dask scheduler whose workers share the file system; empty = none.
 
     Raises:
-        EvaluationError: where the scheduler cannot be used.
+        EvaluationError: the scheduler cannot be used.
     """
     if scheduler:
         yield from _over_cluster(jobs, scheduler)
@@ -39,8 +39,8 @@ def run_jobs(jobs: Sequence[Job], *, workers: int = 0, scheduler: str = "") -> I
 
 
 def _over_cores(jobs: Sequence[Job], workers: int) -> Iterator[JobResult]:
-    """A process that dies breaks its pool: what was left is run again, a pool of one each."""
-    left = []
+    """A process that dies breaks its pool. Unfinished jobs then run again, each in its own pool."""
+    unfinished = []
     pool = _pool(workers)
     try:
         futures = {pool.submit(run_job, job): job for job in jobs}
@@ -48,10 +48,10 @@ def _over_cores(jobs: Sequence[Job], workers: int) -> Iterator[JobResult]:
             try:
                 yield future.result()
             except BrokenProcessPool:
-                left.append(futures[future])
+                unfinished.append(futures[future])
     finally:
         pool.shutdown(cancel_futures=True)
-    for job in left:
+    for job in unfinished:
         with _pool(1) as alone:
             try:
                 yield alone.submit(run_job, job).result()
@@ -60,13 +60,13 @@ def _over_cores(jobs: Sequence[Job], workers: int) -> Iterator[JobResult]:
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    # Started anew: a copy of a process with threads may hang.
+    # Spawn: a forked copy of a process with threads may hang.
     context = multiprocessing.get_context("spawn")
     before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     try:
         pool = ProcessPoolExecutor(workers, mp_context=context, initializer=one_thread)
-        # The processes take the environment as it is when they start: now.
+        # Start all processes now, while the environment has the thread limits.
         for future in [pool.submit(os.getpid) for _ in range(workers)]:
             future.result()
         return pool
@@ -79,7 +79,7 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def one_thread() -> None:
-    """Keep OpenCV to one thread: the cores are taken by the other processes."""
+    """Limit OpenCV to one thread: the other processes use the other cores."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -97,7 +97,7 @@ def _over_cluster(jobs: Sequence[Job], address: str) -> Iterator[JobResult]:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
         raise EvaluationError(
-            f"--scheduler {address}: {error}; wanted the address of a running dask scheduler, "
+            f"--scheduler {address}: {error}; expected the address of a running dask scheduler, "
             "e.g. tcp://host:8786"
         ) from error
     with client:

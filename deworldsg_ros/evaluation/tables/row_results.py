@@ -1,4 +1,4 @@
-"""What a table says: each row's numbers, those of the paper, as values, text and files."""
+"""Results of the rows of a table, with the rows of the paper; as values and files."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ CSV_FILE, LATEX_FILE = "table.csv", "table.tex"
 
 
 @dataclass(frozen=True)
-class TableRow:
-    """One line of a table.
+class RowResult:
+    """Result of one row of a table.
 
     Attributes:
-        name, title: of the row.
-        dataset: that its numbers are of.
-        printed: whether they are the paper's and not ours.
-        numbers: by name, fractions and metres.
-        times_ms: mean milliseconds a frame of each stage.
-        device: that the times were taken on.
-        scans: number of scans behind it.
-        failures: why a scan is not, by scan.
-        details: what else goes into the JSON.
+        name, title: name and title of the row.
+        dataset: name of the data set.
+        printed: True if the numbers are printed in the paper.
+        numbers: numbers by name, fractions and metres.
+        times_ms: mean milliseconds per frame of each stage.
+        device: device of the measured times.
+        scans: number of scans.
+        failures: reason of the failure, by scan.
+        details: more values for JSON.
     """
 
     name: str
@@ -54,7 +54,7 @@ class TableRow:
     details: dict[str, Any] = field(default_factory=dict)
 
     def values(self) -> dict[str, Any]:
-        """For JSON."""
+        """Plain values for JSON."""
         return {
             "name": self.name,
             "title": self.title,
@@ -71,12 +71,12 @@ class TableRow:
 
 def run_row(
     name: str, title: str, dataset: str, results: Sequence[JobResult], vocabulary: Vocabulary
-) -> TableRow:
-    """A row that was run: its scans pooled."""
+) -> RowResult:
+    """The result of a row over all its scans."""
     outcomes = [result.outcome for result in results if result.outcome is not None]
     failures = {result.scan: result.failure for result in results if result.outcome is None}
     if not outcomes:
-        return TableRow(name, title, dataset, False, {}, failures=failures)
+        return RowResult(name, title, dataset, False, {}, failures=failures)
     pooled = protocol.pool([outcome.result for outcome in outcomes], vocabulary)
     together = measures.pool(outcome.measures for outcome in outcomes)
     frames = sum(outcome.frames for outcome in outcomes)
@@ -85,7 +85,7 @@ def run_row(
         stage: sum(outcome.total_ms.get(stage, 0.0) for outcome in outcomes) / frames
         for stage in stages
     }
-    return TableRow(
+    return RowResult(
         name,
         title,
         dataset,
@@ -99,27 +99,27 @@ def run_row(
     )
 
 
-def predicted_row(title: str, evaluation: Evaluation) -> TableRow:
+def predicted_row(title: str, evaluation: Evaluation) -> RowResult:
     """The row of a method of which only the predictions are known."""
     result = evaluation.result
     numbers = all_numbers(result, evaluation.pooled)
-    return TableRow(title, title, evaluation.dataset, False, numbers, scans=len(result.scans))
+    return RowResult(title, title, evaluation.dataset, False, numbers, scans=len(result.scans))
 
 
-def paper_rows(table: str, layout: str) -> list[TableRow]:
+def paper_rows(table: str, layout: str) -> list[RowResult]:
     """The paper's rows of a table."""
     if table == "runtime":
         title = "DeWorldSG as printed"
         times = dict(RUNTIME_MS)
-        return [TableRow("printed", title, "ReplicaSSG", True, {}, times, RUNTIME_DEVICE)]
+        return [RowResult("printed", title, "ReplicaSSG", True, {}, times, RUNTIME_DEVICE)]
     return [
-        TableRow(f"printed {row.title}", row.title, row.dataset, True, row.numbers())
+        RowResult(f"printed {row.title}", row.title, row.dataset, True, row.numbers())
         for row in printed_rows(table, layout)
     ]
 
 
 def all_numbers(result: ProtocolResult, together: Measures) -> dict[str, float]:
-    """The protocol's five, the measures beside them, and nodes an object."""
+    """The five official scores, the measures, and the number of nodes per object."""
     numbers = {**result.numbers(), **together.numbers()}
     numbers["nodes_per_object"] = (
         together.nodes / together.objects if together.objects else math.nan
@@ -128,15 +128,15 @@ def all_numbers(result: ProtocolResult, together: Measures) -> dict[str, float]:
 
 
 def total_ms(times_ms: Mapping[str, float]) -> float:
-    """Of a whole frame; perception's parts are not counted beside it."""
+    """Milliseconds of a whole frame: the sum of the stages, without the parts of perception."""
     if "total" in times_ms:
         return times_ms["total"]
     stages = ("perception", "lifting", "merging", "relations")
     return sum(times_ms.get(stage, 0.0) for stage in stages)
 
 
-def write_table(out: Path, rows: Sequence[TableRow]) -> list[Path]:
-    """CSV with every number and LaTeX rows; raises EvaluationError."""
+def write_table(out: Path, rows: Sequence[RowResult]) -> list[Path]:
+    """Write a CSV file with every number and a file of LaTeX rows; raises EvaluationError."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         lines = {

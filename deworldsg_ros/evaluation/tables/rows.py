@@ -1,4 +1,4 @@
-"""Which rows a table has: a method with a configuration and poses each."""
+"""The rows of each table: method, configuration, detections and poses."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from deworldsg_ros.poses.perturbation import PoseNoise
 
 Kind = Literal["main", "hard", "pose", "ablation", "switches", "runtime"]
 TABLES: tuple[Kind, ...] = ("main", "hard", "pose", "ablation", "switches", "runtime")
-POSE_WORDS = {
-    "ground-truth": "true poses",
-    "slam": "SLAM's poses",
+POSE_TITLES = {
+    "ground-truth": "ground-truth poses",
+    "slam": "SLAM poses",
     "odometry": "odometry",
     "perturbed": "perturbed poses",
 }
-# Configures a row: shipped file, settings of its own.
+# (configuration file, settings of the row, name of the row) -> configuration of the row.
 Configure = Callable[[str, Sequence[str], str], Config]
 
 
@@ -30,12 +30,12 @@ class Row:
     """One method of a table.
 
     Attributes:
-        name: of its folder, and in ``--set NAME:section.field=value``.
-        title: for people.
-        method: the pipeline, or a baseline.
-        config: of the pipeline, or what a baseline uses of it.
-        front_end: where its detections come from.
-        poses: where they come from.
+        name: folder of its results; prefix in ``--set NAME:section.field=value``.
+        title: name in the printed table.
+        method: the pipeline or a baseline.
+        config: configuration of the pipeline; a baseline uses some of it.
+        front_end: source of detections.
+        poses: source of poses.
     """
 
     name: str
@@ -48,10 +48,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Condition:
-    """What makes the input of a row harder; None = as it was asked for.
+    """Faults that make the input of a row harder.
 
     Attributes:
-        name, title: of the condition; without a title there is nothing harder.
+        name, title: suffixes of the row's; an empty title adds none.
+        faults, poses, flip: replace those of the command line; None keeps them.
     """
 
     name: str
@@ -61,7 +62,7 @@ class Condition:
     flip: float | None = None
 
     def apply(self, front_end: FrontEndChoice) -> FrontEndChoice:
-        """The front end under this condition."""
+        """The front end with the faults of this condition."""
         faults = front_end.faults if self.faults is None else self.faults
         flip = front_end.flip if self.flip is None else self.flip
         return replace(front_end, faults=faults, flip=flip)
@@ -84,11 +85,11 @@ ABLATION = (
 )
 
 
-# A hand that trembles, or a tracker that does: 2 cm and 1 degree about each axis.
-TREMBLING = PoseSource("perturbed", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
+# Hand shake, or a tracker without smoothing.
+SHAKING = PoseSource("perturbed", PoseNoise(jitter_m=0.02, jitter_deg=1.0))
 LABELS = Condition("label", "persistent wrong labels", Faults(label=0.1))
-FALSE = Condition("false", "false boxes", Faults(false=1.0))
-TREMBLES = Condition("jitter", "poses ±2 cm, ±1°", poses=TREMBLING)
+FALSE = Condition("false", "false detections", Faults(false=1.0))
+JITTER = Condition("jitter", "pose jitter 2 cm, 1°", poses=SHAKING)
 HARD = (
     Condition("plain"),
     LABELS,
@@ -96,26 +97,29 @@ HARD = (
     Condition("bleed", "bleeding masks", Faults(bleed=0.3)),
     Condition("merge", "merged masks", Faults(merge=0.1)),
     Condition("cut", "cut masks", Faults(cut=0.3)),
-    TREMBLES,
+    JITTER,
     Condition(
-        "all", "all of it", Faults(label=0.1, false=1.0, bleed=0.3, merge=0.1, cut=0.3), TREMBLING
+        "all",
+        "all faults and jitter",
+        Faults(label=0.1, false=1.0, bleed=0.3, merge=0.1, cut=0.3),
+        SHAKING,
     ),
 )
-# name, title, settings on the default configuration
+# name, title, settings on top of the default configuration
 SWITCHES = (
     ("default", "default", ()),
-    ("paper", "the paper's association", ("merging.association=paper",)),
-    ("align", "frames aligned with the graph", ("merging.align_poses=true",)),
-    ("confirm", "one observation confirms", ("merging.confirm_observations=1",)),
-    ("rough", "no depth refinement", ("lifting.pixels=mask",)),
-    ("belief", "the paper's edge belief", ("relations.edge_belief=paper",)),
+    ("paper", "association of the paper", ("merging.association=paper",)),
+    ("align", "pose alignment", ("merging.align_poses=true",)),
+    ("confirmed", "nodes confirmed at once", ("merging.confirm_observations=1",)),
+    ("mask", "all mask pixels", ("lifting.pixels=mask",)),
+    ("belief", "edge belief of the paper", ("relations.edge_belief=paper",)),
 )
 SWITCH_CONDITIONS = (
-    Condition("flip0", "no flips", flip=0.0),
-    Condition("flip10", "flips 0.1", flip=0.1),
+    Condition("flip0", "no flipped labels", flip=0.0),
+    Condition("flip10", "10 % flipped labels", flip=0.1),
     LABELS,
     FALSE,
-    TREMBLES,
+    JITTER,
 )
 
 
@@ -126,14 +130,13 @@ def table_rows(
 
     Args:
         table: one of `TABLES`.
-        poses: of the pose table: one row a method and choice; of the others the first.
-        front_end: of all rows, but for what a row makes harder.
-        configure: makes the configuration of a row from the name of a shipped file, settings, and
-            the row's name.
+        poses: the pose table has rows for each; the other tables use the first.
+        front_end: source of detections, before the faults of a condition.
+        configure: returns the configuration of a row.
 
     Raises:
-        EvaluationError: for a table that does not exist.
-        ConfigurationError: for a setting that does not fit.
+        EvaluationError: an unknown table.
+        ConfigurationError: an invalid setting.
     """
     if table not in TABLES:
         raise EvaluationError(f"table {table}: expected {', '.join(TABLES)}")
@@ -146,7 +149,7 @@ def table_rows(
         return [
             Row(
                 f"{name}-{choice.kind}",
-                f"{title}, {POSE_WORDS[choice.kind]}",
+                f"{title}, {POSE_TITLES[choice.kind]}",
                 method,
                 configure(file, (), name),
                 front_end,
@@ -157,16 +160,11 @@ def table_rows(
             if name != "kim"
         ]
     if table == "switches":
-        return [
-            _harder(
-                Row(
-                    name, title, PIPELINE, configure("default", settings, name), front_end, poses[0]
-                ),
-                condition,
-            )
-            for condition in SWITCH_CONDITIONS
+        rows = [
+            Row(name, title, PIPELINE, configure("default", settings, name), front_end, poses[0])
             for name, title, settings in SWITCHES
         ]
+        return [_harder(row, condition) for condition in SWITCH_CONDITIONS for row in rows]
     rows = [
         Row(name, title, method, configure(file, (), name), front_end, poses[0])
         for name, title, method, file in METHODS

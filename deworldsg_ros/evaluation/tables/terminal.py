@@ -1,4 +1,4 @@
-"""Tables of methods on the terminal."""
+"""Terminal tables that compare methods."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from deworldsg_ros.evaluation.tables.row_results import TableRow, total_ms
+from deworldsg_ros.evaluation.tables.row_results import RowResult, total_ms
 from deworldsg_ros.timing import STAGES
 
 # Heading, number, factor, decimals.
@@ -20,7 +20,7 @@ RECALL_COLUMNS = (
     ("mObj", "object_mean_recall", 100, 1),
     ("mPred", "predicate_mean_recall", 100, 1),
 )
-BESIDE_TITLE = "beside recall (%; cm = median centroid error of main nodes)"
+BESIDE_TITLE = "precision and geometry (%; cm = median centroid error of main nodes)"
 BESIDE_COLUMNS = (
     ("nodes/obj.", "nodes_per_object", 1, 2),
     ("found", "node_recall", 100, 1),
@@ -31,11 +31,11 @@ BESIDE_COLUMNS = (
 
 
 def print_table(
-    console: Console, rows: Sequence[TableRow], title: str, *, timed: bool = False
+    console: Console, rows: Sequence[RowResult], title: str, *, timed: bool = False
 ) -> None:
-    """Recall with the paper's rows in a section of their own; then what recall leaves out.
+    """Print recalls, with the rows of the paper first, then precision and geometry.
 
-    With `timed` there are the mean milliseconds of merging a frame, too.
+    `timed` adds the mean milliseconds per frame of merging.
     """
     printed = [row for row in rows if row.printed]
     table = _table(title, RECALL_COLUMNS)
@@ -63,13 +63,13 @@ def _table(title: str, columns: Sequence[tuple[str, str, int, int]]) -> Table:
     return table
 
 
-def _numbers(row: TableRow, columns: Sequence[tuple[str, str, int, int]]) -> list[str]:
+def _numbers(row: RowResult, columns: Sequence[tuple[str, str, int, int]]) -> list[str]:
     return [_number(row.numbers.get(key, math.nan) * f, d) for _, key, f, d in columns]
 
 
-def print_runtime(console: Console, rows: Sequence[TableRow], title: str) -> None:
-    """Milliseconds a frame of each stage, and the device of each row."""
-    table = Table(title=title, caption="mean milliseconds a frame")
+def print_runtime(console: Console, rows: Sequence[RowResult], title: str) -> None:
+    """Print mean milliseconds per frame of each stage, and the device of each row."""
+    table = Table(title=title, caption="mean milliseconds per frame")
     table.add_column("stage")
     timed = [row for row in rows if row.times_ms]
     for row in timed:
@@ -84,15 +84,15 @@ def print_runtime(console: Console, rows: Sequence[TableRow], title: str) -> Non
     print_failures(console, rows)
 
 
-def print_failures(console: Console, rows: Sequence[TableRow]) -> None:
-    """Each failed scan once, with its rows."""
+def print_failures(console: Console, rows: Sequence[RowResult]) -> None:
+    """Print each reason of failure once, with its row and scans."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         for scan, reason in row.failures.items():
             reasons.setdefault((row.name, reason), []).append(scan)
     for (name, reason), scans in reasons.items():
-        told = f"{name}, {', '.join(scans)}: {reason}"
-        console.print(f"[red]failed:[/] {escape(told)}", highlight=False, soft_wrap=True)
+        text = f"{name}, {', '.join(scans)}: {reason}"
+        console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
 
 
 def _number(value: float, decimals: int) -> str:

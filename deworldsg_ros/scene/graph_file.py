@@ -1,0 +1,35 @@
+"""The file of a finished scene graph: the message of /scene_graph as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import RefusedInput
+
+GRAPH_FILE = "scene_graph.json"
+
+
+def write_graph(folder: Path, graph: wire.SceneGraphMessage) -> Path:
+    """Write ``folder/scene_graph.json``; returns its path. Raises OSError."""
+    path = folder / GRAPH_FILE
+    path.write_text(wire.encode(graph), encoding="utf-8")
+    return path
+
+
+def read_graph(folder: Path) -> wire.SceneGraphMessage:
+    """Read ``folder/scene_graph.json``.
+
+    Raises:
+        RefusedInput: ``unreadable_graph``, or the reason for which `wire.decode` refuses it.
+    """
+    path = folder / GRAPH_FILE
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        message = f"scene graph {path} cannot be read ({error.strerror})"
+        raise RefusedInput("unreadable_graph", message) from error
+    try:
+        return wire.decode(content, wire.SceneGraphMessage)
+    except RefusedInput as refusal:
+        raise RefusedInput(refusal.reason, f"scene graph {path}: {refusal}") from refusal
