@@ -47,7 +47,8 @@ CLASSES = {
 PUBLISHER_DEPTH = 10
 # Without the four nodes: a viewer or a recorder subscribes within this time.
 LISTENER_WAIT_S = 4.0
-# The slowest backends on a CPU need up to ten seconds a frame.
+# Without a result for this time, a node has failed or hangs: the slowest step, a large model on a
+# CPU, takes seconds per frame.
 STALL_S = 30.0
 PROGRESS_PERIOD_S = 0.2
 WAITING_PERIOD_S = 1.0

@@ -84,8 +84,10 @@ def arrow_head(tip: Float64, direction: Float64, length_m: float) -> tuple[Float
     rim = np.outer(np.cos(angles), side) + np.outer(np.sin(angles), np.cross(along, side))
     base = tip - length_m * along
     vertices = np.vstack([tip, base + 0.36 * length_m * rim])
-    turn = np.arange(HEAD_SIDES)
-    mantle = np.stack([np.zeros_like(turn), turn + 1, (turn + 1) % HEAD_SIDES + 1], axis=1)
+    side_index = np.arange(HEAD_SIDES)
+    mantle = np.stack(
+        [np.zeros_like(side_index), side_index + 1, (side_index + 1) % HEAD_SIDES + 1], axis=1
+    )
     return vertices, mantle
 
 

@@ -79,15 +79,15 @@ def test_demo_and_run_end_with_the_same_graph(recording, unposed, tmp_path, pose
 
 
 def test_a_node_that_dies_is_named_with_the_end_of_its_log(recording, tmp_path):
-    told = deworldsg(
+    failed = deworldsg(
         tmp_path,
         *("demo", recording, "--out", "out", "--set", "perception.detector=crystal_ball"),
         limit_s=400,
     )
-    assert told.returncode == 2
-    assert "segmentation_node ended early" in told.stderr
-    assert "crystal_ball" in told.stderr
-    assert "Traceback" not in told.stderr
+    assert failed.returncode == 2
+    assert "segmentation_node ended early" in failed.stderr
+    assert "crystal_ball" in failed.stderr
+    assert "Traceback" not in failed.stderr
 
 
 def children(pid):

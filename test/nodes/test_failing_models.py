@@ -46,7 +46,7 @@ def test_a_failing_model_is_counted_and_the_node_continues(
     segmentation.refuses(reason, lambda: send_frame(segmentation))
     report = segmentation.node.health.report(0.0)
     assert f"the {part} failed: CUDA out of memory" in report.values[f"example {reason}"]
-    # Without a detector there is nothing to publish; else the frame goes on.
+    # Without detections the frame has no product.
     if part != "detector":
         segmentation.expect(lambda: segmentation.products() > published, "a product")
     backend.failing = ""

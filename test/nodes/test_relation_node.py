@@ -83,15 +83,15 @@ def test_the_published_graph_selects_the_pairs_of_the_world_model() -> None:
         )
         at.send(**{"/scene_graph/updates": update, "/scene_graph": snapshot})
 
-    def clips(**wanted: int) -> None:
-        def told() -> bool:
+    def clips(**expected: int) -> None:
+        def reached() -> bool:
             values = at.node.more_values()
             return all(
                 values.get(f"clips {name.replace('__', ' ')}", "0") == str(count)
-                for name, count in wanted.items()
+                for name, count in expected.items()
             )
 
-        at.expect(told, f"clips {wanted}, not {at.node.more_values()}")
+        at.expect(reached, f"clips {expected}, not {at.node.more_values()}")
 
     try:
         stamp_ns = send_two_objects(at)
@@ -128,11 +128,11 @@ def test_a_restarted_recording_is_encoded_again() -> None:
         started_ns = at.stamp_ns
         for count in range(1, 13):  # more than the buffer of eight holds
             send_two_objects(at)
-            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+            at.expect(lambda expected=count: encoded() == expected, f"{count} clips")
         at.stamp_ns = started_ns
         for count in (13, 14):
             send_two_objects(at)
-            at.expect(lambda wanted=count: encoded() == wanted, f"{count} clips")
+            at.expect(lambda expected=count: encoded() == expected, f"{count} clips")
         assert at.node.more_values().get("clips dropped no_frame") is None
     finally:
         at.close()
@@ -173,8 +173,8 @@ def test_predicates_of_an_imported_checkpoint_are_known(
         if predicates == ("on", "under"):
             start(**chosen, perception__detector_path=str(tmp_path))
             continue
-        told = "trained on others" if predicates else "names no predicates"
-        with pytest.raises(ConfigurationError, match=told):
+        message = "trained on others" if predicates else "names no predicates"
+        with pytest.raises(ConfigurationError, match=message):
             start(**chosen, perception__detector_path=str(tmp_path))
     start(**chosen, perception__detector_path="somebody/elsewhere")
     with pytest.raises(ConfigurationError, match="trained on others"):
