@@ -26,7 +26,7 @@ from segmenter_iou import Frame, grab_cut
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
@@ -90,13 +90,13 @@ def main() -> None:
         return segmenter.segment(frame.rgb, frame.depth_m, INTRINSICS, frame.boxes_xyxy)
 
     masks = segment()  # compiles
-    instances = label_image(masks, classes, scores, (HEIGHT, WIDTH))
+    instances = instance_image(masks, classes, scores, (HEIGHT, WIDTH))
     objects = SegmentedObjects(names, scores, None, instances, frame.depth_m, INTRINSICS, UP_CAMERA)
     parts: dict[str, Callable[[], object]] = {
         "detector, 2 threads": lambda: detector.detect(frame.rgb, 0.4),
         "segmenter, 1 thread": segment,
         "grabCut, 1 thread": lambda: grab_cut(frame),
-        "label image": lambda: label_image(masks, classes, scores, (HEIGHT, WIDTH)),
+        "label image": lambda: instance_image(masks, classes, scores, (HEIGHT, WIDTH)),
         "relation head": lambda: head.relate(objects, max_relations=10),
     }
     wall: dict[str, list[float]] = {name: [] for name in parts}

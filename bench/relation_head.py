@@ -23,7 +23,7 @@ from segmenter_iou import INTRINSICS, load
 
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch, SegmentedObjects
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
@@ -45,7 +45,7 @@ def best_predicates(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
-    parser.add_argument("--step", type=int, default=8, help="every n-th frame")
+    parser.add_argument("--step", type=int, default=8, help="use every N-th frame")
     parser.add_argument("--masks", choices=["truth", "segmenter"], default="truth")
     parser.add_argument("--verbose", action="store_true", help="name each disagreement")
     arguments = parser.parse_args()
@@ -70,7 +70,7 @@ def main() -> None:
             else:
                 patches = segmenter.segment(frame.rgb, frame.depth_m, INTRINSICS, frame.boxes_xyxy)
             classes = np.array([d["gt_class"] for d in detections])
-            instances = label_image(patches, classes, scores, frame.depth_m.shape)
+            instances = instance_image(patches, classes, scores, frame.depth_m.shape)
             pose = np.loadtxt(path.with_name(path.name.replace("color.jpg", "pose.txt")))
             up_camera = pose[:3, :3].T @ np.array([0.0, 0.0, 1.0])
             objects = SegmentedObjects(

@@ -1,13 +1,13 @@
-"""Overlap of the RGB-D segmenter with perfect masks, and what it costs.
+"""IoU of the RGB-D segmenter with perfect masks, and its time.
 
     python bench/segmenter_iou.py DATASET [--step 8] [--time]
 
 DATASET is a folder in the layout of the rendered rooms: data/<scene>/sequence/frame-*.{color.jpg,
-depth.pgm,instance.png,frontend.json}. Boxes are the front end's (each edge off by 2 px), masks of
-the visible part are perfect. Objects above 1 000 visible pixels count.
+depth.pgm,instance.png,frontend.json}. Boxes are those of the front end: each edge is off by 2 px.
+Masks of the visible part are perfect. Objects with more than 1 000 visible pixels count.
 
-Times are processor time of one thread, so that other work on the machine does not count.
-References: the box itself, and cv2.grabCut (colour alone, three rounds, started from the box).
+Times are processor times of one thread, which other work on the machine does not change.
+References: the box itself, and cv2.grabCut (colour only, three rounds, initialised with the box).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def load(path: Path) -> Frame:
 
 
 def whole_boxes(frame: Frame) -> list[MaskPatch]:
-    """The box is the object."""
+    """Each box as a mask."""
     patches = []
     height, width = frame.depth_m.shape
     for box in frame.boxes_xyxy:
@@ -115,7 +115,7 @@ def overlap(patch: MaskPatch, truth: np.ndarray) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
-    parser.add_argument("--step", type=int, default=8, help="every n-th frame")
+    parser.add_argument("--step", type=int, default=8, help="use every N-th frame")
     parser.add_argument("--time", action="store_true", help="also time grabCut, paired")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)

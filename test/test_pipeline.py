@@ -19,7 +19,8 @@ from deworldsg_ros.config import (
 )
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
-from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.perception.stage import Perception
+from deworldsg_ros.pipeline import PERCEPTION_PARTS, Pipeline
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
@@ -185,6 +186,10 @@ def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
     asked.process(frame(1))
     assert len(pipeline.graph().nodes) == 3
     assert pipeline.graph().nodes == asked.graph().nodes
+
+
+def test_the_timed_parts_of_perception_are_its_methods() -> None:
+    assert all(callable(getattr(Perception, method)) for method in PERCEPTION_PARTS)
 
 
 def test_the_shipped_configurations_are_what_they_say() -> None:

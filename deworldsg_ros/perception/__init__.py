@@ -2,7 +2,7 @@
 
 `stage` runs a detector, a segmenter and a relation head (`backends`) on each frame. `protocols`
 defines them and `registry` builds them by name. `nested` handles boxes inside boxes,
-`label_image` combines masks.
+`instance_image` combines the masks.
 """
 
 from deworldsg_ros.perception.protocols import (

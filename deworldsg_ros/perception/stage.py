@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import (
     Detections,
@@ -61,6 +61,8 @@ class Perceived:
 
 class Perception:
     """Detector, segmenter and relation head, composed.
+
+    `detect`, `segment` and `relate` are the parts of `perceive` that a run times.
 
     Args:
         detector, segmenter, relation_head: the backends.
@@ -121,16 +123,19 @@ class Perception:
             objects, masks = join_nested(objects, masks, frame.depth_m)
             if len(objects) < count:
                 drops["detected_twice"] = count - len(objects)
-        instances = label_image(
+        instances = instance_image(
             masks,
             objects.class_probabilities.argmax(axis=1),
             objects.scores,
             (intrinsics.height, intrinsics.width),
         )
-        relations = self.relate(frame, objects, instances)
-        if relations is None:
-            drops["relation_head_error"] = len(objects)
-            relations = Relations.none(len(self.vocabulary.predicates))
+        relations = Relations.none(len(self.vocabulary.predicates))
+        if len(objects) > 1 and self._max_relations:
+            related = self.relate(frame, objects, instances)
+            if related is None:
+                drops["relation_head_error"] = len(objects)
+            else:
+                relations = related
         frame_graph = FrameGraph(
             stamp_ns=frame.stamp_ns,
             frame_id=frame.frame_id,
@@ -167,8 +172,6 @@ class Perception:
 
     def relate(self, frame: RgbdFrame, objects: Detections, instances: UInt16) -> Relations | None:
         """The best relations between the objects; None if the relation head failed."""
-        if len(objects) < 2 or not self._max_relations:
-            return Relations.none(len(self.vocabulary.predicates))
         segmented = SegmentedObjects(
             class_names=[
                 self.vocabulary.classes[c] for c in objects.class_probabilities.argmax(axis=1)

@@ -71,7 +71,7 @@ SCANNET_PREDICATES: tuple[str, ...] = (
 )
 # fmt: on
 
-# By the name the configuration uses.
+# By the value of `perception.predicate_set`.
 PREDICATE_SETS: dict[str, tuple[str, ...]] = {
     "replica_ssg": REPLICA_SSG_PREDICATES,
     "3dssg": SCANNET_PREDICATES,

@@ -1,4 +1,4 @@
-"""A model that fails in the middle of a run costs its stage's product, and no more."""
+"""A backend that fails during a run loses only its own results."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def perceive(backend, times=1):
     return found
 
 
-def test_nothing_fails():
+def test_without_failure_all_objects_and_relations_are_returned():
     backend = Backend()
     found = perceive(backend)
     assert len(found.frame_graph) == 3 and len(found.frame_graph.relations.pairs) == 1
     assert found.drops == {} and found.failures == {}
-    # The features of an object go with it into the order by score.
+    # The features are sorted by score together with their objects.
     assert backend.features.tolist() == [[2, 3], [4, 5], [0, 1]]
 
 
-def test_a_failing_relation_head_leaves_the_objects():
+def test_if_the_relation_head_fails_the_objects_are_kept():
     found = perceive(Backend("relation head"))
     assert len(found.frame_graph) == 3 and found.instances.any()
     assert len(found.frame_graph.relations.pairs) == 0
@@ -45,7 +45,7 @@ def test_a_failing_relation_head_leaves_the_objects():
     assert found.failures.keys() <= REASONS.keys()
 
 
-def test_a_failing_segmenter_leaves_out_the_objects_of_the_frame():
+def test_if_the_segmenter_fails_the_frame_has_no_objects():
     found = perceive(Backend("segmenter"))
     assert len(found.frame_graph) == 0 and not found.instances.any()
     assert found.instances.shape == SHAPE and found.instances.dtype == np.uint16
@@ -53,7 +53,7 @@ def test_a_failing_segmenter_leaves_out_the_objects_of_the_frame():
     assert list(found.failures) == ["segmenter_error"] and "segmenter_error" in REASONS
 
 
-def test_a_failing_detector_refuses_the_frame_by_a_reason_that_is_explained():
+def test_if_the_detector_fails_the_frame_is_refused_with_a_documented_reason():
     with pytest.raises(RefusedInput, match="the detector failed: CUDA out of memory") as refusal:
         perceive(Backend("detector"))
     assert refusal.value.reason == "detector_error" and "detector_error" in REASONS
@@ -70,7 +70,7 @@ def test_a_failure_is_logged_once_with_its_traceback(part, caplog):
 @pytest.mark.parametrize(
     ("field", "name"), [("detector", "rtdetr"), ("segmenter", "sam2"), ("segmenter", "sam")]
 )
-def test_without_torch_the_backend_says_what_to_install(field, name, monkeypatch):
+def test_without_torch_the_error_names_the_package_to_install(field, name, monkeypatch):
     really = builtins.__import__
 
     def without_torch(module, *arguments, **options):
@@ -83,7 +83,7 @@ def test_without_torch_the_backend_says_what_to_install(field, name, monkeypatch
         build_perception(PerceptionConfig(**{field: name}))
 
 
-def test_features_are_one_row_an_object():
+def test_features_have_one_row_per_object():
     with pytest.raises(ValueError, match="2 scores, 1 features"):
         Detections(np.zeros((2, 4)), np.ones((2, 1)), np.zeros(2), np.zeros((1, 3), np.float32))
 

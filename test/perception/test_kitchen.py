@@ -40,7 +40,7 @@ def names(frame_graph):
     return [frame_graph.vocabulary.classes[k] for k in frame_graph.class_probabilities.argmax(1)]
 
 
-def test_what_stands_there_is_found(perceived):
+def test_the_objects_of_the_kitchen_are_found(perceived):
     counts = Counter(name for _, found in perceived for name in set(names(found.frame_graph)))
     for name in ("chair", "dining table", "cup", "tv"):
         assert counts[name] >= 3, counts
@@ -50,7 +50,7 @@ def test_what_stands_there_is_found(perceived):
     assert invented <= 0.1 * sum(counts.values()), counts
 
 
-def test_a_cup_is_not_the_table(perceived):
+def test_the_mask_of_a_cup_excludes_the_table(perceived):
     checked = 0
     for frame, found in perceived:
         for row, name in enumerate(names(found.frame_graph)):
@@ -65,11 +65,11 @@ def test_a_cup_is_not_the_table(perceived):
 
 
 def test_cups_are_on_the_table(perceived):
-    told = Counter()
+    counts = Counter()
     for _, found in perceived:
         graph = found.frame_graph
         called = names(graph)
         for (s, o), logits in zip(graph.relations.pairs, graph.relations.logits):
             if (called[s], called[o]) == ("cup", "dining table"):
-                told[graph.vocabulary.predicates[logits.argmax()]] += 1
-    assert told["on"] >= 3 and told.most_common(1)[0][0] == "on", told
+                counts[graph.vocabulary.predicates[logits.argmax()]] += 1
+    assert counts["on"] >= 3 and counts.most_common(1)[0][0] == "on", counts

@@ -1,4 +1,4 @@
-"""One thing detected as a whole and in part is one object; things that are two stay two."""
+"""Nested detections of one object are joined; different objects are kept."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def depth_of(masks, depths_m):
 
 
 @pytest.mark.parametrize("scores", [(0.8, 0.5), (0.5, 0.8)])
-def test_the_lit_part_of_a_screen_is_the_screen(scores):
+def test_the_lit_part_of_a_screen_is_joined_with_the_screen(scores):
     rows = sorted(zip((OUTER, INNER), (SCREEN, SCREEN), scores), key=lambda row: -row[2])
     objects, masks = detections(*rows)
     joined, joined_masks = join_nested(objects, masks, depth_of(masks, (2.0, 2.01)))
     assert joined.boxes_xyxy.tolist() == [OUTER] and joined.scores.tolist() == [0.8]
     image = joined_masks[0].to_image((80, 100))
     assert image.sum() == 81 * 61
-    # Nothing that came in was changed.
+    # The input is unchanged.
     assert objects.boxes_xyxy.tolist() == [row[0] for row in rows]
 
 
-def test_what_has_no_depth_cannot_be_behind():
+def test_nested_boxes_without_depth_are_joined():
     objects, masks = detections((OUTER, SCREEN, 0.8), (INNER, SCREEN, 0.5))
     assert len(join_nested(objects, masks, np.zeros((80, 100), np.float32))[0]) == 1
 
@@ -48,30 +48,30 @@ def test_what_has_no_depth_cannot_be_behind():
     [
         (INNER, CUP, (2.0, 2.0)),  # a cup in front of a screen
         (INNER, SCREEN, (2.0, 2.6)),  # a chair seen through another's back
-        ([60, 20, 99, 60], SCREEN, (2.0, 2.0)),  # beside it, for the most part
+        ([60, 20, 99, 60], SCREEN, (2.0, 2.0)),  # mostly beside it
     ],
 )
-def test_two_things_stay_two(inner, classes, depths_m):
+def test_different_objects_are_not_joined(inner, classes, depths_m):
     objects, masks = detections((OUTER, SCREEN, 0.8), (inner, classes, 0.5))
     joined, joined_masks = join_nested(objects, masks, depth_of(masks, depths_m))
     assert len(joined) == len(joined_masks) == 2
     assert joined.boxes_xyxy.tolist() == objects.boxes_xyxy.tolist()
 
 
-def test_a_box_around_several_is_a_group():
+def test_a_box_around_several_objects_is_removed():
     objects, masks = detections((OUTER, SCREEN, 0.8), (INNER, SCREEN, 0.6), (SECOND, SCREEN, 0.5))
     joined, _ = join_nested(objects, masks, depth_of(masks, (2.0, 2.0, 2.0)))
     assert joined.boxes_xyxy.tolist() == [INNER, SECOND]
 
 
-def test_boxes_like_onion_skins_are_one():
+def test_a_chain_of_nested_boxes_is_one_object():
     core = [25, 25, 40, 50]
     objects, masks = detections((OUTER, SCREEN, 0.8), (INNER, SCREEN, 0.6), (core, SCREEN, 0.5))
     joined, _ = join_nested(objects, masks, depth_of(masks, (2.0, 2.0, 2.0)))
     assert joined.boxes_xyxy.tolist() == [OUTER]
 
 
-def test_nothing():
+def test_no_detections():
     none = Detections(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0))
     joined, masks = join_nested(none, [], np.zeros((80, 100), np.float32))
     assert len(joined) == 0 and masks == []
@@ -82,13 +82,13 @@ def test_nothing():
     [
         (INNER, CUP, True),
         (INNER, SCREEN, False),  # a part of the screen
-        ([60, 20, 99, 60], CUP, False),  # beside it, for the most part
-        ([0, 0, 99, 79], CUP, False),  # what holds the screen
+        ([60, 20, 99, 60], CUP, False),  # mostly beside it
+        ([0, 0, 99, 79], CUP, False),  # the support of the screen
     ],
 )
-def test_what_is_in_front_of_an_object_lies_in_it_and_is_another(box, of_class, in_front):
+def test_weak_detections_in_front_are_inside_an_object_of_another_class(box, of_class, in_front):
     objects, _ = detections((OUTER, SCREEN, 0.8))
-    unsure, _ = detections((box, of_class, 0.3))
-    assert len(in_front_of(objects, unsure)) == in_front
-    assert len(in_front_of(objects.take(slice(0)), unsure)) == 0
-    assert len(in_front_of(objects, unsure.take(slice(0)))) == 0
+    weak, _ = detections((box, of_class, 0.3))
+    assert len(in_front_of(objects, weak)) == in_front
+    assert len(in_front_of(objects.take(slice(0)), weak)) == 0
+    assert len(in_front_of(objects, weak.take(slice(0)))) == 0

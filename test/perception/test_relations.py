@@ -1,4 +1,4 @@
-"""The geometric relation head on layouts whose relations are plain to see."""
+"""The geometric relation head on rendered scenes with obvious relations."""
 
 from __future__ import annotations
 
@@ -50,54 +50,54 @@ CUP = ("cup", [CUP_ON_TABLE])
 
 
 def test_a_cup_on_a_table():
-    told = see([TABLE, CUP])
-    assert told["cup", "table"] == "on"
-    assert told.get(("table", "cup")) not in {"on", "in", "under"}
+    related = see([TABLE, CUP])
+    assert related["cup", "table"] == "on"
+    assert related.get(("table", "cup")) not in {"on", "in", "under"}
 
 
-def test_the_same_in_the_words_of_3dssg():
+def test_a_cup_on_a_table_with_the_predicates_of_3dssg():
     assert see([TABLE, CUP], SCANNET_PREDICATES)["cup", "table"] == "supported by"
 
 
 def test_two_cups_side_by_side_are_near_each_other():
     other = ("bowl", [Slab((-0.05, 1.6, 0.70), (0.08, 1.73, 0.80), (40, 120, 60))])
-    told = see([TABLE, CUP, other])
-    assert told["cup", "bowl"] == told["bowl", "cup"] == "near"
-    assert told["bowl", "table"] == "on"
+    related = see([TABLE, CUP, other])
+    assert related["cup", "bowl"] == related["bowl", "cup"] == "near"
+    assert related["bowl", "table"] == "on"
 
 
-def test_small_things_far_apart_are_not_related():
+def test_small_objects_far_apart_are_not_related():
     other = ("bowl", [Slab((0.35, 1.6, 0.70), (0.48, 1.73, 0.80), (40, 120, 60))])
-    told = see([TABLE, CUP, other])
-    assert ("cup", "bowl") not in told
+    related = see([TABLE, CUP, other])
+    assert ("cup", "bowl") not in related
 
 
 def test_a_plant_in_a_vase():
     vase = ("vase", [Slab((-0.1, 1.6, 0.70), (0.05, 1.75, 0.9), (200, 200, 40))])
     plant = ("plant", [Slab((-0.15, 1.58, 0.9), (0.1, 1.77, 1.1), (30, 140, 30))])
-    told = see([TABLE, vase, plant])
-    assert told["plant", "vase"] == "in"
-    assert told["vase", "table"] == "on"
+    related = see([TABLE, vase, plant])
+    assert related["plant", "vase"] == "in"
+    assert related["vase", "table"] == "on"
 
 
 def test_a_wall_shelf_above_a_chest():
-    told = see([("shelf", [SHELF]), ("cabinet", [CHEST])])
-    assert told["shelf", "cabinet"] == "above"
-    assert told["cabinet", "shelf"] == "under"
+    related = see([("shelf", [SHELF]), ("cabinet", [CHEST])])
+    assert related["shelf", "cabinet"] == "above"
+    assert related["cabinet", "shelf"] == "under"
 
 
 def test_a_table_with_its_chair():
     chair = ("chair", [Slab((0.75, 1.5, 0.0), (1.2, 1.95, 0.9), (30, 60, 120))])
-    told = see([TABLE, chair])
-    assert told["table", "chair"] == "with"
-    assert told["chair", "table"] == "near"
+    related = see([TABLE, chair])
+    assert related["table", "chair"] == "with"
+    assert related["chair", "table"] == "near"
 
 
 def test_furniture_side_by_side():
     low = ("cabinet", [Slab((-0.9, 2.6, 0.0), (-0.1, 3.1, 0.6), (30, 60, 120))])
     high = ("shelf", [Slab((-0.08, 2.6, 0.0), (0.7, 3.1, 0.95), (120, 60, 30))])
-    told = see([low, high])
-    assert told["cabinet", "shelf"] == "against"
+    related = see([low, high])
+    assert related["cabinet", "shelf"] == "against"
 
 
 def test_a_window_has_a_curtain_attached():
@@ -108,7 +108,7 @@ def test_a_window_has_a_curtain_attached():
 
 
 @pytest.mark.parametrize("top", [0, 1, 3])
-def test_as_many_as_asked_for(top):
+def test_at_most_max_relations_are_returned(top):
     other = ("bowl", [Slab((-0.05, 1.6, 0.70), (0.08, 1.73, 0.80), (40, 120, 60))])
     assert len(see([TABLE, CUP, other], top=top)) == top
 
@@ -127,7 +127,7 @@ def test_one_object_has_no_relation():
     assert found.pairs.shape == (0, 2) and found.logits.shape == (0, 7)
 
 
-def test_predicates_that_geometry_cannot_judge_weigh_nothing():
+def test_predicates_that_geometry_cannot_judge_get_little_probability():
     _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
     head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
     found = head.relate(segmented(["table", "cup"], owner, depth_m), 1)
@@ -136,7 +136,7 @@ def test_predicates_that_geometry_cannot_judge_weigh_nothing():
 
 
 @pytest.mark.parametrize("up", [[0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, -0.8, 0], [1, 0, 0]])
-def test_upright_axes_are_a_rotation_with_up_on_top(up):
+def test_upright_axes_are_a_rotation_whose_third_axis_is_up(up):
     axes = upright_axes(np.array(up, dtype=float))
     assert np.allclose(axes @ axes.T, np.eye(3)) and np.isclose(np.linalg.det(axes), 1)
     assert np.allclose(axes @ np.array(up), [0, 0, 1])

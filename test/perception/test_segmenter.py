@@ -1,4 +1,4 @@
-"""The RGB-D segmenter on scenes whose masks are known."""
+"""The RGB-D segmenter on rendered scenes with known masks."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def test_a_box_on_the_floor(noise_m):
     assert overlap(mask, owner == 1) > 0.85
 
 
-def test_a_box_of_the_floors_colour_is_told_by_its_shape():
+def test_a_box_of_the_floors_colour_is_segmented_by_its_depth():
     rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (150, 140, 130))], 0.002)
     rgb[:] = (150, 140, 130)
     (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
     assert overlap(mask, owner == 1) > 0.8
 
 
-def test_a_cup_on_a_table_is_not_the_table_nor_the_reverse():
+def test_the_masks_of_a_cup_and_its_table_are_separate():
     rgb, depth_m, owner = render([TABLE_TOP, TABLE_LEG, CUP_ON_TABLE], 0.002)
     table = (owner == 1) | (owner == 2)
     cup = owner == 3
@@ -56,7 +56,7 @@ def test_a_cup_on_a_table_is_not_the_table_nor_the_reverse():
     assert not (masks[0].to_image(SHAPE) & masks[1].to_image(SHAPE)).any()
 
 
-def test_alone_the_cup_leaves_the_table_behind():
+def test_a_box_of_the_cup_alone_excludes_the_table():
     rgb, depth_m, owner = render([TABLE_TOP, TABLE_LEG, CUP_ON_TABLE], 0.002)
     (mask,) = segment(rgb, depth_m, [box_of(owner == 3)])
     assert overlap(mask, owner == 3) > 0.85
@@ -68,16 +68,16 @@ def test_a_planar_table_is_an_object():
     assert overlap(mask, owner == 1) > 0.85
 
 
-def test_a_picture_on_the_wall_has_only_its_colour():
+def test_a_picture_on_the_wall_is_segmented_by_its_colour():
     rgb, depth_m, owner = render([Slab((-0.4, 3.999, 0.5), (0.4, 4.0, 1.1), (20, 60, 90))], 0.003)
     (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
     assert overlap(mask, owner == 1) > 0.8
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3])
-def test_holes_in_the_depth_are_filled(share):
+@pytest.mark.parametrize("fraction", [0.1, 0.3])
+def test_holes_in_the_depth_are_filled(fraction):
     rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))], 0.002)
-    holes = np.random.default_rng(1).random(SHAPE) < share
+    holes = np.random.default_rng(1).random(SHAPE) < fraction
     box = box_of(owner == 1).astype(int)
     # And one large hole in the object's face.
     x, y = (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
@@ -89,7 +89,7 @@ def test_holes_in_the_depth_are_filled(share):
 
 
 @pytest.mark.parametrize("invalid", [0.0, np.nan, np.inf, -1.0])
-def test_without_any_depth_colour_remains(invalid):
+def test_without_valid_depth_colour_is_used(invalid):
     rgb, depth_m, owner = render([Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))])
     (mask,) = segment(rgb, np.full_like(depth_m, invalid), [box_of(owner == 1)])
     assert overlap(mask, owner == 1) > 0.7
@@ -128,7 +128,7 @@ def test_masks_are_disjoint_and_in_the_order_of_the_boxes():
         assert np.array_equal(shuffled[position].to_image(SHAPE), masks[row].to_image(SHAPE))
 
 
-def test_the_same_frame_twice_gives_the_same_and_keeps_its_input():
+def test_segmentation_is_deterministic_and_keeps_its_input():
     rgb, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE], 0.003)
     boxes = np.stack([box_of(owner == k) for k in (1, 2)])
     before = rgb.copy(), depth_m.copy(), boxes.copy()
@@ -145,7 +145,7 @@ def test_a_narrow_image():
     assert patches[0].pixels.shape == (86, 76)
 
 
-def test_images_of_a_message_and_of_a_file_run_the_same_code():
+def test_read_only_and_sliced_images_use_the_same_compiled_kernel():
     rgb, depth_m, owner = render([TABLE_TOP], 0.002)
     box = [box_of(owner == 1)]
     compiled = len(upsample_labels.signatures)

@@ -117,7 +117,7 @@ def test_the_best_50_objects_are_kept():
     assert perceived.frame_graph.scores.tolist() == scores[:1:-1].tolist()
 
 
-def test_boxes_are_cut_to_the_image():
+def test_boxes_are_clipped_to_the_image():
     frame, *_ = table_and_cup()
     found = stage(ListedDetector([[-20, -30, 60, 300]], [0], [0.9])).perceive(frame)
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
@@ -160,7 +160,7 @@ def test_a_weakly_detected_cup_is_no_object_and_no_part_of_the_table(refine, tak
     assert (perceived.instances[owner == 2] > 0).mean() == pytest.approx(taken, abs=0.1)
 
 
-def test_the_same_frame_gives_the_same():
+def test_perception_is_deterministic():
     frame, table, cup, _ = table_and_cup()
     detector = ListedDetector([table, cup], [0, 1], [0.6, 0.9])
     first, second = stage(detector).perceive(frame), stage(detector).perceive(frame)

@@ -12,7 +12,7 @@ from deworldsg_ros.scene.camera import Intrinsics
 WIDTH, HEIGHT = 320, 240
 INTRINSICS = Intrinsics(262.5, 262.5, 159.5, 119.5, WIDTH, HEIGHT)
 SHAPE = (HEIGHT, WIDTH)
-# The camera looks down at the scene by this much.
+# The camera looks down by this angle.
 PITCH = np.radians(30.0)
 UP_CAMERA = np.array([0.0, -np.cos(PITCH), -np.sin(PITCH)])
 CAMERA_HEIGHT_M = 1.5
@@ -64,7 +64,7 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
         enter, leave = np.minimum(near, far), np.maximum(near, far)
         t = enter.max(axis=2)
         hit = (t < leave.min(axis=2)) & (t > 0) & (t < depth)
-        # A face's brightness depends on where it looks, as in a lit room.
+        # The brightness of a face depends on its direction, as in a lit room.
         shade = np.array([0.8, 0.9, 1.0])[enter.argmax(axis=2)]
         depth[hit] = t[hit]
         owner[hit] = max(number - 1, 0)

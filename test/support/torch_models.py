@@ -1,4 +1,4 @@
-"""Small checkpoints of the detectors and segmenters: real architectures, saved in real formats."""
+"""Small checkpoints of the detectors and segmenters: real architectures and file formats."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def rtdetr_config(version=1, labels=CLASSES, **changes):
 
 
 def random_rtdetr(version=1, seed=0, **changes):
-    """An RT-DETR whose queries do not all say the same, unlike those of a fresh one."""
+    """An RT-DETR whose queries differ; those of a freshly initialised one do not."""
     torch.manual_seed(seed)
     config = rtdetr_config(version, **changes)
     family = (
@@ -84,7 +84,7 @@ def random_rtdetr(version=1, seed=0, **changes):
 
 
 def save_rtdetr(folder, version=1, seed=0, card=None, side=64, normalise=False, **changes):
-    """A folder as `deworldsg models import-fross` writes it, or without card as the hub has it."""
+    """A folder as `deworldsg models import-fross` writes it; without a card, as on the hub."""
     random_rtdetr(version, seed, **changes).save_pretrained(folder)
     preprocessing = {"size": {"height": side, "width": side}, "do_normalize": normalise, **IMAGENET}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))

@@ -18,14 +18,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.perception.backends.nanodet import CALIBRATION, NanoDetDetector, combine
 from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
 from deworldsg_ros.perception.networks.nms import pairwise_iou
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
-# Replica's names for what COCO has, too.
+# Replica classes that COCO also has.
 COCO_OF_REPLICA = {
     "backpack": "backpack",
     "bench": "bench",
@@ -122,7 +122,7 @@ def class_distances(probabilities: np.ndarray, samples: Samples) -> tuple[np.nda
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
-    parser.add_argument("--step", type=int, default=1, help="every n-th frame")
+    parser.add_argument("--step", type=int, default=1, help="use every N-th frame")
     arguments = parser.parse_args()
     detector = NanoDetDetector()
     scenes = sorted(path.parent for path in arguments.dataset.glob("data/*/gt.json"))
@@ -136,9 +136,9 @@ def main() -> None:
         print(
             f"{name}: {len(held.classes)} detections, temperature of the others {temperature:.2f}"
         )
-        merely = held.evidence / held.evidence.sum(axis=1, keepdims=True)
+        normalised = held.evidence / held.evidence.sum(axis=1, keepdims=True)
         calibrated = SoftmaxCalibration(temperature)(held.evidence)
-        for label, p in (("normalised", merely), ("calibrated", calibrated)):
+        for label, p in (("normalised", normalised), ("calibrated", calibrated)):
             same, different = class_distances(p, held)
             print(
                 f"  {label}: NLL {negative_log_likelihood(p, held.classes):.3f}, "

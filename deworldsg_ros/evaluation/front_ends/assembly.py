@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.scene.arrays import Float64, UInt16
@@ -133,7 +133,7 @@ def assemble(
             np.array([item.score for item in kept], np.float64),
         ),
     )
-    instances = label_image(masks, classes.argmax(axis=1), scores, (height, width))
+    instances = instance_image(masks, classes.argmax(axis=1), scores, (height, width))
     empty = sum(not mask.pixels.any() for mask in masks)
     return Perceived(graph, instances, {"empty_mask": empty} if empty else {})
 

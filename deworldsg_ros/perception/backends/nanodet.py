@@ -17,18 +17,21 @@ from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "nanodet_g_416_coco.onnx"
+# Side of the network's input and strides of its outputs, pixels.
 INPUT_SIZE = 416
 STRIDES = (8, 16, 32)
+# The distance to each side of a box is a distribution over 0 to 10 strides.
 BINS = 11
-# BGR, as the network was trained.
+# Of the training images, BGR, 8-bit scale.
 MEAN_BGR = np.array([103.53, 116.28, 123.675], dtype=np.float32)
 STD_BGR = np.array([57.375, 57.12, 58.395], dtype=np.float32)
-# Cells below this are no candidates; far below any useful threshold.
+# Cells with a lower score are ignored. The limit saves time, and is below all useful thresholds.
 CANDIDATE_SCORE = 0.15
+# Boxes of one class with a larger overlap show one object.
 SAME_CLASS_IOU = 0.5
-# Two boxes that agree this well show one object, whatever they call it.
+# Boxes of any classes with a larger overlap show one object.
 ANY_CLASS_IOU = 0.75
-# Fitted by tools/calibration/calibrate_detector.py; docs/perception.md says on what.
+# Fitted by tools/calibration/calibrate_detector.py; see docs/perception.md.
 CALIBRATION = SoftmaxCalibration(temperature=0.35)
 
 
@@ -40,7 +43,7 @@ class NanoDetDetector:
         weights: the ONNX file.
 
     Raises:
-        ConfigurationError: the weights are not there.
+        ConfigurationError: there is no such file.
     """
 
     classes = COCO_CLASSES
@@ -48,11 +51,13 @@ class NanoDetDetector:
 
     def __init__(self, *, threads: int = 2, weights: Path = WEIGHTS) -> None:
         if not weights.is_file():
-            raise ConfigurationError(f"NanoDet weights {weights}: no such file")
+            raise ConfigurationError(
+                f"NanoDet weights {weights}: no such file, install the package again"
+            )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
-        # Threads that spin between frames would take the cores of the other nodes.
+        # Spinning threads would keep cores busy between frames, which other nodes need.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._session = onnxruntime.InferenceSession(
             str(weights), options, providers=["CPUExecutionProvider"]
@@ -65,17 +70,17 @@ class NanoDetDetector:
         return combine(boxes, class_scores, score_threshold)
 
     def candidates(self, rgb: UInt8) -> tuple[Float64, Float64]:
-        """What the network says before suppression: boxes (k, 4) in pixels, scores (k, 80)."""
+        """Output of the network before suppression: boxes (k, 4) in pixels, scores (k, 80)."""
         tensor, scale = letterbox(rgb)
         heads = self._session.run(None, {self._input: tensor})
         boxes, class_scores = decode([np.asarray(head)[0] for head in heads])
         height, width = rgb.shape[:2]
-        # Pixel centres at integers: the network's corner 0 is our -0.5.
+        # Pixel centres are at integers here, and at halves in the network.
         return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
 
 
 def letterbox(rgb: UInt8) -> tuple[Float32, float]:
-    """Network input (1, 3, 416, 416) float32 BGR, image in the top left, and the scale used."""
+    """Network input (1, 3, 416, 416) float32 BGR with the image at the top left, and its scale."""
     height, width = rgb.shape[:2]
     scale = INPUT_SIZE / max(height, width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
@@ -103,7 +108,7 @@ def decode(heads: list[Float32]) -> tuple[Float64, Float64]:
         rows = np.flatnonzero(class_scores.max(axis=1) > CANDIDATE_SCORE)
         logits = side_logits[rows].astype(np.float64).reshape(len(rows), 4, BINS)
         weights = np.exp(logits - logits.max(axis=2, keepdims=True))
-        # Expectation over the bins = distance to left, top, right, bottom, in strides.
+        # The expectation over the bins is the distance to left, top, right and bottom.
         distances = (weights @ np.arange(BINS)) / weights.sum(axis=2) * stride
         centres = (np.stack([rows % side, rows // side], axis=1) + 0.5) * stride
         boxes.append(np.hstack([centres - distances[:, :2], centres + distances[:, 2:]]))
@@ -117,10 +122,16 @@ def combine(
     score_threshold: float,
     calibration: Callable[[Float64], Float64] = CALIBRATION,
 ) -> Detections:
-    """Candidates → objects: suppression, and the evidence of near-identical boxes combined.
+    """Candidates → objects: suppression, and combined class scores of nearly identical boxes.
 
-    A cell that calls the object a vase and its neighbour that calls it a bottle are evidence about
-    one object: for each class the best score among the boxes that nearly coincide counts.
+    Nearly identical boxes show one object, even if one scores as a vase and one as a bottle. The
+    score of each class is the best among them.
+
+    Args:
+        boxes_xyxy: (k, 4) pixels.
+        class_scores: (k, 80) sigmoid scores.
+        score_threshold: minimum score of an object.
+        calibration: scores (n, 80) to distributions.
     """
     best = class_scores.max(axis=1) if len(class_scores) else np.zeros(0)
     keeper = cluster_boxes(

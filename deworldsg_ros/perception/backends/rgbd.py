@@ -1,4 +1,4 @@
-"""Box-conditioned segmenter for RGB-D images without weights."""
+"""Segmenter for RGB-D images without a network."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from deworldsg_ros.perception.superpixels.regions import find_regions, reduce_fr
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
-# Cells across the image; fewer lose chair legs, more cost time.
+# Cells across the image. Fewer cells lose chair legs, more cost time.
 TARGET_WIDTH = 213
 
 
 class RgbdSegmenter:
-    """The visible surface of the object in each box, from colour and depth; all boxes jointly."""
+    """The visible surface of the object in each box, from colour and depth, all boxes jointly."""
 
     def __init__(self) -> None:
-        # The kernels are compiled now, and not when the first image waits.
+        # Compile the kernels now, so that the first image does not wait.
         side = 24
         self.segment(
             np.zeros((side, side, 3), dtype=np.uint8),

@@ -1,4 +1,4 @@
-"""Images as networks want them: resized, scaled, normalised."""
+"""Images as input of a network: resized, scaled, normalised."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How an image becomes a network's input.
+    """Size and normalisation of a network's input.
 
     Attributes:
         height, width: of the input, pixels.
-        mean, std: of each channel, RGB, of values in [0, 1].
+        mean, std: per channel, RGB, of values in [0, 1].
     """
 
     height: int
@@ -31,10 +31,10 @@ class Preprocessing:
 
     @staticmethod
     def of_checkpoint(source: CheckpointSource, default: Preprocessing) -> Preprocessing:
-        """What preprocessor_config.json of a checkpoint says; `default` for what it leaves open.
+        """Read preprocessor_config.json of a checkpoint; `default` fills in missing values.
 
         Raises:
-            ConfigurationError: a file that says something else than sizes and statistics.
+            ConfigurationError: the file cannot be read, or has values of another kind.
         """
         path = source.file("preprocessor_config.json") or source.file("processor_config.json")
         if path is None:
@@ -53,8 +53,8 @@ class Preprocessing:
             return Preprocessing(height, width, mean, (red, green, blue))
         except (OSError, ValueError, TypeError, AttributeError) as error:
             raise ConfigurationError(
-                f"{path}: {error}; wanted size.height, size.width, do_normalize, image_mean and "
-                "image_std"
+                f"{path}: {error}; expected size.height, size.width, do_normalize, image_mean and "
+                "image_std: download the checkpoint again"
             ) from error
 
     def __call__(self, rgb: UInt8, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
@@ -69,8 +69,8 @@ class Preprocessing:
 
 
 def to_device(array: NDArray[Any], device: torch.device) -> torch.Tensor:
-    """A copy on the device; through pinned memory, where that lets it go on at once."""
-    # An image of a message cannot be written, and torch warns of such arrays.
+    """A copy on the device. Pinned memory makes the copy to a GPU asynchronous."""
+    # The copy on the CPU is writable. Images of messages are not, and torch warns of such arrays.
     tensor = torch.from_numpy(np.array(array, order="C"))
     if device.type == "cuda":
         return tensor.pin_memory().to(device, non_blocking=True)
@@ -78,7 +78,7 @@ def to_device(array: NDArray[Any], device: torch.device) -> torch.Tensor:
 
 
 def resize(pixels: torch.Tensor, size: tuple[int, int], *, antialias: bool = False) -> torch.Tensor:
-    """Bilinear; (B, C, h, w) to (B, C, *size)."""
+    """Bilinear resampling of (B, C, h, w) to (B, C, *size)."""
     return torch.nn.functional.interpolate(
         pixels, size=size, mode="bilinear", align_corners=False, antialias=antialias
     )

@@ -1,4 +1,4 @@
-"""Suppression of boxes that show one object, remembering which box stands for which."""
+"""Non-maximum suppression that keeps track of the suppressed boxes."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ def cluster_boxes(
     same_class_iou: float,
     any_class_iou: float,
 ) -> Int64:
-    """Greedy non-maximum suppression that says who suppressed whom.
+    """Greedy non-maximum suppression, with the suppressing box of each box.
 
-    The best remaining box stands for itself and for every remaining one that overlaps it by more
-    than `same_class_iou` with the same class, or by more than `any_class_iou` with any class.
+    The best remaining box suppresses the remaining boxes of its class whose IoU exceeds
+    `same_class_iou`, and those of any class whose IoU exceeds `any_class_iou`.
 
     Args:
         boxes_xyxy: (n, 4) pixels.
         scores: (n,).
-        classes: (n,) likeliest class.
-        same_class_iou: overlap above which boxes of one class are one object.
-        any_class_iou: overlap above which any boxes are one object.
+        classes: (n,) most likely class.
+        same_class_iou: IoU above which boxes of one class show one object.
+        any_class_iou: IoU above which any boxes show one object.
 
     Returns:
-        (n,) int64: the row of the box that stands for each; a survivor stands for itself.
+        (n,) int64: row of the box that suppressed each; its own row if it was kept.
     """
     order = np.argsort(-scores, kind="stable")
     iou = pairwise_iou(boxes_xyxy[order], boxes_xyxy[order])

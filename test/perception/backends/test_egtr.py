@@ -1,4 +1,4 @@
-"""The EGTR relation head: parity with the naive head, ranking, and what start-up refuses."""
+"""The EGTR relation head: parity with the naive head, ranking, and checkpoints that are refused."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def naive(network, features, classes=None):
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("used", [1, LAYERS - 1, LAYERS])
 @torch.no_grad()
-def test_kept_queries_give_what_all_queries_give(used, bias):
+def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
     network = random_head().double()
     generator = torch.Generator().manual_seed(used)
     features = torch.randn(40, 2 * used + 1, WIDTH, generator=generator, dtype=torch.float64)
@@ -97,8 +97,8 @@ def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folder):
     # float32: logits reach 20, and the order of the sums differs from processor to processor.
     assert np.allclose(found.logits, relations[subjects, objects].numpy(), rtol=1e-5, atol=5e-5)
     ranks = (relations.sigmoid().amax(-1) * connectivity.sigmoid())[subjects, objects].numpy()
-    wanted = ranks * every.scores[subjects] * every.scores[objects]
-    assert np.abs(found.scores - wanted).max() < 1e-6
+    expected = ranks * every.scores[subjects] * every.scores[objects]
+    assert np.abs(found.scores - expected).max() < 1e-6
     assert (np.diff(found.scores) <= 0).all()
     best = relate(head, kept, names, 3)
     assert np.array_equal(best.pairs, found.pairs[:3])
@@ -137,7 +137,7 @@ def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
     assert found.scores.tolist() == [0.45, 0.3, 0.3]
 
 
-def test_the_papers_perception_as_one_stage(folder, tmp_path):
+def test_rtdetr_sam2_and_egtr_as_one_stage(folder, tmp_path):
     config = settings(
         detector="rtdetr",
         segmenter="sam2",
@@ -204,7 +204,7 @@ def test_another_decoder_is_refused(tmp_path):
     build(deeper, predicate_set="checkpoint")
 
 
-def test_statistics_that_are_not_there(tmp_path):
+def test_missing_class_pair_statistics_are_refused(tmp_path):
     save_paper_checkpoint(tmp_path)
     path = tmp_path / "egtr_head.safetensors"
     parameters = load_file(path)
@@ -231,7 +231,7 @@ def test_a_head_with_other_parameters_is_refused_by_name(change, message):
         EgtrNetwork.for_parameters(parameters, "head.safetensors")
 
 
-def test_a_damaged_head_file(folder, tmp_path):
+def test_a_damaged_head_file_is_refused(folder, tmp_path):
     save_rtdetr(tmp_path, card=CheckpointCard(predicates=PREDICATES))
     (tmp_path / "egtr_head.safetensors").write_bytes(b"damaged")
     with pytest.raises(ConfigurationError, match=r"egtr_head.safetensors cannot be read \(.*get"):

@@ -69,7 +69,7 @@ def test_suppression_equals_the_plain_loop(rows):
 
 
 @given(st.lists(candidate, min_size=1, max_size=6))
-def test_iou_equals_the_plain_one(rows):
+def test_iou_equals_the_plain_loop(rows):
     table = np.array(rows, dtype=float)
     boxes = np.hstack([table[:, :2], table[:, :2] + table[:, 2:4]])
     expected = [[plain_iou(a, b) for b in boxes] for a in boxes]
@@ -105,7 +105,7 @@ def test_decode_one_cell(level):
     assert scores.shape == (1, 80) and scores.argmax() == CUP
 
 
-def test_decode_nothing():
+def test_decode_without_candidates():
     boxes, scores = decode(empty_heads())
     assert boxes.shape == (0, 4) and scores.shape == (0, 80)
     assert len(combine(boxes, scores, 0.4)) == 0
@@ -118,7 +118,7 @@ def scores_of(**named):
     return scores
 
 
-def test_what_neighbours_call_the_object_counts():
+def test_class_scores_of_nearly_identical_boxes_are_combined():
     boxes = np.array([[10, 10, 60, 60], [11, 10, 61, 60], [200, 10, 260, 60]], dtype=float)
     scores = np.stack([scores_of(vase=0.6), scores_of(bottle=0.55), scores_of(vase=0.6)])
     found = combine(boxes, scores, 0.4)
@@ -129,14 +129,14 @@ def test_what_neighbours_call_the_object_counts():
     assert np.allclose(found.class_probabilities.sum(axis=1), 1)
 
 
-def test_nested_objects_of_different_classes_both_stay():
+def test_nested_objects_of_different_classes_are_kept():
     boxes = np.array([[0, 0, 100, 100], [40, 10, 60, 40]], dtype=float)
     found = combine(boxes, np.stack([scores_of(chair=0.6), scores_of(cup=0.5)]), 0.4)
     assert found.class_probabilities.argmax(axis=1).tolist() == [CHAIR, CUP]
 
 
 def test_calibrated_distributions_can_merge():
-    # FACTS of the merge rule: D_c = 1 - sum p q has to fall below 0.8 for two views of one thing.
+    # Eq. 5: D_c = 1 - sum p q must be below 0.8 for two observations of one object.
     first, second = scores_of(chair=0.45, bench=0.1), scores_of(chair=0.6)
     flat = [s / s.sum() for s in (first, second)]
     sharp = SoftmaxCalibration(0.35)(np.stack([first, second]))
@@ -154,7 +154,7 @@ def test_calibration_gives_distributions_and_keeps_the_order(scores, temperature
     assert (np.diff(p[order]) >= -1e-12).all()
 
 
-def test_calibration_wants_a_positive_temperature():
+def test_calibration_refuses_a_temperature_that_is_not_positive():
     with pytest.raises(ValueError, match="temperature is 0"):
         SoftmaxCalibration(0)
 
@@ -177,7 +177,7 @@ def detector():
 
 
 def clock_picture():
-    """A wall clock, drawn: the plainest thing that a COCO detector knows."""
+    """A drawing of a wall clock, a COCO class that is easy to detect."""
     image = np.full((480, 640, 3), (214, 208, 196), np.uint8)
     centre = (400, 200)
     cv2.circle(image, centre, 92, (40, 40, 40), -1, cv2.LINE_AA)
@@ -192,7 +192,7 @@ def clock_picture():
     return image
 
 
-def test_the_shipped_weights_see_a_clock(detector):
+def test_the_shipped_weights_detect_a_clock(detector):
     found = detector.detect(clock_picture(), detector.default_score_threshold)
     names = [COCO_CLASSES[k] for k in found.class_probabilities.argmax(axis=1)]
     assert "clock" in names
@@ -202,17 +202,17 @@ def test_the_shipped_weights_see_a_clock(detector):
     assert np.allclose(found.class_probabilities.sum(axis=1), 1)
 
 
-def test_the_same_picture_twice_gives_the_same(detector):
+def test_detection_is_deterministic(detector):
     first = detector.detect(clock_picture(), 0.2)
     second = detector.detect(clock_picture(), 0.2)
     assert np.array_equal(first.class_probabilities, second.class_probabilities)
     assert np.array_equal(first.boxes_xyxy, second.boxes_xyxy)
 
 
-def test_an_empty_picture_has_nothing(detector):
+def test_an_empty_image_has_no_detections(detector):
     assert len(detector.detect(np.full((480, 640, 3), 90, np.uint8), 0.4)) == 0
 
 
-def test_missing_weights_are_named():
+def test_missing_weights_are_refused():
     with pytest.raises(ConfigurationError, match="nowhere.onnx"):
         NanoDetDetector(weights=Path("nowhere.onnx"))

@@ -1,4 +1,4 @@
-"""RT-DETR and RT-DETRv2: scores, boxes, preprocessing, layers, and what start-up refuses."""
+"""RT-DETR and RT-DETRv2: scores, boxes, preprocessing, layers, and checkpoints that are refused."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def reference(folder, rgb, *, normalise=False, version=1):
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_all_queries_are_those_of_the_network(folders, version):
+def test_all_detections_equal_the_queries_of_the_network(folders, version):
     rgb = image(48, 96)
     found = detector(folders[f"v{version}"]).detect(rgb, 0.0)
     output = reference(folders, rgb, version=version)
@@ -87,8 +87,8 @@ def test_softmax_scores_are_the_distributions_maxima(folders):
     rgb = image()
     found = detector(folders["softmax"]).detect(rgb, 0.0)
     output = reference(folders, rgb, normalise=True)
-    wanted = output.logits[0].softmax(-1).amax(-1).sort(descending=True).values
-    assert np.allclose(found.scores, wanted, atol=1e-5)
+    expected = output.logits[0].softmax(-1).amax(-1).sort(descending=True).values
+    assert np.allclose(found.scores, expected, atol=1e-5)
     assert np.allclose(found.scores, found.class_probabilities.max(axis=1), atol=1e-6)
 
 
@@ -157,7 +157,7 @@ def test_queries_are_recorded_only_on_request(folders):
     assert np.array_equal(kept.features, found.features[[3, 1]])
 
 
-def test_an_image_that_cannot_be_written_and_one_of_another_size(folders):
+def test_read_only_images_and_other_image_sizes_work(folders):
     found = detector(folders["v1"])
     rgb = image(120, 160)
     rgb.flags.writeable = False
@@ -172,7 +172,7 @@ def test_half_precision_runs_through(folders):
     assert np.allclose(found.detect(image(), 0.0).scores, exact.scores, atol=0.05)
 
 
-def test_a_folder_of_another_architecture_is_named(tmp_path):
+def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
     from support.torch_models import save_sam
 
     with pytest.raises(
@@ -189,12 +189,12 @@ def test_a_folder_of_another_architecture_is_named(tmp_path):
         ("nobody/nothing-of-that-name", "run `hf download nobody/nothing-of-that-name`, or name a"),
     ],
 )
-def test_no_checkpoint(path, message):
+def test_a_missing_checkpoint_is_refused(path, message):
     with pytest.raises(ConfigurationError, match=message):
         detector(path)
 
 
-def test_no_weights_and_damaged_weights(folders, tmp_path):
+def test_missing_and_damaged_weights_are_refused(folders, tmp_path):
     (tmp_path / "config.json").write_bytes((folders["v1"] / "config.json").read_bytes())
     with pytest.raises(ConfigurationError, match="cannot be loaded"):
         detector(tmp_path)
@@ -216,13 +216,13 @@ def test_missing_parameters_are_named(folders, tmp_path):
         detector(tmp_path)
 
 
-def test_cuda_asked_for_and_absent(folders, monkeypatch):
+def test_missing_cuda_is_refused(folders, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigurationError, match="perception.device is 'cuda' .*'auto' or 'cpu'"):
         detector(folders["v1"], device="cuda")
 
 
-def test_out_of_memory_at_start_says_what_to_do(folders, monkeypatch):
+def test_out_of_memory_at_start_up_names_a_remedy(folders, monkeypatch):
     def full(*arguments):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
 
@@ -237,7 +237,7 @@ def test_more_decoder_layers_than_the_network_has_are_refused(folders, tmp_path)
         detector(with_card(folders["v1"], tmp_path, decoder_layers=9))
 
 
-def test_unnamed_and_miscounted_classes(tmp_path):
+def test_unnamed_and_miscounted_classes_are_refused(tmp_path):
     nameless = save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
     with pytest.raises(ConfigurationError, match="does not name its 3 classes"):
         detector(nameless)
@@ -246,7 +246,7 @@ def test_unnamed_and_miscounted_classes(tmp_path):
         detector(short)
 
 
-def test_damaged_cards_and_preprocessing(folders, tmp_path):
+def test_damaged_cards_and_preprocessing_are_refused(folders, tmp_path):
     card = tmp_path / "deworldsg.json"
     card.write_text('{"class_scores": "argmax"}')
     with pytest.raises(ConfigurationError, match="deworldsg.json: .*argmax"):

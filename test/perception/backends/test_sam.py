@@ -16,7 +16,7 @@ from support.torch_models import (
 
 from deworldsg_ros.perception.backends.sam import SamSegmenter
 from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.networks.box_prompts import as_patch
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -52,7 +52,7 @@ def masks(backend, rgb, boxes=BOXES):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
-def test_one_mask_a_box_in_image_pixels(folders, name):
+def test_one_mask_per_box_at_image_size(folders, name):
     found = masks(segmenter(folders, name), image(HEIGHT, WIDTH))
     assert found.shape == (len(BOXES), HEIGHT, WIDTH)
     # Random weights, but masks that say something, and depend on the box.
@@ -82,7 +82,7 @@ def test_an_image_is_encoded_once(folders, name, monkeypatch):
     assert len(calls) == 1
 
 
-def test_sam2_gives_what_the_network_gives_for_the_stretched_image(folders):
+def test_sam2_masks_equal_those_of_the_network_on_the_stretched_image(folders):
     rgb = image(HEIGHT, WIDTH)
     model = transformers.Sam2Model.from_pretrained(folders["sam2"]).eval()
     pixels = torch.from_numpy(rgb.astype(np.float32)).permute(2, 0, 1)[None]
@@ -101,11 +101,11 @@ def test_sam2_gives_what_the_network_gives_for_the_stretched_image(folders):
     logits = torch.nn.functional.interpolate(
         output.pred_masks[0], size=(HEIGHT, WIDTH), mode="bilinear", align_corners=False
     )
-    wanted = (logits[:, 0] > 0).numpy()
-    assert (masks(segmenter(folders, "sam2"), rgb) != wanted).mean() < 1e-3
+    expected = (logits[:, 0] > 0).numpy()
+    assert (masks(segmenter(folders, "sam2"), rgb) != expected).mean() < 1e-3
 
 
-def test_sam_keeps_the_shape_of_the_image(folders):
+def test_sam_keeps_the_aspect_ratio_of_the_image(folders):
     """A square image and the same image with black below: the upper masks are the same."""
     backend = segmenter(folders, "sam")
     assert backend._scale(60, 80) == (1.6, 1.6)
@@ -124,17 +124,17 @@ def test_half_precision_runs_through(folders, name):
     assert (masks(backend, rgb) != exact).mean() < 0.1
 
 
-def test_masks_of_two_classes_leave_what_both_claim_to_nobody(folders):
+def test_pixels_in_masks_of_two_classes_belong_to_no_object(folders):
     found = segmenter(folders, "sam2").segment(image(HEIGHT, WIDTH), DEPTH, INTRINSICS, BOXES[:2])
     one, two = (patch.to_image((HEIGHT, WIDTH)) for patch in found)
-    labels = label_image(found, np.array([0, 1]), np.array([0.9, 0.8]), (HEIGHT, WIDTH))
+    labels = instance_image(found, np.array([0, 1]), np.array([0.9, 0.8]), (HEIGHT, WIDTH))
     assert (one & two).any()
     assert not labels[one & two].any()
     assert (labels[one & ~two] == 1).all() and (labels[two & ~one] == 2).all()
 
 
 @pytest.mark.parametrize("pixels", [[], [(3, 4)], [(0, 0), (5, 6)], [(2, 1), (4, 1)]])
-def test_a_patch_holds_all_of_a_mask(pixels):
+def test_a_patch_contains_all_pixels_of_the_mask(pixels):
     mask = np.zeros((6, 7), bool)
     for row, column in pixels:
         mask[row, column] = True
@@ -143,14 +143,14 @@ def test_a_patch_holds_all_of_a_mask(pixels):
     assert patch.pixels.size <= mask.size
 
 
-def test_the_other_architecture_is_named(folders, tmp_path):
+def test_a_checkpoint_of_another_architecture_is_refused(folders, tmp_path):
     with pytest.raises(ConfigurationError, match="of sam: wanted sam2 or sam2_video"):
         Sam2Segmenter(settings(segmenter_path=str(folders["sam"])))
     with pytest.raises(ConfigurationError, match="of rt_detr: wanted sam"):
         SamSegmenter(settings(segmenter_path=str(save_rtdetr(tmp_path))))
 
 
-def test_nothing_configured_and_no_cuda(folders, monkeypatch):
+def test_a_missing_path_and_missing_cuda_are_refused(folders, monkeypatch):
     with pytest.raises(ConfigurationError, match="segmenter_path is empty"):
         Sam2Segmenter(settings())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
@@ -158,7 +158,7 @@ def test_nothing_configured_and_no_cuda(folders, monkeypatch):
         SamSegmenter(settings(segmenter_path=str(folders["sam"]), device="cuda"))
 
 
-def test_out_of_memory_at_start_says_what_to_do(folders, monkeypatch):
+def test_out_of_memory_at_start_up_names_a_remedy(folders, monkeypatch):
     def full(*arguments):
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1")
 

@@ -1,4 +1,4 @@
-"""Masks → label image, against the slow and obvious rule."""
+"""Masks → instance image, against a slow pixel-by-pixel rule."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.perception.label_image import label_image
+from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch
 
 SHAPE = (6, 7)
 
 
-def obvious(masks, classes, scores):
+def pixelwise(masks, classes, scores):
     labels = np.zeros(SHAPE, np.uint16)
     for y in range(SHAPE[0]):
         for x in range(SHAPE[1]):
@@ -39,9 +39,9 @@ def frames(draw):
 
 
 @given(frames())
-def test_equals_the_obvious_rule(frame):
+def test_equals_the_pixel_by_pixel_rule(frame):
     masks, classes, scores = frame
-    assert np.array_equal(label_image(masks, classes, scores, SHAPE), obvious(*frame))
+    assert np.array_equal(instance_image(masks, classes, scores, SHAPE), pixelwise(*frame))
 
 
 def whole(value=True):
@@ -55,23 +55,23 @@ def whole(value=True):
         ([3, 3], [0.5, 0.6], 2),
         ([3, 3], [0.5, 0.5], 1),
         ([3, 4], [0.5, 0.6], 0),
-        # A third mask does not settle what two classes dispute.
+        # A third mask does not resolve the ambiguity of two classes.
         ([3, 4, 3], [0.5, 0.6, 0.9], 0),
     ],
 )
-def test_a_pixel_that_several_claim(classes, scores, expected):
+def test_a_pixel_in_several_masks(classes, scores, expected):
     masks = [whole() for _ in classes]
-    labels = label_image(masks, np.array(classes), np.array(scores), SHAPE)
+    labels = instance_image(masks, np.array(classes), np.array(scores), SHAPE)
     assert (labels == expected).all()
     assert labels.dtype == np.uint16
 
 
-def test_nothing():
-    labels = label_image([], np.zeros(0, np.int64), np.zeros(0), SHAPE)
+def test_no_masks():
+    labels = instance_image([], np.zeros(0, np.int64), np.zeros(0), SHAPE)
     assert labels.shape == SHAPE and not labels.any()
 
 
-def test_more_masks_than_labels():
+def test_more_masks_than_labels_are_refused():
     masks = [MaskPatch(0, 0, np.zeros((0, 0), dtype=bool))] * 65536
     with pytest.raises(ValueError, match="65536 masks"):
-        label_image(masks, np.zeros(65536, np.int64), np.zeros(65536), SHAPE)
+        instance_image(masks, np.zeros(65536, np.int64), np.zeros(65536), SHAPE)

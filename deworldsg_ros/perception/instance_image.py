@@ -1,4 +1,4 @@
-"""Masks of one frame → one label image."""
+"""Masks of one frame → its instance image."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.scene.arrays import Float64, Int64, UInt16
 
 
-def label_image(
+def instance_image(
     masks: Sequence[MaskPatch], classes: Int64, scores: Float64, shape: tuple[int, int]
 ) -> UInt16:
-    """One label image of masks that may overlap (paper, Section 4.1).
+    """The instance image of masks that may overlap (paper, Section 4.1).
 
-    A pixel that masks of different classes claim is ambiguous and belongs to nobody. Of masks of
-    one class, the one with the higher score takes it (equal scores: the one that comes first).
+    A pixel in masks of different classes is ambiguous and belongs to no object. A pixel in several
+    masks of one class belongs to the one with the highest score, or the first of equal scores.
 
     Args:
         masks: n masks.
-        classes: (n,) the likeliest class of each.
+        classes: (n,) most likely class of each.
         scores: (n,) detection scores.
         shape: H, W of the image.
 
     Returns:
-        (H, W) uint16: 0 = nothing, k + 1 = the object of row k.
+        (H, W) uint16: k + 1 on the pixels of row k, else 0.
 
     Raises:
-        ValueError: more masks than 16 bits can number.
+        ValueError: more masks than uint16 can number.
     """
     if len(masks) > np.iinfo(np.uint16).max:
-        raise ValueError(f"{len(masks)} masks: wanted at most {np.iinfo(np.uint16).max}")
+        raise ValueError(f"{len(masks)} masks, expected at most {np.iinfo(np.uint16).max}")
     labels = np.zeros(shape, dtype=np.uint16)
     ambiguous = np.zeros(shape, dtype=bool)
-    # Index 0 is that of the background, and no class.
+    # The class of each label; label 0 is the background and has none.
     class_of_label = np.concatenate(([-1], np.asarray(classes, dtype=np.int64)))
-    # Best first, so that a pixel once taken stays with the best of its class.
+    # Best first: a later mask takes only free pixels.
     for row in np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable"):
         mask = masks[row]
         here = labels[mask.window]
