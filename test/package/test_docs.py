@@ -1,0 +1,172 @@
+"""Documentation names only files, headings and functions that exist."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "deworldsg_ros"
+METHOD = ROOT / "docs" / "method.md"
+# The fixtures below are checked as if they were the text of this page.
+PAGE = ROOT / "docs" / "page.md"
+# A changelog names files of earlier versions.
+HISTORY = {"CHANGELOG.md"}
+# A program of another project, and files that the package writes.
+ELSEWHERE = {"Merging/evaluate.py", "SCAN/config.yaml", "config.yaml"}
+# Pages that the code names and that are still to be written.
+PLANNED = {"docs/dev/house.md"}
+
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+HEADING = re.compile(r"^#+ +(.+)$", re.MULTILINE)
+FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"`([^`\n]+)`")
+SOURCE_PATH = re.compile(r"[\w./-]+\.(?:py|yaml|yml|sh|toml|md)")
+PAGE_IN_CODE = re.compile(r"\b(?:docs|bench|bags)/[\w/-]+\.md")
+
+
+@cache
+def tracked() -> tuple[Path, ...]:
+    """Files of the repository that are in version control and still there."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    paths = (Path(line) for line in listed.stdout.splitlines())
+    return tuple(path for path in paths if (ROOT / path).is_file())
+
+
+def pages() -> list[Path]:
+    return [path for path in tracked() if path.suffix == ".md" and path.name not in HISTORY]
+
+
+def page_id(path: Path) -> str:
+    return path.as_posix()
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors that GitHub makes of the headings of a page."""
+    found: set[str] = set()
+    for heading in HEADING.findall(FENCE.sub("", text)):
+        plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
+        slug = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+        copies = sum(anchor == slug or anchor.startswith(f"{slug}-") for anchor in found)
+        found.add(f"{slug}-{copies}" if slug in found else slug)
+    return found
+
+
+def broken_links(page: Path, text: str) -> list[str]:
+    """Relative links of a page to a file or a heading that does not exist."""
+    broken = []
+    for link in LINK.findall(FENCE.sub("", text)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        is_missing = bool(name) and not target.exists()
+        if not is_missing and anchor and target.suffix == ".md":
+            content = text if target == page else target.read_text(encoding="utf-8")
+            is_missing = anchor not in anchors(content)
+        if is_missing:
+            broken.append(link)
+    return broken
+
+
+def missing_files(text: str) -> list[str]:
+    """Source files named in backticks that the repository does not contain.
+
+    A name may leave out leading folders: `lifting/stage.py`, `stage.py`. Names with a placeholder
+    in capitals (`NAME.py`) are not checked.
+    """
+    ends = {"/".join(path.parts[start:]) for path in tracked() for start in range(len(path.parts))}
+    words = [word for code in CODE.findall(FENCE.sub("", text)) for word in code.split()]
+    names = [word for word in words if SOURCE_PATH.fullmatch(word)]
+    checked = [re.sub(r"^(\.\./)+", "", name) for name in names if not Path(name).stem.isupper()]
+    return [name for name in checked if name not in ends | ELSEWHERE]
+
+
+def method_rows(text: str) -> list[tuple[list[str], list[str], list[str]]]:
+    """Functions, source files and test files of each row of the table of equations."""
+    rows = []
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if re.fullmatch(r"\d+", cells[0]):
+            _, _, functions, files, tests = cells
+            rows.append((CODE.findall(functions), CODE.findall(files), CODE.findall(tests)))
+    return rows
+
+
+def defined_in(path: Path) -> set[str]:
+    """Names of all functions and classes of a module."""
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}
+
+
+@pytest.mark.parametrize("page", pages(), ids=page_id)
+def test_links_lead_to_files_and_headings(page: Path) -> None:
+    path = ROOT / page
+    assert broken_links(path, path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("page", pages(), ids=page_id)
+def test_named_source_files_exist(page: Path) -> None:
+    assert missing_files((ROOT / page).read_text(encoding="utf-8")) == []
+
+
+def test_pages_named_in_code_exist() -> None:
+    missing = {
+        f"{path}: {name}"
+        for path in tracked()
+        if path.suffix in (".py", ".sh", ".toml", ".yaml")
+        for name in PAGE_IN_CODE.findall((ROOT / path).read_text(encoding="utf-8"))
+        if not (ROOT / name).exists() and name not in PLANNED
+    }
+    assert missing == set()
+
+
+def test_functions_of_the_equations_exist_where_the_table_says() -> None:
+    rows = method_rows(METHOD.read_text(encoding="utf-8"))
+    assert len(rows) == 10
+    for functions, files, tests in rows:
+        assert functions and files and tests
+        defined = set().union(*(defined_in(PACKAGE / file) for file in files))
+        assert set(functions) <= defined
+        assert all((ROOT / test).is_file() for test in tests)
+
+
+@pytest.mark.parametrize(
+    ("text", "broken"),
+    [
+        ("", []),
+        ("[here](#a-heading)\n# A heading", []),
+        ("[here](#no-heading)\n# A heading", ["#no-heading"]),
+        ("[a page](method.md) [a site](https://example.org/x.md)", []),
+        ("[a page](no_such_page.md)", ["no_such_page.md"]),
+        (
+            "[a part](method.md#equations) [none](method.md#no-such-part)",
+            ["method.md#no-such-part"],
+        ),
+    ],
+)
+def test_a_broken_link_is_found(text: str, broken: list[str]) -> None:
+    assert broken_links(PAGE, text) == broken
+
+
+@pytest.mark.parametrize(
+    ("text", "missing"),
+    [
+        ("", []),
+        ("`lifting/stage.py`, `config/default.yaml`, `stage.py`, `bench/NAME.py`", []),
+        ("`python bench/no_such_bench.py`", ["bench/no_such_bench.py"]),
+        (
+            "`lifting/no_such_file.py` and `no_such_file.py`",
+            ["lifting/no_such_file.py", "no_such_file.py"],
+        ),
+    ],
+)
+def test_a_missing_file_is_found(text: str, missing: list[str]) -> None:
+    assert missing_files(text) == missing
