@@ -1,8 +1,8 @@
-"""Stage d: pairing and fusion against plain loops, and what a frame costs without a model's time.
+"""Stage d: pairing and fusion against plain loops, and the time per frame without a world model.
 
     python bench/relations.py
 
-Both sides of a comparison take turns within one run; the ratio is the median over the turns.
+The two sides of a comparison alternate within one run. The ratio is the median over the turns.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def pairs_by_loop(boxes, depths):
 
 
 def fuse_by_loop(logits, has_visual, priors, has_prior):
-    """One edge at a time, with numpy over its predicates."""
+    """Fusion in a loop over edges, with numpy over the predicates."""
     edges = []
     for row in range(len(logits)):
         summed = logits[row] if has_visual[row] else np.zeros(logits.shape[1])
@@ -111,7 +111,7 @@ def local_graph(stamp_ns: int, count: int, generator: np.random.Generator) -> Lo
 
 
 def frame_costs(count: int, turns: int) -> None:
-    """Print what `observe` costs a frame, with clips queued but not encoded."""
+    """Print the time of `observe` per frame, with clips queued but not encoded."""
     generator = np.random.default_rng(2)
     config = RelationsConfig(world_model="fake")
     reasoner = RelationReasoner(config, build_world_model(config))
@@ -121,7 +121,7 @@ def frame_costs(count: int, turns: int) -> None:
     counters = reasoner.counters()
     print(
         f"observe, {count} objects               {1e3 * np.median(times):8.3f} ms   "
-        f"{counters.queued / turns:.1f} clips queued a frame"
+        f"{counters.queued / turns:.1f} clips queued per frame"
     )
 
 

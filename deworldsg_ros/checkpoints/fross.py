@@ -247,10 +247,10 @@ def _backbone_config(shapes: _Shapes) -> Any:
 
 def _fill(model: Any, detector: Tensors, where: str) -> None:
     """Copy published parameters into the model; every name must have its counterpart."""
-    wanted = {name: published_name(name) for name in model.state_dict()}
+    published_names = {name: published_name(name) for name in model.state_dict()}
     expected: dict[str, None] = {}
     found: dict[str, torch.Tensor] = {}
-    for published in wanted.values():
+    for published in published_names.values():
         if published is not None and not _is_counter(published):
             expected[_packed(published)] = None
     for name, value in detector.items():

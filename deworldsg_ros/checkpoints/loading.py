@@ -225,11 +225,11 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 @contextmanager
-def enough_memory(what: str, remedy: str = "") -> Iterator[None]:
+def enough_memory(action: str, remedy: str = "") -> Iterator[None]:
     """Raise ConfigurationError if the block runs out of memory, on the CPU or a GPU.
 
     Args:
-        what: the action, for the message.
+        action: what the block does, for the message.
         remedy: the advice in the message.
     """
     try:
@@ -238,4 +238,4 @@ def enough_memory(what: str, remedy: str = "") -> Iterator[None]:
         if not is_out_of_memory(error):
             raise
         remedy = remedy or "choose a smaller checkpoint, or free memory of the device"
-        raise ConfigurationError(f"out of memory while {what}: {remedy}") from error
+        raise ConfigurationError(f"out of memory while {action}: {remedy}") from error

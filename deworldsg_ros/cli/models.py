@@ -1,4 +1,4 @@
-"""`deworldsg models`: published checkpoints made ready for use."""
+"""`deworldsg models`: conversion of published checkpoints."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rich.console import Console
 from deworldsg_ros.cli.exit_codes import EXIT_USAGE
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
-app = typer.Typer(name="models", help="Make published checkpoints ready for use.")
+app = typer.Typer(name="models", help="Convert published checkpoints.")
 
 
 @app.callback()
 def _models() -> None:
-    """Make published checkpoints ready for use."""
+    """Convert published checkpoints."""
 
 
 @app.command("import-fross")
@@ -34,19 +34,19 @@ def import_fross(
         typer.Option(
             "--names",
             metavar="FILE",
-            help='JSON with "classes" and "predicates", where they are neither Visual Genome\'s '
-            "nor 3DSSG's",
+            help='JSON file with "classes" and "predicates"; needed unless they are '
+            "those of Visual Genome or 3DSSG",
         ),
     ] = None,
     frequency_bias: Annotated[
         Optional[bool],
         typer.Option(
             "--frequency-bias/--no-frequency-bias",
-            help="add the class-pair statistics; without it as FROSS's config.json says",
+            help="add the class-pair statistics; default: the value in FROSS's config.json",
         ),
     ] = None,
 ) -> None:
-    """Turn a checkpoint of FROSS (RT-DETR with EGTR) into a folder that loads by name."""
+    """Convert a checkpoint of FROSS (RT-DETR with EGTR) to a folder for perception."""
     console = Console(highlight=False, soft_wrap=True)
     try:
         made = _import(checkpoint, out, names, frequency_bias)

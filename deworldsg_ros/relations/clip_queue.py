@@ -86,7 +86,7 @@ class ClipQueue:
         return count
 
     def _sift(self) -> list[tuple[Rank, QueuedClip]]:
-        """Drop what need not wait; return the rest with their ranks, the first to encode first."""
+        """Drop clips that need not wait; return the others with their ranks, in encoding order."""
         ranked: list[tuple[Rank, QueuedClip]] = []
         newest: dict[PairKey, int] = {}
         # Newest first: the first clip of a pair is the one to keep.

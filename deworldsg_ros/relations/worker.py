@@ -19,8 +19,8 @@ class EvidenceWorker:
 
     Args:
         reasoner: queues the clips; its counters report dropped clips.
-        deliver: called with each prediction. An exception in it is reported, and the worker goes
-            on.
+        deliver: called with each prediction. An exception in it is reported, and the worker
+            continues.
         report: called with one sentence on each error; default: the log.
     """
 

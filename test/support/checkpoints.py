@@ -62,7 +62,7 @@ def config_of(family, folder, **changes):
 
 
 def save_random_probe(folder, backbone: BackboneIdentity, **changes):
-    """A probe that has learnt nothing."""
+    """An untrained probe."""
     torch.manual_seed(1)
     card = ProbeCard(backbone, VOCABULARY.predicates, **changes)
     probe = Probe(card, build_network(card).eval())

@@ -1,7 +1,7 @@
-"""Drawn rooms of shaded boxes: clips of pairs whose predicate is known, for the tests of probes.
+"""Drawn rooms of shaded boxes: clips of pairs with a known predicate, for the tests of probes.
 
-Each room has walls, a floor and materials of its own. A small and a large box stand in one of five
-relations, seen by a camera that moves by. Colours and textures say nothing about the relation.
+Each room has its own walls, floor and materials. A small and a large box stand in one of five
+relations, seen by a moving camera. Colours and textures do not depend on the relation.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 160, 120
 FOCAL_PX = 150.0
 LIGHT = np.array([0.4, -0.5, 0.77])
 
-# Subject and object classes of each predicate: some pairs of classes have one, some have two.
+# Subject and object classes of each predicate; some class pairs have two predicates.
 CLASSES = ("cup", "box", "table", "chair", "basket")
 CLASS_PAIRS = {
     "on": (("cup", "table"), ("box", "table")),
@@ -105,7 +105,7 @@ def _place(predicate: str, generator: np.random.Generator) -> tuple[Solid, Solid
 
 
 def _background(generator: np.random.Generator) -> np.ndarray:
-    """Wall above, floor below, each with a texture of its own."""
+    """Wall above, floor below, each with its own texture."""
     image = np.zeros((HEIGHT, WIDTH, 3))
     horizon = HEIGHT // 2 + int(generator.integers(-8, 8))
     for rows in (slice(0, horizon), slice(horizon, HEIGHT)):
@@ -151,7 +151,7 @@ def _render(background, solids, yaw, distance):
 
 
 def _parts(solid: Solid) -> list[Solid]:
-    """The plain boxes that it is made of."""
+    """The plain boxes of which a solid consists."""
     low, high = solid.low, solid.high
     thick = 0.05
 

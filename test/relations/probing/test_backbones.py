@@ -1,4 +1,4 @@
-"""V-JEPA 2 and DINOv2 from checkpoints in the real format; what is refused, and how."""
+"""V-JEPA 2 and DINOv2 from checkpoints in the real format; unusable checkpoints are refused."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def load(family, folder, **changes):
 
 
 @pytest.mark.parametrize("family", SAVERS)
-def test_a_clip_gives_one_feature_whatever_is_beside_it(checkpoints, family):
+def test_a_clip_has_the_same_feature_in_every_batch(checkpoints, family):
     backbone = load(family, checkpoints[family])
     assert backbone.identity.family == family and backbone.identity.feature_dim == 48
     assert backbone.identity.image_size == IMAGE_SIZES[family]
@@ -80,19 +80,21 @@ def test_dinov2_is_the_mean_of_the_frames_class_tokens(checkpoints):
     with torch.inference_mode():
         frames = model(images).pooler_output
     np.testing.assert_allclose(backbone.encode([clip()])[0], frames.mean(dim=0), atol=1e-5)
-    # The order of frames is nothing to it.
+    # The feature does not depend on the order of the frames.
     np.testing.assert_allclose(
         backbone.encode([clip()]), backbone.encode([clip()[::-1]]), atol=1e-5
     )
 
 
-def test_vjepa2_sees_the_order_of_frames(checkpoints):
+def test_the_feature_of_vjepa2_depends_on_the_order_of_frames(checkpoints):
     backbone = load("vjepa2", checkpoints["vjepa2"])
     assert not np.allclose(backbone.encode([clip()]), backbone.encode([clip()[::-1]]), atol=1e-3)
 
 
 @pytest.mark.parametrize("family", SAVERS)
-def test_the_fingerprint_is_of_the_weights_and_not_of_the_folder(checkpoints, family, tmp_path):
+def test_the_fingerprint_depends_on_the_weights_and_not_on_the_folder(
+    checkpoints, family, tmp_path
+):
     here = load(family, checkpoints[family]).identity
     assert load(family, SAVERS[family](tmp_path / "same", seed=0)).identity == here
     other = load(family, SAVERS[family](tmp_path / "other", seed=1)).identity
@@ -168,7 +170,7 @@ def test_damaged_or_incomplete_weights_are_refused(checkpoints, tmp_path):
         vjepa2.load_backbone(config_of("vjepa2", tmp_path))
 
 
-def test_the_unused_predictor_need_not_be_there(checkpoints, tmp_path):
+def test_a_checkpoint_without_the_unused_predictor_is_accepted(checkpoints, tmp_path):
     save_vjepa2(tmp_path)
     weights = tmp_path / "model.safetensors"
     state = load_file(weights)
@@ -184,7 +186,7 @@ def test_a_clip_length_that_the_encoder_cannot_split_is_refused(checkpoints):
         load("vjepa2", checkpoints["vjepa2"], clip_length=5)
 
 
-def test_cuda_asked_for_and_absent(checkpoints, monkeypatch):
+def test_cuda_without_a_device_is_refused(checkpoints, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     chosen = {choose_device("relations.device", choice) for choice in ("auto", "cpu")}
     assert chosen == {torch.device("cpu")}
@@ -192,7 +194,7 @@ def test_cuda_asked_for_and_absent(checkpoints, monkeypatch):
         load("vjepa2", checkpoints["vjepa2"], device="cuda")
 
 
-def test_half_precision_on_cuda_alone():
+def test_half_precision_only_on_cuda():
     assert choose_dtype(torch.device("cpu")) == torch.float32
     assert choose_dtype(torch.device("cuda")) == torch.float16
 
@@ -200,7 +202,7 @@ def test_half_precision_on_cuda_alone():
 @pytest.mark.parametrize(
     "error", [MemoryError(), torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB")]
 )
-def test_out_of_memory_says_what_to_do_and_the_run_goes_on(
+def test_out_of_memory_is_reported_with_advice_and_the_run_continues(
     checkpoints, tmp_path, monkeypatch, error
 ):
     identity = load("vjepa2", checkpoints["vjepa2"]).identity
