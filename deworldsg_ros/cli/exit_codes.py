@@ -4,3 +4,5 @@
 EXIT_USAGE = 2
 # Ctrl-C: 128 + SIGINT, as shells report it.
 EXIT_INTERRUPTED = 130
+# An evaluation in which every scan failed.
+EXIT_NOTHING_DONE = 1

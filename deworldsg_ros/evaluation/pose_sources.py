@@ -81,9 +81,9 @@ def _of_slam(
 ) -> Iterator[RgbdFrame]:
     trajectory = read_trajectory(dataset.sequence, "slam")
     T_truth_slam = None
-    for place, frame in enumerate(frames):
+    for index, frame in enumerate(frames):
         number = dataset.frame_numbers[frame.stamp_ns]
-        T_slam_camera = trajectory.at(frame.stamp_ns, number, place, 0)
+        T_slam_camera = trajectory.at(frame.stamp_ns, number, index, 0)
         if T_slam_camera is None:
             drops["no_slam_pose"] += 1
             continue

@@ -75,7 +75,7 @@ def node(
 
 
 def related(*pairs: tuple[int, int, int]) -> Relations:
-    """Pairs with the place of their predicate."""
+    """Pairs with the index of their predicate."""
     logits = np.array([np.where(np.arange(2) == p, 3.0, -3.0) for _, _, p in pairs]).reshape(-1, 2)
     ends = np.array([(s, o) for s, o, _ in pairs], np.int64).reshape(-1, 2)
     return Relations(ends, logits, np.ones(len(pairs)))
@@ -123,7 +123,7 @@ def test_fross_covariance_is_positive_definite_off_the_axis_too() -> None:
     assert np.abs(on_top[:2]).max() < 1e-12
 
 
-def test_fross_turns_with_the_pose() -> None:
+def test_fross_rotates_with_the_pose() -> None:
     T = np.eye(4)
     T[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     T[:3, 3] = [1, 2, 3]
@@ -134,7 +134,7 @@ def test_fross_turns_with_the_pose() -> None:
     assert lifted.covariance_world[0, 0] > 20 * lifted.covariance_world[1, 1]
 
 
-def test_fross_drops_what_has_no_depth_at_its_centre() -> None:
+def test_fross_drops_objects_without_depth_at_the_centre() -> None:
     depth_m = np.full((480, 640), 2.0, np.float32)
     depth_m[240, 320] = 0.0
     boxes = [[270, 190, 370, 290], [100, 100, 100.5, 200], [10, 10, 60, 60]]
@@ -195,7 +195,7 @@ def test_fross_fuses_by_numbers_of_points() -> None:
     assert fused.weight == 0.0
 
 
-def test_a_node_that_absorbed_meets_the_others_again() -> None:
+def test_a_node_that_absorbed_another_is_compared_again() -> None:
     """The third node reaches neither of the two that were there, but closes the gap."""
     method = Fross()
     reach = math.sqrt(-8 * 0.01 * math.log(1 - 0.85**2))
@@ -333,7 +333,7 @@ def posed_frame(stamp_ns: int, depth_m: np.ndarray) -> RgbdFrame:
 @pytest.mark.parametrize("name", list(BASELINES))
 def test_a_still_camera_sees_each_object_once(name: str) -> None:
     boxes = [[20, 20, 120, 120], [200, 100, 330, 300], [450, 200, 600, 420]]
-    # The second has no depth at all: its relation cannot be told.
+    # The second has no depth at all: its relation cannot be result.
     depth_m = np.full((480, 640), 2.0, np.float32)
     depth_m[100:301, 200:331] = 0.0
     perceiver = Still(boxes, related((0, 2, 1), (0, 1, 0)))
@@ -358,6 +358,6 @@ def test_a_still_camera_sees_each_object_once(name: str) -> None:
     }
 
 
-def test_a_baseline_of_another_name_is_named() -> None:
+def test_an_unknown_baseline_is_refused_by_name() -> None:
     with pytest.raises(EvaluationError, match=r"'frost': expected one of fross, kim"):
         build_baseline("frost")

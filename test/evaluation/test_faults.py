@@ -46,10 +46,10 @@ def frame(number: int) -> RgbdFrame:
 def seen() -> FrameDetections:
     image = np.zeros((HEIGHT, WIDTH), np.uint16)
     detections = []
-    for place, (rows, columns) in enumerate(PLACES):
-        image[rows, columns] = place + 1
+    for index, (rows, columns) in enumerate(PLACES):
+        image[rows, columns] = index + 1
         box = np.array([columns.start, rows.start, columns.stop - 1, rows.stop - 1], np.float64)
-        detections.append(Detection(box, spread({place: 0.9}, 6), 0.9, place + 1))
+        detections.append(Detection(box, spread({index: 0.9}, 6), 0.9, index + 1))
     return FrameDetections(detections, [Relation(0, 1, 0.9, spread({0: 0.9}, 2))], image)
 
 
@@ -82,7 +82,7 @@ def test_without_faults_nothing_changes() -> None:
         assert len(item.relations) == 1
 
 
-def test_a_wrong_label_stays_for_a_spell_and_has_its_share() -> None:
+def test_a_wrong_label_lasts_a_spell_and_has_the_chosen_rate() -> None:
     items = run(label=0.2)
     wrong = [[labels(item)[value] != value - 1 for item in items] for value in (1, 2, 3)]
     assert 0.1 < np.mean(wrong) < 0.3
@@ -98,7 +98,7 @@ def test_a_wrong_label_stays_for_a_spell_and_has_its_share() -> None:
     assert min(lengths(short)) == 5
 
 
-def test_a_wrong_label_is_a_look_alike_where_the_detection_names_them() -> None:
+def test_a_wrong_label_is_a_second_choice_of_the_detection() -> None:
     given = seen()
     named = replace(given.detections[0], class_probabilities=spread({0: 0.7, 4: 0.2}, 6))
     items = run(60, once=replace(given, detections=[named, *given.detections[1:]]), label=1.0)
@@ -106,7 +106,7 @@ def test_a_wrong_label_is_a_look_alike_where_the_detection_names_them() -> None:
     assert items[0].detections[0].class_probabilities[[0, 4]].tolist() == [0.2, 0.7]
 
 
-def test_false_boxes_stay_for_a_while_on_what_is_no_object() -> None:
+def test_false_boxes_last_and_are_on_the_background() -> None:
     items = run(false=2.0)
     objects = seen().instance_image > 0
     counts = []
@@ -129,7 +129,7 @@ def test_false_boxes_stay_for_a_while_on_what_is_no_object() -> None:
     assert (steps > 5).any()
 
 
-def test_a_false_box_that_stays_is_at_one_place_of_the_room() -> None:
+def test_a_static_false_box_has_one_position_in_the_room() -> None:
     injection = Injection(VOCABULARY, CLASSES, FrameFaults(), Faults(false=8.0, false_s=100.0), 3)
     centres = []
     for number in (0, 1):
@@ -145,7 +145,7 @@ def test_a_false_box_that_stays_is_at_one_place_of_the_room() -> None:
     assert sum(abs(shift + 6) <= 1 for shift in shifts) >= 2
 
 
-def test_bleeding_takes_a_strip_of_everything_beside() -> None:
+def test_a_bleeding_mask_includes_a_strip_around_the_object() -> None:
     always = run(2, bleed=1.0)[0]
     image = always.instance_image
     # The last one bleeds over the background, as far as the strip is wide.
@@ -158,7 +158,7 @@ def test_bleeding_takes_a_strip_of_everything_beside() -> None:
     assert 0.15 < share < 0.45
 
 
-def test_merging_takes_the_neighbour_with_its_detection_and_relations() -> None:
+def test_a_merged_mask_removes_the_neighbour_and_its_relations() -> None:
     once = run(1, merge=1.0)[0]
     assert [part.instance for part in once.detections] == [1, 3]
     assert once.detections[0].box_xyxy.tolist() == [10, 20, 79, 59]
@@ -167,7 +167,7 @@ def test_merging_takes_the_neighbour_with_its_detection_and_relations() -> None:
     assert areas(run(50, merge=1.0), 3).tolist() == [40 * 40] * 50
 
 
-def test_a_cut_mask_covers_a_part_for_a_spell() -> None:
+def test_a_cut_mask_covers_a_part_of_its_object_for_a_spell() -> None:
     whole = 40 * 40
     share = areas(run(cut=0.3), 3) / whole
     cut = share < 1
@@ -180,7 +180,7 @@ def test_a_cut_mask_covers_a_part_for_a_spell() -> None:
             assert part.box_xyxy.tolist() == expected
 
 
-def test_faults_do_not_depend_on_which_frames_come() -> None:
+def test_faults_are_independent_of_the_frames_processed_before() -> None:
     everything = {"label": 0.3, "bleed": 0.3, "merge": 0.3, "cut": 0.3}
     whole = run(60, **everything)
     injection = Injection(VOCABULARY, CLASSES, FrameFaults(), Faults(**everything), 0)
@@ -195,7 +195,7 @@ def test_faults_do_not_depend_on_which_frames_come() -> None:
     assert all(labels(a).items() <= labels(b).items() for a, b in zip(whole, alone))
 
 
-def test_what_is_asked_for_is_told_and_checked() -> None:
+def test_faults_are_parsed_described_and_checked() -> None:
     assert parse_faults("") == Faults()
     assert parse_faults("label=0.1, false=2,spell_s=1") == Faults(0.1, 2.0, spell_s=1.0)
     assert Faults().describe() == ""

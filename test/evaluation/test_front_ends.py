@@ -113,7 +113,7 @@ def test_faults_are_seeded_and_have_the_chosen_rates(tmp_path: Path) -> None:
         assert np.not_equal(*classes).all()
 
 
-def test_what_is_too_small_is_not_detected() -> None:
+def test_small_objects_are_not_detected() -> None:
     image = np.zeros((50, 50), np.uint16)
     image[0:9, 0:40] = 1
     image[10:24, 0:14] = 2

@@ -42,7 +42,7 @@ def node(number: int, label: str, x: float, weight: float = 1.0) -> NodeView:
     return NodeView(number, label, 0.8, np.array([x, 0.5, 0.5]), cube, weight)
 
 
-def test_nothing() -> None:
+def test_an_empty_graph() -> None:
     numbers = measure_views([], [], SCENE).numbers()
     assert numbers["node_recall"] == 0
     assert math.isnan(numbers["node_precision"])

@@ -80,8 +80,8 @@ class Hostile:
         return self.call
 
 
-@pytest.mark.parametrize("place", ["top", "value", "dtype", "key"])
-def test_a_pickle_cannot_run_anything(tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("index", ["top", "value", "dtype", "key"])
+def test_a_pickle_cannot_run_anything(tmp_path: Path, index: str) -> None:
     marker = tmp_path / "ran"
     hostile = Hostile(Path.touch, marker)
     content: Any = {
@@ -89,7 +89,7 @@ def test_a_pickle_cannot_run_anything(tmp_path: Path, place: str) -> None:
         "value": {"a": {**official(), "mean": hostile}},
         "dtype": {"a": {**official(), "mean": Hostile(np.dtype, hostile)}},
         "key": {"a": {**official(), "mean": [{(1, 2): [hostile]}]}},
-    }[place]
+    }[index]
     path = tmp_path / "p.pkl"
     path.write_bytes(pickle.dumps(content))
     with pytest.raises(EvaluationError, match="refused"):
@@ -160,7 +160,7 @@ def test_open_format(tmp_path: Path) -> None:
         ({"class_index": 0, "points": []}, {"subject": -1, "object": 0}, "expected 0 or more"),
     ],
 )
-def test_open_format_errors_say_what_was_wanted(
+def test_open_format_errors_state_what_was_expected(
     tmp_path: Path, node: Any, edge: Any, expected: str
 ) -> None:
     edges = [{**edge, "predicate_probabilities": [1.0, 0.0]}] if edge else []

@@ -71,9 +71,9 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
             assert supports == official["prediction_supports"]
 
 
-# Scores, place, rank: of equals the last comes first, NaN before every number.
+# Scores, index, rank: of equals the last comes first, NaN before every number.
 @pytest.mark.parametrize(
-    ("scores", "place", "expected"),
+    ("scores", "index", "expected"),
     [
         ([], 0, NO_RANK),
         ([1.0], 0, 0),
@@ -88,8 +88,8 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
         ([math.inf, math.nan], 0, 1),
     ],
 )
-def test_rank(scores: list[float], place: int, expected: int) -> None:
-    assert rank(np.array(scores), place) == expected
+def test_rank(scores: list[float], index: int, expected: int) -> None:
+    assert rank(np.array(scores), index) == expected
 
 
 def test_rank_is_that_of_a_flipped_stable_sort() -> None:
@@ -97,7 +97,7 @@ def test_rank_is_that_of_a_flipped_stable_sort() -> None:
     for _ in range(50):
         scores = generator.choice([0.0, 0.25, 1.0, np.nan, np.inf], 12)
         order = np.argsort(scores, kind="stable")[::-1]
-        assert [rank(scores, place) for place in order] == list(range(12))
+        assert [rank(scores, index) for index in order] == list(range(12))
 
 
 def test_triple_rank_takes_every_cell_of_the_table() -> None:
@@ -110,9 +110,9 @@ def test_triple_rank_takes_every_cell_of_the_table() -> None:
         for k in range(3)
     ]
     order = list(np.argsort(table, kind="stable")[::-1])
-    for place in range(48):
-        triple = (place // 12, place // 3 % 4, place % 3)
-        assert triple_rank(subject, object_, predicate, triple) == order.index(place)
+    for index in range(48):
+        triple = (index // 12, index // 3 % 4, index % 3)
+        assert triple_rank(subject, object_, predicate, triple) == order.index(index)
 
 
 def test_zero_vectors_make_the_last_triple_the_top() -> None:
@@ -179,7 +179,7 @@ def test_most_points_win_and_the_first_of_equals() -> None:
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_matching_against_looking_at_every_pair(seed: int) -> None:
+def test_matching_equals_a_search_over_all_pairs(seed: int) -> None:
     generator = np.random.default_rng(seed)
     surface_points = generator.uniform(0, 0.5, (40, 3))
     ids = generator.integers(0, 5, 40)
@@ -222,7 +222,7 @@ def test_points_that_are_not_finite_do_not_vote_but_count() -> None:
 def graph(
     objects: list[tuple[int, int]], edges: list[tuple[int, int, int]], **extra: np.ndarray
 ) -> ScanPrediction:
-    """Nodes (object id, class) and edges (subject, object, predicate) between places."""
+    """Nodes (object id, class) and edges (subject, object, predicate) between indices."""
     return ScanPrediction(
         tuple(segment(number) for number, _ in objects),
         extra.get("classes", np.array([one_hot(c) for _, c in objects]).reshape(-1, 3)),
@@ -302,7 +302,9 @@ def test_a_scan_written_twice_is_evaluated_twice(tmp_path: Path) -> None:
     assert result.objects == (0, 4)
 
 
-def test_skip_looks_at_the_last_relation_entry_and_takes_the_points_too(tmp_path: Path) -> None:
+def test_skipped_objects_follow_the_last_relation_entry(
+    tmp_path: Path,
+) -> None:
     objects = [("chair", 1), ("table", 2), ("book", 3)]
     root = write_dataset(tmp_path, {"a": (objects, [])})
     entries = [[[1, 2, 0, "near"], [3, 2, 0, "on"]], [[1, 2, 0, "on"]]]
@@ -349,7 +351,7 @@ def test_both_layouts(tmp_path: Path, layout: str) -> None:
     assert (result.objects, result.relationships) == ((2, 2), (1, 2))
 
 
-def test_where_the_official_program_stops(tmp_path: Path) -> None:
+def test_input_on_which_the_official_program_stops(tmp_path: Path) -> None:
     scans = {
         "none": ([("wall", 1)], []),
         "one": ([("chair", 1)], [(1, 6, "near"), (1, 1, "never heard")]),
@@ -403,7 +405,7 @@ def test_a_cut_ply_is_named(tmp_path: Path) -> None:
             Annotations(root, "replica").points("a")
 
 
-def test_a_missing_file_says_where_and_how_to_get_it(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_with_its_source(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"replica_to_visual_genome\.json is missing.*Replica"):
         Annotations(tmp_path, "replica")
     root = write_dataset(tmp_path, {"a": ROOM})

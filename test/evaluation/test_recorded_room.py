@@ -27,7 +27,7 @@ def evaluate(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
-def test_what_counts_is_what_can_be_detected() -> None:
+def test_only_objects_that_can_be_detected_count() -> None:
     room = open_annotations(RECORDING, "recording")
     assert isinstance(room, RecordedRoom)
     assert room.scans("test") == ["demo_room"]
@@ -35,7 +35,7 @@ def test_what_counts_is_what_can_be_detected() -> None:
     truth = json.loads(RECORDING.with_name("demo_room.gt.json").read_text(encoding="utf-8"))
     detectable = {item["id"] for item in truth["objects"] if item["detectable"]}
     assert annotation.objects.keys() == detectable
-    names = {room.vocabulary.classes[place] for place in annotation.objects.values()}
+    names = {room.vocabulary.classes[index] for index in annotation.objects.values()}
     assert {"tv", "couch", "dining table", "potted plant", "cup"} <= names
     assert all({line[0], line[1]} <= detectable for line in annotation.relations)
     assert len(annotation.relations) > 80
@@ -58,11 +58,11 @@ def test_surface_points_are_those_of_the_objects() -> None:
 
 
 def test_command_on_a_recording(tmp_path: Path) -> None:
-    told = evaluate(
+    result = evaluate(
         *("--front-end", "ground-truth", "--every", 8, "--max-frames", 10),
         *("--pose-noise", "jitter_m=0.001", "--out", tmp_path, "--json", tmp_path / "n.json"),
     )
-    assert told.exit_code == 0, told.output
+    assert result.exit_code == 0, result.output
     values = json.loads((tmp_path / "n.json").read_text())
     assert values["scans"][0]["frames"] == 10
     assert values["measures"]["found"] >= 10
@@ -88,15 +88,15 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_does_not_go_together_is_refused(
+def test_conflicting_options_are_refused(
     tmp_path: Path, arguments: tuple[str, ...], words: str
 ) -> None:
-    told = evaluate(*arguments, "--out", tmp_path)
-    assert told.exit_code != 0
-    assert words in " ".join((told.stdout + told.stderr).split())
+    result = evaluate(*arguments, "--out", tmp_path)
+    assert result.exit_code != 0
+    assert words in " ".join((result.stdout + result.stderr).split())
 
 
-def test_a_recording_without_ground_truth_says_what_is_missing(tmp_path: Path) -> None:
+def test_a_recording_without_ground_truth_is_refused_with_the_missing_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"room\.gt\.json is missing"):
         open_annotations(tmp_path / "room", "recording")
     shutil.copy(RECORDING.with_name("demo_room.gt.json"), tmp_path / "room.gt.json")

@@ -46,7 +46,7 @@ def task(root: Path, out: Path, **changes: object) -> ScanTask:
     return ScanTask(**{**values, **changes})  # type: ignore[arg-type]
 
 
-def test_a_scan_travels_to_another_process_and_back(tmp_path: Path) -> None:
+def test_tasks_and_outcomes_can_be_pickled(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     sent = pickle.loads(pickle.dumps(task(root, tmp_path / "out", checkpoints=2)))
     outcome: ScanOutcome = pickle.loads(pickle.dumps(evaluate_scan(sent)))
@@ -71,7 +71,7 @@ def test_a_scan_travels_to_another_process_and_back(tmp_path: Path) -> None:
     assert load_config(tmp_path / "out" / "room_0" / "config.yaml") == Config()
 
 
-def test_two_runs_leave_the_same_graph(tmp_path: Path) -> None:
+def test_two_runs_write_the_same_graph(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     texts = []
     for name in ("a", "b"):
@@ -110,7 +110,7 @@ def test_labels_of_a_detector_become_classes(tmp_path: Path) -> None:
     assert translate(graph, annotations) is graph
 
 
-def test_a_scan_of_3rscan_is_turned_and_found(tmp_path: Path) -> None:
+def test_rotated_images_of_3rscan_are_evaluated(tmp_path: Path) -> None:
     objects = [(name, number) for number, name, _, _ in BLOCKS]
     root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
     write_surface(write_sequence(root / "data" / "a"))

@@ -59,7 +59,7 @@ def evaluate(root: Path, kind: str, *arguments: object) -> Result:
     return CliRunner().invoke(app, [str(word) for word in words])
 
 
-def test_a_finished_job_is_taken_from_before(root: Path, tmp_path: Path) -> None:
+def test_the_result_of_a_finished_job_is_reused(root: Path, tmp_path: Path) -> None:
     first = run_job(job(root, tmp_path, method="fross"))
     assert first.outcome is not None
     assert not first.reused
@@ -69,7 +69,7 @@ def test_a_finished_job_is_taken_from_before(root: Path, tmp_path: Path) -> None
     assert not run_job(replace(job(root, tmp_path, method="fross"), fresh=True)).reused
 
 
-def test_a_job_is_run_again_where_anything_differs(root: Path, tmp_path: Path) -> None:
+def test_a_job_runs_again_if_its_inputs_differ(root: Path, tmp_path: Path) -> None:
     run_job(job(root, tmp_path))
     other = msgspec.structs.replace(Config(), merging=MergingConfig(overlap_threshold=0.4))
     assert not run_job(job(root, tmp_path, config=other)).reused
@@ -83,7 +83,7 @@ def test_a_job_is_run_again_where_anything_differs(root: Path, tmp_path: Path) -
     assert not run_job(job(root, tmp_path)).reused
 
 
-def test_the_fingerprint_is_of_the_task_and_not_of_its_folder(root: Path, tmp_path: Path) -> None:
+def test_the_fingerprint_is_independent_of_the_folder(root: Path, tmp_path: Path) -> None:
     known = fingerprint(job(root, tmp_path).task)
     assert fingerprint(job(root, tmp_path / "elsewhere").task) == known
     for changes in (
@@ -104,7 +104,7 @@ def test_a_failed_scan_does_not_stop_the_rest(root: Path, tmp_path: Path) -> Non
     assert "room_9" in results[0].failure
 
 
-def test_an_unexpected_error_is_told_and_written_down(root: Path, tmp_path: Path) -> None:
+def test_the_traceback_of_an_unexpected_error_is_saved(root: Path, tmp_path: Path) -> None:
     result = run_job(job(root, tmp_path, options=None))
     assert "AttributeError" in result.failure
     assert "Traceback" in (tmp_path / "room_0" / "error.txt").read_text()
@@ -118,7 +118,7 @@ class Deadly:
 
 
 @pytest.mark.timeout(300)
-def test_processes_give_the_same_results_and_may_die(
+def test_processes_give_the_same_results_and_survive_a_crash(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
@@ -149,7 +149,7 @@ def test_a_cluster_gives_the_same_results(root: Path, tmp_path: Path) -> None:
     assert results["room_9"].outcome is None
 
 
-def test_a_scheduler_without_dask_says_what_to_install(
+def test_a_scheduler_without_dask_is_refused_with_the_package_to_install(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -169,8 +169,8 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
         *("--out", out, "--json", tmp_path / "t.json"),
         *("--predictions", f"SGFN={tmp_path / 'p.json'}"),
     )
-    told = evaluate(root, *arguments)
-    assert told.exit_code == 0, told.output
+    result = evaluate(root, *arguments)
+    assert result.exit_code == 0, result.output
     values = json.loads((tmp_path / "t.json").read_text())
     rows = {row["name"]: row for row in values["rows"]}
     assert list(rows) == [
@@ -187,17 +187,17 @@ def test_the_main_table(root: Path, tmp_path: Path) -> None:
     assert rows["default"]["nodes_per_object"] == 1.0
     assert rows["SGFN"]["object_recall"] == 1.0
     assert rows["paper"]["times_ms"].keys() == {"perception", "lifting", "merging", "relations"}
-    assert "printed" in told.output
+    assert "printed" in result.output
     lines = (out / "table.csv").read_text().splitlines()
     assert len(lines) == 1 + len(rows)
     assert len((out / "table.tex").read_text().splitlines()) == len(rows)
     # What was finished is not done again.
-    told = evaluate(root, *arguments)
-    assert "4 from before, 0 failed" in told.output
+    result = evaluate(root, *arguments)
+    assert "4 from before, 0 failed" in result.output
 
 
-def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Path) -> None:
-    told = evaluate(
+def test_the_ablation_table_reports_failed_rows(root: Path, tmp_path: Path) -> None:
+    result = evaluate(
         *(root, "ablation", "--workers", 1, "--checkpoints", 0),
         *(
             "--out",
@@ -208,12 +208,12 @@ def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Pat
             "a:lifting.covariance_ridge_m2=0.5",
         ),
     )
-    assert told.exit_code == 0, told.output
+    assert result.exit_code == 0, result.output
     values = json.loads((tmp_path / "t.json").read_text())
     rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
     assert [rows[name]["scan_count"] for name in "abcde"] == [1, 1, 1, 0, 0]
     assert rows["e"]["failed"]["room_0"]
-    assert "failed:" in told.output
+    assert "failed:" in result.output
     effective = (tmp_path / "a" / "room_0" / "config.yaml").read_text()
     assert "pixels: box" in effective
     assert "covariance_ridge_m2: 0.5" in effective
@@ -223,33 +223,33 @@ def test_the_ablation_table_reports_what_it_cannot_run(root: Path, tmp_path: Pat
 
 
 def test_the_pose_table(root: Path, tmp_path: Path) -> None:
-    told = evaluate(
+    result = evaluate(
         *(root, "pose", "--workers", 1, "--checkpoints", 0, "--poses", "slam"),
         *("--poses", "perturbed", "--pose-noise", "jitter_m=0.0001"),
         *("--out", tmp_path, "--json", tmp_path / "t.json"),
     )
-    assert told.exit_code == 0, told.output
+    assert result.exit_code == 0, result.output
     values = json.loads((tmp_path / "t.json").read_text())
     rows = {row["name"]: row for row in values["rows"] if not row["printed"]}
     assert rows["default-perturbed"]["object_recall"] == 1.0
     assert "slam.pose.txt" in rows["default-slam"]["failed"]["room_0"]
 
 
-def test_the_hard_table_and_that_of_the_switches(root: Path, tmp_path: Path) -> None:
+def test_the_tables_of_hard_input_and_of_switches(root: Path, tmp_path: Path) -> None:
     for table, name in (("hard", "default-jitter"), ("switches", "confirmed-label")):
-        told = evaluate(
+        result = evaluate(
             *(root, table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),
         )
-        assert told.exit_code == 0, told.output
+        assert result.exit_code == 0, result.output
         rows = {row["name"]: row for row in json.loads((tmp_path / "t.json").read_text())["rows"]}
         assert name in rows
         assert len(rows) == {"hard": 24, "switches": 5 * len(SWITCHES)}[table]
         assert not any(row["failed"] for row in rows.values())
-        assert ("merging ms" in told.output) == (table == "switches")
+        assert ("merging ms" in result.output) == (table == "switches")
 
 
-def test_each_condition_is_given_to_its_rows() -> None:
+def test_each_condition_applies_to_its_rows() -> None:
     def configure(file: str, settings: object, row: str) -> Config:
         return Config()
 
@@ -267,15 +267,15 @@ def test_each_condition_is_given_to_its_rows() -> None:
 
 
 def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
-    told = evaluate(
+    result = evaluate(
         *(root, "runtime", "--checkpoints", 0),
         *("--out", tmp_path, "--json", tmp_path / "t.json"),
     )
-    assert told.exit_code == 0, told.output
+    assert result.exit_code == 0, result.output
     rows = json.loads((tmp_path / "t.json").read_text())["rows"]
     assert rows[0]["device"] == "NVIDIA RTX A6000"
     assert all(row["device"] and total_ms(row["times_ms"]) > 0 for row in rows)
-    assert "milliseconds" in told.output
+    assert "milliseconds" in result.output
 
 
 @pytest.mark.parametrize(
@@ -290,21 +290,21 @@ def test_the_runtime_table_names_the_device(root: Path, tmp_path: Path) -> None:
         (("main", "--set", "paper:lifting.tao=0.1"), "there is no lifting.tao"),
     ],
 )
-def test_what_a_table_refuses(
+def test_invalid_options_of_a_table_are_refused(
     root: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
 ) -> None:
-    told = evaluate(root, *arguments, "--out", tmp_path)
-    assert told.exit_code == 2
-    assert words in " ".join(told.stderr.split())
+    result = evaluate(root, *arguments, "--out", tmp_path)
+    assert result.exit_code == 2
+    assert words in " ".join(result.stderr.split())
 
 
-def test_nothing_done_is_an_error(root: Path, tmp_path: Path) -> None:
-    told = evaluate(*(root, "main", "--scan", "room_9", "--workers", 1, "--out", tmp_path))
-    assert told.exit_code == 1
-    assert "failed:" in told.output
+def test_a_table_without_a_finished_scan_is_an_error(root: Path, tmp_path: Path) -> None:
+    result = evaluate(*(root, "main", "--scan", "room_9", "--workers", 1, "--out", tmp_path))
+    assert result.exit_code == 1
+    assert "failed:" in result.output
 
 
-def test_rows_of_every_table_have_names_of_their_own() -> None:
+def test_names_and_titles_of_rows_are_unique_in_every_table() -> None:
     def configure(file: str, settings: object, row: str) -> Config:
         return Config()
 
@@ -315,7 +315,7 @@ def test_rows_of_every_table_have_names_of_their_own() -> None:
         assert len({row.title for row in rows}) == len(rows)
 
 
-def test_the_printed_numbers_are_the_paper_s(shared_dir: Path) -> None:
+def test_the_printed_numbers_are_in_the_paper(shared_dir: Path) -> None:
     """Every printed row stands in the paper's source, number by number."""
     text = (shared_dir / "paper" / "deworldsg.tex").read_text(encoding="utf-8")
     for wrapper in ("\\textbf{", "}", " ", "\n"):
@@ -327,7 +327,7 @@ def test_the_printed_numbers_are_the_paper_s(shared_dir: Path) -> None:
         assert f"{value:.2f}ms" in text.replace("~", "").replace("\\", "")
 
 
-def test_slam_poses_begin_where_the_camera_truly_was(tmp_path: Path) -> None:
+def test_slam_poses_start_at_the_first_true_pose(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set", frames=4)
     source = open_source(root / "data" / "room_0")
     true = [frame.T_world_camera for frame in Recording(source, Config().inputs).frames()]

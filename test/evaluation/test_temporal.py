@@ -51,7 +51,7 @@ def test_an_empty_stream_has_nothing_and_no_rates() -> None:
     assert quality.numbers()["id_switches_per_minute"] is None
 
 
-def test_a_steady_graph_has_no_switches_and_no_flips() -> None:
+def test_a_stable_graph_has_no_switches_and_no_flips() -> None:
     steady = {"nodes": [node(1), node(2, "table")], "edges": [edge(1, 2)]}
     updates = stream(*({**steady, "at": [1, 2]} for _ in range(4)))
     quality = measure_stream(updates, truth(*[[10, 20]] * 4))
@@ -73,14 +73,14 @@ def test_another_node_is_a_switch_each_time() -> None:
     assert quality.per_minute(quality.id_switches) == pytest.approx(40.0)
 
 
-def test_a_node_that_became_another_is_no_switch() -> None:
+def test_a_merge_is_not_a_switch() -> None:
     merged = [wire.RemovedNode(2, 1)]
     updates = stream({"nodes": [node(1), node(2)], "at": [2]}, {"removed_nodes": merged, "at": [1]})
     quality = measure_stream(updates, truth([7], [7]))
     assert (quality.id_switches, quality.merges, quality.removals) == (0, 1, 0)
 
 
-def test_a_node_that_was_removed_and_made_anew_is_a_switch() -> None:
+def test_a_node_that_is_removed_and_created_again_is_a_switch() -> None:
     updates = stream(
         {"nodes": [node(1)], "at": [1]},
         {"removed_nodes": [wire.RemovedNode(1)]},
@@ -90,13 +90,13 @@ def test_a_node_that_was_removed_and_made_anew_is_a_switch() -> None:
     assert (quality.id_switches, quality.removals) == (1, 1)
 
 
-def test_what_nobody_knows_and_what_has_no_node_is_left_out() -> None:
+def test_detections_without_a_true_object_or_node_are_left_out() -> None:
     updates = stream({"at": [1, 5]}, {"at": [0, 6]}, {"at": [1, 7]})
     quality = measure_stream(updates, truth([7, 0], [7, 0], [7, 0]))
     assert (quality.associations, quality.id_switches) == (2, 0)
 
 
-def test_tentative_nodes_that_nobody_saw_do_not_count_as_removed() -> None:
+def test_unpublished_nodes_do_not_count_as_removed() -> None:
     quality = measure_stream(stream({"removed_nodes": [wire.RemovedNode(9)]}))
     assert quality.removals == 0
 
@@ -107,7 +107,7 @@ def test_labels_that_change_are_flips() -> None:
     assert quality.label_flips == 2
 
 
-def test_a_node_that_is_shown_again_has_no_label_to_flip() -> None:
+def test_a_node_that_is_published_again_has_no_label_flip() -> None:
     gone = {"removed_nodes": [wire.RemovedNode(1)]}
     quality = measure_stream(stream({"nodes": [node(1)]}, gone, {"nodes": [node(1, "bowl")]}))
     assert (quality.label_flips, quality.removals) == (0, 1)
@@ -133,12 +133,12 @@ def test_edges_that_change_are_flips(parts: list[dict], flips: int) -> None:  # 
     assert quality.edge_flips == flips
 
 
-def test_frames_whose_rows_do_not_match_are_an_error() -> None:
+def test_different_numbers_of_rows_and_associations_are_an_error() -> None:
     with pytest.raises(ValueError, match="2 true objects and 1 associations"):
         measure_stream(stream({"at": [1]}), truth([7, 8]))
 
 
-def test_the_true_object_is_what_most_pixels_show() -> None:
+def test_the_true_object_covers_most_pixels_of_the_detection() -> None:
     instances = np.array([[1, 1, 1, 2], [3, 3, 0, 2]], np.uint16)
     shown = np.array([[7, 7, 8, 0], [5, 6, 9, 0]], np.uint16)
     assert true_objects([1, 2, 3, 4], instances, shown) == [7, 0, 5, 0]

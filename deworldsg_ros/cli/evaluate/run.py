@@ -18,6 +18,7 @@ from deworldsg_ros.cli.evaluate.options import (
     ScoringOptions,
 )
 from deworldsg_ros.cli.evaluate.score import finish, header, protocol_options, report
+from deworldsg_ros.cli.exit_codes import EXIT_NOTHING_DONE
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice, parse_faults
@@ -30,8 +31,6 @@ from deworldsg_ros.poses.perturbation import parse_noise
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
-
-EXIT_NOTHING_DONE = 1
 
 
 def run_scans(

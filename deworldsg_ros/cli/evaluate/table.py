@@ -17,8 +17,9 @@ from deworldsg_ros.cli.evaluate.options import (
     ScoringOptions,
     TableOptions,
 )
-from deworldsg_ros.cli.evaluate.run import EXIT_NOTHING_DONE, pose_sources, scan_tasks
+from deworldsg_ros.cli.evaluate.run import pose_sources, scan_tasks
 from deworldsg_ros.cli.evaluate.score import finish, header, print_files
+from deworldsg_ros.cli.exit_codes import EXIT_NOTHING_DONE
 from deworldsg_ros.cli.installation import find_shared
 from deworldsg_ros.cli.progress import frame_progress
 from deworldsg_ros.config import Config

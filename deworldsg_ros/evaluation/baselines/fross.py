@@ -75,17 +75,17 @@ class Fross:
         In the released code two equal Gaussians give NaN and never merge. Here the Bhattacharyya
         distance is clamped at 0 (`scene.gaussian`).
         """
-        places = [place for place, other in enumerate(others) if other.label == node.label]
-        if not places:
+        indices = [index for index, other in enumerate(others) if other.label == node.label]
+        if not indices:
             return None
         distances = hellinger_distance(
             node.mean_world,
             node.covariance_world,
-            np.array([others[place].mean_world for place in places]),
-            np.array([others[place].covariance_world for place in places]),
+            np.array([others[index].mean_world for index in indices]),
+            np.array([others[index].covariance_world for index in indices]),
         )
         nearest = int(distances.argmin())
-        return places[nearest] if distances[nearest] < MAX_HELLINGER_DISTANCE else None
+        return indices[nearest] if distances[nearest] < MAX_HELLINGER_DISTANCE else None
 
     def fuse(self, keeper: BaselineNode, other: BaselineNode) -> BaselineNode:
         """Both nodes in one, weighted by their numbers of evaluation points."""

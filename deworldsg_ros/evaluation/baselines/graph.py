@@ -219,5 +219,5 @@ def _fractions(scores: Float64 | Int64) -> Float64:
 def _beliefs(fractions: Float64, names: Sequence[str]) -> list[wire.Belief]:
     best = np.argsort(-fractions, kind="stable")[:TOP_K].tolist()
     return [
-        wire.Belief(names[place], float(fractions[place])) for place in best if fractions[place] > 0
+        wire.Belief(names[index], float(fractions[index])) for index in best if fractions[index] > 0
     ]

@@ -150,7 +150,7 @@ def top_classes(class_scores: Float64) -> frozenset[int]:
     """The three best classes, without classes that tie with the fourth (an evenly spread rest)."""
     order = np.argsort(-class_scores, kind="stable").tolist()
     fourth = class_scores[order[3]] if len(order) > 3 else 0.0
-    return frozenset(place for place in order[:3] if class_scores[place] > fourth)
+    return frozenset(index for index in order[:3] if class_scores[index] > fourth)
 
 
 def class_similarity(a: frozenset[int], b: frozenset[int]) -> float:

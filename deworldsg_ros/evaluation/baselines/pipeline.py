@@ -96,13 +96,13 @@ class BaselinePipeline:
 
 def between(relations: Relations, rows: Sequence[int]) -> Relations:
     """Relations between these rows of the frame graph, with indices into `rows` as pairs."""
-    place_of = {row: place for place, row in enumerate(rows)}
+    index_of = {row: index for index, row in enumerate(rows)}
     kept = [
         number
         for number, (subject, object_) in enumerate(relations.pairs.tolist())
-        if subject in place_of and object_ in place_of
+        if subject in index_of and object_ in index_of
     ]
-    pairs = [[place_of[end] for end in pair] for pair in relations.pairs[kept].tolist()]
+    pairs = [[index_of[end] for end in pair] for pair in relations.pairs[kept].tolist()]
     return Relations(
         np.array(pairs, np.int64).reshape(-1, 2), relations.logits[kept], relations.scores[kept]
     )

@@ -81,8 +81,8 @@ def spread(stated: Mapping[int, float], count: int) -> Float64:
     others = count - len(stated)
     left = max(0.0, 1.0 - sum(stated.values()))
     distribution = np.full(count, left / others if others else 0.0)
-    for place, probability in stated.items():
-        distribution[place] = probability
+    for index, probability in stated.items():
+        distribution[index] = probability
     return np.asarray(distribution / distribution.sum())
 
 
@@ -105,9 +105,9 @@ def assemble(
     Detections are ordered by score. The `top_relations` relations with the highest score are kept.
     """
     detections, relations = seen.detections, seen.relations
-    order = sorted(range(len(detections)), key=lambda place: -detections[place].score)
-    row_of = {place: row for row, place in enumerate(order)}
-    chosen = [detections[place] for place in order]
+    order = sorted(range(len(detections)), key=lambda index: -detections[index].score)
+    row_of = {index: row for row, index in enumerate(order)}
+    chosen = [detections[index] for index in order]
     width, height = frame.intrinsics.width, frame.intrinsics.height
     boxes = np.array([item.box_xyxy for item in chosen], np.float64).reshape(-1, 4)
     boxes = np.clip(boxes, 0.0, [width - 1.0, height - 1.0] * 2)

@@ -85,30 +85,30 @@ class GroundTruthFrontEnd:
         if instances is None:
             instances = self._nearest_objects(frame)
         detections: list[Detection] = []
-        places: dict[int, int] = {}
-        for object_id, class_place in self._annotation.objects.items():
+        indices: dict[int, int] = {}
+        for object_id, class_index in self._annotation.objects.items():
             box = visible_box(instances, object_id)
             if box is not None:
-                places[object_id] = len(detections)
-                scores = spread({class_place: TRUE_PROBABILITY}, len(self.vocabulary.classes))
+                indices[object_id] = len(detections)
+                scores = spread({class_index: TRUE_PROBABILITY}, len(self.vocabulary.classes))
                 detections.append(Detection(box, scores, TRUE_PROBABILITY, object_id))
-        seen = FrameDetections(detections, self._relate(number, places), instances)
+        seen = FrameDetections(detections, self._relate(number, indices), instances)
         if self._injection is not None:
             seen = self._injection.apply(seen, frame, number)
         return assemble(frame, self.vocabulary, seen, self._top_relations)
 
-    def _relate(self, number: int, places: Mapping[int, int]) -> list[Relation]:
+    def _relate(self, number: int, indices: Mapping[int, int]) -> list[Relation]:
         stated: dict[tuple[int, int], dict[int, float]] = {}
         for subject, object_, predicate in self._annotation.relations:
-            if subject in places and object_ in places and subject != object_ and predicate >= 0:
+            if subject in indices and object_ in indices and subject != object_ and predicate >= 0:
                 stated.setdefault((subject, object_), {})[predicate] = TRUE_PROBABILITY
         relations = []
         for (subject, object_), probabilities in stated.items():
             generator = np.random.default_rng([self._seed, 1, number, subject, object_])
             relations.append(
                 Relation(
-                    places[subject],
-                    places[object_],
+                    indices[subject],
+                    indices[object_],
                     float(generator.uniform(*RELATION_SCORES)),
                     spread(probabilities, len(self.vocabulary.predicates)),
                 )

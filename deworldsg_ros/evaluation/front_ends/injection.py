@@ -121,7 +121,7 @@ class Injection:
         others = np.flatnonzero(probabilities > 1.001 * probabilities.min())
         others = others[others != best]
         if not len(others):
-            others = np.array([place for place in self._room_classes if place != best], np.int64)
+            others = np.array([index for index in self._room_classes if index != best], np.int64)
         return item if not len(others) else relabelled(item, int(generator.choice(others)))
 
     def _disturb(self, item: Detection, number: int, frame: RgbdFrame) -> Detection | None:
@@ -178,35 +178,35 @@ class Injection:
         background = ~np.isin(image, [item.instance for item in seen.detections])
         background &= frame.depth_m > 0
         detections = list(seen.detections)
-        for place in range(MAX_FALSE_BOXES):
+        for index in range(MAX_FALSE_BOXES):
             length_s = self._faults.false_s
-            spell = self._spell(FALSE, place, stamp_s, length_s)
-            generator = np.random.default_rng([self._seed, FALSE, place, spell])
+            spell = self._spell(FALSE, index, stamp_s, length_s)
+            generator = np.random.default_rng([self._seed, FALSE, index, spell])
             if generator.random() * MAX_FALSE_BOXES >= self._faults.false:
                 continue
-            class_place = int(generator.choice(self._room_classes))
+            class_index = int(generator.choice(self._room_classes))
             certainty = float(generator.uniform(*FALSE_SCORE))
-            age_s = stamp_s - (spell - self._phase(place)) * length_s
+            age_s = stamp_s - (spell - self._phase(index)) * length_s
             region = (
-                self._staying(generator, (place, spell), frame, background)
+                self._staying(generator, (index, spell), frame, background)
                 if generator.random() < 0.5
                 else _moving(generator, age_s, frame)
             )
             if region is None:
                 continue
-            value = FIRST_FALSE + place
+            value = FIRST_FALSE + index
             mask = region & background
             image[mask] = value
             background &= ~mask
             box = visible_box(image, value)
             if box is None:
                 continue
-            scores = spread({class_place: certainty}, self._class_count)
+            scores = spread({class_index: certainty}, self._class_count)
             detections.append(Detection(box, scores, certainty, value))
         return replace(seen, detections=detections, instance_image=image)
 
-    def _phase(self, place: int) -> float:
-        return float(np.random.default_rng([self._seed, FALSE, place]).random())
+    def _phase(self, index: int) -> float:
+        return float(np.random.default_rng([self._seed, FALSE, index]).random())
 
     def _staying(
         self,
@@ -239,22 +239,22 @@ class Injection:
         return region & (np.abs(frame.depth_m - z) < half_m)
 
 
-def relabelled(item: Detection, class_place: int) -> Detection:
+def relabelled(item: Detection, class_index: int) -> Detection:
     """The detection with the probabilities of its best class and of another class swapped."""
     probabilities = item.class_probabilities.copy()
     best = int(probabilities.argmax())
-    probabilities[[best, class_place]] = probabilities[[class_place, best]]
+    probabilities[[best, class_index]] = probabilities[[class_index, best]]
     return replace(item, class_probabilities=probabilities)
 
 
 def keep(seen: FrameDetections, detections: Sequence[Detection | None]) -> FrameDetections:
     """The frame with these detections instead of its own, in the same order; None drops one."""
-    kept = [place for place, item in enumerate(detections) if item is not None]
-    new_place = {place: new for new, place in enumerate(kept)}
+    kept = [index for index, item in enumerate(detections) if item is not None]
+    new_index = {index: new for new, index in enumerate(kept)}
     relations = [
-        Relation(new_place[item.subject], new_place[item.object], item.score, item.probabilities)
+        Relation(new_index[item.subject], new_index[item.object], item.score, item.probabilities)
         for item in seen.relations
-        if item.subject in new_place and item.object in new_place
+        if item.subject in new_index and item.object in new_index
     ]
     return FrameDetections(
         [item for item in detections if item is not None], relations, seen.instance_image

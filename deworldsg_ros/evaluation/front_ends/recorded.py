@@ -122,9 +122,9 @@ class RecordedFrontEnd:
             instance_image = read_instances(self._sequence / names.pop())
         if instance_image.shape != shape:
             raise ValueError(f"instance image is {instance_image.shape}: expected {shape}")
-        places = {place for item in relations for place in (item.subject, item.object)}
-        if not places <= set(range(len(detections))):
-            raise ValueError(f"relations name detections {sorted(places)} of {len(detections)}")
+        indices = {index for item in relations for index in (item.subject, item.object)}
+        if not indices <= set(range(len(detections))):
+            raise ValueError(f"relations name detections {sorted(indices)} of {len(detections)}")
         return FrameDetections(detections, relations, instance_image)
 
 

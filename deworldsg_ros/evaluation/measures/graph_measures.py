@@ -170,12 +170,12 @@ def measure_prediction(
     weight is the number of its points. A node without a finite point counts as stray.
     """
     nodes = []
-    for place, points in enumerate(prediction.points_world):
+    for index, points in enumerate(prediction.points_world):
         surface = np.asarray(points, np.float64)
         surface = surface[np.isfinite(surface).all(axis=1)]
         mean = np.median(surface, axis=0) if len(surface) else np.full(3, np.nan)
-        label, probability = _top(prediction.class_scores[place], vocabulary.classes)
-        nodes.append(NodeView(place, label, probability, mean, surface, len(surface)))
+        label, probability = _top(prediction.class_scores[index], vocabulary.classes)
+        nodes.append(NodeView(index, label, probability, mean, surface, len(surface)))
     edges = []
     for (subject, object_), scores in zip(prediction.edges.tolist(), prediction.edge_scores):
         edges.append(EdgeView(subject, object_, *_top(scores, vocabulary.predicates)))
@@ -245,7 +245,7 @@ def _geometric_errors(
     best_errors, main_errors, extent_errors, ious = [], [], [], []
     for row, matched in sorted(nodes_of.items()):
         errors = [float(np.linalg.norm(n.mean_m - reference.centroids[row])) for n in matched]
-        main = max(range(len(matched)), key=lambda place: matched[place].weight)
+        main = max(range(len(matched)), key=lambda index: matched[index].weight)
         best_errors.append(min(errors))
         main_errors.append(errors[main])
         if len(matched[main].points_m):
@@ -305,8 +305,8 @@ def calibration_error(beliefs: Sequence[Calibrated]) -> float:
     right = np.array([item.right for item in beliefs], np.float64)
     bins = np.clip((probabilities * CALIBRATION_BINS).astype(int), 0, CALIBRATION_BINS - 1)
     gaps = [
-        abs(float((right[bins == place] - probabilities[bins == place]).sum()))
-        for place in range(CALIBRATION_BINS)
+        abs(float((right[bins == index] - probabilities[bins == index]).sum()))
+        for index in range(CALIBRATION_BINS)
     ]
     return sum(gaps) / len(beliefs)
 
@@ -335,10 +335,10 @@ def _top(scores: Float64, names: Sequence[str]) -> tuple[str, float]:
     """The label of the highest score (of equal ones the last), and its fraction of the sum."""
     if not len(scores):
         return "", 0.0
-    place = len(scores) - 1 - int(np.argmax(scores[::-1]))
-    value, total = float(scores[place]), float(np.nansum(scores))
+    index = len(scores) - 1 - int(np.argmax(scores[::-1]))
+    value, total = float(scores[index]), float(np.nansum(scores))
     share = value / total if total > 0 and 0 <= value <= total else 0.0
-    return (names[place] if place < len(names) else ""), share
+    return (names[index] if index < len(names) else ""), share
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -108,12 +108,12 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
     nodes, edges = list(graph["nodes"]), list(graph.get("edges", []))
     notes: list[str] = []
     class_scores = np.zeros((len(nodes), class_count))
-    places: dict[int, int] = {}
+    indices: dict[int, int] = {}
     for row, node in enumerate(nodes):
         node_id = int(node.get("id", row))
-        if node_id in places:
+        if node_id in indices:
             raise EvaluationError(f"two nodes have the id {node_id}")
-        places[node_id] = row
+        indices[node_id] = row
         if node.get("class_probabilities") is not None:
             class_scores[row] = _vector(node["class_probabilities"], class_count)
         else:
@@ -123,9 +123,9 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
     for row, edge in enumerate(edges):
         ids = (int(edge["subject"]), int(edge["object"]))
         _refuse_negative(min(ids))
-        if not places.keys() >= set(ids):
+        if not indices.keys() >= set(ids):
             notes.append(f"edge {ids} names a node that does not exist: the edge is ignored")
-        ends[row] = [places.get(end, len(nodes)) for end in ids]
+        ends[row] = [indices.get(end, len(nodes)) for end in ids]
         if edge.get("predicate_probabilities") is not None:
             edge_scores[row] = _vector(edge["predicate_probabilities"], predicate_count)
         else:

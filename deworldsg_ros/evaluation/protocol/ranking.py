@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 NO_RANK = 99999
 
 
-def rank(scores: NDArray[Any], place: int) -> int:
-    """Number of scores (n,) that rank before the one at index `place`; 0 = the top.
+def rank(scores: NDArray[Any], index: int) -> int:
+    """Number of scores (n,) that rank before the one at `index`; 0 = the top.
 
     An index outside the scores has the rank `NO_RANK`, or n if that is larger.
     """
-    if not 0 <= place < len(scores):
+    if not 0 <= index < len(scores):
         return max(NO_RANK, len(scores))
-    value = scores[place]
-    later = scores[place + 1 :]
+    value = scores[index]
+    later = scores[index + 1 :]
     if scores.dtype.kind != "f":
         return int((scores > value).sum() + (later == value).sum())
     if np.isnan(value):
@@ -40,11 +40,11 @@ def triple_rank(
     number type of the arrays. Ties follow the row-major order of triples, the predicate fastest.
     """
     sizes = (len(subject_scores), len(object_scores), len(predicate_scores))
-    if not all(0 <= place < size for place, size in zip(triple, sizes)):
+    if not all(0 <= index < size for index, size in zip(triple, sizes)):
         return max(NO_RANK, sizes[0] * sizes[1] * sizes[2])
     # Predictions may overflow or contain NaN: the ranking defines both.
     with np.errstate(all="ignore"):
         ends = subject_scores[:, None] * object_scores[None, :]
         table = ends[:, :, None] * predicate_scores[None, None, :]
-    place = (triple[0] * sizes[1] + triple[1]) * sizes[2] + triple[2]
-    return rank(table.ravel(), place)
+    index = (triple[0] * sizes[1] + triple[1]) * sizes[2] + triple[2]
+    return rank(table.ravel(), index)

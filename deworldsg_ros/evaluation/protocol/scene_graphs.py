@@ -36,9 +36,9 @@ def to_prediction(
     Raises:
         EvaluationError: all classes, or some predicate, are outside the vocabulary.
     """
-    classes = {name: place for place, name in enumerate(vocabulary.classes)}
-    predicates = {name: place for place, name in enumerate(vocabulary.predicates)}
-    place_of = {node.id: place for place, node in enumerate(graph.nodes)}
+    classes = {name: index for index, name in enumerate(vocabulary.classes)}
+    predicates = {name: index for index, name in enumerate(vocabulary.predicates)}
+    index_of = {node.id: index for index, node in enumerate(graph.nodes)}
     points = tuple(_segment(node) if sampled else _points(node) for node in graph.nodes)
     labels = {belief.label for node in graph.nodes for belief in node.classes}
     if labels and not labels & set(classes):
@@ -48,7 +48,7 @@ def to_prediction(
         raise _foreign("predicate", unknown)
     class_scores = [_expand(node.classes, classes) for node in graph.nodes]
     edge_scores = [_expand(edge.predicates, predicates) for edge in graph.edges]
-    edges = [(place_of[edge.subject], place_of[edge.object]) for edge in graph.edges]
+    edges = [(index_of[edge.subject], index_of[edge.object]) for edge in graph.edges]
     return ScanPrediction(
         points,
         np.array(class_scores).reshape(-1, len(classes)),
@@ -67,13 +67,13 @@ def _segment(node: wire.NodeState) -> Float64:
     return np.tile(_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
 
 
-def _expand(beliefs: Sequence[wire.Belief], places: dict[str, int]) -> Float64:
-    others = len(places) - sum(belief.label in places for belief in beliefs)
+def _expand(beliefs: Sequence[wire.Belief], indices: dict[str, int]) -> Float64:
+    others = len(indices) - sum(belief.label in indices for belief in beliefs)
     left = max(0.0, 1.0 - sum(belief.probability for belief in beliefs))
-    scores = np.full(len(places), left / others if others else 0.0)
+    scores = np.full(len(indices), left / others if others else 0.0)
     for belief in beliefs:
-        if belief.label in places:
-            scores[places[belief.label]] = belief.probability
+        if belief.label in indices:
+            scores[indices[belief.label]] = belief.probability
     return scores
 
 

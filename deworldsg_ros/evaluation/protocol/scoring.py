@@ -155,7 +155,7 @@ def score_scan(
     objects = annotation.objects
     if options.skip_no_rel_objects:
         related = annotation.related_ids or frozenset()
-        objects = {number: place for number, place in objects.items() if number in related}
+        objects = {number: index for number, index in objects.items() if number in related}
     matching = match(
         list(objects),
         points.points_world,
@@ -164,9 +164,9 @@ def score_scan(
         options.overlap_threshold_m,
     )
     object_ranks = []
-    for number, place in objects.items():
+    for number, index in objects.items():
         row = matching.prediction_of.get(number)
-        ranked = NO_RANK if row is None else rank(prediction.class_scores[row], place)
+        ranked = NO_RANK if row is None else rank(prediction.class_scores[row], index)
         object_ranks.append(ranked)
     predicate_ranks, relationship_ranks = _rank_relations(
         annotation.relations, objects, matching, prediction
@@ -225,9 +225,9 @@ def _rank_relations(
 def pool(scans: Sequence[ScanResult], vocabulary: Vocabulary) -> ProtocolResult:
     """Scores over the items of all scans."""
     objects = [
-        (place, ranked == 0)
+        (index, ranked == 0)
         for scan in scans
-        for place, ranked in zip(scan.object_classes, scan.object_ranks)
+        for index, ranked in zip(scan.object_classes, scan.object_ranks)
     ]
     predicates = [
         (line[2], ranked == 0)
@@ -252,10 +252,10 @@ def _count(rights: Iterable[bool]) -> Count:
 
 def _by_class(items: Sequence[tuple[int, bool]], names: Sequence[str]) -> dict[str, Count]:
     hits, totals = [0] * len(names), [0] * len(names)
-    for place, right in items:
-        if place >= 0:
-            hits[place] += right
-            totals[place] += 1
+    for index, right in items:
+        if index >= 0:
+            hits[index] += right
+            totals[index] += 1
     return {name: Count(hit, total) for name, hit, total in zip(names, hits, totals) if total}
 
 

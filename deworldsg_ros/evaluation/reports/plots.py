@@ -25,12 +25,12 @@ def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
     """Bars of items and of right items by class, most items first."""
     items = class_items(counts)[:MAX_CLASSES]
     figure, axes = _figure(10.0, 1.2 + 0.24 * max(len(items), 3))
-    places = np.arange(len(items))
-    axes.barh(places, [count.total for _, count in items], color=ALL, label="annotated")
-    axes.barh(places, [count.hits for _, count in items], color=RIGHT, label="right")
-    for place, (_, count) in enumerate(items):
-        axes.text(count.total, place, f" {100 * count.recall:.0f} %", va="center", fontsize=8)
-    axes.set_yticks(places, [name for name, _ in items], fontsize=9)
+    indices = np.arange(len(items))
+    axes.barh(indices, [count.total for _, count in items], color=ALL, label="annotated")
+    axes.barh(indices, [count.hits for _, count in items], color=RIGHT, label="right")
+    for index, (_, count) in enumerate(items):
+        axes.text(count.total, index, f" {100 * count.recall:.0f} %", va="center", fontsize=8)
+    axes.set_yticks(indices, [name for name, _ in items], fontsize=9)
     axes.invert_yaxis()
     axes.margins(x=0.08)
     axes.set_xlabel("items")
