@@ -19,10 +19,8 @@ def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64
     Returns:
         (N, 3) float64, metres.
     """
-    depths = pixels.depths_m.astype(np.float64)
-    x = (pixels.columns - intrinsics.cx) / intrinsics.fx * depths
-    y = (pixels.rows - intrinsics.cy) / intrinsics.fy * depths
-    points_camera = np.stack([x, y, depths], axis=1)
+    depths_m = pixels.depths_m.astype(np.float64)
+    points_camera = intrinsics.back_project(pixels.columns, pixels.rows, depths_m)
     return points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 

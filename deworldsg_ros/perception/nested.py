@@ -11,6 +11,7 @@ import numpy as np
 
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64
+from deworldsg_ros.scene.boxes import areas, shared_areas
 
 # Two objects have one class if the dot product of their class distributions exceeds this.
 SAME_CLASS = 0.3
@@ -78,10 +79,8 @@ def _nested(objects: Detections) -> Bool:
 
 def _compare(a: Detections, b: Detections) -> tuple[Bool, Bool, Bool]:
     """(n, m) bool each: a is inside b, which is larger; they overlap; they have one class."""
-    area_a, area_b = ((x.boxes_xyxy[:, 2:] - x.boxes_xyxy[:, :2]).prod(axis=1) for x in (a, b))
-    low = np.maximum(a.boxes_xyxy[:, None, :2], b.boxes_xyxy[None, :, :2])
-    high = np.minimum(a.boxes_xyxy[:, None, 2:], b.boxes_xyxy[None, :, 2:])
-    shared = np.clip(high - low, 0.0, None).prod(axis=2)
+    area_a, area_b = areas(a.boxes_xyxy), areas(b.boxes_xyxy)
+    shared = shared_areas(a.boxes_xyxy, b.boxes_xyxy)
     inside = (shared > NESTED_FRACTION * area_a[:, None]) & (area_a[:, None] < area_b[None, :])
     same_class = a.class_probabilities @ b.class_probabilities.T > SAME_CLASS
     return inside, shared > 0, same_class

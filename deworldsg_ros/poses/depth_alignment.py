@@ -34,9 +34,7 @@ def points_of(depth_m: Float32, intrinsics: Intrinsics, step_px: int = POINT_STE
     """Points (n, 3) float64 of a depth image's valid pixels on a grid, camera frame, metres."""
     rows, columns = np.nonzero(depth_m[::step_px, ::step_px])
     z = depth_m[::step_px, ::step_px][rows, columns].astype(np.float64)
-    x = (columns * step_px - intrinsics.cx) / intrinsics.fx * z
-    y = (rows * step_px - intrinsics.cy) / intrinsics.fy * z
-    return np.stack([x, y, z], axis=1)
+    return intrinsics.back_project(columns * step_px, rows * step_px, z)
 
 
 def fit_fraction(
@@ -68,14 +66,7 @@ def surface_of(depth_m: Float32, intrinsics: Intrinsics) -> Surface:
     z = depth_m[::step, ::step].astype(np.float64)
     z[z <= 0] = np.nan
     rows, columns = np.mgrid[: z.shape[0], : z.shape[1]]
-    points = np.stack(
-        [
-            (columns * step - intrinsics.cx) / intrinsics.fx * z,
-            (rows * step - intrinsics.cy) / intrinsics.fy * z,
-            z,
-        ],
-        axis=-1,
-    )
+    points = intrinsics.back_project(columns * step, rows * step, z)
     normals = np.full(points.shape, np.nan)
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]

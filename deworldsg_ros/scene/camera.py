@@ -54,6 +54,26 @@ class Intrinsics:
         """K, (3, 3) float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    def back_project(self, columns: NDArray[Any], rows: NDArray[Any], depths_m: Float64) -> Float64:
+        """Points of pixels in the camera frame, z K⁻¹ [u v 1]ᵀ (Eq. 3).
+
+        Args:
+            columns: (...) pixel coordinate u.
+            rows: (...) pixel coordinate v.
+            depths_m: (...) float64, metres along the optical axis.
+
+        Returns:
+            (..., 3) float64, metres.
+        """
+        x = (columns - self.cx) / self.fx * depths_m
+        y = (rows - self.cy) / self.fy * depths_m
+        return np.stack([x, y, depths_m], axis=-1)
+
+    def project(self, points_camera: Float64) -> Float64:
+        """Pixels u, v (..., 2) of points (..., 3) in the camera frame, with z > 0."""
+        x, y, z = (points_camera[..., axis] for axis in range(3))
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
 
 @dataclass(frozen=True)
 class RgbdFrame:

@@ -127,14 +127,15 @@ def visible_boxes(
     """
     points_camera = (points.points_world - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     in_front = points_camera[:, 2] > 0
-    x, y, z = points_camera[in_front].T
+    points_in_front = points_camera[in_front]
+    z = points_in_front[:, 2]
     ids = points.object_ids[in_front]
-    column, row = (np.rint(value).astype(np.int64) for value in _project(depth_camera, x, y, z))
+    column, row = np.rint(depth_camera.project(points_in_front)).astype(np.int64).T
     inside = (column >= 0) & (column < depth_m.shape[1]) & (row >= 0) & (row < depth_m.shape[0])
     visible = np.zeros(len(z), np.bool_)
     gaps_m = np.abs(depth_m[row[inside], column[inside]] - z[inside])
     visible[inside] = gaps_m < MAX_DEPTH_GAP_M
-    u, v = _project(color_camera, x, y, z)
+    u, v = color_camera.project(points_in_front).T
     visible &= (u >= 0) & (u <= color_camera.width - 1)
     visible &= (v >= 0) & (v <= color_camera.height - 1)
     boxes: dict[int, Float64] = {}
@@ -143,7 +144,3 @@ def visible_boxes(
         if np.count_nonzero(own) >= MIN_POINTS:
             boxes[object_id] = np.array([u[own].min(), v[own].min(), u[own].max(), v[own].max()])
     return boxes
-
-
-def _project(camera: Intrinsics, x: Float64, y: Float64, z: Float64) -> tuple[Float64, Float64]:
-    return camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.boxes import shared_areas
 
 # Candidates of a label: a ring of directions at each distance from its anchor.
 DIRECTIONS = 16
@@ -63,7 +64,7 @@ def place(anchors: Float64, sizes: Float64, frame: Float64) -> Placement:
             if sweep == 0:
                 others[index:] = False
             taken = Placement(centres[others], sizes[others]).boxes
-            cost = OVERLAP_COST * overlap_areas(boxes, taken).sum(axis=1)
+            cost = OVERLAP_COST * shared_areas(boxes, taken).sum(axis=1)
             cost += OUTSIDE_COST * _outside(boxes, frame)
             cost += ANCHOR_COST * _covered(boxes, anchors)
             cost += DISTANCE_COST * np.linalg.norm(candidates - anchors[index], axis=1)
@@ -74,18 +75,10 @@ def place(anchors: Float64, sizes: Float64, frame: Float64) -> Placement:
 def place_if_free(candidates: Float64, size: Float64, taken: Float64, frame: Float64) -> int | None:
     """Index of the first candidate centre (m, 2) at which a label covers no box, or None."""
     boxes = boxes_at(candidates, size)
-    free = (overlap_areas(boxes, taken).sum(axis=1) <= FREE_OVERLAP_PX2) & (
+    free = (shared_areas(boxes, taken).sum(axis=1) <= FREE_OVERLAP_PX2) & (
         _outside(boxes, frame) == 0
     )
     return int(np.argmax(free)) if free.any() else None
-
-
-def overlap_areas(boxes: Float64, others: Float64) -> Float64:
-    """(n, m) overlap areas of n boxes with m others."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    sides = np.maximum(high - low, 0.0)
-    return np.asarray(sides[..., 0] * sides[..., 1])
 
 
 def nearest_on_box(point: Float64, box: Float64) -> Float64:

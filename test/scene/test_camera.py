@@ -26,6 +26,19 @@ def test_intrinsics_matrix() -> None:
     assert Intrinsics(**GOOD).matrix.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
 
 
+@pytest.mark.parametrize("shape", [(0,), (5,), (2, 3)])
+def test_projection_is_the_inverse_of_back_projection(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(0)
+    camera = Intrinsics(**GOOD)
+    u, v, z = rng.uniform(0, 640, shape), rng.uniform(0, 480, shape), rng.uniform(0.1, 9, shape)
+    points = camera.back_project(u, v, z)
+    assert points.shape == (*shape, 3)
+    homogeneous = np.stack([u, v, np.ones(shape)], axis=-1)
+    expected = z[..., None] * (homogeneous @ np.linalg.inv(camera.matrix).T)
+    np.testing.assert_allclose(points, expected, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(camera.project(points), np.stack([u, v], axis=-1), rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     "bad",
     [

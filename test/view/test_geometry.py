@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.view import make_edge, make_graph, make_node
 
+from deworldsg_ros.scene.boxes import shared_areas
 from deworldsg_ros.view.colours import PALETTE, class_colours, predicate_colours, shade, to_rgb
 from deworldsg_ros.view.geometry import drawable_edges, principal_axes, view_axes
-from deworldsg_ros.view.labelling import overlap_areas, place, place_if_free
+from deworldsg_ros.view.labelling import place, place_if_free
 from deworldsg_ros.view.solids import arrow_head, ellipsoid, joined, unit_sphere
 
 
@@ -137,7 +138,7 @@ def test_labels_do_not_overlap_and_stay_inside(count):
     frame = np.array([0.0, 0.0, 1200.0, 1200.0])
     placed = place(anchors, sizes, frame)
     boxes = placed.boxes
-    shared = overlap_areas(boxes, boxes)
+    shared = shared_areas(boxes, boxes)
     np.fill_diagonal(shared, 0)
     assert (shared <= 4).all()
     assert (boxes[:, :2] >= 0).all()

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.perception.backends.nanodet import CALIBRATION, NanoDetDetector, combine
 from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.perception.networks.nms import pairwise_iou
+from deworldsg_ros.scene.boxes import pairwise_iou
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
 # Replica classes that COCO also has.

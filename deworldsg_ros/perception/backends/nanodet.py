@@ -10,9 +10,10 @@ import numpy as np
 import onnxruntime
 
 from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.perception.networks.nms import cluster_boxes, pairwise_iou
+from deworldsg_ros.perception.networks.nms import cluster_boxes
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.boxes import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 

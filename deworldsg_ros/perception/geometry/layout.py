@@ -68,8 +68,7 @@ def measure_layout(
     pixels, owners = _sample(read_only(depth_m), read_only(instances), count, POINTS_PER_OBJECT)
     v, u = pixels[:, 0], pixels[:, 1]
     z = depth_m[v, u].astype(np.float64)
-    x, y = (u - intrinsics.cx) / intrinsics.fx * z, (v - intrinsics.cy) / intrinsics.fy * z
-    points = np.stack([x, y, z], axis=1) @ upright_axes(up_camera).T
+    points = intrinsics.back_project(u, v, z) @ upright_axes(up_camera).T
     low, high, valid = _bounds(points, owners, count)
     separation = np.clip(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None

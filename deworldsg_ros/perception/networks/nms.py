@@ -5,17 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64, Int64
-
-
-def pairwise_iou(boxes_a: Float64, boxes_b: Float64) -> Float64:
-    """Intersection over union, (n, m), of boxes (n, 4) and (m, 4) given as x1, y1, x2, y2."""
-    top_left = np.maximum(boxes_a[:, None, :2], boxes_b[None, :, :2])
-    bottom_right = np.minimum(boxes_a[:, None, 2:], boxes_b[None, :, 2:])
-    intersection = np.clip(bottom_right - top_left, 0.0, None).prod(axis=2)
-    area_a = np.clip(boxes_a[:, 2:] - boxes_a[:, :2], 0.0, None).prod(axis=1)
-    area_b = np.clip(boxes_b[:, 2:] - boxes_b[:, :2], 0.0, None).prod(axis=1)
-    union = area_a[:, None] + area_b[None, :] - intersection
-    return np.asarray(intersection / np.maximum(union, 1e-12))
+from deworldsg_ros.scene.boxes import pairwise_iou
 
 
 def cluster_boxes(

@@ -20,7 +20,8 @@ from deworldsg_ros.perception.backends.nanodet import (
     letterbox,
 )
 from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.perception.networks.nms import cluster_boxes, pairwise_iou
+from deworldsg_ros.perception.networks.nms import cluster_boxes
+from deworldsg_ros.scene.boxes import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
