@@ -1,4 +1,4 @@
-"""The four stages in one process, without ROS: the same graph as the four nodes give."""
+"""The four stages in one process, without ROS; the graph equals that of the four nodes."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.timing import timed, watch
 
-# Methods of perception that are timed, and what the time is called.
+# Methods of perception that are timed, with the names of their times.
 PERCEPTION_PARTS = {"detect": "detection", "segment": "masks", "relate": "relation_inference"}
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What each stage made of one frame.
+    """The results of the stages for one frame.
 
     Attributes:
         perceived: 2D scene graph and instance labels.
@@ -40,7 +40,7 @@ class FrameResult:
 
 
 class Perceiver(Protocol):
-    """Stage a, as the pipeline needs it."""
+    """Perception (stage a), as the pipeline uses it."""
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The 2D scene graph and the instance labels of `frame`."""
@@ -48,17 +48,16 @@ class Perceiver(Protocol):
 
 
 class Pipeline:
-    """perceive → lift → merge → relate, a frame at a time.
+    """perceive → lift → merge → relate, for one frame at a time.
 
     Args:
         config: the whole configuration.
         perceiver: in place of the configured perception, e.g. recorded detections.
 
     Attributes:
-        builder: holds the global graph; None before the first frame, whose world frame it takes.
-        drops: what was left out so far, by reason.
-        times_s: seconds spent in each stage, a list entry a frame; of perception also in its
-            parts.
+        builder: keeps the global graph; None before the first frame, which gives the world frame.
+        drops: number of dropped inputs and objects, by reason.
+        times_s: seconds of each frame in each stage, and in each part of perception.
     """
 
     def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
@@ -69,7 +68,7 @@ class Pipeline:
             perception = build_perception(config.perception, world_up=config.inputs.world_up)
             require_predicates(world_model, perception.vocabulary.predicates)
             self.perception = perception
-        else:  # recorded detections bring their vocabulary with each frame
+        else:  # recorded detections have their vocabulary in each frame
             self.perception = perceiver
         self.lifting = Lifting(config.lifting)
         self.relations = RelationReasoner(config.relations, world_model)
@@ -81,15 +80,15 @@ class Pipeline:
         watch_parts(self.perception, self.times_s)
 
     def go_on_with(self, builder: GraphBuilder) -> None:
-        """Take frames into a graph that is there already, e.g. that of a map."""
+        """Continue with an existing graph, e.g. that of a map."""
         self.builder = builder
         self.relations.watch(LiveGraph(builder.graph))
 
     def process(self, frame: RgbdFrame) -> FrameResult:
-        """Take one frame into the graph.
+        """Process one frame into the graph.
 
         Raises:
-            RefusedInput: where the frame does not fit those before it; the graph is unchanged.
+            RefusedInput: if the frame does not fit the earlier ones; the graph is unchanged.
         """
         with timed(self.times_s["perception"]):
             perceived = self.perception.perceive(frame)
@@ -122,12 +121,12 @@ class Pipeline:
             RefusedInput: ``no_frames`` before the first frame.
         """
         if self.builder is None:
-            raise RefusedInput("no_frames", "no frame was processed: there is no graph")
+            raise RefusedInput("no_frames", "there is no graph: no frame was processed")
         return self.builder.full()
 
 
 def watch_parts(perceiver: Perceiver, times_s: dict[str, list[float]]) -> None:
-    """Time the parts of perception from now on, where it is made of them."""
+    """Time the parts of perception from now on; other perceivers have no parts."""
     if isinstance(perceiver, Perception):
         for method, name in PERCEPTION_PARTS.items():
             watch(perceiver, method, times_s.setdefault(name, []))

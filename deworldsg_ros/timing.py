@@ -1,4 +1,4 @@
-"""How long parts take: for the pipeline, which is the only one with a clock."""
+"""Times of the pipeline's parts. Only the pipeline reads a clock, no stage does."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-# In the order in which a frame passes them; the first three are parts of perception, and relations
-# is the refinement by a world model.
+# In processing order. The first three are parts of perception. `relations` is the world model.
 STAGES = ("detection", "masks", "relation_inference", "lifting", "merging", "relations")
 
 
 @contextmanager
 def timed(times_s: list[float]) -> Iterator[None]:
-    """Append the seconds that the block takes, unless it raises."""
+    """Append the duration of the block in seconds, unless it raises."""
     start = time.perf_counter()
     yield
     times_s.append(time.perf_counter() - start)
 
 
 def watch(owner: object, method: str, times_s: list[float]) -> None:
-    """From now on each call of a method of this one object is timed."""
+    """Time each call of a method of this one object from now on."""
     inner = getattr(owner, method)
 
     @functools.wraps(inner)
@@ -37,14 +36,14 @@ def watch(owner: object, method: str, times_s: list[float]) -> None:
 
 
 def total_ms(times_s: Mapping[str, Sequence[float]]) -> dict[str, float]:
-    """Milliseconds of each part that ran, all calls together."""
+    """Total milliseconds of each part that ran."""
     return {name: 1e3 * sum(times) for name, times in times_s.items() if times}
 
 
 def device_name() -> str:
-    """What the times are taken on: the processor, and the accelerator where models use one."""
+    """The processor, and the accelerator if models use one."""
     names = [_processor_name()]
-    # Whoever computes on an accelerator has imported this; nobody else shall have to.
+    # torch is imported only if a model uses it. Importing it here would take seconds.
     torch: Any = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():
         names.append(torch.cuda.get_device_name())

@@ -1,4 +1,4 @@
-"""The edges that are told: only those are made anew of which something changed."""
+"""The published edges: only changed ones are rebuilt."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ def stated(message: SceneGraphMessage) -> dict[tuple[int, int], tuple[str, float
     }
 
 
-def test_what_one_direction_learns_changes_the_other_in_the_updates() -> None:
+def test_evidence_of_one_direction_changes_the_other_in_the_updates() -> None:
     builder, replica = builder_of(2), GraphReplica()
     seen = [(1, 2, {"on": 30, "near": 10}), (2, 1, {"on": 30, "near": 11}), (2, 1, {"on": 30})]
-    wanted = [
+    expected = [
         {(1, 2): ("on", 1.0)},
         {(1, 2): ("on", 0.731), (2, 1): ("near", 0.731)},
         {(1, 2): ("near", 1.0), (2, 1): ("on", 1.0)},
     ]
-    for (subject, object_, certainties), edges in zip(seen, wanted):
+    for (subject, object_, certainties), edges in zip(seen, expected):
         see(builder, subject, object_, **certainties)
         update = builder.update()
         assert update is not None
@@ -62,14 +62,14 @@ def test_what_one_direction_learns_changes_the_other_in_the_updates() -> None:
         assert list(replica.edges.values()) == builder.snapshot().edges
 
 
-def test_without_the_switch_each_direction_stands_alone() -> None:
+def test_the_paper_treats_each_direction_by_itself() -> None:
     builder = builder_of(2, robust=False)
     see(builder, 1, 2, on=30)
     see(builder, 2, 1, on=30)
     assert stated(builder.full()) == {(1, 2): ("on", 1.0), (2, 1): ("on", 1.0)}
 
 
-def test_an_edge_that_stays_is_the_same() -> None:
+def test_an_unchanged_edge_is_the_same_object() -> None:
     builder = builder_of(4)
     see(builder, 1, 2, on=3)
     see(builder, 3, 4, on=3)
@@ -111,9 +111,7 @@ def change(builder: GraphBuilder, generator: np.random.Generator) -> None:
 @pytest.mark.parametrize("robust", [True, False])
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 10_000))
-def test_edges_are_what_a_builder_without_a_past_makes_of_the_graph(
-    robust: bool, seed: int
-) -> None:
+def test_edges_do_not_depend_on_the_history_of_the_builder(robust: bool, seed: int) -> None:
     builder, replica = builder_of(6, robust), GraphReplica()
     generator = np.random.default_rng(seed)
     for _ in range(40):

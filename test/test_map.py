@@ -1,4 +1,4 @@
-"""A graph that was saved as a map goes on as if it had never been away."""
+"""A graph that continues from a map equals one that never stopped."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def saved(builder: GraphBuilder, folder: Path) -> Path:
 
 @pytest.mark.parametrize("association", ["surface", "paper"])
 @pytest.mark.parametrize("seed", range(4))
-def test_going_on_is_as_never_having_stopped(tmp_path, association, seed):
+def test_continuing_from_a_map_equals_not_stopping(tmp_path, association, seed):
     # A map leaves out tentative nodes. Here every node is confirmed.
     config = config_of(association=association, confirm_observations=1)
     frames = random_local_graphs(np.random.default_rng(seed), 60)
@@ -52,7 +52,7 @@ def test_going_on_is_as_never_having_stopped(tmp_path, association, seed):
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
-def test_what_is_tentative_stays_behind_and_ids_go_on(tmp_path):
+def test_tentative_nodes_are_dropped_and_ids_continue(tmp_path):
     builder = builder_of()
     for stamp in range(1, 5):
         builder.integrate(frame(stamp, (WHOLE, TABLE)))
@@ -63,7 +63,7 @@ def test_what_is_tentative_stays_behind_and_ids_go_on(tmp_path):
     assert again.integrate(frame(2, (WHOLE, TABLE), (MUG, CUP))) == [1, 3]
 
 
-def test_the_first_update_tells_of_all_of_it(tmp_path):
+def test_the_first_update_contains_the_whole_map(tmp_path):
     builder = builder_of()
     for stamp in range(1, 5):
         builder.integrate(frame(stamp, (WHOLE, TABLE)))
@@ -113,7 +113,7 @@ def test_objects_of_a_map_with_another_cell_size_are_recognised(tmp_path):
     assert again.integrate(frame(6, (WHOLE, TABLE))) == [1]
 
 
-def test_files_that_are_no_map_are_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     builder = builder_of()
     graph_io.save(builder.graph, tmp_path / "graph.map")  # without priors
     (tmp_path / "text.map").write_text("hello")
@@ -123,7 +123,7 @@ def test_files_that_are_no_map_are_refused(tmp_path):
             read_map(Config(), tmp_path / name)
 
 
-def test_a_map_that_could_not_be_written_is_refused_beforehand(tmp_path):
+def test_an_unwritable_map_is_refused_at_the_start(tmp_path):
     check_map_writable(tmp_path / "maps" / "room.map")
     assert list((tmp_path / "maps").iterdir()) == []
     (tmp_path / "file").write_text("")
@@ -131,7 +131,7 @@ def test_a_map_that_could_not_be_written_is_refused_beforehand(tmp_path):
         check_map_writable(tmp_path / "file" / "room.map")
 
 
-def test_the_node_goes_on_with_its_map_and_writes_it_at_the_end(tmp_path):
+def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
     rclpy = pytest.importorskip("rclpy")
     from std_msgs.msg import String
     from support.nodes_bench import Bench, works

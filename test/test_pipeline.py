@@ -136,7 +136,7 @@ def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> Non
     assert builder.update() is None
 
 
-def test_an_update_after_long_tells_of_the_frames_that_are_remembered() -> None:
+def test_a_late_update_contains_the_remembered_frames_only() -> None:
     builder = GraphBuilder(PAPER, VOCABULARY, "map")
     seen = local_graph(0)
     for stamp_ns in range(1100):
@@ -192,7 +192,7 @@ def test_the_timed_parts_of_perception_are_its_methods() -> None:
     assert all(callable(getattr(Perception, method)) for method in PERCEPTION_PARTS)
 
 
-def test_the_shipped_configurations_are_what_they_say() -> None:
+def test_the_paper_differs_from_the_default_in_these_options() -> None:
     assert load_config(CONFIGURATIONS / "default.yaml") == Config()
     default, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
     assert {

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.errors import RefusedInput
 
-# A rotation whose R Rᵀ differs from the identity by more than this is not a rotation.
-ROTATION_TOLERANCE = 1e-3
+# Maximum difference of R Rᵀ from the identity: poses are often written with four decimals.
+_ROTATION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,11 @@ class Intrinsics:
             raise RefusedInput(
                 "invalid_intrinsics",
                 f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: "
-                "wanted finite values with fx > 0 and fy > 0 (is the camera calibrated?)",
+                "expected finite values with fx > 0 and fy > 0 (is the camera calibrated?)",
             )
         if self.width <= 0 or self.height <= 0:
             raise RefusedInput(
-                "invalid_intrinsics", f"image size {self.width}x{self.height}: wanted > 0"
+                "invalid_intrinsics", f"image size {self.width}x{self.height}: expected > 0"
             )
 
     @property
@@ -77,7 +77,7 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class RgbdFrame:
-    """One registered RGB-D image with its pose; checked once, here.
+    """One registered RGB-D image with its pose, checked.
 
     Attributes:
         stamp_ns: time of the RGB image, nanoseconds.
@@ -88,7 +88,7 @@ class RgbdFrame:
         frame_id: name of the world frame.
 
     Raises:
-        RefusedInput: ``grid_mismatch`` where the sizes differ, ``invalid_pose`` for a bad pose.
+        RefusedInput: ``grid_mismatch`` if the sizes differ, ``invalid_pose`` for a bad pose.
     """
 
     stamp_ns: int
@@ -104,7 +104,7 @@ class RgbdFrame:
             raise RefusedInput(
                 "grid_mismatch",
                 f"RGB is {_size(self.rgb)}, depth {_size(self.depth_m)}, camera_info "
-                f"{grid[1]}x{grid[0]}: wanted one size (is depth registered to RGB?)",
+                f"{grid[1]}x{grid[0]}: expected one size (is depth registered to RGB?)",
             )
         check_pose(self.T_world_camera)
 
@@ -114,16 +114,16 @@ def _size(image: NDArray[Any]) -> str:
 
 
 def check_pose(T: Float64) -> None:
-    """Refuse what is not a rigid transform: ``invalid_pose``."""
+    """Check a rigid transform (4, 4); raises RefusedInput ``invalid_pose``."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise RefusedInput("invalid_pose", f"pose {T.tolist()}: wanted a finite 4x4 matrix")
+        raise RefusedInput("invalid_pose", f"pose {T.tolist()}: expected a finite 4x4 matrix")
     rotation = T[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
         raise RefusedInput(
             "invalid_pose",
             f"pose rotation is off orthonormal by {error:.2g} (determinant "
-            f"{np.linalg.det(rotation):.3f}): wanted a right-handed rotation",
+            f"{np.linalg.det(rotation):.3f}): expected a right-handed rotation",
         )
 
 
@@ -131,7 +131,7 @@ def pose_from_quaternion(translation_m: Float64, quat_xyzw: Float64) -> Float64:
     """Rigid transform from a translation (3,) in metres and a quaternion (4,) x, y, z, w.
 
     Raises:
-        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion that is not near unit.
+        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion whose norm is not about 1.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     translation = np.asarray(translation_m, dtype=np.float64)
@@ -139,11 +139,11 @@ def pose_from_quaternion(translation_m: Float64, quat_xyzw: Float64) -> Float64:
     if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
         raise RefusedInput(
             "invalid_pose",
-            f"pose position {translation.tolist()}, orientation {quat.tolist()}: wanted finite",
+            f"pose position {translation.tolist()}, orientation {quat.tolist()}: expected finite",
         )
     if abs(norm - 1.0) > 1e-2:
         raise RefusedInput(
-            "invalid_pose", f"orientation {quat.tolist()} has norm {norm:.4f}: wanted 1"
+            "invalid_pose", f"orientation {quat.tolist()} has norm {norm:.4f}: expected 1"
         )
     x, y, z, w = quat / norm
     T = np.eye(4)

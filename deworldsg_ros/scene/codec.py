@@ -1,4 +1,4 @@
-"""Between the nouns of a frame and their messages; both ways, without loss."""
+"""Conversion between the graphs of a frame and their messages, without loss."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _relations_from_wire(items: list[wire.RelationLogits], predicate_count: int)
 def _rows(rows: list[list[float]], width: int, name: str) -> Float64:
     for index, row in enumerate(rows):
         if len(row) != width:
-            raise ValueError(f"{name} of row {index} have {len(row)} values: wanted {width}")
+            raise ValueError(f"{name} of row {index} have {len(row)} values: expected {width}")
     return np.array(rows, np.float64).reshape(len(rows), width)
 
 
@@ -67,7 +67,7 @@ def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
 
 
 def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
-    """The 2D scene graph of a message; ``invalid_message`` where its parts do not fit."""
+    """The 2D scene graph of a message; ``invalid_message`` if its parts do not fit."""
     objects = message.objects
     try:
         return FrameGraph(
@@ -121,7 +121,7 @@ def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
 
 
 def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
-    """The local 3D graph of a message; ``invalid_message`` where its parts do not fit."""
+    """The local 3D graph of a message; ``invalid_message`` if its parts do not fit."""
     objects = message.objects
     try:
         return LocalGraph(
@@ -207,7 +207,7 @@ def evidence_to_message(evidence: RelationEvidence, frame_id: str) -> wire.Relat
 
 
 def evidence_from_message(message: wire.RelationEvidenceMessage) -> RelationEvidence:
-    """The relation evidence of a message; ``invalid_message`` where its parts do not fit."""
+    """The relation evidence of a message; ``invalid_message`` if its parts do not fit."""
     pairs = message.pairs
     width = len(message.predicates)
     try:

@@ -1,9 +1,9 @@
-"""Corrections of poses: what was built on poses that have since been corrected moves along.
+"""Pose corrections: which nodes move with corrected poses.
 
-When a SLAM system closes a loop it changes the poses of a stretch of the trajectory. Objects that
-were first seen on that stretch lie where the uncorrected poses put them, and are moved by the
-correction. A node that was known before, and seen again on the stretch, is a mean of both; the
-earlier observations founded it and hold it in place, so it stays.
+When a SLAM system closes a loop, it corrects the poses of a part of the trajectory. Nodes first
+seen in that part have the error of its poses and are moved by the correction. A node that was seen
+before and again in that part averages both. Its earlier observations had correct poses, so it
+stays.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What changed between two snapshots of the scene graph."""
+"""The changes between two snapshots of the scene graph."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from deworldsg_ros.scene import wire
 
 
 def empty_scene_graph(frame_id: str, stamp_ns: int = 0) -> wire.SceneGraphMessage:
-    """The snapshot before the first update: sequence 0, nothing in it."""
+    """The empty snapshot before the first update: sequence 0."""
     return wire.SceneGraphMessage(
         schema=wire.schema_of(wire.SceneGraphMessage),
         stamp=wire.stamp_from_ns(stamp_ns),
@@ -25,35 +25,36 @@ def diff(
     removed: Mapping[int, int | None] | None = None,
     associations: Iterable[wire.Association] = (),
 ) -> wire.SceneGraphUpdateMessage:
-    """The update that turns one snapshot into the next.
+    """The update from one snapshot to the next.
 
     Args:
         previous: snapshot of sequence n - 1.
         current: snapshot of sequence n.
-        removed: ids gone since, each with the node it was merged into (`SceneGraph.take_removals`);
-            ids that no snapshot showed are told too, for clients that know them by association.
-        associations: of the frames integrated since.
+        removed: ids removed since, each with the node it was merged into
+            (`SceneGraph.take_removals`). They include ids that no snapshot contained, because
+            clients know these from associations.
+        associations: of the frames merged since.
 
     Raises:
-        ValueError: where the sequence numbers do not follow each other.
+        ValueError: if the sequence numbers are not consecutive.
     """
     if current.sequence != previous.sequence + 1:
         raise ValueError(
-            f"snapshots {previous.sequence} and {current.sequence}: wanted consecutive ones"
+            f"snapshots {previous.sequence} and {current.sequence}: expected consecutive numbers"
         )
     known_nodes = {node.id: node for node in previous.nodes}
     known_edges = {(edge.subject, edge.object): edge for edge in previous.edges}
     node_ids = {node.id for node in current.nodes}
     pairs = {(edge.subject, edge.object) for edge in current.edges}
-    # A node that was filtered out of the snapshot is gone for clients though it lives.
-    gone: dict[int, int | None] = dict.fromkeys(known_nodes.keys() - node_ids)
-    gone.update(removed or {})
+    # A live node that became tentative is removed from the snapshot.
+    left: dict[int, int | None] = dict.fromkeys(known_nodes.keys() - node_ids)
+    left.update(removed or {})
     return wire.SceneGraphUpdateMessage(
         schema=wire.schema_of(wire.SceneGraphUpdateMessage),
         stamp=current.stamp,
         frame_id=current.frame_id,
         sequence=current.sequence,
-        removed_nodes=[wire.RemovedNode(node, gone[node]) for node in sorted(gone)],
+        removed_nodes=[wire.RemovedNode(node, left[node]) for node in sorted(left)],
         removed_edges=[wire.RemovedEdge(*pair) for pair in sorted(known_edges.keys() - pairs)],
         nodes=[node for node in current.nodes if not _same(known_nodes.get(node.id), node)],
         edges=[
@@ -66,5 +67,5 @@ def diff(
 
 
 def _same(known: object, now: object) -> bool:
-    # Identity first: what did not change is the same object where it was cached.
+    # Identity first: an unchanged message is usually the same object.
     return known is now or known == now

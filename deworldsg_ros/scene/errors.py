@@ -1,4 +1,4 @@
-"""The errors of the package: bad configuration raises, bad data is refused with a named reason."""
+"""The errors of the package: bad configuration raises, bad data is refused with a reason."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class ConfigurationError(DeWorldSGError):
 
 
 class RefusedInput(DeWorldSGError):
-    """A message or frame is refused; the node counts it under `reason` and lives on.
+    """A message or frame is refused; the node counts it under `reason` and continues.
 
     Attributes:
         reason: short snake_case name under which the refusal is counted, e.g. ``grid_mismatch``.

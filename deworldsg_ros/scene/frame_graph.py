@@ -1,4 +1,4 @@
-"""What one frame saw: in the image (FrameGraph), and lifted into the world (LocalGraph)."""
+"""The graphs of one frame: in the image (FrameGraph) and lifted into the world (LocalGraph)."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class FrameGraph:
 
 @dataclass(frozen=True)
 class DepthGrid:
-    """The depth image on every n-th pixel: what the camera saw, and saw through.
+    """Every n-th pixel of the depth image: it shows which space the camera saw as free.
 
     Attributes:
         depth_mm: (h, w) uint16, millimetres along the optical axis; 0 = invalid. Row r, column c
@@ -102,7 +102,7 @@ class DepthGrid:
 
     def __post_init__(self) -> None:
         if self.stride_px < 1:
-            raise ValueError(f"stride of the depth grid is {self.stride_px}: wanted >= 1")
+            raise ValueError(f"stride of the depth grid is {self.stride_px}: expected >= 1")
         first = self.stride_px // 2
         shape = tuple(
             len(range(first, size, self.stride_px))
@@ -132,7 +132,7 @@ class LocalGraph:
         surface_points_world: n arrays (k, 3) float32, a deterministic sample of the inliers.
         relations: visual relations between rows.
         drops: number of objects not lifted, by reason.
-        depth_grid: what the camera saw of everything, objects or not; None = not told.
+        depth_grid: depth of the whole image, objects or not; None = not available.
     """
 
     stamp_ns: int
@@ -176,9 +176,9 @@ class LocalGraph:
 
 def _check(name: str, array: NDArray[np.generic], shape: tuple[int, ...]) -> None:
     if array.shape != shape:
-        raise ValueError(f"{name} have shape {array.shape}: wanted {shape}")
+        raise ValueError(f"{name} have shape {array.shape}: expected {shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name} hold NaN or infinity: wanted finite values")
+        raise ValueError(f"{name} contain NaN or infinity: expected finite values")
 
 
 def _check_covariances(covariances: Float64) -> None:
@@ -198,7 +198,7 @@ def _check_objects(
     if count and not np.allclose(class_probabilities.sum(axis=1), 1.0, atol=1e-6):
         worst = class_probabilities.sum(axis=1)
         raise ValueError(
-            f"class probabilities sum to {worst[np.abs(worst - 1).argmax()]:.6f}: wanted 1"
+            f"class probabilities sum to {worst[np.abs(worst - 1).argmax()]:.6f}: expected 1"
         )
 
 
@@ -206,7 +206,7 @@ def _check_relations(count: int, vocabulary: Vocabulary, relations: Relations) -
     if relations.logits.shape[1] != len(vocabulary.predicates):
         raise ValueError(
             f"relation logits have {relations.logits.shape[1]} predicates: "
-            f"wanted {len(vocabulary.predicates)}"
+            f"expected {len(vocabulary.predicates)}"
         )
     if len(relations.pairs) and (relations.pairs.min() < 0 or relations.pairs.max() >= count):
         raise ValueError(f"a relation names object {relations.pairs.max()} of {count}")
@@ -214,7 +214,7 @@ def _check_relations(count: int, vocabulary: Vocabulary, relations: Relations) -
 
 @dataclass(frozen=True)
 class RelationEvidence:
-    """Geometric neighbours of one frame (Eq. 8) and what a world model says of some of them.
+    """Geometric neighbours of one frame (Eq. 8), with a world model's predictions for some.
 
     Attributes:
         stamp_ns: frame whose local graph the pairs refer to.
@@ -222,9 +222,9 @@ class RelationEvidence:
         pairs: (m, 2) int64 ordered pairs, subject and object, rows of that local graph.
         pair_classes: (m, 2) int64, arg-max classes of subject and object in that frame.
         geo_costs: (m,) float64, the cost of Eq. 8.
-        predictions: (m, R) float64, the probe's distribution of each pair; a row of NaN where no
-            clip was encoded (yet).
-        source: name of the world model, ``none`` where there is none.
+        predictions: (m, R) float64, the probe's distribution of each pair; a row of NaN if no
+            clip was encoded.
+        source: name of the world model, ``none`` without one.
     """
 
     stamp_ns: int
@@ -243,10 +243,10 @@ class RelationEvidence:
         if self.predictions.shape != (count, len(self.vocabulary.predicates)):
             raise ValueError(
                 f"predictions have shape {self.predictions.shape}: "
-                f"wanted {(count, len(self.vocabulary.predicates))}"
+                f"expected {(count, len(self.vocabulary.predicates))}"
             )
 
     @property
     def predicted(self) -> Bool:
-        """(m,) bool: rows that carry a prediction."""
+        """(m,) bool: rows with a prediction."""
         return np.asarray(~np.isnan(self.predictions).any(axis=1))

@@ -25,7 +25,7 @@ def moments(points_xyz: Float64, ridge_m2: float) -> tuple[Float64, Float64]:
     """
     points = np.asarray(points_xyz, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        raise ValueError(f"points of shape {points.shape}: wanted (N, 3) with N >= 2")
+        raise ValueError(f"points of shape {points.shape}: expected (N, 3) with N >= 2")
     mean = points.mean(axis=0)
     centred = points - mean
     return mean, centred.T @ centred / (len(points) - 1) + ridge_m2 * np.eye(3)
@@ -35,7 +35,7 @@ def transform(means: Float64, covariances: Float64, T: Float64) -> tuple[Float64
     """Gaussians under a rigid transform (4, 4): μ → Rμ + t, Σ → RΣRᵀ."""
     rotation = T[:3, :3]
     moved = rotation @ covariances @ rotation.T
-    # Rounding must not make a covariance asymmetric.
+    # Rounding can make the product asymmetric.
     return means @ rotation.T + T[:3, 3], (moved + np.swapaxes(moved, -1, -2)) / 2
 
 
@@ -44,12 +44,12 @@ def bhattacharyya_distance(
 ) -> Float64:
     """BD = dᵀS⁻¹d / 8 + ½ ln(|S| / √(|A||B|)), S = (A + B) / 2; clamped at >= 0.
 
-    The clamp is part of the definition here: for two equal Gaussians rounding gives a tiny
-    negative value, and the square root in the Hellinger distance would give NaN.
+    The clamp is necessary: for two equal Gaussians, rounding can give a negative value, and the
+    Hellinger distance would be NaN.
     """
     mixed = (covariance_a + covariance_b) / 2
     difference = mean_a - mean_b
-    # As many axes as the matrices have: numpy 1 would take fewer for one vector, not a stack.
+    # Same number of axes as the matrices: numpy 1 and 2 differ for a single vector.
     shape = np.broadcast_shapes(difference.shape, mixed.shape[:-1])
     solved = np.linalg.solve(mixed, np.broadcast_to(difference, shape)[..., None])[..., 0]
     mahalanobis = np.sum(difference * solved, axis=-1)
@@ -88,11 +88,12 @@ def fuse(
 def log_determinant(covariance: Float64) -> float:
     """The logarithm of |Σ| of one covariance (3, 3), by its LDLᵀ pivots.
 
-    The operations are those of the association kernel, one by one, so that for two equal
-    Gaussians the kernel's distance is exactly 0.
+    The operations and their order are those of the association kernel, so that its distance of two
+    equal Gaussians is exactly 0. Kernels of other files repeat these lines: numba does not notice
+    changes in the files of called kernels (see `kernels.kernel`).
 
     Raises:
-        ValueError: where the covariance is not positive definite.
+        ValueError: if the covariance is not positive definite.
     """
     (c00, _, _), (c10, c11, _), (c20, c21, c22) = covariance.tolist()
     if c00 > 0.0:
@@ -106,11 +107,11 @@ def log_determinant(covariance: Float64) -> float:
 
 
 def eigenvalue_bound(covariance: Float64) -> float:
-    """A number no smaller than the largest eigenvalue of a covariance (3, 3).
+    """An upper bound of the largest eigenvalue of a covariance (3, 3).
 
     The Frobenius norm: equal to it for a thin Gaussian, at most √3 times it for a sphere.
     """
-    squares = 0.0  # summed in this order also where nodes are fused (`sum` is not, everywhere)
+    squares = 0.0  # in the order of the fusion kernel; `sum` of newer Pythons differs
     for value in covariance.ravel().tolist():
         squares += value * value
     return math.sqrt(squares)

@@ -1,4 +1,4 @@
-"""The messages of the nodes, rebuilt only for the nodes that changed."""
+"""The messages of the nodes; only those of changed nodes are rebuilt."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.nodes import NodeTable
 from deworldsg_ros.scene.surface import even_moments
 
-# What a message was built with: top k, with surface points.
+# Form of a message: top k, with surface points.
 _Form = tuple[int, bool]
 
 
 class NodeStateCache:
-    """The newest message of each node, in each form asked for, with the revision it shows.
+    """The newest message of each node in each requested form, with its revision.
 
     Args:
         even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
@@ -47,7 +47,7 @@ class NodeStateCache:
         return states
 
     def forget(self, node_id: int) -> None:
-        """Drop the messages of a node that is gone."""
+        """Drop the messages of a removed node."""
         for known in self._known.values():
             known.pop(node_id, None)
 
@@ -56,7 +56,7 @@ def _state(
     nodes: NodeTable, row: int, classes: tuple[str, ...], top_k: int, with_points: bool, even: bool
 ) -> wire.NodeState:
     probabilities = nodes.class_probabilities[row]
-    # Stable: of equal probabilities the first class of the vocabulary comes first.
+    # A stable sort: classes of equal probability stay in the order of the vocabulary.
     order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
     beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
     possible = probabilities[probabilities > 0]

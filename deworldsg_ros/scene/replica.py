@@ -13,9 +13,9 @@ from deworldsg_ros.scene.errors import RefusedInput
 class GraphReplica:
     """Rebuilds `/scene_graph` from `/scene_graph/updates`, exactly.
 
-    A client that was there from the first update needs no snapshot. One that joins later, or that
-    lost an update, calls `reset` with the newest `/scene_graph`, then goes on applying updates;
-    those that the snapshot already shows are passed over.
+    A client that receives every update from the first one needs no snapshot. A client that joins
+    later, or that lost an update, calls `reset` with the newest `/scene_graph` and continues with
+    the updates; those that the snapshot already contains are skipped.
     """
 
     def __init__(self) -> None:
@@ -23,7 +23,7 @@ class GraphReplica:
 
     @property
     def sequence(self) -> int:
-        """Number of the last update that this copy shows."""
+        """Number of the last update in this copy."""
         return self._sequence
 
     @property
@@ -37,7 +37,7 @@ class GraphReplica:
         return MappingProxyType(self._edges)
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
-        """Start anew from a snapshot."""
+        """Replace the copy by a snapshot."""
         self._stamp = snapshot.stamp
         self._frame_id = snapshot.frame_id
         self._sequence = snapshot.sequence
@@ -45,11 +45,11 @@ class GraphReplica:
         self._edges = {(edge.subject, edge.object): edge for edge in snapshot.edges}
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
-        """Apply the next update; returns False for one that this copy already shows.
+        """Apply the next update; returns False for one that this copy already contains.
 
         Raises:
-            RefusedInput: ``lost_updates`` where updates are missing in between; the copy is left
-                as it was and needs a `reset`.
+            RefusedInput: ``lost_updates`` if updates in between are missing; the copy is unchanged
+                and needs a `reset`.
         """
         if update.sequence <= self._sequence:
             return False

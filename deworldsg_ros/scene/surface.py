@@ -1,8 +1,8 @@
 """A bounded, deterministic sample of an object's surface points.
 
-Of all distinct points ever seen, the sample keeps those with the smallest content hash. The hash
-depends on the point alone, so the sample does not depend on the order of the frames, on how often
-a point was seen, or on which nodes were merged on the way; and it is a uniform draw.
+Of all distinct points, the sample keeps those with the smallest hash. The hash depends on the point
+alone. So the sample is uniform, and it does not depend on the order of frames, on repeated points,
+or on the order of merges.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt32, UInt64
 
-# Within this distance points of a surface are of one part of it: half a cell of the surface map.
+# Radius in which the density of points is counted: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015
 
 # The constants of SplitMix64.
@@ -34,14 +34,14 @@ def add_points(
     rows: Sequence[int],
     point_sets: Sequence[Float32],
 ) -> None:
-    """Take a set of points (k, 3) into each of n different samples.
+    """Add a set of points (k, 3) to each of n different samples.
 
     Args:
         hashes: (S, K) uint64, the content hashes of S samples of at most K points; they ascend
             strictly.
         points_world: (S, K, 3) float32, the points, metres.
-        counts: (S,) int64, how many points each sample has.
-        rows: (n,) the samples that take something in.
+        counts: (S,) int64, number of points of each sample.
+        rows: (n,) indices of the samples.
         point_sets: n sets of points.
     """
     if not len(point_sets) or not hashes.shape[1]:
@@ -83,7 +83,7 @@ def _add(
     for index in range(len(rows)):
         row = rows[index]
         known = counts[row]
-        # Of most frames nothing enters a sample that is full.
+        # Most frames add nothing to a full sample.
         count = 0
         for place in range(starts[index], starts[index + 1]):
             entering[count] = place
@@ -105,7 +105,7 @@ def _add(
                 for axis in range(3):
                     all_bits[kept, axis] = new_bits[entering[order[new]], axis]
                 new += 1
-            # Points of equal hash are equal points: 64 bits do not collide on what a node sees.
+            # Equal hashes mean equal points: with 64 bits, collisions within a node are negligible.
             kept += int(kept == 0 or all_hashes[kept] != all_hashes[kept - 1])
         counts[row] = kept
         for place in range(kept):
@@ -115,11 +115,12 @@ def _add(
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
-    """Mean (3,) and covariance (3, 3) of a surface that was not seen evenly.
+    """Mean (3,) and covariance (3, 3) of a surface with uneven point density.
 
-    Points (n, 3), n >= 1, lie densely where a camera looked long or from near: each weighs with the
-    inverse square root of the number within `EVEN_RADIUS_M` of it. The inverse itself would count
-    every part once, a stray point as much as a patch. The covariance includes that of such a ball.
+    Points (n, 3), n >= 1, are dense on parts that were seen longer or from nearby. The weight of a
+    point is the inverse square root of the number of points within `EVEN_RADIUS_M`. The inverse
+    itself would give a stray point the weight of a whole patch. The covariance of a ball of that
+    radius is added.
     """
     points = points_world.astype(np.float64)
     weights = _neighbours(np.ascontiguousarray(points_world), EVEN_RADIUS_M) ** -0.5

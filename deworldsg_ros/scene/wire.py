@@ -1,8 +1,8 @@
 """The JSON messages of every topic, typed.
 
-One msgspec Struct a message; `msg_schemas/` is generated from these. 64-bit nanoseconds never
-become a JSON number: a time is {sec, nanosec}. floats keep full precision (the shortest decimal
-that reads back as the same float64), so that a graph built over DDS equals one built in process.
+One msgspec Struct per message; `msg_schemas/` is generated from them. A time is {sec, nanosec},
+because JSON numbers cannot hold 64-bit nanoseconds. Floats keep full precision (the shortest
+decimal that reads back as the same float64), so that a graph over DDS equals one in process.
 """
 
 from typing import Annotated, Any, Literal, TypeVar, Union
@@ -54,7 +54,7 @@ class Schema(msgspec.Struct, frozen=True):
 
 
 class Message(msgspec.Struct, kw_only=True):
-    """What every message carries."""
+    """Fields of every message."""
 
     schema: Schema
     stamp: Stamp
@@ -131,7 +131,7 @@ class LocalGraphMessage(Message, kw_only=True):
 
 
 class PairEvidence(msgspec.Struct):
-    """A geometric neighbour pair (Eq. 8), with the world model's prediction where there is one."""
+    """A geometric neighbour pair (Eq. 8), with the world model's prediction if there is one."""
 
     subject: Annotated[int, msgspec.Meta(ge=0, description="row in the local graph")]
     object: Annotated[int, msgspec.Meta(ge=0, description="row in the local graph")]
@@ -169,14 +169,14 @@ class NodeState(msgspec.Struct, frozen=True):
     first_seen: Stamp
     last_seen: Stamp
     confirmed: Annotated[
-        bool, msgspec.Meta(description="false = tentative: seen too rarely to be sure")
+        bool, msgspec.Meta(description="false = tentative: not enough evidence yet")
     ] = True
     surface_points_m: list[Vector3] = []
     entropy_nats: Annotated[
         Union[float, None],
         msgspec.Meta(
-            description="of the whole class distribution: how much its observations disagree; "
-            "null = not told"
+            description="of the whole class distribution; high if observations disagree; "
+            "null = not available"
         ),
     ] = None
 
@@ -208,14 +208,14 @@ class SceneGraphMessage(Message, kw_only=True):
 
 
 class RemovedNode(msgspec.Struct, frozen=True):
-    """A node that is gone; after a merge, the node that lives on."""
+    """A removed node; after a merge, with the node that replaces it."""
 
     id: Annotated[int, msgspec.Meta(ge=1)]
     merged_into: Union[int, None] = None
 
 
 class RemovedEdge(msgspec.Struct, frozen=True):
-    """An edge that is gone."""
+    """A removed edge."""
 
     subject: Annotated[int, msgspec.Meta(ge=1)]
     object: Annotated[int, msgspec.Meta(ge=1)]
@@ -229,9 +229,9 @@ class Association(msgspec.Struct, frozen=True):
 
 
 class SceneGraphUpdateMessage(Message, kw_only=True):
-    """/scene_graph/updates: what changed between sequence - 1 and sequence.
+    """/scene_graph/updates: the changes between sequence - 1 and sequence.
 
-    Apply removals first, then put every given node and edge in place of the one it replaces.
+    Apply removals first. Then replace each given node and edge.
     """
 
     sequence: Annotated[int, msgspec.Meta(ge=1)]
@@ -254,7 +254,7 @@ M = TypeVar("M", bound=Message)
 
 
 def schema_of(kind: type[Message]) -> Schema:
-    """The schema header that messages of this type carry."""
+    """The schema header of messages of this type."""
     return Schema(next(name for name, known in MESSAGES.items() if known is kind))
 
 
@@ -267,19 +267,19 @@ def decode(text: Union[str, bytes], kind: type[M]) -> M:
     """Read and validate a message.
 
     Raises:
-        RefusedInput: ``invalid_message`` where the text does not fit the schema,
-            ``unknown_schema`` where it is another message or of a later version.
+        RefusedInput: ``invalid_message`` if the text does not fit the schema,
+            ``unknown_schema`` if it is another message or of a later version.
     """
     try:
         message = msgspec.json.decode(text, type=kind)
     except msgspec.MsgspecError as error:
         raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
-    wanted = schema_of(kind)
-    if message.schema.name != wanted.name or message.schema.version > wanted.version:
+    known = schema_of(kind)
+    if message.schema.name != known.name or message.schema.version > known.version:
         raise RefusedInput(
             "unknown_schema",
             f"message is {message.schema.name} version {message.schema.version}: "
-            f"wanted {wanted.name} version {wanted.version} or older",
+            f"expected {known.name} version {known.version} or older",
         )
     return message
 

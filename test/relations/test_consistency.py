@@ -107,7 +107,7 @@ def random_pairs(seed):
         ("flurbs", "flurbs", False),
     ],
 )
-def test_what_contradicts(one, other, contradictory):
+def test_contradictory_predicates(one, other, contradictory):
     assert contradictions([one, other])[0, 1] == contradictory
     assert contradictions([other, one])[0, 1] == contradictory
 
@@ -155,7 +155,7 @@ def test_edges_equal_the_reference(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(seeds)
-def test_a_pair_is_the_same_to_the_last_bit_whatever_is_beside_it(seed):
+def test_a_pair_does_not_depend_on_the_other_pairs_to_the_last_bit(seed):
     edges, logits, seen, priors, told = random_pairs(seed)
     whole, _ = reconciled(edges, logits, seen, priors, told)
     for row, (a, b) in enumerate(edges):
@@ -182,7 +182,7 @@ def test_names_of_nodes_and_order_of_edges_do_not_matter(seed):
 
 @settings(max_examples=20, deadline=None)
 @given(seeds)
-def test_nothing_changes_where_no_predicate_is_known(seed):
+def test_unknown_predicates_change_nothing(seed):
     edges, logits, seen, priors, told = random_pairs(seed)
     names = tuple(f"predicate_{place}" for place in range(WIDTH))
     after, before = reconciled(edges, logits, seen, priors, told, names)
@@ -199,7 +199,7 @@ def test_two_certain_contradictory_edges_become_half_and_half():
         assert entropy_nats(row) == pytest.approx(math.log(2))
 
 
-def test_the_one_with_the_less_likely_alternative_stays():
+def test_the_direction_with_the_less_likely_alternative_prevails():
     """Both as certain as numbers get; the second would rather be something else."""
     after, before = reconciled(BOTH, [logits_of(on=5000, near=3000), logits_of(on=5000, near=3010)])
     assert (before[:, ON] == 1).all()
@@ -222,12 +222,12 @@ def test_a_direction_that_was_not_seen_has_no_say():
     assert (after == before).all()
 
 
-def test_a_vocabulary_in_which_nothing_goes_together_is_left_alone():
+def test_a_vocabulary_of_contradictions_only_changes_nothing():
     after, before = reconciled(BOTH, [[3.0, 1.0], [2.0, 2.5]], predicates=("on", "in"))
     assert (after == before).all()
 
 
-def test_a_predicate_that_goes_with_nothing_has_no_chance():
+def test_a_predicate_that_contradicts_all_others_gets_probability_zero():
     after, _ = reconciled(BOTH, [[9.0, 0, 0], [1.0, 0, 0]], predicates=("on", "above", "in"))
     assert (after[:, 0] == 0).all() and after.sum(axis=1) == pytest.approx(1)
 

@@ -62,7 +62,7 @@ def test_fuse_edge_equals_the_reference(seed, alpha, threshold):
 
 @settings(max_examples=30, deadline=None)
 @given(seeds, st.integers(1, 60))
-def test_each_row_is_the_same_whatever_is_beside_it(seed, predicates):
+def test_a_row_does_not_depend_on_the_other_rows(seed, predicates):
     """Changes and snapshots are computed over different sets of edges and must agree exactly."""
     logits, seen, priors, told = random_edges(seed, 9, predicates)
     fused = fuse_edges(logits, seen, priors, told, 0.5, 1.0)
@@ -135,9 +135,9 @@ def test_ambiguous_edge_without_a_prior_stays_visual():
     assert fuse_edge(np.zeros(4), None, 0.5, 1.0).provenance == "visual"
 
 
-def test_nothing_known_is_no_edge():
+def test_without_evidence_and_prior_there_is_no_edge():
     assert fuse_edge(None, None, 0.5, 1.0) is None
-    # Two predicates cannot be less certain than ln 2: the gate stays shut, nothing is known.
+    # Two predicates cannot be less certain than ln 2: the prior stays inactive.
     assert fuse_edge(None, np.array([0.9, 0.1]), 0.5, 1.0) is None
 
 
@@ -223,7 +223,7 @@ def test_choice_of_directions_equals_the_reference(seed):
 
 
 @pytest.mark.parametrize("difference", [1e-14, 0.04])
-def test_neither_rounding_nor_one_more_prediction_turns_an_edge_round(difference):
+def test_neither_rounding_nor_one_more_prediction_reverses_an_edge(difference):
     """Two priors that were summed in another order differ in their last bits."""
     almost = np.array([UNSURE, UNSURE])
     almost[1] += (difference, -difference, 0)

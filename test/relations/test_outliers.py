@@ -1,4 +1,4 @@
-"""How much one frame weighs in an edge: `bounded_logits`, against the mixture in plain Python."""
+"""The bounded evidence of one frame: `bounded_logits`, against the mixture in plain Python."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ def test_equals_the_mixture_and_follows_a_permutation_of_predicates(seed, rate):
 
 @settings(max_examples=20, deadline=None)
 @given(rates, st.sampled_from([1.0, 1e3, 1e300]))
-def test_no_frame_weighs_more_than_an_outlier_may(rate, scale):
+def test_the_evidence_of_a_frame_is_bounded(rate, scale):
     values = bounded_logits(scale * np.array([[1.0, 0.0, -1.0, 0.5]]), rate)
     bound = math.log(1 + 4 * (1 - rate) / rate)
     assert np.isfinite(values).all() and np.ptp(values) <= bound * (1 + 1e-12)
 
 
-def test_one_frame_that_is_surely_wrong_does_not_outweigh_two_that_are_right():
+def test_one_confident_wrong_frame_does_not_outweigh_two_right_ones():
     frames = np.array([[13.8, -13.8, -13.8], [-1.0, 2.0, -1.0], [-1.0, 2.0, -1.0]])
     assert frames.sum(axis=0).argmax() == 0
     assert bounded_logits(frames, 0.1).sum(axis=0).argmax() == 1

@@ -1,4 +1,4 @@
-"""The class-pair prior: a running mean that does not know an order."""
+"""The class-pair prior: a running mean that does not depend on the order."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def every_class_pair():
     return np.argwhere(np.ones((CLASSES, CLASSES)))
 
 
-def test_empty_prior_knows_nothing():
+def test_an_empty_prior_has_no_class_pairs():
     prior = ClassPairPrior(CLASSES, PREDICATES)
     prior.update(np.zeros((0, 2), np.int64), np.zeros((0, PREDICATES)))
     assert len(prior) == 0
@@ -58,7 +58,7 @@ def test_is_the_mean_in_any_order_and_any_portions(count, seed, portions):
         assert mean.sum() == pytest.approx(1.0)
 
 
-def test_pairs_without_a_prediction_do_not_enter():
+def test_pairs_without_a_prediction_are_skipped():
     prior = ClassPairPrior(CLASSES, PREDICATES)
     predictions = np.array([[0.2, 0.3, 0.5], [np.nan] * 3])
     prior.update(np.array([[0, 1], [2, 3]]), predictions)
@@ -106,7 +106,7 @@ def test_saved_and_loaded_it_is_the_same_and_goes_on():
         ([[0, 1]], [[0.5, 0.5]], r"shape \(1, 2\): expected \(1, 3\)"),
     ],
 )
-def test_refuses_what_is_no_prediction_and_stays_as_it_was(classes, predictions, message):
+def test_an_invalid_prediction_is_refused_and_changes_nothing(classes, predictions, message):
     prior = ClassPairPrior(CLASSES, PREDICATES)
     with pytest.raises(RefusedInput, match=message) as refused:
         prior.update(np.array(classes), np.array(predictions))
@@ -130,7 +130,7 @@ def test_refuses_a_saved_state_that_does_not_fit(change):
         ClassPairPrior.from_state({**prior.to_state(), **change})
 
 
-def test_what_a_float32_probe_left_off_one_is_made_good():
+def test_sums_that_differ_from_one_by_float32_rounding_are_normalised():
     prior = ClassPairPrior(CLASSES, PREDICATES)
     prior.update(np.array([[0, 1]]), np.array([[0.2, 0.3, 0.5]]) * 1.0005)
     np.testing.assert_allclose(mean_of(prior, 0, 1), [0.2, 0.3, 0.5], rtol=1e-12)

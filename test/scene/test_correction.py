@@ -76,9 +76,7 @@ def test_a_correction_and_its_inverse_restore_the_graph(association: str, seed: 
 @pytest.mark.parametrize("association", ["paper", "surface"])
 @settings(max_examples=15)
 @given(seed=seeds)
-def test_what_was_known_before_stays_and_what_is_new_moves_rigidly(
-    association: str, seed: int
-) -> None:
+def test_older_nodes_stay_and_newer_ones_move_rigidly(association: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     builder = built(rng, association)
     first = dict(zip(builder.graph.nodes.ids.tolist(), builder.graph.nodes.first_seen_ns.tolist()))
@@ -117,7 +115,7 @@ def test_a_node_seen_before_and_after_stays() -> None:
 
 
 @pytest.mark.parametrize("association", ["paper", "surface"])
-def test_after_the_correction_the_object_is_known_where_it_is_now(association: str) -> None:
+def test_after_the_correction_the_object_is_matched_at_its_new_position(association: str) -> None:
     builder = GraphBuilder(config(association), *_world())
     builder.integrate(_box(1 * S, 0.0))
     T = np.eye(4)
@@ -128,7 +126,7 @@ def test_after_the_correction_the_object_is_known_where_it_is_now(association: s
     assert builder.integrate(_box(3 * S, 0.0)) == [2]
 
 
-def test_clients_are_told_of_what_moved_and_of_nothing_else() -> None:
+def test_the_update_contains_only_the_moved_nodes() -> None:
     builder = GraphBuilder(config("surface"), *_world())
     builder.integrate(_box(1 * S, 0.0))
     builder.integrate(_box(2 * S, 3.0))
@@ -143,7 +141,7 @@ def test_clients_are_told_of_what_moved_and_of_nothing_else() -> None:
     assert builder.update() is None
 
 
-def test_what_is_no_rigid_transform_is_refused_and_changes_nothing() -> None:
+def test_a_transform_that_is_not_rigid_is_refused_and_changes_nothing() -> None:
     builder = GraphBuilder(config("surface"), *_world())
     builder.integrate(_box(1 * S, 0.0))
     before = builder.full()
@@ -188,7 +186,7 @@ def graph_bench() -> Iterator[object]:
     yield from bench(GraphNode, topics)
 
 
-def test_the_node_applies_corrections_and_refuses_what_it_cannot(graph_bench) -> None:  # type: ignore[no-untyped-def]
+def test_the_node_applies_corrections_and_refuses_invalid_ones(graph_bench) -> None:  # type: ignore[no-untyped-def]
     from support.nodes_bench import local_graph as message_of
     from support.nodes_bench import pose, works
 

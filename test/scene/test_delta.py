@@ -70,7 +70,7 @@ def test_a_replica_that_missed_nothing_is_the_graph(seed: int) -> None:
         known, previous = now, current
 
 
-def test_an_update_says_what_was_merged_into_what() -> None:
+def test_an_update_names_the_successors_of_merged_nodes() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     for x in range(4):
         graph.add_node(np.array([x, 0.0, 0]), np.eye(3), np.full(4, 0.25), 0)

@@ -1,4 +1,4 @@
-"""The global graph: ids, bookkeeping of merges, memory of frames, messages, save and load."""
+"""The global graph: ids, merges, remembered frames, messages, save and load."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_merge_moves_edges_and_sums_their_evidence() -> None:
     }
 
 
-def test_evidence_of_ids_that_are_gone_reaches_who_lives() -> None:
+def test_evidence_for_removed_ids_reaches_their_successors() -> None:
     graph = graph_of(5)
     graph.merge_nodes(3, 4)
     graph.merge_nodes(3, 2)
@@ -185,7 +185,7 @@ def test_frames_are_remembered_up_to_a_number() -> None:
     assert graph.nodes_of_frame(20) == [0]
 
 
-def test_mistakes_are_named_and_change_nothing() -> None:
+def test_invalid_edits_raise_and_change_nothing() -> None:
     graph = graph_of(2)
     graph.take_removals()
     before = arrays_of(graph)
@@ -203,7 +203,7 @@ def test_mistakes_are_named_and_change_nothing() -> None:
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
 
-def test_what_did_not_change_keeps_its_message() -> None:
+def test_unchanged_nodes_keep_their_message() -> None:
     graph = graph_of(3)
     first = graph.node_states(2, with_points=True)
     graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
@@ -216,13 +216,13 @@ def test_what_did_not_change_keeps_its_message() -> None:
     assert third[3] is first[3]
 
 
-def test_tentative_nodes_are_told_only_on_request() -> None:
+def test_tentative_nodes_are_published_only_on_request() -> None:
     graph = graph_of(1)
     for x in (5.0, 9.0):
         graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
     assert list(graph.node_states(2)) == [1]
-    asked = graph.node_states(2, tentative=True)
-    assert [(node.id, node.confirmed) for node in asked.values()] == [
+    published = graph.node_states(2, tentative=True)
+    assert [(node.id, node.confirmed) for node in published.values()] == [
         (1, True),
         (2, False),
         (3, False),
@@ -230,7 +230,7 @@ def test_tentative_nodes_are_told_only_on_request() -> None:
     graph.set_confirmed(3, True)
     assert list(graph.node_states(2)) == [1, 3]
     assert graph.node_states(2)[3].confirmed
-    assert graph.merge_nodes(2, 3) == 2  # what was sure of one is sure of both
+    assert graph.merge_nodes(2, 3) == 2  # a confirmed node stays confirmed
     assert list(graph.node_states(2)) == [1, 2]
 
 
@@ -302,7 +302,7 @@ def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, se
     assert equal(loaded, graph)
 
 
-def test_files_that_are_no_graph_are_refused(tmp_path: Path) -> None:
+def test_other_files_are_refused(tmp_path: Path) -> None:
     graph_io.save(graph_of(3), tmp_path / "good.npz")
     whole = (tmp_path / "good.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
@@ -329,7 +329,7 @@ def test_a_file_of_a_later_version_is_refused(tmp_path: Path, monkeypatch) -> No
     ("classes", "entropy_nats"),
     [([1.0, 0.0, 0.0, 0.0], 0.0), ([0.5, 0.5, 0.0, 0.0], np.log(2)), ([0.25] * 4, np.log(4))],
 )
-def test_a_node_tells_how_much_its_labels_disagree(classes, entropy_nats) -> None:
+def test_the_entropy_of_a_node_measures_disagreement(classes, entropy_nats) -> None:
     graph = SceneGraph(VOCABULARY, "world")
     graph.add_node(np.zeros(3), np.eye(3), np.array(classes), 1)
     (state,) = graph.node_states(1).values()

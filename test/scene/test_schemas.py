@@ -115,7 +115,7 @@ BROKEN = [pytest.param(*case, id=f"{case[0]}-{'.'.join(map(str, case[1]))}-{inde
 
 
 @pytest.mark.parametrize(("name", "path", "value"), BROKEN)
-def test_what_is_wrong_is_refused_by_schema_and_reader(name, path, value):
+def test_schema_and_reader_refuse_the_same_errors(name, path, value):
     example = deepcopy(load(f"{name}.example.json"))
     place = example
     for key in path[:-1]:

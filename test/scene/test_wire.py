@@ -202,7 +202,7 @@ def _set(path: str, value: object) -> Callable[[dict], None]:
         (_set("schema.version", wire.VERSION + 1), "unknown_schema"),
     ],
 )
-def test_what_does_not_fit_is_refused(change: Callable[[dict], None], reason: str) -> None:
+def test_inconsistent_messages_are_refused(change: Callable[[dict], None], reason: str) -> None:
     content = json.loads(wire.encode(local_message()))
     change(content)
     with pytest.raises(RefusedInput) as refused:
@@ -212,24 +212,24 @@ def test_what_does_not_fit_is_refused(change: Callable[[dict], None], reason: st
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"schema": 3}', "\x00"])
 @pytest.mark.parametrize("kind", list(wire.MESSAGES.values()))
-def test_what_is_no_message_is_refused(text: str, kind: type[wire.Message]) -> None:
+def test_text_that_is_no_message_is_refused(text: str, kind: type[wire.Message]) -> None:
     with pytest.raises(RefusedInput) as refused:
         wire.decode(text, kind)
     assert refused.value.reason == "invalid_message"
     assert kind.__name__ in str(refused.value)
 
 
-def test_other_messages_name_what_does_not_fit() -> None:
+def test_errors_name_the_field_and_its_row() -> None:
     rng = np.random.default_rng(5)
     graph = next(g for g in (random_frame_graph(rng) for _ in range(50)) if len(g) > 1)
     message = frame_graph_to_message(graph)
     message.objects[1].class_probabilities.pop()
-    with pytest.raises(RefusedInput, match="class probabilities of row 1 have 3 values: wanted 4"):
+    with pytest.raises(RefusedInput, match="row 1 have 3 values: expected 4"):
         frame_graph_from_message(message)
     evidence = next(e for e in (random_evidence(rng) for _ in range(50)) if len(e.pairs))
     told = evidence_to_message(evidence, "map")
     told.pairs[0].prediction = [1.0]
-    with pytest.raises(RefusedInput, match="prediction of row 0 have 1 values: wanted 3"):
+    with pytest.raises(RefusedInput, match="prediction of row 0 have 1 values: expected 3"):
         evidence_from_message(told)
 
 
