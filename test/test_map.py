@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import msgspec
@@ -13,6 +14,7 @@ from support.surfaces import CUP, TABLE, WHOLE, frame, slab
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
+from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import RelationEvidence
@@ -121,6 +123,16 @@ def test_other_files_are_refused(tmp_path):
     for name in ("graph.map", "text.map", "folder.map"):
         with pytest.raises(ConfigurationError, match=f"{name} cannot be used: (?!graph file|')"):
             read_map(Config(), tmp_path / name)
+
+
+def test_priors_of_another_vocabulary_are_refused(tmp_path):
+    path = saved(builder_of(), tmp_path)
+    arrays = graph_io.read(path)
+    prior = ClassPairPrior(2, 5).to_state()
+    arrays["prior"] = np.frombuffer(json.dumps(prior).encode(), np.uint8)
+    graph_io.write(path, arrays)
+    with pytest.raises(ConfigurationError, match="priors are of 2 classes and 5 predicates: expec"):
+        read_map(Config(), path)
 
 
 def test_an_unwritable_map_is_refused_at_the_start(tmp_path):

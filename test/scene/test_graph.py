@@ -302,6 +302,21 @@ def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, se
     assert equal(loaded, graph)
 
 
+@given(seeds)
+@settings(max_examples=10)
+def test_a_state_does_not_change_with_its_graph(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
+    edit_at_random(graph, rng, 30)
+    state = graph.state()
+    before = graph_io.to_arrays(state)
+    again = SceneGraph.from_state(state)
+    edit_at_random(graph, rng, 30)
+    edit_at_random(again, rng, 30)
+    after = graph_io.to_arrays(state)
+    assert all(np.array_equal(before[name], after[name]) for name in before)
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     graph_io.save(graph_of(3), tmp_path / "good.npz")
     whole = (tmp_path / "good.npz").read_bytes()
