@@ -1,4 +1,4 @@
-"""Batches of 3D Gaussians: moments, change of frame, Hellinger distance, fusion.
+"""Batches of 3D Gaussians: change of frame, Hellinger distance, fusion.
 
 Leading dimensions broadcast: means are (..., 3) in metres, covariances (..., 3, 3) in square
 metres, all float64.
@@ -11,24 +11,6 @@ import math
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64
-
-
-def moments(points_xyz: Float64, ridge_m2: float) -> tuple[Float64, Float64]:
-    """Sample mean and covariance with a ridge (Eq. 4).
-
-    Args:
-        points_xyz: (N, 3) points in any frame, metres, N >= 2.
-        ridge_m2: the ε of εI, square metres.
-
-    Returns:
-        mean (3,) and covariance (3, 3) with N - 1 in the denominator.
-    """
-    points = np.asarray(points_xyz, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
-        raise ValueError(f"points of shape {points.shape}: expected (N, 3) with N >= 2")
-    mean = points.mean(axis=0)
-    centred = points - mean
-    return mean, centred.T @ centred / (len(points) - 1) + ridge_m2 * np.eye(3)
 
 
 def transform(means: Float64, covariances: Float64, T: Float64) -> tuple[Float64, Float64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
+from support.gaussians import moments
 from support.merging import (
     VOCABULARY,
     local_graph,
@@ -18,7 +19,7 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import PaperMerging
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
-from deworldsg_ros.scene.gaussian import moments, transform
+from deworldsg_ros.scene.gaussian import transform
 from deworldsg_ros.scene.graph import SceneGraph
 
 CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])

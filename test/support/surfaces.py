@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from support.gaussians import moments
 from support.merging import VOCABULARY
 
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations
-from deworldsg_ros.scene.gaussian import moments
 
 CUP, TABLE, CHAIR = 0, 1, 2
 
