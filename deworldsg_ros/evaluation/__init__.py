@@ -1,1 +1,1 @@
-"""The official protocol, the measures beside it, replayable front ends, and what they print."""
+"""Evaluation: the official protocol, measures beside it, front ends, baselines, reports, tables."""

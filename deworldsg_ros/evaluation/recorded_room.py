@@ -173,11 +173,13 @@ def _seen_surface(recording: Path) -> ScanPoints:
             step = slice(None, None, PIXEL_STRIDE)
             depth_m, ids = frame.depth_m[step, step], image[step, step]
             rows, columns = np.nonzero((depth_m > 0) & (ids > 0))
-            z = depth_m[rows, columns].astype(np.float64)
-            camera, T = frame.intrinsics, frame.T_world_camera
-            x = (columns * PIXEL_STRIDE - camera.cx) / camera.fx * z
-            y = (rows * PIXEL_STRIDE - camera.cy) / camera.fy * z
-            world = np.stack([x, y, z], axis=1) @ T[:3, :3].T + T[:3, 3]
+            camera_points = frame.intrinsics.back_project(
+                columns * PIXEL_STRIDE,
+                rows * PIXEL_STRIDE,
+                depth_m[rows, columns].astype(np.float64),
+            )
+            T = frame.T_world_camera
+            world = camera_points @ T[:3, :3].T + T[:3, 3]
             cells = np.floor(world / CELL_M).astype(np.int64)
             hits.append(np.column_stack([cells, ids[rows, columns]]))
     finally:

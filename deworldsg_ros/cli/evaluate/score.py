@@ -56,7 +56,7 @@ def protocol_options(data: DataOptions, scoring: ScoringOptions) -> ProtocolOpti
 
 
 def header(data: DataOptions, scoring: ScoringOptions) -> dict[str, Any]:
-    """The first values of every JSON file: what was evaluated."""
+    """First values of every JSON file: data set and options of the protocol."""
     return {
         "dataset": data.dataset.resolve().name,
         "layout": data.layout,

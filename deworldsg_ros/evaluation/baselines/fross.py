@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineNode, fuse_nodes
-from deworldsg_ros.evaluation.baselines.lifting import Lifted, back_project
+from deworldsg_ros.evaluation.baselines.lifting import Lifted
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
@@ -50,7 +50,7 @@ class Fross:
             if not 0.0 < depth < np.inf:
                 drops["no_centre_depth"] += 1
                 continue
-            centre = back_project(np.array([[u, v]]), np.array([depth]), intrinsics)[0]
+            centre = intrinsics.back_project(np.array([u]), np.array([v]), np.array([depth]))[0]
             mean, covariance = transform(
                 centre, box_covariance(u, v, width, height, depth, intrinsics), T_world_camera
             )
@@ -137,5 +137,6 @@ def evaluation_points(
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     depths = depth_m[pixels[:, 1], pixels[:, 0]]
     valid = (depths > 0) & np.isfinite(depths)
-    points = back_project(pixels[valid], depths[valid], intrinsics)
+    kept = pixels[valid]
+    points = intrinsics.back_project(kept[:, 0], kept[:, 1], depths[valid].astype(np.float64))
     return np.asarray(points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from deworldsg_ros.evaluation.baselines.graph import BaselineNode, fuse_nodes
-from deworldsg_ros.evaluation.baselines.lifting import Lifted, back_project
+from deworldsg_ros.evaluation.baselines.lifting import Lifted
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph
@@ -125,7 +125,8 @@ def window_points(box_xyxy: Float64, depth_m: Float32, intrinsics: Intrinsics) -
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     depths = depth_m[pixels[:, 1], pixels[:, 0]]
     valid = (depths > 0) & np.isfinite(depths)
-    points = back_project(pixels[valid], depths[valid], intrinsics)
+    kept = pixels[valid]
+    points = intrinsics.back_project(kept[:, 0], kept[:, 1], depths[valid].astype(np.float64))
     return np.asarray(points[(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)])
 
 

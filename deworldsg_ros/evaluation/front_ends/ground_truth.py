@@ -122,12 +122,13 @@ class GroundTruthFrontEnd:
         rows, columns = np.nonzero(depth_m > 0)
         if self._tree is None or not len(rows):
             return labels
-        camera = frame.intrinsics
-        z = depth_m[rows, columns].astype(np.float64)
-        x = (columns * PIXEL_STRIDE - camera.cx) / camera.fx * z
-        y = (rows * PIXEL_STRIDE - camera.cy) / camera.fy * z
+        points_camera = frame.intrinsics.back_project(
+            columns * PIXEL_STRIDE,
+            rows * PIXEL_STRIDE,
+            depth_m[rows, columns].astype(np.float64),
+        )
         T = frame.T_world_camera
-        points_world = np.stack([x, y, z], axis=1) @ T[:3, :3].T + T[:3, 3]
+        points_world = points_camera @ T[:3, :3].T + T[:3, 3]
         distances, nearest = self._tree.query(points_world, distance_upper_bound=MAX_DISTANCE_M)
         near = np.isfinite(distances)
         coarse = np.zeros(depth_m.shape, np.uint16)

@@ -223,9 +223,8 @@ class Injection:
             return None
         if key not in self._anchors:
             pixel = int(generator.integers(len(rows)))
-            u, v = columns[pixel], rows[pixel]
-            z = float(frame.depth_m[v, u])
-            point = np.array([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+            u, v = columns[[pixel]], rows[[pixel]]
+            point = camera.back_project(u, v, frame.depth_m[v, u].astype(np.float64))[0]
             T = frame.T_world_camera
             self._anchors[key] = T[:3, :3] @ point + T[:3, 3]
         T = frame.T_world_camera

@@ -337,8 +337,8 @@ def _top(scores: Float64, names: Sequence[str]) -> tuple[str, float]:
         return "", 0.0
     index = len(scores) - 1 - int(np.argmax(scores[::-1]))
     value, total = float(scores[index]), float(np.nansum(scores))
-    share = value / total if total > 0 and 0 <= value <= total else 0.0
-    return (names[index] if index < len(names) else ""), share
+    fraction = value / total if total > 0 and 0 <= value <= total else 0.0
+    return (names[index] if index < len(names) else ""), fraction
 
 
 def _ratio(part: float, whole: float) -> float:
