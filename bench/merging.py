@@ -16,15 +16,17 @@ from typing import Literal
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+
+from support.reference_merging import class_distance, may_merge
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import build_merging
-from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
-from deworldsg_ros.merging.kernel import nearest_row, warm_up
+from deworldsg_ros.merging.nearest import bhattacharyya_bound, nearest_row, observed, warm_up
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
-from deworldsg_ros.scene.gaussian import eigenvalue_bound, hellinger_distance, log_determinant
+from deworldsg_ros.scene.gaussian import hellinger_distance
 from deworldsg_ros.scene.graph import SceneGraph
 
 CLASSES = 80
@@ -120,16 +122,7 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
 def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
     bound = bhattacharyya_bound(0.7)
     return [
-        nearest_row(
-            mean,
-            covariance,
-            log_determinant(covariance),
-            eigenvalue_bound(covariance),
-            probabilities,
-            graph.nodes,
-            bound,
-            0.8,
-        )
+        nearest_row(observed(mean, covariance, probabilities), graph.nodes, bound, 0.8)
         for mean, covariance, probabilities in zip(
             local.means_world, local.covariances_world, local.class_probabilities
         )

@@ -1,8 +1,9 @@
-"""Negative evidence: a depth image that looks through the place where a node should be."""
+"""Negative evidence: the depth image sees through the position of a node."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,57 +13,85 @@ from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
 
-# A surface this far, and this share of its depth, in front of what was measured was seen through:
-# well beyond the noise of depth cameras, poses and the grid's step at an edge.
+# A point is seen through if the measured depth is larger than its own by THROUGH_M and
+# THROUGH_FRACTION of its depth. This is well above the noise of depth cameras and poses, and above
+# the step of the depth grid at an edge.
 THROUGH_M = 0.08
-THROUGH_SHARE = 0.03
-# Fewer visible points than this say nothing, nor does a node of which less than this is visible.
+THROUGH_FRACTION = 0.03
+# A node is judged only if this many of its points, and this fraction of them, are visible.
 MIN_VISIBLE_POINTS = 6
-MIN_VISIBLE_SHARE = 0.5
-# This share of the visible points has to be seen through, or to be there.
-DECISIVE_SHARE = 0.7
-# A node with this share of its points in the image is in full view of the camera; one of which less
-# than this is visible is not in view.
-WHOLE_SHARE = 0.9
-LEAST_SHARE = 0.25
-# How much of a node is in view: nothing, less than half of it, half, or all.
-VIEWS = UNSEEN, LITTLE, HALF, WHOLE = range(4)
-# Nearer than this nothing is measured.
+MIN_VISIBLE_FRACTION = 0.5
+# This fraction of the visible points decides: seen through, or present.
+DECISIVE_FRACTION = 0.7
+# A node is in full view if this fraction of its points is in the image, and not in view if less
+# than MIN_IN_VIEW_FRACTION is visible.
+FULL_VIEW_FRACTION = 0.9
+MIN_IN_VIEW_FRACTION = 0.25
+# How much of a present node is visible: less than a quarter, a quarter, half, or all of it.
+VISIBILITIES = NOT_VISIBLE, QUARTER, HALF, FULL = range(4)
+# Depth cameras measure nothing nearer than this.
 NEAR_M = 0.1
-# Surface points of a node that the depth image is compared with.
+# Surface points of a node that are compared with the depth image.
 SAMPLED_POINTS = 48
 
 
-class SeenThrough:
-    """Counts, by owner, the frames in a row that looked through a node's place.
+class _Samples(NamedTuple):
+    """Surface points of each owner, and its number of consecutive frames that see through it.
 
-    Args:
-        enough_frames: after this many, the node is no longer at its position.
+    Attributes:
+        points_world: (n, SAMPLED_POINTS, 3) float32, metres.
+        counts: (n,) int64, number of points.
+        balls_world: (n, 4) float64, centre and radius of a ball around the points, metres.
+        frames: (n,) int64.
     """
 
-    def __init__(self, enough_frames: int) -> None:
-        self._enough_frames = enough_frames
-        self._points_world = np.zeros((0, SAMPLED_POINTS, 3), np.float32)
-        self._point_counts = np.zeros(0, np.int64)
-        # Centre and radius of a ball around the points of each.
-        self._balls_world = np.zeros((0, 4))
-        self._frames = np.zeros(0, np.int64)
+    points_world: Float32
+    counts: Int64
+    balls_world: Float64
+    frames: Int64
 
-    def renew(self, owners: list[int], nodes: NodeTable, rows: list[int]) -> None:
-        """Take a few surface points of some nodes, by owner and row, for what is to be seen."""
+
+class _Camera(NamedTuple):
+    """Pinhole camera of a depth grid; pixels of the full image."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    stride_px: int
+
+
+class AbsenceEvidence:
+    """Counts, for each owner, the consecutive frames that see through its position.
+
+    Args:
+        absent_frames: number of such frames after which the object is absent.
+    """
+
+    def __init__(self, absent_frames: int) -> None:
+        self._absent_frames = absent_frames
+        self._samples = _Samples(
+            np.zeros((0, SAMPLED_POINTS, 3), np.float32),
+            np.zeros(0, np.int64),
+            np.zeros((0, 4)),
+            np.zeros(0, np.int64),
+        )
+
+    def update_points(self, owners: list[int], nodes: NodeTable, rows: list[int]) -> None:
+        """Sample the surface of some nodes, by owner and row; resets their frame counts."""
         if not owners:
             return
-        if max(owners) >= len(self._frames):
+        if max(owners) >= len(self._samples.frames):
             more = 64 + max(owners)
-            self._points_world = np.pad(self._points_world, ((0, more), (0, 0), (0, 0)))
-            self._point_counts = np.pad(self._point_counts, (0, more))
-            self._balls_world = np.pad(self._balls_world, ((0, more), (0, 0)))
-            self._frames = np.pad(self._frames, (0, more))
-        _renew(
-            self._points_world,
-            self._point_counts,
-            self._balls_world,
-            self._frames,
+            samples = self._samples
+            self._samples = _Samples(
+                np.pad(samples.points_world, ((0, more), (0, 0), (0, 0))),
+                np.pad(samples.counts, (0, more)),
+                np.pad(samples.balls_world, ((0, more), (0, 0))),
+                np.pad(samples.frames, (0, more)),
+            )
+        _update_points(
+            self._samples,
             np.array(owners, np.int64),
             nodes.surface_points_world,
             nodes.surface_counts,
@@ -70,64 +99,56 @@ class SeenThrough:
         )
 
     def forget(self, owner: int) -> None:
-        """Drop what is known of an owner that is gone."""
-        if owner < len(self._frames):
-            self._point_counts[owner] = self._frames[owner] = 0
+        """Drop the data of a removed owner."""
+        if owner < len(self._samples.frames):
+            self._samples.counts[owner] = self._samples.frames[owner] = 0
 
-    def look(
-        self, T_world_camera: Float64, grid: DepthGrid, seen: list[int]
+    def observe(
+        self, T_world_camera: Float64, grid: DepthGrid, detected: list[int]
     ) -> tuple[list[int], Int64]:
-        """Take in one frame, in which some owners were seen.
+        """Compare all owners with the depth of one frame.
+
+        Args:
+            T_world_camera: (4, 4) float64.
+            grid: depth samples of the frame.
+            detected: owners detected in the frame; they are not absent.
 
         Returns:
-            The owners that are gone, and by owner how much of it is there in view.
+            The absent owners, and by owner how much of it is visible (`VISIBILITIES`).
         """
         camera = grid.intrinsics
-        gone, views = _look(
-            self._points_world,
-            self._point_counts,
-            self._balls_world,
-            self._frames,
-            self._enough_frames,
-            np.array(seen, np.int64),
+        absent, visibilities = _observe(
+            self._samples,
+            self._absent_frames,
+            np.array(detected, np.int64),
             invert_pose(T_world_camera),
             grid.depth_mm,
-            grid.stride_px,
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
+            _Camera(camera.fx, camera.fy, camera.cx, camera.cy, grid.stride_px),
         )
-        return gone.tolist(), views
+        return absent.tolist(), visibilities
 
 
 @kernel
-def _renew(
-    kept_points: Float32,
-    kept_counts: Int64,
-    balls: Float64,
-    frames: Int64,
-    owners: Int64,
-    points: Float32,
-    counts: Int64,
-    rows: Int64,
+def _update_points(
+    samples: _Samples, owners: Int64, points: Float32, counts: Int64, rows: Int64
 ) -> None:
+    balls = samples.balls_world
     for index in range(len(owners)):
         owner, row = owners[index], rows[index]
         count = min(counts[row], SAMPLED_POINTS)
-        kept_counts[owner] = count
-        frames[owner] = 0
+        samples.counts[owner] = count
+        samples.frames[owner] = 0
         for axis in range(4):
             balls[owner, axis] = 0.0
-        for place in range(count):
+        for point in range(count):
             for axis in range(3):
-                kept_points[owner, place, axis] = points[row, place, axis]
-                balls[owner, axis] += points[row, place, axis] / count
-        for place in range(count):
+                samples.points_world[owner, point, axis] = points[row, point, axis]
+                balls[owner, axis] += points[row, point, axis] / count
+        for point in range(count):
             squared = 0.0
             for axis in range(3):
-                squared += (points[row, place, axis] - balls[owner, axis]) ** 2
-            # Wider by more than rounding.
+                squared += (points[row, point, axis] - balls[owner, axis]) ** 2
+            # Slightly larger, so that rounding leaves no point outside.
             radius = 1.000001 * math.sqrt(squared) + 1e-6
             balls[owner, 3] = max(balls[owner, 3], radius)
 
@@ -142,19 +163,13 @@ def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 @kernel
-def _beside_view(
-    ball: Float64,
-    T_camera_world: Float64,
-    width_px: int,
-    height_px: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+def _is_out_of_view(
+    ball: Float64, T_camera_world: Float64, width_px: int, height_px: int, camera: _Camera
 ) -> bool:
-    """Whether all of a ball is behind the camera, or beyond one side of the image."""
+    """Whether a ball is behind the camera, or completely beyond one side of the image."""
     x, y, z = _in_camera(T_camera_world, ball[0], ball[1], ball[2])
     radius = ball[3]
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
     right, below = cx - width_px, cy - height_px
     return bool(
         z < NEAR_M - radius
@@ -166,73 +181,79 @@ def _beside_view(
 
 
 @kernel
-def _look(
-    points: Float32,
-    counts: Int64,
-    balls: Float64,
-    frames: Int64,
-    enough_frames: int,
-    seen: Int64,
+def _compare(
+    points: Float32, count: int, T_camera_world: Float64, depth_mm: UInt16, camera: _Camera
+) -> tuple[int, int, int]:
+    """Number of points that are seen through, present, and in the image."""
+    rows, columns = depth_mm.shape
+    through = present = inside = 0
+    most_hidden = (1.0 - MIN_IN_VIEW_FRACTION) * count
+    for index in range(count):
+        # Too little of the node is visible already; the other points do not matter.
+        if index - through - present > most_hidden:
+            break
+        x, y, z = _in_camera(
+            T_camera_world,
+            np.float64(points[index, 0]),
+            np.float64(points[index, 1]),
+            np.float64(points[index, 2]),
+        )
+        if z < NEAR_M:
+            continue
+        column = int(np.floor((camera.fx * x / z + camera.cx) / camera.stride_px))
+        row = int(np.floor((camera.fy * y / z + camera.cy) / camera.stride_px))
+        if column < 0 or row < 0 or column >= columns or row >= rows:
+            continue
+        inside += 1
+        measured_m = depth_mm[row, column] * 0.001
+        if measured_m == 0.0:
+            continue
+        tolerance_m = THROUGH_M + THROUGH_FRACTION * z
+        if measured_m > z + tolerance_m:
+            through += 1
+        elif measured_m > z - tolerance_m:
+            present += 1
+    return through, present, inside
+
+
+@kernel
+def _observe(
+    samples: _Samples,
+    absent_frames: int,
+    detected: Int64,
     T_camera_world: Float64,
     depth_mm: UInt16,
-    stride: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    camera: _Camera,
 ) -> tuple[Int64, Int64]:
-    found = np.zeros(len(points), np.bool_)
-    for owner in seen:
-        if owner < len(points):
-            found[owner] = True
+    counts, frames = samples.counts, samples.frames
+    is_detected = np.zeros(len(counts), np.bool_)
+    for owner in detected:
+        if owner < len(counts):
+            is_detected[owner] = True
             frames[owner] = 0
-    gone = np.zeros(len(points), np.bool_)
-    views = np.full(len(points), UNSEEN)
-    rows, columns = depth_mm.shape
-    for node in range(len(points)):
-        gone[node] = enough_frames <= frames[node]
-        if _beside_view(
-            balls[node], T_camera_world, columns * stride, rows * stride, fx, fy, cx, cy
-        ):
+    absent = np.zeros(len(counts), np.bool_)
+    visibilities = np.full(len(counts), NOT_VISIBLE)
+    width_px, height_px = depth_mm.shape[1] * camera.stride_px, depth_mm.shape[0] * camera.stride_px
+    for owner in range(len(counts)):
+        absent[owner] = absent_frames <= frames[owner]
+        ball = samples.balls_world[owner]
+        if _is_out_of_view(ball, T_camera_world, width_px, height_px, camera):
             continue
-        through = there = inside = 0
-        most_hidden = (1.0 - LEAST_SHARE) * counts[node]
-        for index in range(counts[node]):
-            # Of a node that is too little visible the rest of the points tell nothing.
-            if index - through - there > most_hidden:
-                break
-            x, y, z = _in_camera(
-                T_camera_world,
-                np.float64(points[node, index, 0]),
-                np.float64(points[node, index, 1]),
-                np.float64(points[node, index, 2]),
-            )
-            if z < NEAR_M:
-                continue
-            column = int(np.floor((fx * x / z + cx) / stride))
-            row = int(np.floor((fy * y / z + cy) / stride))
-            if column < 0 or row < 0 or column >= columns or row >= rows:
-                continue
-            inside += 1
-            measured_m = depth_mm[row, column] * 0.001
-            if measured_m == 0.0:
-                continue
-            tolerance_m = THROUGH_M + THROUGH_SHARE * z
-            if measured_m > z + tolerance_m:
-                through += 1
-            elif measured_m > z - tolerance_m:
-                there += 1
-        visible = through + there
-        if visible < MIN_VISIBLE_POINTS or visible < LEAST_SHARE * counts[node]:
+        count = counts[owner]
+        through, present, inside = _compare(
+            samples.points_world[owner], count, T_camera_world, depth_mm, camera
+        )
+        visible = through + present
+        if visible < MIN_VISIBLE_POINTS or visible < MIN_IN_VIEW_FRACTION * count:
             continue
-        half = visible >= MIN_VISIBLE_SHARE * counts[node]
-        if there >= DECISIVE_SHARE * visible:
-            views[node] = LITTLE
+        half = visible >= MIN_VISIBLE_FRACTION * count
+        if present >= DECISIVE_FRACTION * visible:
+            visibilities[owner] = QUARTER
             if half:
-                views[node] = WHOLE if inside >= WHOLE_SHARE * counts[node] else HALF
-                frames[node] = 0
-                gone[node] = False
-        elif half and through >= DECISIVE_SHARE * visible and not found[node]:
-            frames[node] += 1
-            gone[node] = enough_frames <= frames[node]
-    return np.flatnonzero(gone), views
+                visibilities[owner] = FULL if inside >= FULL_VIEW_FRACTION * count else HALF
+                frames[owner] = 0
+                absent[owner] = False
+        elif half and through >= DECISIVE_FRACTION * visible and not is_detected[owner]:
+            frames[owner] += 1
+            absent[owner] = absent_frames <= frames[owner]
+    return np.flatnonzero(absent), visibilities

@@ -1,4 +1,9 @@
-"""Evidence that a node is an object: how often it was detected when it could have been."""
+"""Evidence that a node is an object: how often it was detected when it was visible.
+
+Frames from one camera position show one picture, and the errors of a detector in them are one
+error. So viewpoints are counted instead of frames. A viewpoint of a node lasts until the camera has
+moved by `baseline_deg` as seen from the node. It detected the node if any of its frames did.
+"""
 
 from __future__ import annotations
 
@@ -9,78 +14,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.merging.absence import VIEWS, WHOLE
+from deworldsg_ros.merging.absence import FULL, VISIBILITIES
 from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.scene.arrays import Float64, Int64
 
-# Another look comes soon where the camera moves, and is waited for this long, so that what it sees
-# is found well within two seconds. A camera that stands gives none, and is not waited for.
-WAIT_NS = 500_000_000
+# A second viewpoint is required for at most this long, so that an object is confirmed well within
+# two seconds. A camera that stands still has one viewpoint only and does not wait.
+MAX_WAIT_NS = 500_000_000
+# The camera stands still if it moves less than this.
 STILL_M = 0.001
-# From further away than a node was ever detected from, by this factor, it need not be.
-REACH = 1.1
-# Detections that are all as likely wrong as right have to be so many times as frequent.
-UNSURE_TIMES = 4
-# Errors may last, but for a moment: a reflection, a shadow. What was found for no longer is taken
-# for one where the chance that an object was missed ever since is less than this.
+# Beyond the largest distance of a detection, by this factor, a miss is not counted.
+REACH_FACTOR = 1.1
+# Without a detection of `confirm_score`, a node needs this many times the observations.
+LOW_SCORE_FACTOR = 4
+# A false detection lasts for a moment: a reflection, a shadow. If all detections of a node lie
+# within MOMENT_NS, it becomes tentative when the probability that an object would have been missed
+# ever since falls below MISS_PROBABILITY.
 MOMENT_NS = 1_000_000_000
-ERROR_CHANCE = 0.05
-# How often objects are found is learned; at first, so many looks have found one in two.
-PRIOR_LOOKS = 10.0
+MISS_PROBABILITY = 0.05
+# The detection rate of objects is learned. At first, PRIOR_VIEWPOINTS viewpoints count as observed,
+# and half of them as having detected the object.
+PRIOR_VIEWPOINTS = 10.0
 
 RECORD = np.dtype(
     [
         ("detections", np.int64),
-        # Furthest distance of a detection, and its best score.
+        # Largest distance of a detection, and best score.
         ("reach_m", np.float64),
         ("best_score", np.float64),
         ("first_ns", np.int64),
         ("last_ns", np.int64),
-        # Looks that are over, and those of them that found the node.
-        ("looks", np.int64),
-        ("found", np.int64),
-        # Whether the present look found it, where and when it began, and the best view it had.
-        ("finds", np.bool_),
+        # Number of past viewpoints, and of those that detected the node.
+        ("viewpoints", np.int64),
+        ("detecting", np.int64),
+        # The present viewpoint: whether it detected the node, its position, its start, and its best
+        # visibility of the node.
+        ("is_detecting", np.bool_),
         ("camera_world", np.float64, 3),
-        ("look_ns", np.int64),
-        ("best_view", np.int64),
-        # That an object is missed in all looks between the last that found it and the present one.
-        ("chance", np.float64),
+        ("viewpoint_ns", np.int64),
+        ("visibility", np.int64),
+        # Probability that an object is missed from all past viewpoints since the last detection.
+        ("miss_probability", np.float64),
         # Whether the camera has moved since the first detection.
-        ("moving", np.bool_),
+        ("has_moved", np.bool_),
     ],
     align=True,
 )
 
 
 class Existence:
-    """Counts, by owner, the looks at a node and those in which it was detected.
-
-    Frames from one place show one picture, and the detector's errors in them are one error. A look
-    is all that was seen of a node from about one place; it found the node if any of its frames did.
+    """Counts the viewpoints of each owner, and those that detected it.
 
     Args:
         confirm_observations: detections that confirm a node.
         limits: further conditions.
+
+    Attributes:
+        counts_by_visibility: (len(VISIBILITIES), 2) float64, viewpoints of nodes that are known for
+            longer than a moment, and those of them that detected the node.
     """
 
     def __init__(self, confirm_observations: int, limits: LifeCycleLimits) -> None:
         self._confirm_observations = confirm_observations
         self._limits = limits
         self._baseline_rad = math.radians(limits.baseline_deg)
-        self._nodes = np.zeros(0, RECORD)
-        # By view: looks at nodes known for longer than a moment, and those of them that found one.
-        self.by_view = np.full((len(VIEWS), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
+        self._records = np.zeros(0, RECORD)
+        prior = (PRIOR_VIEWPOINTS, PRIOR_VIEWPOINTS / 2)
+        self.counts_by_visibility = np.full((len(VISIBILITIES), 2), prior)
 
     def warm_up(self) -> None:
-        """Compile now what would else be compiled during the first frame."""
-        place = np.zeros((1, 3))
+        """Compile the kernels before the first frame."""
+        means = np.zeros((1, 3))
         spare = Existence(self._confirm_observations, self._limits)
-        spare.detected([0], place, np.ones(1), place[0], 0)
-        spare.viewed([0], np.ones(1, np.int64))
-        spare.missed([0], np.ones(1, np.int64), place, place[0], 0)
+        spare.add_detections([0], means, np.ones(1), means[0], 0)
+        spare.update_visibility([0], np.ones(1, np.int64))
+        spare.add_misses([0], np.ones(1, np.int64), means, means[0], 0)
 
-    def detected(
+    def add_detections(
         self,
         owners: list[int],
         means_world: Float64,
@@ -88,12 +98,20 @@ class Existence:
         camera_world: Float64,
         stamp_ns: int,
     ) -> None:
-        """Take in the objects (n) of a frame, by owner, seen from a camera position (3,)."""
+        """Add the detections (n) of a frame.
+
+        Args:
+            owners: n owners.
+            means_world: (n, 3) means of the detections, metres.
+            scores: (n,) detection scores.
+            camera_world: (3,) camera position, metres.
+            stamp_ns: of the frame.
+        """
         if owners:
             self._make_room(max(owners) + 1)
-            _detected(
-                self._nodes,
-                self.by_view,
+            _add_detections(
+                self._records,
+                self.counts_by_visibility,
                 np.array(owners, np.int64),
                 means_world,
                 scores,
@@ -102,150 +120,178 @@ class Existence:
                 self._baseline_rad,
             )
 
-    def viewed(self, owners: list[int], views: Int64) -> None:
-        """Take in how much of nodes (n) was in view that were detected."""
-        known = self._nodes["best_view"]
-        known[owners] = np.maximum(known[owners], views)
+    def update_visibility(self, owners: list[int], visibilities: Int64) -> None:
+        """Add the visibilities (n) of detected owners (n) in a frame."""
+        best = self._records["visibility"]
+        best[owners] = np.maximum(best[owners], visibilities)
 
-    def missed(
+    def add_misses(
         self,
         owners: list[int],
-        views: Int64,
+        visibilities: Int64,
         means_world: Float64,
         camera_world: Float64,
         stamp_ns: int,
     ) -> list[int]:
-        """Take in nodes (n) that were in view but not detected; returns those now in doubt."""
+        """Add owners (n) that were visible in a frame but not detected.
+
+        Args:
+            owners: n owners.
+            visibilities: (n,) how much of each is visible.
+            means_world: (n, 3) means of the nodes, metres.
+            camera_world: (3,) camera position, metres.
+            stamp_ns: of the frame.
+
+        Returns:
+            Those of the owners that are more likely an error than an object.
+        """
         if not owners:
             return []
-        doubted: list[int] = _missed(
-            self._nodes,
-            self.by_view,
+        doubtful: list[int] = _add_misses(
+            self._records,
+            self.counts_by_visibility,
             np.array(owners, np.int64),
-            views,
+            visibilities,
             means_world,
             np.ascontiguousarray(camera_world),
             stamp_ns,
             self._baseline_rad,
             self._limits.min_detection_rate,
         ).tolist()
-        return doubted
+        return doubtful
 
-    def sure(self, owner: int) -> bool:
-        """Whether a node was detected often and surely enough, and in more than one look."""
-        node = self._nodes[owner]
-        surely = node["best_score"] >= self._limits.confirm_score
-        wanted = self._confirm_observations * (1 if surely else UNSURE_TIMES)
-        waited = node["last_ns"] - node["first_ns"] >= WAIT_NS
-        again = node["looks"] or not node["moving"] or waited
-        return bool(again and node["detections"] >= wanted and not self._doubtful(owner))
+    def is_confirmed(self, owner: int) -> bool:
+        """Whether there are enough detections, from more than one viewpoint, and few misses."""
+        record = self._records[owner]
+        has_score = record["best_score"] >= self._limits.confirm_score
+        required = self._confirm_observations * (1 if has_score else LOW_SCORE_FACTOR)
+        has_waited = record["last_ns"] - record["first_ns"] >= MAX_WAIT_NS
+        has_viewpoints = record["viewpoints"] or not record["has_moved"] or has_waited
+        enough = has_viewpoints and record["detections"] >= required
+        return bool(enough and not self._is_doubtful(owner))
 
     def records(self, owners: list[int]) -> NDArray[np.void]:
-        """What is known of owners (n), as plain values for `restore`."""
-        return self._nodes[owners]
+        """The records (n,) of owners (n), for `restore`."""
+        return self._records[owners]
 
-    def restore(self, owners: list[int], records: NDArray[np.void], by_view: Float64) -> None:
-        """Go on from the `records` of an earlier run, and its looks `by_view`."""
+    def restore(
+        self, owners: list[int], records: NDArray[np.void], counts_by_visibility: Float64
+    ) -> None:
+        """Continue with the state of an earlier run."""
         self._make_room(max(owners, default=-1) + 1)
-        self._nodes[owners] = records
-        self.by_view[:] = by_view
+        self._records[owners] = records
+        self.counts_by_visibility[:] = counts_by_visibility
 
-    def presume(self, owner: int, detections: int) -> None:
-        """Take in a confirmed node of which only the number of detections is known."""
+    def assume_confirmed(self, owner: int, detections: int) -> None:
+        """Add a confirmed node of which only the number of detections is known."""
         self._make_room(owner + 1)
-        node = self._nodes[owner]
-        node["detections"], node["best_score"] = detections, 1.0
-        node["first_ns"], node["chance"] = -MOMENT_NS, 1.0
-        # What found it was a look from somewhere else.
-        node["finds"] = True
-        node["camera_world"] = np.inf
+        record = self._records[owner]
+        record["detections"], record["best_score"] = detections, 1.0
+        record["first_ns"], record["miss_probability"] = -MOMENT_NS, 1.0
+        # Its last detection was from another viewpoint than any to come.
+        record["is_detecting"] = True
+        record["camera_world"] = np.inf
 
-    def merge(self, kept: int, gone: int) -> None:
-        """Count two owners, which are one object, as one."""
-        node, other = self._nodes[kept], self._nodes[gone]
-        node["detections"] += other["detections"]
-        for name in ("reach_m", "best_score", "last_ns", "chance"):
-            node[name] = max(node[name], other[name])
-        node["first_ns"] = min(node["first_ns"], other["first_ns"])
-        # What one of them missed the other may have found: looks at the same place are not added.
-        if other["found"] * node["looks"] > node["found"] * other["looks"]:
-            node["looks"], node["found"] = other["looks"], other["found"]
+    def merge(self, kept: int, removed: int) -> None:
+        """Combine the records of two owners that are one object."""
+        record, other = self._records[kept], self._records[removed]
+        record["detections"] += other["detections"]
+        for name in ("reach_m", "best_score", "last_ns", "miss_probability"):
+            record[name] = max(record[name], other[name])
+        record["first_ns"] = min(record["first_ns"], other["first_ns"])
+        # Both may have missed or detected the object from the same viewpoints, so their numbers are
+        # not added: the better rate is kept.
+        if other["detecting"] * record["viewpoints"] > record["detecting"] * other["viewpoints"]:
+            record["viewpoints"], record["detecting"] = other["viewpoints"], other["detecting"]
 
     def forget(self, owner: int) -> None:
-        """Drop what is known of an owner that is gone."""
-        if owner < len(self._nodes):
-            self._nodes[owner] = np.zeros((), RECORD)
+        """Drop the record of a removed owner."""
+        if owner < len(self._records):
+            self._records[owner] = np.zeros((), RECORD)
 
-    def _doubtful(self, owner: int) -> bool:
+    def _is_doubtful(self, owner: int) -> bool:
         rate = self._limits.min_detection_rate
-        return bool(_doubtful(self._nodes, owner, self.by_view, rate))
+        return bool(_is_doubtful(self._records, owner, self.counts_by_visibility, rate))
 
     def _make_room(self, count: int) -> None:
-        if count > len(self._nodes):
-            more = np.zeros(max(64, 2 * count) - len(self._nodes), RECORD)
-            self._nodes = np.concatenate((self._nodes, more))
+        if count > len(self._records):
+            more = np.zeros(max(64, 2 * count) - len(self._records), RECORD)
+            self._records = np.concatenate((self._records, more))
 
 
 @kernel
-def _doubtful(nodes: NDArray[Any], owner: int, by_view: Float64, min_rate: float) -> bool:
+def _is_doubtful(
+    records: NDArray[Any], owner: int, counts_by_visibility: Float64, min_rate: float
+) -> bool:
     """Whether a node is more likely an error than an object."""
-    node = nodes[owner]
-    counts = node.finds or node.best_view == WHOLE
-    if node.found + node.finds < min_rate * (node.looks + counts):
+    record = records[owner]
+    is_counted = record.is_detecting or record.visibility == FULL
+    if record.detecting + record.is_detecting < min_rate * (record.viewpoints + is_counted):
         return True
-    chance = node.chance
-    if node.last_ns < node.look_ns:
-        chance *= _miss_chance(by_view, node.best_view)
-    return bool(chance < ERROR_CHANCE and node.last_ns - node.first_ns < MOMENT_NS)
+    probability = record.miss_probability
+    if record.last_ns < record.viewpoint_ns:
+        probability *= _miss_probability(counts_by_visibility, record.visibility)
+    is_momentary = record.last_ns - record.first_ns < MOMENT_NS
+    return bool(probability < MISS_PROBABILITY and is_momentary)
 
 
 @kernel
-def _miss_chance(by_view: Float64, view: int) -> float:
-    return 1.0 - by_view[view, 1] / by_view[view, 0] if view > 0 else 1.0
+def _miss_probability(counts_by_visibility: Float64, visibility: int) -> float:
+    """Probability that a viewpoint with this visibility does not detect an object."""
+    if visibility == 0:
+        return 1.0
+    rate = counts_by_visibility[visibility, 1] / counts_by_visibility[visibility, 0]
+    return float(1.0 - rate)
 
 
 @kernel
-def _look(
-    node: Any, by_view: Float64, mean: Float64, camera: Float64, stamp_ns: int, baseline_rad: float
+def _update_viewpoint(
+    record: Any,
+    counts_by_visibility: Float64,
+    mean: Float64,
+    camera: Float64,
+    stamp_ns: int,
+    baseline_rad: float,
 ) -> float:
-    """Begin another look where the camera has moved on; returns its distance from the node."""
-    # A clock that is behind that of an earlier run: what was known then was known before.
-    behind_ns = max(0, max(node.last_ns, node.look_ns) - stamp_ns)
-    node.first_ns -= behind_ns
-    node.last_ns -= behind_ns
-    node.look_ns -= behind_ns
+    """Begin a new viewpoint if the camera has moved; returns its distance from the node, metres."""
+    # The clock may be behind that of an earlier run: stamps of that run move into the past.
+    behind_ns = max(0, max(record.last_ns, record.viewpoint_ns) - stamp_ns)
+    record.first_ns -= behind_ns
+    record.last_ns -= behind_ns
+    record.viewpoint_ns -= behind_ns
     distance = 0.0
     step = 0.0
     for axis in range(3):
         distance += (mean[axis] - camera[axis]) ** 2
-        step += (node.camera_world[axis] - camera[axis]) ** 2
+        step += (record.camera_world[axis] - camera[axis]) ** 2
     distance, step = math.sqrt(distance), math.sqrt(step)
-    node.moving = node.moving or step > STILL_M
-    for_a_moment = node.last_ns - node.first_ns < MOMENT_NS
+    record.has_moved = record.has_moved or step > STILL_M
+    is_momentary = record.last_ns - record.first_ns < MOMENT_NS
     moved = step > STILL_M and step >= baseline_rad * distance
-    if moved and (node.finds or node.best_view == WHOLE):
-        node.looks += 1
-        node.found += node.finds
-    if moved or (for_a_moment and stamp_ns - node.look_ns >= WAIT_NS):
-        found = node.last_ns >= node.look_ns
-        if not found:
-            node.chance *= _miss_chance(by_view, node.best_view)
-        if not for_a_moment:
-            by_view[node.best_view, 0] += 1
-            by_view[node.best_view, 1] += found
-        node.best_view = 0
-        node.look_ns = stamp_ns
+    if moved and (record.is_detecting or record.visibility == FULL):
+        record.viewpoints += 1
+        record.detecting += record.is_detecting
+    # For a momentary node, a camera that stands still gives a viewpoint each MAX_WAIT_NS.
+    if moved or (is_momentary and stamp_ns - record.viewpoint_ns >= MAX_WAIT_NS):
+        detected = record.last_ns >= record.viewpoint_ns
+        if not detected:
+            record.miss_probability *= _miss_probability(counts_by_visibility, record.visibility)
+        if not is_momentary:
+            counts_by_visibility[record.visibility, 0] += 1
+            counts_by_visibility[record.visibility, 1] += detected
+        record.visibility = 0
+        record.viewpoint_ns = stamp_ns
     if moved:
-        node.finds = False
+        record.is_detecting = False
         for axis in range(3):
-            node.camera_world[axis] = camera[axis]
+            record.camera_world[axis] = camera[axis]
     return distance
 
 
 @kernel
-def _detected(
-    nodes: NDArray[Any],
-    by_view: Float64,
+def _add_detections(
+    records: NDArray[Any],
+    counts_by_visibility: Float64,
     owners: Int64,
     means: Float64,
     scores: Float64,
@@ -254,47 +300,52 @@ def _detected(
     baseline_rad: float,
 ) -> None:
     for index in range(len(owners)):
-        node = nodes[owners[index]]
-        if node.detections == 0:
-            node.first_ns = node.look_ns = stamp_ns
-            node.chance = 1.0
+        record = records[owners[index]]
+        if record.detections == 0:
+            record.first_ns = record.viewpoint_ns = stamp_ns
+            record.miss_probability = 1.0
             for axis in range(3):
-                node.camera_world[axis] = camera[axis]
-        distance = _look(node, by_view, means[index], camera, stamp_ns, baseline_rad)
-        # What was taken for an error may be found by another one.
-        if node.chance < ERROR_CHANCE and node.last_ns - node.first_ns < MOMENT_NS:
-            node.first_ns = stamp_ns
-        node.chance = 1.0
-        node.finds = True
-        node.detections += 1
-        node.last_ns = stamp_ns
-        node.reach_m = max(node.reach_m, distance)
-        node.best_score = max(node.best_score, scores[index])
+                record.camera_world[axis] = camera[axis]
+        distance = _update_viewpoint(
+            record, counts_by_visibility, means[index], camera, stamp_ns, baseline_rad
+        )
+        # A node marked false restarts when it is detected again.
+        is_momentary = record.last_ns - record.first_ns < MOMENT_NS
+        if record.miss_probability < MISS_PROBABILITY and is_momentary:
+            record.first_ns = stamp_ns
+        record.miss_probability = 1.0
+        record.is_detecting = True
+        record.detections += 1
+        record.last_ns = stamp_ns
+        record.reach_m = max(record.reach_m, distance)
+        record.best_score = max(record.best_score, scores[index])
 
 
 @kernel
-def _missed(
-    nodes: NDArray[Any],
-    by_view: Float64,
+def _add_misses(
+    records: NDArray[Any],
+    counts_by_visibility: Float64,
     owners: Int64,
-    views: Int64,
+    visibilities: Int64,
     means: Float64,
     camera: Float64,
     stamp_ns: int,
     baseline_rad: float,
     min_rate: float,
 ) -> Int64:
-    doubted = np.empty(len(owners), np.int64)
+    doubtful = np.empty(len(owners), np.int64)
     count = 0
     for index in range(len(owners)):
-        node = nodes[owners[index]]
+        record = records[owners[index]]
         squared = 0.0
         for axis in range(3):
             squared += (means[index, axis] - camera[axis]) ** 2
-        if math.sqrt(squared) <= REACH * node.reach_m:
-            _look(node, by_view, means[index], camera, stamp_ns, baseline_rad)
-            node.best_view = max(node.best_view, views[index])
-            if _doubtful(nodes, owners[index], by_view, min_rate):
-                doubted[count] = owners[index]
+        if math.sqrt(squared) <= REACH_FACTOR * record.reach_m:
+            _update_viewpoint(
+                record, counts_by_visibility, means[index], camera, stamp_ns, baseline_rad
+            )
+            record.visibility = max(record.visibility, visibilities[index])
+            if _is_doubtful(records, owners[index], counts_by_visibility, min_rate):
+                doubtful[count] = owners[index]
                 count += 1
-    return doubted[:count]
+    return doubtful[:count]

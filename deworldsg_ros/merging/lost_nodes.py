@@ -1,4 +1,4 @@
-"""Nodes whose object has gone from its place, and how it is known again elsewhere."""
+"""Nodes whose object is absent from its position, and their recognition elsewhere."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from deworldsg_ros.scene.gaussian import hellinger_distance
 from deworldsg_ros.scene.graph import SceneGraph
 
-# Shapes agree below this Hellinger distance of the two Gaussians laid on one another.
+# Maximum Hellinger distance of two Gaussians with the same mean whose shapes are similar.
 SHAPE_THRESHOLD = 0.6
 
 
 class LostNodes:
-    """Keeps lost nodes, hidden, for a while; a new node may turn out to be one of them.
+    """Keeps lost nodes, hidden, for a while. A new node may turn out to be one of them.
 
     Args:
-        memory_s: how long a lost node may be found again.
+        memory_s: time in which a lost node may be recognised.
     """
 
     def __init__(self, memory_s: float) -> None:
@@ -26,20 +26,20 @@ class LostNodes:
         return node_id in self._lost_ns
 
     def add(self, node_id: int, stamp_ns: int) -> None:
-        """Note that a node's object is no longer where it was."""
+        """Add a node whose object is absent."""
         self._lost_ns[node_id] = stamp_ns
 
     def match(self, graph: SceneGraph, node_id: int) -> int | None:
-        """The one lost node that a new node is: same label, same shape, and no other so alike."""
-        alike = [lost_id for lost_id in self._lost_ns if _alike(graph, lost_id, node_id)]
-        return alike[0] if len(alike) == 1 else None
+        """The lost node that is the same object as a new node; None if there is not exactly one."""
+        similar = [lost_id for lost_id in self._lost_ns if _are_similar(graph, lost_id, node_id)]
+        return similar[0] if len(similar) == 1 else None
 
-    def found(self, node_id: int) -> None:
-        """Note that a lost node was found again."""
+    def remove(self, node_id: int) -> None:
+        """Remove a lost node that was recognised."""
         del self._lost_ns[node_id]
 
     def take_expired(self, stamp_ns: int) -> list[int]:
-        """Nodes that have been lost for too long; they are forgotten here."""
+        """Remove and return the nodes that have been lost for too long."""
         expired = [
             node_id
             for node_id, lost_ns in self._lost_ns.items()
@@ -50,16 +50,21 @@ class LostNodes:
         return expired
 
 
-def alike_elsewhere(graph: SceneGraph, lost_id: int) -> int | None:
-    """The one confirmed node first seen after another was last seen, that looks like it."""
+def moved_object(graph: SceneGraph, lost_id: int) -> int | None:
+    """The confirmed node that is the object of a lost node at its new position.
+
+    It was first seen after the lost node was last seen, and has the same class and a similar shape.
+    None if there is not exactly one.
+    """
     nodes = graph.nodes
     last_ns = nodes.last_seen_ns[nodes.row(lost_id)]
     later = nodes.ids[nodes.confirmed & (nodes.first_seen_ns > last_ns)].tolist()
-    alike = [node_id for node_id in later if _alike(graph, lost_id, node_id)]
-    return alike[0] if len(alike) == 1 else None
+    similar = [node_id for node_id in later if _are_similar(graph, lost_id, node_id)]
+    return similar[0] if len(similar) == 1 else None
 
 
-def _alike(graph: SceneGraph, a_id: int, b_id: int) -> bool:
+def _are_similar(graph: SceneGraph, a_id: int, b_id: int) -> bool:
+    """Whether two nodes have the same class and similar shapes."""
     nodes = graph.nodes
     a, b = nodes.row(a_id), nodes.row(b_id)
     if nodes.class_probabilities[a].argmax() != nodes.class_probabilities[b].argmax():

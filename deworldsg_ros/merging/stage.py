@@ -1,11 +1,11 @@
-"""The merging stage: each object of a local graph joins the global node it is, or founds one."""
+"""The merging stage: each object of a frame matches a node of the global graph, or creates one."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging.local import Memory
+from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.scene.arrays import Float64
@@ -14,42 +14,42 @@ from deworldsg_ros.scene.graph import SceneGraph
 
 
 class Merging(Protocol):
-    """An association rule, with what it remembers of one scene graph."""
+    """An association rule, with its state for one scene graph."""
 
     def warm_up(self) -> None:
-        """Compile now what would else be compiled during the first frame."""
+        """Compile the kernels before the first frame."""
         ...
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
-        """Merge one frame into the graph, always the same one.
+        """Merge one frame into the graph. All calls use the same graph.
 
         Returns:
-            The id of the node that each row became, after all merges of this frame.
+            The node id of each row of the local graph, after all merges of this frame.
 
         Raises:
-            RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` where the local graph
-                does not speak of the same classes and predicates, or the same world frame.
+            RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` if the local graph has other
+                classes and predicates, or another world frame, than the graph.
         """
         ...
 
     def memory(self) -> Memory:
-        """What it remembers beside the graph, for `restore`."""
+        """The state besides the graph, as arrays by name, for `restore`."""
         ...
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
-        """Go on with a graph of an earlier run; before the first frame.
+        """Continue with a graph of an earlier run; call it before the first frame.
 
         Args:
-            graph: may lack nodes that are remembered.
-            memory: of the rule that made it, which may have been another.
+            graph: may lack nodes that the memory contains.
+            memory: of the rule that made the graph; it may be another rule.
 
         Raises:
-            KeyError, ValueError, TypeError, IndexError: where this is no memory.
+            KeyError, ValueError, TypeError, IndexError: if this is no memory of a rule.
         """
         ...
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
-        """Follow nodes that a correction (4, 4) has moved in the graph."""
+        """Update the state of nodes that a pose-graph correction (4, 4) moved in the graph."""
         ...
 
 

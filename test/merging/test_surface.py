@@ -1,4 +1,4 @@
-"""The surface rule on objects that a camera sees in parts, with flipping labels, side by side."""
+"""The surface rule: partial views, flipping labels, adjacent objects."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ def test_partial_views_are_one_object(graph, merging, parts) -> None:
     assert len(graph) == 1
 
 
-def test_a_label_that_flips_founds_no_node(graph, merging) -> None:
+def test_a_flipping_label_creates_no_node(graph, merging) -> None:
     for stamp in range(10):
         kind = CHAIR if stamp % 5 == 3 else TABLE
         assert merging.merge(graph, frame(stamp, (WHOLE, kind))) == [1]
-    told = graph.node_states(3)[1]
-    assert told.label == VOCABULARY.classes[TABLE]
-    assert told.classes[0].probability == pytest.approx((8 * 0.85 + 2 * 0.05) / 10)
-    assert told.classes[1].label == VOCABULARY.classes[CHAIR]  # the disagreement is visible
+    state = graph.node_states(3)[1]
+    assert state.label == VOCABULARY.classes[TABLE]
+    assert state.classes[0].probability == pytest.approx((8 * 0.85 + 2 * 0.05) / 10)
+    assert state.classes[1].label == VOCABULARY.classes[CHAIR]  # the disagreement is visible
 
 
-def test_objects_that_touch_stay_two(graph, merging) -> None:
+def test_objects_that_touch_stay_separate(graph, merging) -> None:
     cup = slab((0.3, 0.1, 1.05), (0.08, 0.08, 0.09))
     for stamp in range(5):
         order = [(WHOLE, TABLE), (cup, CUP)]
@@ -59,13 +59,15 @@ def test_objects_that_touch_stay_two(graph, merging) -> None:
     assert merging.merge(graph, frame(10, (WHOLE, TABLE))) == [1]
 
 
-def test_neighbours_of_one_class_stay_two_while_both_are_seen(graph, merging) -> None:
+def test_adjacent_objects_of_one_class_stay_separate_while_both_are_detected(
+    graph, merging
+) -> None:
     books = [slab((x, 0, 1), (0.04, 0.15, 0.2)) for x in (0.0, 0.045, 0.09)]
     for stamp in range(10):
         assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
 
 
-def test_a_neighbour_that_is_often_missed_is_not_swallowed(graph, merging) -> None:
+def test_an_adjacent_object_that_is_often_missed_stays_separate(graph, merging) -> None:
     books = [slab((x, 0, 1), (0.035, 0.15, 0.2)) for x in (0.0, 0.036, 0.072)]
     for stamp in range(3):
         assert merging.merge(graph, frame(stamp, *[(book, CUP) for book in books])) == [1, 2, 3]
@@ -76,30 +78,30 @@ def test_a_neighbour_that_is_often_missed_is_not_swallowed(graph, merging) -> No
     assert merging.merge(graph, frame(50, (books[1], CUP))) == [2]
 
 
-def test_of_neighbours_a_newcomer_is_the_one_that_is_new(graph, merging) -> None:
+def test_a_new_detection_between_adjacent_nodes_creates_a_node(graph, merging) -> None:
     left, middle, right = (slab((x, 0, 1), (0.02, 0.15, 0.2)) for x in (0.0, 0.022, 0.044))
     for stamp in range(3):
         assert merging.merge(graph, frame(stamp, (left, CUP), (right, CUP))) == [1, 2]
-    # The newcomer's label is the surest, and its cells touch those of both neighbours.
+    # The new detection has the highest class score, and its cells touch both adjacent nodes.
     classes = np.array([[0.97, 0.01, 0.01, 0.01], [0.7, 0.1, 0.1, 0.1], [0.7, 0.1, 0.1, 0.1]])
     for stamp in range(3, 10):
         local = frame(stamp, (middle, CUP), (left, CUP), (right, CUP), class_probabilities=classes)
         assert merging.merge(graph, local) == [3, 1, 2]
 
 
-def test_a_small_thing_on_a_large_one_is_no_other_name_for_it(graph, merging) -> None:
+def test_a_small_object_on_a_large_one_of_another_class_is_a_node(graph, merging) -> None:
     for stamp in range(3):
         assert merging.merge(graph, frame(stamp, (WHOLE, TABLE))) == [1]
     mat = slab((0.5, 0.1, 1.005), (0.2, 0.15, 0.01))
     for stamp in range(3, 6):
         assert merging.merge(graph, frame(stamp, (mat, CUP))) == [2]
-    # Nor is the large one another name for the small.
+    # The large object does not match the small node either.
     assert merging.merge(graph, frame(6, (WHOLE, TABLE))) == [1]
     # A part of the table that is called a chair is the table.
     assert merging.merge(graph, frame(7, (LEFT, CHAIR))) == [1]
 
 
-def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
+def test_two_halves_of_an_object_are_merged(graph, merging) -> None:
     gap_left, gap_right = slab((-0.7, 0, 1), (0.7, 0.8, 0.01)), slab((0.7, 0, 1), (0.7, 0.8, 0.01))
     assert merging.merge(graph, frame(0, (gap_left, TABLE))) == [1]
     assert merging.merge(graph, frame(1, (gap_right, TABLE))) == [2]
@@ -111,7 +113,7 @@ def test_two_halves_that_were_two_nodes_become_one(graph, merging) -> None:
 
 
 def split_after_one_mask_over_two(graph) -> list[list[int]]:
-    """Ten frames that take two things for one, six that tell them apart, then each alone."""
+    """Ten frames with one mask over two objects, six with two masks, then each object alone."""
     merging = SurfaceMerging(CONFIG)
     left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.1)), slab((0.06, 0, 1), (0.12, 0.3, 0.1))
     views = [[np.concatenate((left, right))]] * 10 + [[left, right]] * 6 + [[right], [left]]
@@ -121,7 +123,7 @@ def split_after_one_mask_over_two(graph) -> list[list[int]]:
     ]
 
 
-def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart(graph) -> None:
+def test_a_node_of_two_objects_is_corrected_when_both_are_detected(graph) -> None:
     ids = split_after_one_mask_over_two(graph)
     assert ids[9] == [1] and ids[15] == [1, 2]
     assert ids[16:] == [[2], [1]]
@@ -134,7 +136,7 @@ def test_a_node_that_swallowed_two_objects_is_corrected_when_they_are_told_apart
     assert graph.nodes.surface(0)[:, 0].max() < 2 * CELL_M
 
 
-def test_a_node_is_tentative_until_seen_often_enough_and_expires(graph, merging) -> None:
+def test_a_tentative_node_expires(graph, merging) -> None:
     cup = slab((3, 0, 1), (0.08, 0.08, 0.09))
     merging.merge(graph, frame(0, (WHOLE, TABLE), (cup, CUP)))
     assert not graph.nodes.confirmed.any()
@@ -156,13 +158,13 @@ def test_a_confirmed_node_out_of_view_stays(graph, merging) -> None:
     assert graph.nodes.ids.tolist() == [1]
 
 
-def test_more_pixels_weigh_more(graph, merging) -> None:
+def test_observations_are_weighted_by_pixels(graph, merging) -> None:
     few = frame(0, (LEFT, TABLE), pixel_counts=np.array([1000]))
     many = frame(1, (WHOLE, TABLE), pixel_counts=np.array([9000]))
     merging.merge(graph, few)
     merging.merge(graph, many)
-    wanted = (few.means_world[0] + 9 * many.means_world[0]) / 10
-    assert graph.nodes.means[0] == pytest.approx(wanted)
+    expected = (few.means_world[0] + 9 * many.means_world[0]) / 10
+    assert graph.nodes.means[0] == pytest.approx(expected)
     assert graph.nodes.observations.tolist() == [2]
 
 
@@ -190,7 +192,7 @@ def test_the_result_does_not_depend_on_the_world_frame() -> None:
     assert results[0][1] == pytest.approx(results[1][1], abs=1e-5)
 
 
-def test_what_does_not_fit_is_refused_and_changes_nothing(graph, merging) -> None:
+def test_a_refused_local_graph_changes_nothing(graph, merging) -> None:
     merging.merge(graph, frame(0, (WHOLE, TABLE)))
     revision = graph.revision
     for changes, reason in (

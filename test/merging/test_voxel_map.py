@@ -1,4 +1,4 @@
-"""The surface map against sets of cells, and what must hold of it."""
+"""The surface map against plain sets of cells, and its properties."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.merging.voxel_map import MIN_REVERSE_CELLS, VoxelMap
+from deworldsg_ros.merging.cell_kernels import MIN_OWNER_CELLS
+from deworldsg_ros.merging.voxel_map import VoxelMap
 
 seeds = st.integers(0, 10**6)
 CELL_M = 0.05
@@ -24,20 +25,20 @@ def neighbourhood(cell: tuple[int, ...]) -> list[tuple[int, ...]]:
     return [tuple(c + s for c, s in zip(cell, step)) for step in steps]
 
 
-def reference_share(seen: set[tuple[int, ...]], known: set[tuple[int, ...]]) -> float:
+def reference_overlap(seen: set[tuple[int, ...]], known: set[tuple[int, ...]]) -> float:
     on_owner = sum(any(cell in known for cell in neighbourhood(c)) for c in seen)
     met = {cell for c in seen for cell in neighbourhood(c)} & known
-    share = on_owner / len(seen) if seen else 0.0
-    if on_owner and len(known) >= MIN_REVERSE_CELLS:
-        share = max(share, len(met) / len(known))
-    return share
+    overlap = on_owner / len(seen) if seen else 0.0
+    if on_owner and len(known) >= MIN_OWNER_CELLS:
+        overlap = max(overlap, len(met) / len(known))
+    return overlap
 
 
-def dense(owners: np.ndarray, shares: np.ndarray, owner_count: int) -> np.ndarray:
-    """Shares (n, owner_count), with the owners that nothing met."""
-    assert (shares > 0).any(axis=0).all()
-    result = np.zeros((len(shares), owner_count))
-    result[:, owners] = shares
+def dense(owners: np.ndarray, overlaps: np.ndarray, owner_count: int) -> np.ndarray:
+    """Overlap fractions (n, owner_count), including owners that no set meets."""
+    assert (overlaps > 0).any(axis=0).all()
+    result = np.zeros((len(overlaps), owner_count))
+    result[:, owners] = overlaps
     return result
 
 
@@ -47,23 +48,23 @@ def random_points(rng: np.random.Generator, count: int) -> np.ndarray:
 
 @given(seeds)
 @settings(max_examples=20)
-def test_an_owner_holds_the_points_that_lie_in_its_cells(seed: int) -> None:
+def test_an_owner_contains_the_points_in_its_cells(seed: int) -> None:
     rng = np.random.default_rng(seed)
     surfaces = VoxelMap(CELL_M)
     known = [random_points(rng, 20) for _ in range(2)]
     surfaces.add([0, 1], surfaces.cells_of(known))
-    asked = random_points(rng, 40)
+    queried = random_points(rng, 40)
     for owner in (0, 1):
         cells = cells_of(known[owner])
-        expected = [tuple(c) in cells for c in np.floor(asked.astype(np.float64) / CELL_M)]
-        assert surfaces.holds(owner, asked).tolist() == expected
-        assert surfaces.holds(owner, known[owner]).all()
-    assert not surfaces.holds(0, np.full((1, 3), 1e6, np.float32)).any()
+        expected = [tuple(c) in cells for c in np.floor(queried.astype(np.float64) / CELL_M)]
+        assert surfaces.contains(owner, queried).tolist() == expected
+        assert surfaces.contains(owner, known[owner]).all()
+    assert not surfaces.contains(0, np.full((1, 3), 1e6, np.float32)).any()
 
 
 @given(seeds)
 @settings(max_examples=30)
-def test_shares_equal_the_reference(seed: int) -> None:
+def test_overlaps_equal_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     surfaces = VoxelMap(CELL_M)
     known: list[set[tuple[int, ...]]] = [set() for _ in range(3)]  # a cell has room for four
@@ -73,13 +74,13 @@ def test_shares_equal_the_reference(seed: int) -> None:
         surfaces.add([owner], surfaces.cells_of([points]))
         known[owner] |= cells_of(points)
     sets = [random_points(rng, int(rng.integers(0, 30))) for _ in range(4)]
-    shares = dense(*surfaces.shares(surfaces.cells_of(sets)), 3)
+    overlaps = dense(*surfaces.overlaps(surfaces.cells_of(sets)), 3)
     for row, points in enumerate(sets):
         for owner in range(3):
-            wanted = reference_share(cells_of(points), known[owner])
-            assert shares[row, owner] == pytest.approx(wanted, abs=1e-12)
+            expected = reference_overlap(cells_of(points), known[owner])
+            assert overlaps[row, owner] == pytest.approx(expected, abs=1e-12)
     for owner in range(3):
-        assert surfaces.cell_count(owner) == len(known[owner])
+        assert len(surfaces.centres(owner)) == len(known[owner])
 
 
 @given(seeds)
@@ -91,9 +92,9 @@ def test_contested_cells_equal_the_reference(seed: int) -> None:
     for owner, points in enumerate(known):
         surfaces.add([owner], surfaces.cells_of([points]))
     seen = [random_points(rng, int(rng.integers(0, 60))) for _ in range(4)]
-    owners = [2, -1, 0, 1]  # the second founds a node; the last node is out of view
-    least_share = float(rng.choice([0.0, 0.1]))
-    lost = surfaces.contest(owners, surfaces.cells_of(seen), least_share)
+    owners = [2, -1, 0, 1]  # the second is a new node; the last node is out of view
+    min_fraction = float(rng.choice([0.0, 0.1]))
+    lost = surfaces.contest(owners, surfaces.cells_of(seen), min_fraction)
     for owner, points in enumerate(known):
         had, own = cells_of(points), set()
         shown = cells_of(seen[owners.index(owner)]) if owner in owners else set()
@@ -101,59 +102,59 @@ def test_contested_cells_equal_the_reference(seed: int) -> None:
             others = [s for s, o in zip(seen, owners) if o != owner]
             own = had & set().union(*map(cells_of, others))
             own = {cell for cell in own if not shown & set(neighbourhood(cell))}
-        share = len(own) / len(had)
-        own = own if share > least_share else set()
-        assert lost.get(owner, 0.0) == pytest.approx(share if own else 0.0)
+        fraction = len(own) / len(had)
+        own = own if fraction > min_fraction else set()
+        assert lost.get(owner, 0.0) == pytest.approx(fraction if own else 0.0)
         assert cells_of(surfaces.centres(owner)) == had - own
-        assert surfaces.cell_count(owner) == len(had - own)
+        assert len(surfaces.centres(owner)) == len(had - own)
 
 
-def test_no_points_no_share() -> None:
+def test_sets_without_points_overlap_nothing() -> None:
     surfaces = VoxelMap(CELL_M)
     surfaces.add([], surfaces.cells_of([]))
-    assert surfaces.shares(surfaces.cells_of([]))[1].shape == (0, 0)
+    assert surfaces.overlaps(surfaces.cells_of([]))[1].shape == (0, 0)
     empty = surfaces.cells_of([np.zeros((0, 3), np.float32)])
     surfaces.add([0], empty)
-    assert surfaces.shares(empty)[1].shape == (1, 0)
+    assert surfaces.overlaps(empty)[1].shape == (1, 0)
 
 
-def test_growing_loses_nothing_and_a_removed_owner_is_gone() -> None:
+def test_growing_keeps_all_cells_and_a_removed_owner_has_none() -> None:
     rng = np.random.default_rng(1)
     surfaces = VoxelMap(0.01, cells_per_owner=100_000)
     sets = surfaces.cells_of([rng.uniform(-5, 5, (30_000, 3)) for _ in range(2)])
     surfaces.add([0, 1], sets)
-    assert surfaces.shares(sets)[1].diagonal().tolist() == [1.0, 1.0]
-    count = surfaces.cell_count(0)
+    assert surfaces.overlaps(sets)[1].diagonal().tolist() == [1.0, 1.0]
+    count = len(surfaces.centres(0))
     removed = surfaces.remove(0)
-    assert surfaces.cell_count(0) == 0
-    after = dense(*surfaces.shares(sets), 2)
+    assert len(surfaces.centres(0)) == 0
+    after = dense(*surfaces.overlaps(sets), 2)
     assert after[0, 0] == after[1, 0] == 0.0
     assert after[1, 1] == 1.0
     surfaces.add([2], removed)
-    assert surfaces.cell_count(2) == count
-    assert dense(*surfaces.shares(sets), 3)[0].tolist() == [0.0, after[0, 1], 1.0]
+    assert len(surfaces.centres(2)) == count
+    assert dense(*surfaces.overlaps(sets), 3)[0].tolist() == [0.0, after[0, 1], 1.0]
 
 
-def test_an_owner_has_at_most_so_many_cells() -> None:
+def test_the_number_of_cells_of_an_owner_is_limited() -> None:
     surfaces = VoxelMap(0.01, cells_per_owner=50)
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
     surfaces.add([0], surfaces.cells_of([points]))
-    assert surfaces.cell_count(0) == 50
+    assert len(surfaces.centres(0)) == 50
 
 
-def test_points_beyond_the_map_are_left_out() -> None:
+def test_points_beyond_the_map_are_ignored() -> None:
     surfaces = VoxelMap(0.01)
     points = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 0]], np.float32)
     surfaces.add([0], surfaces.cells_of([points]))
     assert surfaces.centres(0) == pytest.approx(np.full((1, 3), 0.005))
 
 
-def test_what_is_gone_takes_no_room() -> None:
+def test_removed_owners_take_no_room() -> None:
     rng = np.random.default_rng(0)
     surfaces = VoxelMap(CELL_M)
-    room = len(surfaces._keys)
+    capacity = surfaces.capacity
     for _ in range(1000):
         cells = surfaces.cells_of([random_points(rng, 20) + rng.uniform(-9, 9, 3).astype("f4")])
         surfaces.add([0], cells)
         surfaces.remove(0)
-    assert len(surfaces._keys) == room
+    assert surfaces.capacity == capacity

@@ -1,4 +1,4 @@
-"""Eq. 5 and 6: the gates, and the compiled search against np.linalg."""
+"""Eq. 5 and 6: the compiled search against np.linalg."""
 
 from __future__ import annotations
 
@@ -7,14 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import random_classes, random_covariances, random_pose, seeds
+from support.reference_merging import class_distance, may_merge
 
-from deworldsg_ros.merging.gates import bhattacharyya_bound, class_distance, may_merge
-from deworldsg_ros.merging.kernel import _nearest, nearest_row, warm_up
+from deworldsg_ros.merging.nearest import (
+    _nearest,
+    bhattacharyya_bound,
+    nearest_row,
+    observed,
+    warm_up,
+)
 from deworldsg_ros.scene.gaussian import (
     bhattacharyya_distance,
     eigenvalue_bound,
     hellinger_distance,
-    log_determinant,
 )
 from deworldsg_ros.scene.nodes import NodeTable
 
@@ -28,17 +33,8 @@ def table_of(means, covariances, classes, ids=None) -> NodeTable:
 
 
 def search(mean, covariance, classes, nodes, delta_g=0.7, delta_c=0.8, skipped_row=-1) -> int:
-    return nearest_row(
-        mean,
-        covariance,
-        log_determinant(covariance),
-        eigenvalue_bound(covariance),
-        classes,
-        nodes,
-        bhattacharyya_bound(delta_g),
-        delta_c,
-        skipped_row,
-    )
+    item = observed(mean, covariance, classes)
+    return nearest_row(item, nodes, bhattacharyya_bound(delta_g), delta_c, skipped_row)
 
 
 @given(seeds, st.sampled_from([0.05, 0.3, 0.7, 0.95]), st.sampled_from([0.2, 0.8, 1.0]))
@@ -96,7 +92,7 @@ def test_an_equal_gaussian_is_at_distance_zero_so_the_smallest_id_wins(seed: int
     assert nodes.ids[search(mean, covariance, np.ones(1), nodes, delta_g=1e-7)] == 1
 
 
-def test_after_the_warm_up_nothing_is_left_to_compile() -> None:
+def test_the_warm_up_compiles_the_only_signature() -> None:
     warm_up()
     compiled = list(_nearest.signatures)
     rng = np.random.default_rng(0)
@@ -110,7 +106,7 @@ def test_after_the_warm_up_nothing_is_left_to_compile() -> None:
     assert list(_nearest.signatures) == compiled
 
 
-def test_nothing_to_find() -> None:
+def test_an_empty_graph_has_no_nearest_node() -> None:
     assert search(np.zeros(3), np.eye(3), np.ones(1), NodeTable(1)) == -1
 
 
@@ -125,7 +121,7 @@ def test_the_bounds_of_the_prefilter_hold(seed: int) -> None:
     assert d @ np.linalg.solve((a + b) / 2, d) / 8 <= distance + 1e-9
 
 
-def test_the_bound_is_the_threshold() -> None:
+def test_the_bound_equals_the_threshold() -> None:
     assert bhattacharyya_bound(0.7) == pytest.approx(0.67334455, abs=1e-8)
     for threshold in (0.1, 0.5, 0.99):
         assert np.sqrt(1 - np.exp(-bhattacharyya_bound(threshold))) == pytest.approx(threshold)

@@ -1,4 +1,4 @@
-"""What every association rule does with a local graph, before and after it has found the nodes."""
+"""Steps that both association rules share."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.surface import even_moments
 
-# What a rule remembers beside the graph.
+# State of a rule besides the graph, as arrays by name.
 Memory = dict[str, NDArray[Any]]
 
 
 def warm_up_graph() -> None:
-    """Compile what changes a scene graph, or load it from the cache."""
+    """Compile the kernels of the scene graph, or load them from the cache."""
     graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
-    seen = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
-    graph.observe(graph.add_node(*seen), *seen)
+    observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
+    graph.observe(graph.add_node(*observation), *observation)
     even_moments(np.zeros((1, 3), np.float32))
 
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
-    """Refuse a local graph of another vocabulary or world frame than the scene graph's."""
+    """Raise RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` if a local graph differs."""
     if local.vocabulary != graph.vocabulary:
         raise RefusedInput(
             "vocabulary_mismatch",
@@ -42,8 +42,14 @@ def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
 
 
 def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
-    """Sum a frame's visual relation logits into the edges of the nodes its rows became."""
-    # Summed by pair first, so that a frame counts once also where two of its rows are one node.
+    """Add the visual relation logits of a frame to the edges of its nodes (Eq. 9).
+
+    Args:
+        graph: changed.
+        local: the frame.
+        node_ids: node of each row of the frame.
+    """
+    # Summed by pair first: a frame counts once even if two of its rows are one node.
     sums: dict[tuple[int, int], Float64] = {}
     for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
         pair = (node_ids[subject], node_ids[object_])

@@ -1,0 +1,437 @@
+"""Compiled kernels of the surface map (`voxel_map`), and the arrays they work on.
+
+Space is divided into cells, and 4 x 4 x 4 cells are a block. The 64 cells of a block are the bits
+of a uint64 mask: bit 16 x + 4 y + z. Adjacent cells are then found by shifts.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int32, Int64, UInt64
+
+EMPTY = np.int64(-1)
+# Cell indices lie in ±2^20: with cells of 3 cm, 31 km around the origin.
+INDEX_BIAS = 1 << 20
+INDEX_MASK = (1 << 21) - 1
+# An owner with fewer cells says too little by lying within a set.
+MIN_OWNER_CELLS = 4
+# The six faces of a block. For each face: its cells, the rotation to the right that turns their
+# bits into the bits of the cells that they touch in the adjacent block, and the step to that block.
+_FACES = np.array(
+    [
+        0x8888888888888888,
+        0x1111111111111111,
+        0xF000F000F000F000,
+        0x000F000F000F000F,
+        0xFFFF000000000000,
+        0x000000000000FFFF,
+    ],
+    np.uint64,
+)
+_ROTATIONS = np.array([3, 61, 12, 52, 48, 16], np.uint64)
+_STEPS = np.array([1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
+
+
+class CellSets(NamedTuple):
+    """Cells of n sets of points, one set after the other.
+
+    Attributes:
+        blocks: (m,) int64, packed block indices; those of set k, all different, are
+            blocks[starts[k] : starts[k + 1]].
+        masks: (m,) uint64, the cells in each block.
+        starts: (n + 1,) int64.
+    """
+
+    blocks: Int64
+    masks: UInt64
+    starts: Int64
+
+
+class CellTable(NamedTuple):
+    """Hash table of cells. A slot holds the cells of one owner in one block.
+
+    The slots of a block lie between its home slot and the next empty slot.
+
+    Attributes:
+        keys: (capacity,) int64, block of each slot; -1 = empty.
+        masks: (capacity,) uint64, cells of each slot.
+        owners: (capacity,) int32, owner of each slot; -1 = removed.
+        marks: (capacity,) uint64, cells that a query has met; zero between queries.
+    """
+
+    keys: Int64
+    masks: UInt64
+    owners: Int32
+    marks: UInt64
+
+
+def new_table(capacity: int) -> CellTable:
+    """An empty table; the capacity is a power of two."""
+    return CellTable(
+        np.full(capacity, EMPTY, np.int64),
+        np.zeros(capacity, np.uint64),
+        np.full(capacity, -1, np.int32),
+        np.zeros(capacity, np.uint64),
+    )
+
+
+@kernel
+def _home_slot(keys: Int64, block: np.int64) -> int:
+    """First slot in which a block may lie."""
+    mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
+    return int(np.int64(mixed >> np.uint64(32)) & (len(keys) - 1))
+
+
+@kernel
+def _bit_count(mask: np.uint64) -> int:
+    """Number of set bits."""
+    mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    pairs = np.uint64(0x3333333333333333)
+    mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
+    mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
+
+
+@kernel
+def _rotated(mask: np.uint64, by: np.uint64) -> np.uint64:
+    """A mask, rotated to the right."""
+    return (mask >> by) | (mask << (np.uint64(64) - by))
+
+
+@kernel
+def _dilated(mask: np.uint64) -> np.uint64:
+    """Cells of a block, and the cells of the same block that share a face with them."""
+    z, y, x = np.uint64(1), np.uint64(4), np.uint64(16)
+    dilated = mask | (mask << x) | (mask >> x)
+    dilated |= ((mask & ~_FACES[0]) << z) | ((mask & ~_FACES[1]) >> z)
+    return np.uint64(dilated | ((mask & ~_FACES[2]) << y) | ((mask & ~_FACES[3]) >> y))
+
+
+@kernel
+def _cell_of(point: Float32, cells_per_m: float) -> tuple[np.int64, np.uint64]:
+    """Block and bit of the cell of a point; block -1 if it is beyond the map."""
+    block = np.int64(0)
+    bit = np.int64(0)
+    inside = True
+    for axis in range(3):
+        step = np.int64(np.floor(np.float64(point[axis]) * cells_per_m)) + INDEX_BIAS
+        inside = bool(inside and 0 <= step < 2 * INDEX_BIAS)
+        block = (block << 21) | (step >> 2)
+        bit = (bit << 2) | (step & 3)
+    return (block if inside else np.int64(-1)), np.uint64(1) << np.uint64(bit)
+
+
+@kernel
+def contains(table: CellTable, owner: int, points: Float32, cell_m: float) -> Bool:
+    """Whether each point (k, 3) lies in a cell of an owner."""
+    contained = np.zeros(len(points), np.bool_)
+    for index in range(len(points)):
+        block, bit = _cell_of(points[index], 1.0 / cell_m)
+        slot = _home_slot(table.keys, block)
+        while table.keys[slot] != -1:
+            if table.keys[slot] == block and table.owners[slot] == owner:
+                contained[index] = table.masks[slot] & bit != 0
+            slot = (slot + 1) & (len(table.keys) - 1)
+    return contained
+
+
+@kernel
+def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt64, Int64]:
+    """Arrays of the `CellSets` of sets of points; set k is points[starts[k] : starts[k + 1]]."""
+    blocks = np.empty(len(points), np.int64)
+    masks = np.zeros(len(points), np.uint64)
+    new_starts = np.zeros(len(starts), np.int64)
+    count = 0
+    cells_per_m = 1.0 / cell_m
+    for index in range(len(starts) - 1):
+        capacity = 16
+        while capacity < 2 * (starts[index + 1] - starts[index]):
+            capacity *= 2
+        # Position of each block in `blocks`, by hash.
+        known = np.full(capacity, -1, np.int64)
+        for point in range(starts[index], starts[index + 1]):
+            block, bit = _cell_of(points[point], cells_per_m)
+            if block < 0:
+                continue
+            slot = _home_slot(known, block)
+            while known[slot] >= 0 and blocks[known[slot]] != block:
+                slot = (slot + 1) & (capacity - 1)
+            if known[slot] < 0:
+                known[slot] = count
+                blocks[count] = block
+                count += 1
+            masks[known[slot]] |= bit
+        new_starts[index + 1] = count
+    return blocks[:count].copy(), masks[:count].copy(), new_starts
+
+
+@kernel
+def _find_slots(table: CellTable, block: np.int64, owner: int) -> tuple[int, int, int, np.uint64]:
+    """The owner's slot of a block, a removed slot (-1 = none), the next empty slot, and the cells
+    of the block that have four owners.
+    """
+    own = removed = -1
+    # The three bits of the number of owners of each cell.
+    ones = twos = fours = np.uint64(0)
+    slot = _home_slot(table.keys, block)
+    while table.keys[slot] != -1:
+        if table.owners[slot] < 0:
+            removed = slot
+        elif table.keys[slot] == block:
+            if table.owners[slot] == owner:
+                own = slot
+            carried = ones & table.masks[slot]
+            ones ^= table.masks[slot]
+            fours |= twos & carried
+            twos ^= carried
+        slot = (slot + 1) & (len(table.keys) - 1)
+    return own, removed, slot, fours
+
+
+@kernel
+def add(
+    table: CellTable, counts: Int64, max_cells: int, used: int, owners: Int64, sets: CellSets
+) -> tuple[Int64, Int64, int]:
+    """Add the cells of each set to its owner.
+
+    Args:
+        table: with room for all blocks of the sets.
+        counts: number of cells of each owner; updated.
+        max_cells: of an owner.
+        used: number of slots that are not empty.
+        owners: (n,) owner of each set.
+        sets: n sets.
+
+    Returns:
+        The blocks that are new to their owner, their starts by set, and the new `used`.
+    """
+    new = np.empty(len(sets.blocks), np.int64)
+    new_starts = np.zeros(len(sets.starts), np.int64)
+    new_count = 0
+    for index in range(len(owners)):
+        owner = owners[index]
+        for at in range(sets.starts[index], sets.starts[index + 1]):
+            slot, removed, empty, full = _find_slots(table, sets.blocks[at], owner)
+            # A cell keeps four owners; a fifth is not recorded.
+            cells = sets.masks[at] & ~full
+            if slot >= 0:
+                cells &= ~table.masks[slot]
+            while _bit_count(cells) > max_cells - counts[owner]:
+                cells &= cells - np.uint64(1)
+            if cells == 0:
+                continue
+            if slot < 0:
+                slot = empty if removed < 0 else removed
+                used += int(removed < 0)
+                table.keys[slot] = sets.blocks[at]
+                table.owners[slot] = owner
+                new[new_count] = sets.blocks[at]
+                new_count += 1
+            table.masks[slot] |= cells
+            counts[owner] += _bit_count(cells)
+        new_starts[index + 1] = new_count
+    return new[:new_count].copy(), new_starts, used
+
+
+@kernel
+def overlaps(table: CellTable, counts: Int64, used: int, sets: CellSets) -> tuple[Int64, Float64]:
+    """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
+    set_count = len(sets.starts) - 1
+    # Cells of the set that lie on the owner, and cells of the owner that the set meets.
+    on_owner = np.zeros((set_count, len(counts)), np.int64)
+    of_owner = np.zeros((set_count, len(counts)), np.int64)
+    met = np.zeros(len(counts), np.bool_)
+    # Cells of one block of the set that lie on each owner, and the list of these owners.
+    on_block = np.zeros(len(counts), np.uint64)
+    block_owners = np.empty(len(counts), np.int64)
+    marked = np.empty(used, np.int64)
+    for index in range(set_count):
+        marked_count = 0
+        for at in range(sets.starts[index], sets.starts[index + 1]):
+            owner_count = 0
+            # The block itself (-1), then the adjacent blocks that the cells touch through a face.
+            for face in range(-1, 6):
+                owner_count, marked_count = _meet(
+                    table, sets.blocks[at], sets.masks[at], face,
+                    on_block, block_owners, owner_count, marked, marked_count,
+                )  # fmt: skip
+            for position in range(owner_count):
+                owner = block_owners[position]
+                on_owner[index, owner] += _bit_count(on_block[owner])
+                on_block[owner] = 0
+                met[owner] = True
+        for position in range(marked_count):
+            slot = marked[position]
+            of_owner[index, table.owners[slot]] += _bit_count(table.marks[slot])
+            table.marks[slot] = 0
+    columns = np.flatnonzero(met)
+    return columns, _fractions(columns, on_owner, of_owner, counts, sets)
+
+
+@kernel
+def _meet(
+    table: CellTable,
+    set_block: np.int64,
+    set_mask: np.uint64,
+    face: int,
+    on_block: UInt64,
+    block_owners: Int64,
+    owner_count: int,
+    marked: Int64,
+    marked_count: int,
+) -> tuple[int, int]:
+    """Record the owners that the cells of one block of a set meet, in it or through a face.
+
+    Returns:
+        The new numbers of block owners and of marked slots.
+    """
+    block = set_block
+    touching = _dilated(set_mask)
+    if face >= 0:
+        block += _STEPS[face]
+        touching = _rotated(set_mask & _FACES[face], _ROTATIONS[face])
+        if touching == 0:
+            return owner_count, marked_count
+    slot = _home_slot(table.keys, block)
+    while table.keys[slot] != -1:
+        cells = touching & table.masks[slot]
+        if table.keys[slot] == block and cells != 0:
+            owner = table.owners[slot]
+            if table.marks[slot] == 0:
+                marked[marked_count] = slot
+                marked_count += 1
+            table.marks[slot] |= cells
+            if on_block[owner] == 0:
+                block_owners[owner_count] = owner
+                owner_count += 1
+            if face >= 0:
+                on_block[owner] |= _rotated(cells, np.uint64(64) - _ROTATIONS[face])
+            else:
+                on_block[owner] |= _dilated(table.masks[slot]) & set_mask
+        slot = (slot + 1) & (len(table.keys) - 1)
+    return owner_count, marked_count
+
+
+@kernel
+def _fractions(
+    columns: Int64, on_owner: Int64, of_owner: Int64, counts: Int64, sets: CellSets
+) -> Float64:
+    """Overlap fraction of each set (row) with each of some owners (column)."""
+    set_count = len(sets.starts) - 1
+    fractions = np.zeros((set_count, len(columns)))
+    for index in range(set_count):
+        cell_count = 0
+        for at in range(sets.starts[index], sets.starts[index + 1]):
+            cell_count += _bit_count(sets.masks[at])
+        for column in range(len(columns)):
+            owner = columns[column]
+            if on_owner[index, owner] > 0:
+                fraction = on_owner[index, owner] / cell_count
+                if counts[owner] >= MIN_OWNER_CELLS:
+                    fraction = max(fraction, of_owner[index, owner] / counts[owner])
+                fractions[index, column] = fraction
+    return fractions
+
+
+@kernel
+def _dilated_set(block: np.int64, sets: CellSets, index: int) -> np.uint64:
+    """Cells of a block that are in a set, or share a face with a cell of the set."""
+    near = np.uint64(0)
+    for at in range(sets.starts[index], sets.starts[index + 1]):
+        if sets.blocks[at] == block:
+            near |= _dilated(sets.masks[at])
+        for face in range(6):
+            if sets.blocks[at] + _STEPS[face] == block:
+                near |= _rotated(sets.masks[at] & _FACES[face], _ROTATIONS[face])
+    return near
+
+
+@kernel
+def _contested(
+    table: CellTable, slot: int, sets: CellSets, at: int, set_owner: int, set_of: Int64
+) -> np.uint64:
+    """Cells of a slot that a set of another owner contains, and that are not near the set of the
+    slot's owner.
+    """
+    cells = sets.masks[at] & table.masks[slot] & ~table.marks[slot]
+    if table.keys[slot] != sets.blocks[at] or cells == 0:
+        return np.uint64(0)
+    owner = table.owners[slot]
+    if owner == set_owner or set_of[owner] < 0:
+        return np.uint64(0)
+    return np.uint64(cells & ~_dilated_set(sets.blocks[at], sets, set_of[owner]))
+
+
+@kernel
+def contest(
+    table: CellTable,
+    counts: Int64,
+    used: int,
+    owners: Int64,
+    sets: CellSets,
+    min_fraction: float,
+) -> Int64:
+    """Number of cells that each owner lost; see `VoxelMap.contest`."""
+    set_of = np.full(len(counts), -1, np.int64)
+    for index in range(len(owners)):
+        if owners[index] >= 0:
+            set_of[owners[index]] = index
+    lost = np.zeros(len(counts), np.int64)
+    marked = np.empty(used, np.int64)
+    marked_count = 0
+    for index in range(len(owners)):
+        for at in range(sets.starts[index], sets.starts[index + 1]):
+            slot = _home_slot(table.keys, sets.blocks[at])
+            while table.keys[slot] != -1:
+                cells = _contested(table, slot, sets, at, owners[index], set_of)
+                if cells != 0:
+                    if table.marks[slot] == 0:
+                        marked[marked_count] = slot
+                        marked_count += 1
+                    table.marks[slot] |= cells
+                    lost[table.owners[slot]] += _bit_count(cells)
+                slot = (slot + 1) & (len(table.keys) - 1)
+    for owner in range(len(counts)):
+        if lost[owner] <= min_fraction * counts[owner]:
+            lost[owner] = 0
+    for position in range(marked_count):
+        slot = marked[position]
+        if lost[table.owners[slot]] > 0:
+            table.masks[slot] &= ~table.marks[slot]
+        table.marks[slot] = 0
+    for owner in range(len(counts)):
+        counts[owner] -= lost[owner]
+    return lost
+
+
+@kernel
+def slots_of(table: CellTable, owner: int, blocks: Int64) -> Int64:
+    """Slots of an owner in blocks in which it has one."""
+    slots = np.empty(len(blocks), np.int64)
+    for index in range(len(blocks)):
+        slot = _home_slot(table.keys, blocks[index])
+        while table.keys[slot] != blocks[index] or table.owners[slot] != owner:
+            slot = (slot + 1) & (len(table.keys) - 1)
+        slots[index] = slot
+    return slots
+
+
+@kernel
+def rehash(table: CellTable, larger: CellTable) -> int:
+    """Copy all slots with an owner to an empty table; returns their number."""
+    used = 0
+    for slot in range(len(table.keys)):
+        if table.owners[slot] < 0:
+            continue
+        target = _home_slot(larger.keys, table.keys[slot])
+        while larger.keys[target] != -1:
+            target = (target + 1) & (len(larger.keys) - 1)
+        larger.keys[target] = table.keys[slot]
+        larger.masks[target] = table.masks[slot]
+        larger.owners[target] = table.owners[slot]
+        used += 1
+    return used

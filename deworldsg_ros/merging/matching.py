@@ -1,0 +1,152 @@
+"""Matching of the objects of a frame with the nodes that their surfaces overlap."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.nodes import NodeTable
+
+# Minimum overlap fraction of a match whose classes differ. Without a match of different classes,
+# labels that flip create nodes of their own (docs/dev/notebook.md).
+OVERLAP_THRESHOLD_OTHER_CLASS = 0.55
+# Maximum size ratio of two matched objects whose classes differ. A book lies wholly on the cells of
+# the table below it.
+SIZE_RATIO_OTHER_CLASS = 5.0
+# Classes agree if two labels, one drawn from each distribution, are equal with this probability.
+CLASS_AGREEMENT = 0.3
+# Weights of the agreement of classes and of Gaussians in the match score; the overlap fraction has
+# weight 1. Objects in a row touch each other's cells: then the Gaussians disambiguate.
+CLASS_WEIGHT = 0.5
+GAUSSIAN_WEIGHT = 0.5
+# Maximum distance of the means of a match, in standard deviations of the object's or of the node's
+# Gaussian. The mean of a part of an evenly observed object lies within 3.
+MAX_DEVIATIONS = 4.0
+
+
+class _Items(NamedTuple):
+    """Gaussians and class distributions of n objects or nodes."""
+
+    means: Float64
+    covariances: Float64
+    class_probabilities: Float64
+
+
+def match_scores(
+    local: LocalGraph,
+    nodes: NodeTable,
+    rows: Int64,
+    overlaps: Float64,
+    overlap_threshold: float,
+    cell_m: float,
+) -> tuple[Float64, Bool]:
+    """Match score of each object of a frame with each of some nodes.
+
+    Args:
+        local: n objects.
+        nodes: the nodes of the graph.
+        rows: (k,) rows of the nodes to compare with.
+        overlaps: (n, k) overlap fractions of their surfaces.
+        overlap_threshold: minimum overlap fraction of a match whose classes agree.
+        cell_m: edge of a cell, metres.
+
+    Returns:
+        (n, k) float64: overlap + CLASS_WEIGHT · Σ p q + GAUSSIAN_WEIGHT · exp(-BD); 0 = no match.
+        BD is the Bhattacharyya distance of the two Gaussians, both blurred by the size of a cell.
+        And (n, k) bool: whether the surfaces touch and the classes agree.
+    """
+    return _match_scores(
+        _Items(local.means_world, local.covariances_world, local.class_probabilities),
+        _Items(nodes.means, nodes.covariances, nodes.class_probabilities),
+        rows,
+        overlaps,
+        overlap_threshold,
+        # Variance of a point in a cell along each axis, if only the cell is known.
+        cell_m**2 / 12,
+    )
+
+
+def one_to_one(scores: Float64) -> list[int]:
+    """One-to-one assignment with the greatest total score: column of each row, -1 = none."""
+    matched = [-1] * len(scores)
+    for row, column in zip(*(ends.tolist() for ends in linear_sum_assignment(scores, True))):
+        if scores[row, column] > 0:
+            matched[row] = column
+    return matched
+
+
+def warm_up() -> None:
+    """Compile the kernel, or load it from the cache."""
+    item = _Items(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
+    _match_scores(item, item, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 1.0)
+
+
+@kernel
+def _solve(covariance: Float64, d0: float, d1: float, d2: float) -> tuple[float, float]:
+    """|Σ| and dᵀΣ⁻¹d by the LDLᵀ pivots of a covariance."""
+    c00 = covariance[0, 0]
+    l10 = covariance[1, 0] / c00
+    l20 = covariance[2, 0] / c00
+    pivot_1 = covariance[1, 1] - l10 * covariance[1, 0]
+    rest = covariance[2, 1] - l20 * covariance[1, 0]
+    pivot_2 = covariance[2, 2] - l20 * covariance[2, 0] - rest / pivot_1 * rest
+    y1 = d1 - l10 * d0
+    y2 = d2 - l20 * d0 - rest / pivot_1 * y1
+    squared = d0 * d0 / c00 + y1 * y1 / pivot_1 + y2 * y2 / pivot_2
+    return c00 * pivot_1 * pivot_2, squared
+
+
+@kernel
+def _match_scores(
+    objects: _Items,
+    nodes: _Items,
+    rows: Int64,
+    overlaps: Float64,
+    overlap_threshold: float,
+    blur_m2: float,
+) -> tuple[Float64, Bool]:
+    scores = np.zeros(overlaps.shape)
+    touching = np.zeros(overlaps.shape, np.bool_)
+    blur = blur_m2 * np.eye(3)
+    for index in range(len(overlaps)):
+        for column in range(len(rows)):
+            overlap = overlaps[index, column]
+            if overlap == 0.0:
+                continue
+            row = rows[column]
+            agreement = 0.0
+            for label in range(objects.class_probabilities.shape[1]):
+                agreement += (
+                    objects.class_probabilities[index, label]
+                    * nodes.class_probabilities[row, label]
+                )
+            agree = agreement > CLASS_AGREEMENT
+            touching[index, column] = agree
+            if overlap < (overlap_threshold if agree else OVERLAP_THRESHOLD_OTHER_CLASS):
+                continue
+            a = objects.covariances[index] + blur
+            b = nodes.covariances[row] + blur
+            if not agree:
+                size_a = a[0, 0] + a[1, 1] + a[2, 2]
+                size_b = b[0, 0] + b[1, 1] + b[2, 2]
+                if max(size_a, size_b) > SIZE_RATIO_OTHER_CLASS**2 * min(size_a, size_b):
+                    continue
+            d0 = objects.means[index, 0] - nodes.means[row, 0]
+            d1 = objects.means[index, 1] - nodes.means[row, 1]
+            d2 = objects.means[index, 2] - nodes.means[row, 2]
+            determinant_a, squared_a = _solve(a, d0, d1, d2)
+            determinant_b, squared_b = _solve(b, d0, d1, d2)
+            if min(squared_a, squared_b) > MAX_DEVIATIONS**2:
+                continue
+            determinant, squared = _solve((a + b) / 2, d0, d1, d2)
+            likeness = math.exp(-squared / 8) * math.sqrt(
+                math.sqrt(determinant_a * determinant_b) / determinant
+            )
+            scores[index, column] = overlap + CLASS_WEIGHT * agreement + GAUSSIAN_WEIGHT * likeness
+    return scores, touching

@@ -1,0 +1,169 @@
+"""Match scores against their formulas, the assignment, and the evidence for merging nodes."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from numpy.typing import ArrayLike
+from support.merging import local_graph, random_classes, random_covariances, seeds
+
+from deworldsg_ros.merging.joint import SEPARATE_WEIGHT, JointEvidence
+from deworldsg_ros.merging.matching import (
+    CLASS_AGREEMENT,
+    CLASS_WEIGHT,
+    GAUSSIAN_WEIGHT,
+    MAX_DEVIATIONS,
+    OVERLAP_THRESHOLD_OTHER_CLASS,
+    SIZE_RATIO_OTHER_CLASS,
+    match_scores,
+    one_to_one,
+)
+from deworldsg_ros.scene.gaussian import bhattacharyya_distance
+from deworldsg_ros.scene.nodes import NodeTable
+
+OVERLAP_THRESHOLD = 0.3
+CELL_M = 0.03
+
+
+def deviations(difference: np.ndarray, covariance: np.ndarray) -> float:
+    return float(np.sqrt(difference @ np.linalg.solve(covariance, difference)))
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_match_scores_equal_the_formulas(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    local = local_graph(
+        1, rng.normal(0, 0.3, (4, 3)), random_covariances(rng, 4, 0.01), random_classes(rng, 4)
+    )
+    nodes = NodeTable(4)
+    for index in range(5):
+        covariance, classes = random_covariances(rng, 1, 0.01)[0], random_classes(rng, 1)[0]
+        nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
+    rows = rng.permutation(5)[:3]
+    overlaps = rng.uniform(0, 1, (4, 3))
+    scores, touching = match_scores(local, nodes, rows, overlaps, OVERLAP_THRESHOLD, CELL_M)
+    blur = CELL_M**2 / 12 * np.eye(3)
+    for (index, column), overlap in np.ndenumerate(overlaps):
+        row = rows[column]
+        agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
+        same = agreement > CLASS_AGREEMENT
+        threshold = OVERLAP_THRESHOLD if same else OVERLAP_THRESHOLD_OTHER_CLASS
+        ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
+        difference = local.means_world[index] - nodes.means[row]
+        apart = min(deviations(difference, ours), deviations(difference, theirs))
+        distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
+        score = overlap + CLASS_WEIGHT * agreement + GAUSSIAN_WEIGHT * np.exp(-distance)
+        sizes = np.sqrt([np.trace(ours), np.trace(theirs)])
+        alike = same or sizes.max() <= SIZE_RATIO_OTHER_CLASS * sizes.min()
+        matches = overlap >= threshold and alike and apart <= MAX_DEVIATIONS
+        assert scores[index, column] == pytest.approx(score if matches else 0.0, abs=1e-9)
+        assert touching[index, column] == same
+
+
+def test_a_frame_without_objects_has_no_matches() -> None:
+    empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
+    scores, touching = match_scores(
+        empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), OVERLAP_THRESHOLD, CELL_M
+    )
+    assert scores.shape == touching.shape == (0, 0)
+    assert one_to_one(scores) == []
+    assert one_to_one(np.zeros((2, 0))) == [-1, -1]
+
+
+@given(seeds)
+@settings(max_examples=25)
+def test_the_assignment_has_the_greatest_total(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scores = rng.uniform(0, 2, (3, 4)) * (rng.random((3, 4)) < 0.6)
+    matched = one_to_one(scores)
+    taken = [column for column in matched if column >= 0]
+    assert len(taken) == len(set(taken))
+    total = sum(scores[row, column] for row, column in enumerate(matched) if column >= 0)
+    assert all(scores[row, column] > 0 for row, column in enumerate(matched) if column >= 0)
+    best = max(
+        scores[range(3), list(columns)].sum() for columns in itertools.permutations(range(4), 3)
+    )
+    assert total == pytest.approx(best)
+
+
+def add_frame(
+    evidence: JointEvidence, seen: list[int], known: list[int], scores: ArrayLike
+) -> None:
+    """One frame of objects; each touches the owners with which it has a match score."""
+    match_scores = np.array(scores).reshape(len(seen), len(known))
+    matched = [known.index(owner) if owner in known else -1 for owner in seen]
+    evidence.add_frame(seen, known, match_scores, match_scores > 0, matched)
+
+
+def test_a_frame_that_shows_two_objects_outweighs_ten_overlaps() -> None:
+    evidence = JointEvidence()
+    for _ in range(2):
+        add_frame(evidence, [4], [4, 7], [[1, 1]])
+        assert evidence.next_merge() is None
+    add_frame(evidence, [4], [4, 7], [[1, 1]])
+    assert evidence.next_merge() == (4, 7)
+    evidence.forget(7)
+
+    # Two objects of one frame, which need not touch.
+    add_frame(evidence, [4, 7], [4, 7], [[1, 0], [0, 1]])
+    for _ in range(12):
+        add_frame(evidence, [4], [4, 7], [[1, 1]])
+    assert evidence.next_merge() is None
+    add_frame(evidence, [4], [4, 7], [[1, 1]])
+    assert evidence.next_merge() == (4, 7)
+    evidence.forget(7)
+    assert evidence.next_merge() is None
+    assert evidence.balances == {}
+
+
+def test_nodes_that_touch_in_nine_frames_are_merged() -> None:
+    evidence = JointEvidence()
+    scores, touching = np.array([[1.0, 0.0]]), np.ones((1, 2), bool)
+    for _ in range(8):
+        evidence.add_frame([4], [4, 7], scores, touching, [0])
+    assert evidence.next_merge() is None
+    evidence.add_frame([4], [4, 7], scores, touching, [0])
+    assert evidence.next_merge() == (4, 7)
+
+
+def test_a_new_node_is_separate_from_the_others_of_its_frame() -> None:
+    evidence = JointEvidence()
+    add_frame(evidence, [2, 5], [2], [[1], [0.5]])
+    assert evidence.balances == {(2, 5): -SEPARATE_WEIGHT}
+
+
+def test_a_merged_node_keeps_the_separations_of_both_parts() -> None:
+    evidence = JointEvidence()
+    add_frame(evidence, [1, 3], [], [[], []])
+    add_frame(evidence, [2, 3], [3], [[0], [1]])
+    evidence.merge(1, 2)
+    assert evidence.balances == {(1, 3): -2 * SEPARATE_WEIGHT}
+
+
+def test_a_node_that_overlaps_two_separate_nodes_merges_with_one_only() -> None:
+    evidence = JointEvidence()
+    add_frame(evidence, [2, 3], [], [[], []])
+    for _ in range(3):
+        add_frame(evidence, [1], [1, 2, 3], [[1, 1, 1]])
+    pair = evidence.next_merge()
+    assert pair in {(1, 2), (1, 3)}
+    evidence.merge(*pair)
+    assert evidence.next_merge() is None
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_evidence_continues_from_its_balances(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    evidence, restored = JointEvidence(), JointEvidence()
+    for _ in range(30):
+        owners = rng.permutation(6)[: rng.integers(1, 5)].tolist()
+        add_frame(
+            evidence, owners, [*owners, 6], rng.integers(0, 2, (len(owners), len(owners) + 1))
+        )
+    restored.restore(evidence.balances)
+    assert restored.balances == evidence.balances
