@@ -51,14 +51,10 @@ class _Samples(NamedTuple):
     frames: Int64
 
 
-class _Camera(NamedTuple):
-    """Pinhole camera of a depth grid; pixels of the full image."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    stride_px: int
+# The arrays of `_Samples` as a plain tuple, and the camera of a depth grid: fx, fy, cx, cy, stride,
+# pixels of the full image. Numba is slower to call with named tuples.
+_SampleArrays = tuple[Float32, Int64, Float64, Int64]
+_Camera = tuple[float, float, float, float, int]
 
 
 class AbsenceEvidence:
@@ -91,7 +87,7 @@ class AbsenceEvidence:
                 np.pad(samples.frames, (0, more)),
             )
         _update_points(
-            self._samples,
+            self._samples[:],
             np.array(owners, np.int64),
             nodes.surface_points_world,
             nodes.surface_counts,
@@ -118,31 +114,31 @@ class AbsenceEvidence:
         """
         camera = grid.intrinsics
         absent, visibilities = _observe(
-            self._samples,
+            self._samples[:],
             self._absent_frames,
             np.array(detected, np.int64),
             invert_pose(T_world_camera),
             grid.depth_mm,
-            _Camera(camera.fx, camera.fy, camera.cx, camera.cy, grid.stride_px),
+            (camera.fx, camera.fy, camera.cx, camera.cy, grid.stride_px),
         )
         return absent.tolist(), visibilities
 
 
 @kernel
 def _update_points(
-    samples: _Samples, owners: Int64, points: Float32, counts: Int64, rows: Int64
+    samples: _SampleArrays, owners: Int64, points: Float32, counts: Int64, rows: Int64
 ) -> None:
-    balls = samples.balls_world
+    kept_points, kept_counts, balls, frames = samples
     for index in range(len(owners)):
         owner, row = owners[index], rows[index]
         count = min(counts[row], SAMPLED_POINTS)
-        samples.counts[owner] = count
-        samples.frames[owner] = 0
+        kept_counts[owner] = count
+        frames[owner] = 0
         for axis in range(4):
             balls[owner, axis] = 0.0
         for point in range(count):
             for axis in range(3):
-                samples.points_world[owner, point, axis] = points[row, point, axis]
+                kept_points[owner, point, axis] = points[row, point, axis]
                 balls[owner, axis] += points[row, point, axis] / count
         for point in range(count):
             squared = 0.0
@@ -169,7 +165,7 @@ def _is_out_of_view(
     """Whether a ball is behind the camera, or completely beyond one side of the image."""
     x, y, z = _in_camera(T_camera_world, ball[0], ball[1], ball[2])
     radius = ball[3]
-    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    fx, fy, cx, cy, _ = camera
     right, below = cx - width_px, cy - height_px
     return bool(
         z < NEAR_M - radius
@@ -185,6 +181,7 @@ def _compare(
     points: Float32, count: int, T_camera_world: Float64, depth_mm: UInt16, camera: _Camera
 ) -> tuple[int, int, int]:
     """Number of points that are seen through, present, and in the image."""
+    fx, fy, cx, cy, stride = camera
     rows, columns = depth_mm.shape
     through = present = inside = 0
     most_hidden = (1.0 - MIN_IN_VIEW_FRACTION) * count
@@ -200,8 +197,8 @@ def _compare(
         )
         if z < NEAR_M:
             continue
-        column = int(np.floor((camera.fx * x / z + camera.cx) / camera.stride_px))
-        row = int(np.floor((camera.fy * y / z + camera.cy) / camera.stride_px))
+        column = int(np.floor((fx * x / z + cx) / stride))
+        row = int(np.floor((fy * y / z + cy) / stride))
         if column < 0 or row < 0 or column >= columns or row >= rows:
             continue
         inside += 1
@@ -218,14 +215,15 @@ def _compare(
 
 @kernel
 def _observe(
-    samples: _Samples,
+    samples: _SampleArrays,
     absent_frames: int,
     detected: Int64,
     T_camera_world: Float64,
     depth_mm: UInt16,
     camera: _Camera,
 ) -> tuple[Int64, Int64]:
-    counts, frames = samples.counts, samples.frames
+    points, counts, balls, frames = samples
+    stride = camera[4]
     is_detected = np.zeros(len(counts), np.bool_)
     for owner in detected:
         if owner < len(counts):
@@ -233,16 +231,13 @@ def _observe(
             frames[owner] = 0
     absent = np.zeros(len(counts), np.bool_)
     visibilities = np.full(len(counts), NOT_VISIBLE)
-    width_px, height_px = depth_mm.shape[1] * camera.stride_px, depth_mm.shape[0] * camera.stride_px
+    width_px, height_px = depth_mm.shape[1] * stride, depth_mm.shape[0] * stride
     for owner in range(len(counts)):
         absent[owner] = absent_frames <= frames[owner]
-        ball = samples.balls_world[owner]
-        if _is_out_of_view(ball, T_camera_world, width_px, height_px, camera):
+        if _is_out_of_view(balls[owner], T_camera_world, width_px, height_px, camera):
             continue
         count = counts[owner]
-        through, present, inside = _compare(
-            samples.points_world[owner], count, T_camera_world, depth_mm, camera
-        )
+        through, present, inside = _compare(points[owner], count, T_camera_world, depth_mm, camera)
         visible = through + present
         if visible < MIN_VISIBLE_POINTS or visible < MIN_IN_VIEW_FRACTION * count:
             continue

@@ -69,6 +69,11 @@ class CellTable(NamedTuple):
     marks: UInt64
 
 
+# The kernels take the same arrays as plain tuples: numba is slower to call with named ones.
+TableArrays = tuple[Int64, UInt64, Int32, UInt64]
+SetArrays = tuple[Int64, UInt64, Int64]
+
+
 def new_table(capacity: int) -> CellTable:
     """An empty table; the capacity is a power of two."""
     return CellTable(
@@ -126,16 +131,17 @@ def _cell_of(point: Float32, cells_per_m: float) -> tuple[np.int64, np.uint64]:
 
 
 @kernel
-def contains(table: CellTable, owner: int, points: Float32, cell_m: float) -> Bool:
+def contains(table: TableArrays, owner: int, points: Float32, cell_m: float) -> Bool:
     """Whether each point (k, 3) lies in a cell of an owner."""
+    keys, masks, slot_owners, marks = table
     contained = np.zeros(len(points), np.bool_)
     for index in range(len(points)):
         block, bit = _cell_of(points[index], 1.0 / cell_m)
-        slot = _home_slot(table.keys, block)
-        while table.keys[slot] != -1:
-            if table.keys[slot] == block and table.owners[slot] == owner:
-                contained[index] = table.masks[slot] & bit != 0
-            slot = (slot + 1) & (len(table.keys) - 1)
+        slot = _home_slot(keys, block)
+        while keys[slot] != -1:
+            if keys[slot] == block and slot_owners[slot] == owner:
+                contained[index] = masks[slot] & bit != 0
+            slot = (slot + 1) & (len(keys) - 1)
     return contained
 
 
@@ -170,31 +176,32 @@ def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt
 
 
 @kernel
-def _find_slots(table: CellTable, block: np.int64, owner: int) -> tuple[int, int, int, np.uint64]:
+def _find_slots(table: TableArrays, block: np.int64, owner: int) -> tuple[int, int, int, np.uint64]:
     """The owner's slot of a block, a removed slot (-1 = none), the next empty slot, and the cells
     of the block that have four owners.
     """
+    keys, masks, slot_owners, marks = table
     own = removed = -1
     # The three bits of the number of owners of each cell.
     ones = twos = fours = np.uint64(0)
-    slot = _home_slot(table.keys, block)
-    while table.keys[slot] != -1:
-        if table.owners[slot] < 0:
+    slot = _home_slot(keys, block)
+    while keys[slot] != -1:
+        if slot_owners[slot] < 0:
             removed = slot
-        elif table.keys[slot] == block:
-            if table.owners[slot] == owner:
+        elif keys[slot] == block:
+            if slot_owners[slot] == owner:
                 own = slot
-            carried = ones & table.masks[slot]
-            ones ^= table.masks[slot]
+            carried = ones & masks[slot]
+            ones ^= masks[slot]
             fours |= twos & carried
             twos ^= carried
-        slot = (slot + 1) & (len(table.keys) - 1)
+        slot = (slot + 1) & (len(keys) - 1)
     return own, removed, slot, fours
 
 
 @kernel
 def add(
-    table: CellTable, counts: Int64, max_cells: int, used: int, owners: Int64, sets: CellSets
+    table: TableArrays, counts: Int64, max_cells: int, used: int, owners: Int64, sets: SetArrays
 ) -> tuple[Int64, Int64, int]:
     """Add the cells of each set to its owner.
 
@@ -209,17 +216,19 @@ def add(
     Returns:
         The blocks that are new to their owner, their starts by set, and the new `used`.
     """
-    new = np.empty(len(sets.blocks), np.int64)
-    new_starts = np.zeros(len(sets.starts), np.int64)
+    keys, masks, slot_owners, marks = table
+    blocks, set_masks, starts = sets
+    new = np.empty(len(blocks), np.int64)
+    new_starts = np.zeros(len(starts), np.int64)
     new_count = 0
     for index in range(len(owners)):
         owner = owners[index]
-        for at in range(sets.starts[index], sets.starts[index + 1]):
-            slot, removed, empty, full = _find_slots(table, sets.blocks[at], owner)
+        for at in range(starts[index], starts[index + 1]):
+            slot, removed, empty, full = _find_slots(table, blocks[at], owner)
             # A cell keeps four owners; a fifth is not recorded.
-            cells = sets.masks[at] & ~full
+            cells = set_masks[at] & ~full
             if slot >= 0:
-                cells &= ~table.masks[slot]
+                cells &= ~masks[slot]
             while _bit_count(cells) > max_cells - counts[owner]:
                 cells &= cells - np.uint64(1)
             if cells == 0:
@@ -227,20 +236,34 @@ def add(
             if slot < 0:
                 slot = empty if removed < 0 else removed
                 used += int(removed < 0)
-                table.keys[slot] = sets.blocks[at]
-                table.owners[slot] = owner
-                new[new_count] = sets.blocks[at]
+                keys[slot] = blocks[at]
+                slot_owners[slot] = owner
+                new[new_count] = blocks[at]
                 new_count += 1
-            table.masks[slot] |= cells
+            masks[slot] |= cells
             counts[owner] += _bit_count(cells)
         new_starts[index + 1] = new_count
     return new[:new_count].copy(), new_starts, used
 
 
 @kernel
-def overlaps(table: CellTable, counts: Int64, used: int, sets: CellSets) -> tuple[Int64, Float64]:
+def _mark(slot: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_count: int) -> int:
+    """Mark cells of a slot; lists the slot if it is new, and returns the number of slots listed."""
+    if cells != 0 and marks[slot] == 0:
+        marked[marked_count] = slot
+        marked_count += 1
+    marks[slot] |= cells
+    return marked_count
+
+
+@kernel
+def overlaps(
+    table: TableArrays, counts: Int64, used: int, sets: SetArrays
+) -> tuple[Int64, Float64]:
     """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
-    set_count = len(sets.starts) - 1
+    keys, masks, slot_owners, marks = table
+    blocks, set_masks, starts = sets
+    set_count = len(starts) - 1
     # Cells of the set that lie on the owner, and cells of the owner that the set meets.
     on_owner = np.zeros((set_count, len(counts)), np.int64)
     of_owner = np.zeros((set_count, len(counts)), np.int64)
@@ -251,14 +274,10 @@ def overlaps(table: CellTable, counts: Int64, used: int, sets: CellSets) -> tupl
     marked = np.empty(used, np.int64)
     for index in range(set_count):
         marked_count = 0
-        for at in range(sets.starts[index], sets.starts[index + 1]):
-            owner_count = 0
-            # The block itself (-1), then the adjacent blocks that the cells touch through a face.
-            for face in range(-1, 6):
-                owner_count, marked_count = _meet(
-                    table, sets.blocks[at], sets.masks[at], face,
-                    on_block, block_owners, owner_count, marked, marked_count,
-                )  # fmt: skip
+        for at in range(starts[index], starts[index + 1]):
+            owner_count, marked_count = _meet(
+                table, blocks[at], set_masks[at], on_block, block_owners, marked, marked_count
+            )
             for position in range(owner_count):
                 owner = block_owners[position]
                 on_owner[index, owner] += _bit_count(on_block[owner])
@@ -266,67 +285,67 @@ def overlaps(table: CellTable, counts: Int64, used: int, sets: CellSets) -> tupl
                 met[owner] = True
         for position in range(marked_count):
             slot = marked[position]
-            of_owner[index, table.owners[slot]] += _bit_count(table.marks[slot])
-            table.marks[slot] = 0
+            of_owner[index, slot_owners[slot]] += _bit_count(marks[slot])
+            marks[slot] = 0
     columns = np.flatnonzero(met)
     return columns, _fractions(columns, on_owner, of_owner, counts, sets)
 
 
 @kernel
 def _meet(
-    table: CellTable,
+    table: TableArrays,
     set_block: np.int64,
     set_mask: np.uint64,
-    face: int,
     on_block: UInt64,
     block_owners: Int64,
-    owner_count: int,
     marked: Int64,
     marked_count: int,
 ) -> tuple[int, int]:
     """Record the owners that the cells of one block of a set meet, in it or through a face.
 
     Returns:
-        The new numbers of block owners and of marked slots.
+        The number of owners, and the new number of marked slots.
     """
-    block = set_block
-    touching = _dilated(set_mask)
-    if face >= 0:
-        block += _STEPS[face]
-        touching = _rotated(set_mask & _FACES[face], _ROTATIONS[face])
-        if touching == 0:
-            return owner_count, marked_count
-    slot = _home_slot(table.keys, block)
-    while table.keys[slot] != -1:
-        cells = touching & table.masks[slot]
-        if table.keys[slot] == block and cells != 0:
-            owner = table.owners[slot]
-            if table.marks[slot] == 0:
-                marked[marked_count] = slot
-                marked_count += 1
-            table.marks[slot] |= cells
-            if on_block[owner] == 0:
-                block_owners[owner_count] = owner
-                owner_count += 1
-            if face >= 0:
-                on_block[owner] |= _rotated(cells, np.uint64(64) - _ROTATIONS[face])
-            else:
-                on_block[owner] |= _dilated(table.masks[slot]) & set_mask
-        slot = (slot + 1) & (len(table.keys) - 1)
+    keys, masks, slot_owners, marks = table
+    owner_count = 0
+    # The block itself (-1), then the adjacent blocks that the cells touch through a face.
+    for face in range(-1, 6):
+        block = set_block
+        touching = _dilated(set_mask)
+        if face >= 0:
+            block += _STEPS[face]
+            touching = _rotated(set_mask & _FACES[face], _ROTATIONS[face])
+            if touching == 0:
+                continue
+        slot = _home_slot(keys, block)
+        while keys[slot] != -1:
+            cells = touching & masks[slot]
+            if keys[slot] == block and cells != 0:
+                owner = slot_owners[slot]
+                marked_count = _mark(slot, cells, marks, marked, marked_count)
+                if on_block[owner] == 0:
+                    block_owners[owner_count] = owner
+                    owner_count += 1
+                if face >= 0:
+                    on_block[owner] |= _rotated(cells, np.uint64(64) - _ROTATIONS[face])
+                else:
+                    on_block[owner] |= _dilated(masks[slot]) & set_mask
+            slot = (slot + 1) & (len(keys) - 1)
     return owner_count, marked_count
 
 
 @kernel
 def _fractions(
-    columns: Int64, on_owner: Int64, of_owner: Int64, counts: Int64, sets: CellSets
+    columns: Int64, on_owner: Int64, of_owner: Int64, counts: Int64, sets: SetArrays
 ) -> Float64:
     """Overlap fraction of each set (row) with each of some owners (column)."""
-    set_count = len(sets.starts) - 1
+    blocks, set_masks, starts = sets
+    set_count = len(starts) - 1
     fractions = np.zeros((set_count, len(columns)))
     for index in range(set_count):
         cell_count = 0
-        for at in range(sets.starts[index], sets.starts[index + 1]):
-            cell_count += _bit_count(sets.masks[at])
+        for at in range(starts[index], starts[index + 1]):
+            cell_count += _bit_count(set_masks[at])
         for column in range(len(columns)):
             owner = columns[column]
             if on_owner[index, owner] > 0:
@@ -338,44 +357,32 @@ def _fractions(
 
 
 @kernel
-def _dilated_set(block: np.int64, sets: CellSets, index: int) -> np.uint64:
+def _dilated_set(
+    block: np.int64, blocks: Int64, set_masks: UInt64, start: int, stop: int
+) -> np.uint64:
     """Cells of a block that are in a set, or share a face with a cell of the set."""
     near = np.uint64(0)
-    for at in range(sets.starts[index], sets.starts[index + 1]):
-        if sets.blocks[at] == block:
-            near |= _dilated(sets.masks[at])
+    for at in range(start, stop):
+        if blocks[at] == block:
+            near |= _dilated(set_masks[at])
         for face in range(6):
-            if sets.blocks[at] + _STEPS[face] == block:
-                near |= _rotated(sets.masks[at] & _FACES[face], _ROTATIONS[face])
+            if blocks[at] + _STEPS[face] == block:
+                near |= _rotated(set_masks[at] & _FACES[face], _ROTATIONS[face])
     return near
 
 
 @kernel
-def _contested(
-    table: CellTable, slot: int, sets: CellSets, at: int, set_owner: int, set_of: Int64
-) -> np.uint64:
-    """Cells of a slot that a set of another owner contains, and that are not near the set of the
-    slot's owner.
-    """
-    cells = sets.masks[at] & table.masks[slot] & ~table.marks[slot]
-    if table.keys[slot] != sets.blocks[at] or cells == 0:
-        return np.uint64(0)
-    owner = table.owners[slot]
-    if owner == set_owner or set_of[owner] < 0:
-        return np.uint64(0)
-    return np.uint64(cells & ~_dilated_set(sets.blocks[at], sets, set_of[owner]))
-
-
-@kernel
 def contest(
-    table: CellTable,
+    table: TableArrays,
     counts: Int64,
     used: int,
     owners: Int64,
-    sets: CellSets,
+    sets: SetArrays,
     min_fraction: float,
 ) -> Int64:
     """Number of cells that each owner lost; see `VoxelMap.contest`."""
+    keys, masks, slot_owners, marks = table
+    blocks, set_masks, starts = sets
     set_of = np.full(len(counts), -1, np.int64)
     for index in range(len(owners)):
         if owners[index] >= 0:
@@ -384,54 +391,58 @@ def contest(
     marked = np.empty(used, np.int64)
     marked_count = 0
     for index in range(len(owners)):
-        for at in range(sets.starts[index], sets.starts[index + 1]):
-            slot = _home_slot(table.keys, sets.blocks[at])
-            while table.keys[slot] != -1:
-                cells = _contested(table, slot, sets, at, owners[index], set_of)
-                if cells != 0:
-                    if table.marks[slot] == 0:
-                        marked[marked_count] = slot
-                        marked_count += 1
-                    table.marks[slot] |= cells
-                    lost[table.owners[slot]] += _bit_count(cells)
-                slot = (slot + 1) & (len(table.keys) - 1)
+        for at in range(starts[index], starts[index + 1]):
+            slot = _home_slot(keys, blocks[at])
+            while keys[slot] != -1:
+                owner = slot_owners[slot]
+                cells = set_masks[at] & masks[slot] & ~marks[slot]
+                is_block = keys[slot] == blocks[at] and cells != 0
+                if is_block and owner != owners[index] and set_of[owner] >= 0:
+                    start, stop = starts[set_of[owner]], starts[set_of[owner] + 1]
+                    cells &= ~_dilated_set(blocks[at], blocks, set_masks, start, stop)
+                    marked_count = _mark(slot, cells, marks, marked, marked_count)
+                    lost[owner] += _bit_count(cells)
+                slot = (slot + 1) & (len(keys) - 1)
     for owner in range(len(counts)):
         if lost[owner] <= min_fraction * counts[owner]:
             lost[owner] = 0
     for position in range(marked_count):
         slot = marked[position]
-        if lost[table.owners[slot]] > 0:
-            table.masks[slot] &= ~table.marks[slot]
-        table.marks[slot] = 0
+        if lost[slot_owners[slot]] > 0:
+            masks[slot] &= ~marks[slot]
+        marks[slot] = 0
     for owner in range(len(counts)):
         counts[owner] -= lost[owner]
     return lost
 
 
 @kernel
-def slots_of(table: CellTable, owner: int, blocks: Int64) -> Int64:
+def slots_of(table: TableArrays, owner: int, blocks: Int64) -> Int64:
     """Slots of an owner in blocks in which it has one."""
+    keys, masks, slot_owners, marks = table
     slots = np.empty(len(blocks), np.int64)
     for index in range(len(blocks)):
-        slot = _home_slot(table.keys, blocks[index])
-        while table.keys[slot] != blocks[index] or table.owners[slot] != owner:
-            slot = (slot + 1) & (len(table.keys) - 1)
+        slot = _home_slot(keys, blocks[index])
+        while keys[slot] != blocks[index] or slot_owners[slot] != owner:
+            slot = (slot + 1) & (len(keys) - 1)
         slots[index] = slot
     return slots
 
 
 @kernel
-def rehash(table: CellTable, larger: CellTable) -> int:
+def rehash(table: TableArrays, larger: TableArrays) -> int:
     """Copy all slots with an owner to an empty table; returns their number."""
+    keys, masks, slot_owners, _ = table
+    new_keys, new_masks, new_owners, _ = larger
     used = 0
-    for slot in range(len(table.keys)):
-        if table.owners[slot] < 0:
+    for slot in range(len(keys)):
+        if slot_owners[slot] < 0:
             continue
-        target = _home_slot(larger.keys, table.keys[slot])
-        while larger.keys[target] != -1:
-            target = (target + 1) & (len(larger.keys) - 1)
-        larger.keys[target] = table.keys[slot]
-        larger.masks[target] = table.masks[slot]
-        larger.owners[target] = table.owners[slot]
+        target = _home_slot(new_keys, keys[slot])
+        while new_keys[target] != -1:
+            target = (target + 1) & (len(new_keys) - 1)
+        new_keys[target] = keys[slot]
+        new_masks[target] = masks[slot]
+        new_owners[target] = slot_owners[slot]
         used += 1
     return used

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -30,12 +29,8 @@ GAUSSIAN_WEIGHT = 0.5
 MAX_DEVIATIONS = 4.0
 
 
-class _Items(NamedTuple):
-    """Gaussians and class distributions of n objects or nodes."""
-
-    means: Float64
-    covariances: Float64
-    class_probabilities: Float64
+# Means, covariances and class distributions of n objects or nodes.
+_Items = tuple[Float64, Float64, Float64]
 
 
 def match_scores(
@@ -62,8 +57,8 @@ def match_scores(
         And (n, k) bool: whether the surfaces touch and the classes agree.
     """
     return _match_scores(
-        _Items(local.means_world, local.covariances_world, local.class_probabilities),
-        _Items(nodes.means, nodes.covariances, nodes.class_probabilities),
+        (local.means_world, local.covariances_world, local.class_probabilities),
+        (nodes.means, nodes.covariances, nodes.class_probabilities),
         rows,
         overlaps,
         overlap_threshold,
@@ -83,7 +78,7 @@ def one_to_one(scores: Float64) -> list[int]:
 
 def warm_up() -> None:
     """Compile the kernel, or load it from the cache."""
-    item = _Items(np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
+    item = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
     _match_scores(item, item, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 1.0)
 
 
@@ -111,6 +106,8 @@ def _match_scores(
     overlap_threshold: float,
     blur_m2: float,
 ) -> tuple[Float64, Bool]:
+    means, covariances, classes = objects
+    node_means, node_covariances, node_classes = nodes
     scores = np.zeros(overlaps.shape)
     touching = np.zeros(overlaps.shape, np.bool_)
     blur = blur_m2 * np.eye(3)
@@ -121,25 +118,22 @@ def _match_scores(
                 continue
             row = rows[column]
             agreement = 0.0
-            for label in range(objects.class_probabilities.shape[1]):
-                agreement += (
-                    objects.class_probabilities[index, label]
-                    * nodes.class_probabilities[row, label]
-                )
+            for label in range(classes.shape[1]):
+                agreement += classes[index, label] * node_classes[row, label]
             agree = agreement > CLASS_AGREEMENT
             touching[index, column] = agree
             if overlap < (overlap_threshold if agree else OVERLAP_THRESHOLD_OTHER_CLASS):
                 continue
-            a = objects.covariances[index] + blur
-            b = nodes.covariances[row] + blur
+            a = covariances[index] + blur
+            b = node_covariances[row] + blur
             if not agree:
                 size_a = a[0, 0] + a[1, 1] + a[2, 2]
                 size_b = b[0, 0] + b[1, 1] + b[2, 2]
                 if max(size_a, size_b) > SIZE_RATIO_OTHER_CLASS**2 * min(size_a, size_b):
                     continue
-            d0 = objects.means[index, 0] - nodes.means[row, 0]
-            d1 = objects.means[index, 1] - nodes.means[row, 1]
-            d2 = objects.means[index, 2] - nodes.means[row, 2]
+            d0 = means[index, 0] - node_means[row, 0]
+            d1 = means[index, 1] - node_means[row, 1]
+            d2 = means[index, 2] - node_means[row, 2]
             determinant_a, squared_a = _solve(a, d0, d1, d2)
             determinant_b, squared_b = _solve(b, d0, d1, d2)
             if min(squared_a, squared_b) > MAX_DEVIATIONS**2:

@@ -44,15 +44,10 @@ class Observed(NamedTuple):
     class_probabilities: Float64
 
 
-class _Nodes(NamedTuple):
-    """The arrays of a `NodeTable` that the search reads; n nodes."""
-
-    ids: Int64
-    means: Float64
-    covariances: Float64
-    log_determinants: Float64
-    eigenvalue_bounds: Float64
-    class_probabilities: Float64
+# The fields of `Observed`, and the arrays of a `NodeTable` that the kernel reads, as plain tuples:
+# numba is slower to call with named tuples.
+_ItemArrays = tuple[Float64, Float64, float, float, Float64]
+_NodeArrays = tuple[Int64, Float64, Float64, Float64, Float64, Float64]
 
 
 def bhattacharyya_bound(hellinger_threshold: float) -> float:
@@ -90,7 +85,7 @@ def nearest_row(
     Returns:
         The row; among equal distances that of the smallest id; -1 if no node passes.
     """
-    table = _Nodes(
+    table = (
         nodes.ids,
         nodes.means,
         nodes.covariances,
@@ -98,7 +93,7 @@ def nearest_row(
         nodes.eigenvalue_bounds,
         nodes.class_probabilities,
     )
-    return int(_nearest(item, table, skipped_row, bhattacharyya_bound, class_distance_threshold))
+    return int(_nearest(item[:], table, skipped_row, bhattacharyya_bound, class_distance_threshold))
 
 
 def warm_up() -> None:
@@ -111,35 +106,35 @@ def warm_up() -> None:
 
 @kernel
 def _nearest(  # pragma: no cover - compiled
-    item: Observed,
-    nodes: _Nodes,
+    item: _ItemArrays,
+    nodes: _NodeArrays,
     skipped_row: int,
     bhattacharyya_bound: float,
     class_distance_threshold: float,
 ) -> int:
-    mean, covariance = item.mean, item.covariance
+    mean, covariance, log_determinant, eigenvalue_bound, classes = item
+    ids, means, covariances, log_determinants, eigenvalue_bounds, node_classes = nodes
     a00, a10, a11 = covariance[0, 0], covariance[1, 0], covariance[1, 1]
     a20, a21, a22 = covariance[2, 0], covariance[2, 1], covariance[2, 2]
     best_row = -1
     best = bhattacharyya_bound
     best_slack = best * _SLACK
-    for row in range(len(nodes.ids)):
-        d0 = mean[0] - nodes.means[row, 0]
-        d1 = mean[1] - nodes.means[row, 1]
-        d2 = mean[2] - nodes.means[row, 2]
+    for row in range(len(ids)):
+        d0 = mean[0] - means[row, 0]
+        d1 = mean[1] - means[row, 1]
+        d2 = mean[2] - means[row, 2]
         squared = d0 * d0 + d1 * d1 + d2 * d2
-        if squared > 4.0 * best_slack * (item.eigenvalue_bound + nodes.eigenvalue_bounds[row]):
+        if squared > 4.0 * best_slack * (eigenvalue_bound + eigenvalue_bounds[row]):
             continue
         if row == skipped_row:
             continue
         # LDLᵀ of S; the operations are those of scene.gaussian.log_determinant.
-        b = nodes.covariances[row]
-        s00 = (a00 + b[0, 0]) / 2
-        s10 = (a10 + b[1, 0]) / 2
-        s11 = (a11 + b[1, 1]) / 2
-        s20 = (a20 + b[2, 0]) / 2
-        s21 = (a21 + b[2, 1]) / 2
-        s22 = (a22 + b[2, 2]) / 2
+        s00 = (a00 + covariances[row, 0, 0]) / 2
+        s10 = (a10 + covariances[row, 1, 0]) / 2
+        s11 = (a11 + covariances[row, 1, 1]) / 2
+        s20 = (a20 + covariances[row, 2, 0]) / 2
+        s21 = (a21 + covariances[row, 2, 1]) / 2
+        s22 = (a22 + covariances[row, 2, 2]) / 2
         l10 = s10 / s00
         l20 = s20 / s00
         pivot_1 = s11 - l10 * s10
@@ -152,15 +147,14 @@ def _nearest(  # pragma: no cover - compiled
         if mahalanobis > 8.0 * best_slack:
             continue
         log_mixed = math.log(s00 * pivot_1 * pivot_2)
-        log_ratio = log_mixed - (item.log_determinant + nodes.log_determinants[row]) / 2
+        log_ratio = log_mixed - (log_determinant + log_determinants[row]) / 2
         distance = max(mahalanobis / 8 + log_ratio / 2, 0.0)
         # Among equal distances the smallest id wins; rows are in no order.
-        loses_tie = best_row < 0 or nodes.ids[row] > nodes.ids[best_row]
-        if distance > best or (distance == best and loses_tie):
+        if distance > best or (distance == best and (best_row < 0 or ids[row] > ids[best_row])):
             continue
         inner = 0.0
-        for index in range(len(item.class_probabilities)):
-            inner += item.class_probabilities[index] * nodes.class_probabilities[row, index]
+        for index in range(len(classes)):
+            inner += classes[index] * node_classes[row, index]
         if 1.0 - inner < class_distance_threshold:
             best_row = row
             best = distance

@@ -74,12 +74,12 @@ class VoxelMap:
         if 2 * (self._used + len(sets.blocks)) > self.capacity:
             self._grow(len(sets.blocks))
         new, starts, self._used = cell_kernels.add(
-            self._table,
+            self._table[:],
             self._counts,
             self._cells_per_owner,
             self._used,
             np.array(owners, np.int64),
-            sets,
+            sets[:],
         )
         for owner, start, stop in zip(owners, starts[:-1].tolist(), starts[1:].tolist()):
             if stop > start:
@@ -95,7 +95,7 @@ class VoxelMap:
         Returns:
             The k owners that any set meets, ascending, and the fractions (n, k) float64 in [0, 1].
         """
-        owners, fractions = cell_kernels.overlaps(self._table, self._counts, self._used, sets)
+        owners, fractions = cell_kernels.overlaps(self._table[:], self._counts, self._used, sets[:])
         return owners.tolist(), fractions
 
     def contest(
@@ -114,7 +114,12 @@ class VoxelMap:
         """
         self._make_room(max(owners, default=-1) + 1)
         lost = cell_kernels.contest(
-            self._table, self._counts, self._used, np.array(owners, np.int64), sets, min_fraction
+            self._table[:],
+            self._counts,
+            self._used,
+            np.array(owners, np.int64),
+            sets[:],
+            min_fraction,
         )
         losers = np.flatnonzero(lost)
         fractions = lost[losers] / (lost[losers] + self._counts[losers])
@@ -122,7 +127,7 @@ class VoxelMap:
 
     def contains(self, owner: int, points: Float32) -> Bool:
         """Whether each point (k, 3), metres, lies in a cell of an owner, (k,)."""
-        return cell_kernels.contains(self._table, owner, points, self.cell_m)
+        return cell_kernels.contains(self._table[:], owner, points, self.cell_m)
 
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""
@@ -137,7 +142,7 @@ class VoxelMap:
     def _slots_of(self, owner: int) -> tuple[Int64, Int64]:
         """Blocks in which an owner has cells, and the slots of these cells."""
         blocks = np.concatenate([np.zeros(0, np.int64), *self._blocks_of.get(owner, [])])
-        return blocks, cell_kernels.slots_of(self._table, owner, blocks)
+        return blocks, cell_kernels.slots_of(self._table[:], owner, blocks)
 
     def _make_room(self, owner_count: int) -> None:
         if owner_count > len(self._counts):
@@ -150,5 +155,5 @@ class VoxelMap:
         while capacity < 3 * slots:
             capacity *= 2
         larger = cell_kernels.new_table(capacity)
-        self._used = cell_kernels.rehash(self._table, larger)
+        self._used = cell_kernels.rehash(self._table[:], larger[:])
         self._table = larger
