@@ -54,7 +54,7 @@ class Side:
     def __init__(
         self, config: Config, first: LocalGraph, lead: float | None, queue_size: int
     ) -> None:
-        model = build_world_model(config.relations)
+        model = build_world_model(config.relations, config.perception.device)
         if lead is not None:
             model = FakeWorldModel(config.relations.clip_length, lead_logit=lead)
         self.builder = GraphBuilder(config, first.vocabulary, first.frame_id)

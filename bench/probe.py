@@ -143,8 +143,8 @@ def main() -> None:
     backbones = {}
     for family, (load, save, sizes) in loaders.items():
         folder = str(save(out / family, **sizes))
-        config = RelationsConfig(world_model=family, world_model_path=folder, device="cpu")
-        backbones[family] = load(config)
+        config = RelationsConfig(world_model=family, world_model_path=folder)
+        backbones[family] = load(config, device="cpu")
     backbones["boxes alone"] = blind(backbones["dinov2"])
     for family, backbone in backbones.items():
         for inputs in ("clip", "clip_and_boxes"):

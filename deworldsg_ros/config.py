@@ -67,7 +67,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = ""
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        option("device of rtdetr, egtr, sam2 and sam; auto = CUDA if available"),
+        option("device of all networks on torch, world models too; auto = CUDA if available"),
     ] = "auto"
     threads: Annotated[int, option("CPU threads of the networks; 0 = all cores", ge=0, le=64)] = 2
 
@@ -163,10 +163,6 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str, option("checkpoint of the world model: a folder, or a hub id in the local cache")
     ] = ""
     probe_path: Annotated[str, option("folder of the trained probe")] = ""
-    device: Annotated[
-        Literal["auto", "cpu", "cuda"],
-        option("device of the world model; auto = CUDA if available, else the CPU"),
-    ] = "auto"
 
 
 class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

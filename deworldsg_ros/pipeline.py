@@ -62,7 +62,7 @@ class Pipeline:
 
     def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
         self.config = config
-        world_model = build_world_model(config.relations)
+        world_model = build_world_model(config.relations, config.perception.device)
         self.perception: Perceiver
         if perceiver is None:
             perception = build_perception(config.perception, world_up=config.inputs.world_up)

@@ -20,9 +20,9 @@ from deworldsg_ros.training.options import FitOptions, TrainingOptions
 
 # Options of the command by the configuration fields that they set, for error messages.
 OPTION_OF = {
-    "world_model_path": "--model",
-    "clip_length": "--clip-length",
-    "device": "--device",
+    "relations.world_model_path": "--model",
+    "relations.clip_length": "--clip-length",
+    "perception.device": "--device",
 }
 
 # Options of the commands. typer evaluates these annotations at run time.
@@ -94,7 +94,8 @@ class ProbeTraining:
     Attributes:
         source: folder of clips, or data set.
         out: folder of the probe.
-        relations: world model, checkpoint, clip length and device.
+        relations: world model, checkpoint and clip length.
+        device: auto, cpu or cuda.
         download: whether the checkpoint may be downloaded.
         predicates: names of the probe's outputs.
         clips_per_pair: clips per related pair of a data set.
@@ -105,6 +106,7 @@ class ProbeTraining:
     source: Path
     out: Path
     relations: RelationsConfig
+    device: str
     download: bool
     predicates: tuple[str, ...]
     clips_per_pair: int
@@ -138,7 +140,6 @@ def train_probe(
         "world_model": world_model,
         "world_model_path": model,
         "clip_length": clip_length,
-        "device": device,
     }
     training = TrainingOptions(
         layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
@@ -152,6 +153,7 @@ def train_probe(
         source=source,
         out=out,
         relations=from_mapping({"relations": choice}, "train-probe").relations,
+        device=_one_of("device", device, ("auto", "cpu", "cuda")),
         download=download,
         predicates=read_predicates(predicates),
         clips_per_pair=clips_per_pair,
@@ -169,7 +171,7 @@ def run_training(options: ProbeTraining, console: Console) -> None:
     from deworldsg_ros.training.train import train_probe as train
 
     clips = read_clips(options.source, options.relations.clip_length, options.clips_per_pair)
-    backbone = _load_backbone(options.relations, options.download)
+    backbone = _load_backbone(options)
     with frame_progress(console) as bar:
         encoding = bar.add_task("features", total=len(clips), note="")
         fitting = bar.add_task("epochs", total=options.training.fit.epochs, note="")
@@ -244,18 +246,18 @@ def read_predicates(choice: str) -> tuple[str, ...]:
     return names
 
 
-def _load_backbone(config: RelationsConfig, download: bool) -> Any:
+def _load_backbone(options: ProbeTraining) -> Any:
     from deworldsg_ros.relations.world_models import dinov2, vjepa2
 
     loaders = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
-    load = loaders[_one_of("world-model", config.world_model, tuple(loaders))]
+    load = loaders[_one_of("world-model", options.relations.world_model, tuple(loaders))]
     try:
-        return load(config, download=download)
+        return load(options.relations, device=options.device, download=options.download)
     except ConfigurationError as error:
         # The user typed options of the command, not configuration fields.
         message = str(error).replace(": run `hf", ": give --download, run `hf")
         for name, option in OPTION_OF.items():
-            message = message.replace(f"relations.{name}", option)
+            message = message.replace(name, option)
         raise ConfigurationError(message) from error
 
 

@@ -33,7 +33,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         super().__init__("relation_node", "evidence messages", **options)
         config = self.parameters.relations
         report = self.get_logger().warning
-        world_model = build_world_model(config)
+        world_model = build_world_model(config, self.parameters.perception.device)
         predicates = graph_predicates(self.parameters.perception)
         if predicates is not None:  # else the first local graph contains them
             require_predicates(world_model, predicates)

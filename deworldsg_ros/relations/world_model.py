@@ -97,8 +97,8 @@ def world_model_names() -> tuple[str, ...]:
     return tuple(sorted(module.name for module in pkgutil.iter_modules(world_models.__path__)))
 
 
-def build_world_model(config: RelationsConfig) -> WorldModel | None:
-    """The configured world model; None for ``none``.
+def build_world_model(config: RelationsConfig, device: str = "auto") -> WorldModel | None:
+    """The configured world model, on a device (auto, cpu or cuda); None for ``none``.
 
     Its module, and the libraries of the module, are imported only here.
 
@@ -120,5 +120,5 @@ def build_world_model(config: RelationsConfig) -> WorldModel | None:
             f"world model '{config.world_model}' needs {' and '.join(MODEL_LIBRARIES)}: "
             f"pip install 'deworldsg_ros[models]' ({error})"
         ) from error
-    model: WorldModel | None = module.build(config)
+    model: WorldModel | None = module.build(config, device)
     return model

@@ -57,7 +57,7 @@ def save_dinov2(folder, seed=0, **changes):
 
 
 def config_of(family, folder, **changes):
-    settings = {"clip_length": CLIP_LENGTH, "device": "cpu", "world_model_path": str(folder)}
+    settings = {"clip_length": CLIP_LENGTH, "world_model_path": str(folder)}
     return RelationsConfig(world_model=family, **{**settings, **changes})
 
 

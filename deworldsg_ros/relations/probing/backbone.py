@@ -101,15 +101,15 @@ def load_checkpoint(
     return model
 
 
-def place(
-    config: RelationsConfig, model: torch.nn.Module
+def to_device(
+    model: torch.nn.Module, choice: str
 ) -> tuple[torch.nn.Module, torch.device, torch.dtype]:
-    """Move a model to the configured device, in the precision of that device.
+    """Move a model to a device (auto, cpu or cuda), in the precision of that device.
 
     Raises:
         ConfigurationError: no CUDA device, or too little memory.
     """
-    device = choose_device("relations.device", config.device)
+    device = choose_device("perception.device", choice)
     dtype = choose_dtype(device)
     with enough_memory(f"moving the backbone to {device}", REMEDY):
         return model.to(device, dtype), device, dtype

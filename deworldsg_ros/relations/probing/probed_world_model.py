@@ -64,7 +64,7 @@ def relative_boxes(request: ClipRequest) -> Float32:
 
 
 def build_probed(
-    config: RelationsConfig, load_backbone: Callable[[RelationsConfig], FrozenBackbone]
+    config: RelationsConfig, load_backbone: Callable[..., FrozenBackbone], device: str
 ) -> ProbedWorldModel:
     """The configured backbone and probe.
 
@@ -83,4 +83,4 @@ def build_probed(
             f"relations.probe_path '{config.probe_path}' was trained on {probe.card.backbone}: "
             f"relations.world_model '{config.world_model}' needs another probe"
         )
-    return ProbedWorldModel(load_backbone(config), probe)
+    return ProbedWorldModel(load_backbone(config, device=device), probe)

@@ -17,7 +17,7 @@ from deworldsg_ros.relations.probing.backbone import (
     FrozenBackbone,
     fingerprint,
     load_checkpoint,
-    place,
+    to_device,
 )
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
 from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
@@ -28,12 +28,17 @@ IMAGE_SIZE_PX = 224
 
 
 def load_backbone(
-    config: RelationsConfig, *, download: bool = False, image_size: int = IMAGE_SIZE_PX
+    config: RelationsConfig,
+    *,
+    device: str = "auto",
+    download: bool = False,
+    image_size: int = IMAGE_SIZE_PX,
 ) -> FrozenBackbone:
     """The configured checkpoint.
 
     Args:
         config: section ``relations``.
+        device: auto, cpu or cuda.
         download: whether a hub id may be downloaded.
         image_size: edge of the square input, pixels, a multiple of the patch size.
 
@@ -47,14 +52,14 @@ def load_backbone(
     identity = BackboneIdentity(
         "dinov2", model.config.hidden_size, image_size, config.clip_length, fingerprint(model)
     )
-    placed, device, dtype = place(config, model)
+    placed, where, dtype = to_device(model, device)
 
     def features(videos: torch.Tensor) -> torch.Tensor:
         clips, frames = videos.shape[:2]
         tokens: torch.Tensor = placed(videos.flatten(0, 1)).last_hidden_state
         return tokens[:, 0].to(torch.float32).reshape(clips, frames, -1).mean(dim=1)
 
-    return FrozenBackbone(identity, clip_geometry(image_size), device, dtype, features)
+    return FrozenBackbone(identity, clip_geometry(image_size), where, dtype, features)
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
@@ -62,6 +67,6 @@ def clip_geometry(image_size: int) -> ClipGeometry:
     return ClipGeometry(image_size * 256 // 224, image_size, "bicubic")
 
 
-def build(config: RelationsConfig) -> ProbedWorldModel:
+def build(config: RelationsConfig, device: str) -> ProbedWorldModel:
     """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
-    return build_probed(config, load_backbone)
+    return build_probed(config, load_backbone, device)

@@ -65,6 +65,6 @@ def _uniform(key: Sequence[object], count: int) -> Float64:
     return np.frombuffer(digest, "<u4").astype(np.float64) / 2.0**32
 
 
-def build(config: RelationsConfig) -> FakeWorldModel:
+def build(config: RelationsConfig, device: str) -> FakeWorldModel:
     """The fake world model for the configured clip length."""
     return FakeWorldModel(config.clip_length)

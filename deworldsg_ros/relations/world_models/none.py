@@ -5,6 +5,6 @@ from __future__ import annotations
 from deworldsg_ros.config import RelationsConfig
 
 
-def build(config: RelationsConfig) -> None:
+def build(config: RelationsConfig, device: str) -> None:
     """No world model."""
-    del config
+    del config, device

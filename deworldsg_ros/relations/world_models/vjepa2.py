@@ -17,18 +17,21 @@ from deworldsg_ros.relations.probing.backbone import (
     FrozenBackbone,
     fingerprint,
     load_checkpoint,
-    place,
+    to_device,
 )
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
 from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
-def load_backbone(config: RelationsConfig, *, download: bool = False) -> FrozenBackbone:
+def load_backbone(
+    config: RelationsConfig, *, device: str = "auto", download: bool = False
+) -> FrozenBackbone:
     """The encoder of the configured checkpoint.
 
     Args:
         config: section ``relations``.
+        device: auto, cpu or cuda.
         download: whether a hub id may be downloaded.
 
     Raises:
@@ -45,14 +48,14 @@ def load_backbone(config: RelationsConfig, *, download: bool = False) -> FrozenB
     identity = BackboneIdentity(
         "vjepa2", settings.hidden_size, settings.crop_size, config.clip_length, fingerprint(model)
     )
-    placed, device, dtype = place(config, model)
+    placed, where, dtype = to_device(model, device)
 
     def features(videos: torch.Tensor) -> torch.Tensor:
         hidden: torch.Tensor = placed(videos, skip_predictor=True).last_hidden_state
         # Half precision is too coarse for the mean of thousands of tokens.
         return hidden.mean(dim=1, dtype=torch.float32)
 
-    return FrozenBackbone(identity, clip_geometry(settings.crop_size), device, dtype, features)
+    return FrozenBackbone(identity, clip_geometry(settings.crop_size), where, dtype, features)
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
@@ -60,6 +63,6 @@ def clip_geometry(image_size: int) -> ClipGeometry:
     return ClipGeometry(image_size * 256 // 224, image_size, "bilinear")
 
 
-def build(config: RelationsConfig) -> ProbedWorldModel:
+def build(config: RelationsConfig, device: str) -> ProbedWorldModel:
     """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
-    return build_probed(config, load_backbone)
+    return build_probed(config, load_backbone, device)

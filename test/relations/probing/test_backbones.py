@@ -188,10 +188,10 @@ def test_a_clip_length_that_the_encoder_cannot_split_is_refused(checkpoints):
 
 def test_cuda_without_a_device_is_refused(checkpoints, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    chosen = {choose_device("relations.device", choice) for choice in ("auto", "cpu")}
+    chosen = {choose_device("perception.device", choice) for choice in ("auto", "cpu")}
     assert chosen == {torch.device("cpu")}
     with pytest.raises(ConfigurationError, match="finds no CUDA device: set it to 'auto' or 'cpu'"):
-        load("vjepa2", checkpoints["vjepa2"], device="cuda")
+        vjepa2.load_backbone(config_of("vjepa2", checkpoints["vjepa2"]), device="cuda")
 
 
 def test_half_precision_only_on_cuda():
