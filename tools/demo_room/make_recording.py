@@ -4,13 +4,15 @@
     pip install embreex numba numpy scipy opencv-python-headless rosbags
     python tools/demo_room/make_recording.py
 
-writes ``demo_room/`` (rosbag2, MCAP), ``demo_room.gt.json`` and ``demo_room.instances.npz`` into
-``bags/``. The same seed on the same machine gives the same recording.
+The command writes `demo_room/` (rosbag2, MCAP), `demo_room.gt.json` and `demo_room.instances.npz`
+into `bags/`. It replaces the recording there. The same seed on the same machine gives the same
+recording.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import lzma
 import multiprocessing
@@ -41,10 +43,12 @@ from scene_room.room import build_room
 from scene_room.scene import Scene, assemble
 from scene_room.sensor import DepthNoise, expose, jpeg, sense_depth
 
+BAGS = Path(__file__).resolve().parents[2] / "bags"
+
 
 @dataclass(frozen=True)
 class Encoded:
-    """One frame as it goes into the recording, with what only the ground truth needs."""
+    """One encoded frame, and its instances and exact depth for the ground truth."""
 
     picture_bgr: NDArray[np.uint8]
     jpeg: bytes
@@ -54,8 +58,8 @@ class Encoded:
 
 
 @dataclass(frozen=True)
-class Studio:
-    """All that the frames share."""
+class Renderer:
+    """The scene, light, camera path and exposure of all frames."""
 
     scene: Scene
     light: NDArray[np.float32]
@@ -64,8 +68,8 @@ class Studio:
     seed: int
     jpeg_quality: int
 
-    def shoot(self, index: int) -> Encoded:
-        """Render and degrade frame ``index``; its noise depends on seed and index alone."""
+    def render(self, index: int) -> Encoded:
+        """Render frame `index` and add noise. The noise depends only on the seed and the index."""
         rng = np.random.default_rng([self.seed, index])
         frame = render(self.scene, self.light, self.poses[index], rng)
         picture = expose(frame.radiance, float(self.gains[index]), rng)
@@ -79,47 +83,50 @@ class Studio:
         )
 
 
-_studio: Studio | None = None
+# The child processes of the pool inherit it.
+_renderer: Renderer | None = None
 
 
-def _shoot(index: int) -> Encoded:
-    assert _studio is not None
-    return _studio.shoot(index)
+def _render(index: int) -> Encoded:
+    assert _renderer is not None
+    return _renderer.render(index)
 
 
 def exposure_gains(count: int, seed: int) -> NDArray[np.float64]:
-    """Slow wander of the automatic exposure, about ±6 %."""
+    """Factor (count,) of the automatic exposure, which varies slowly by about ±6 %."""
     steps = np.random.default_rng([seed, 99]).normal(size=count)
     slow = np.convolve(steps, np.hanning(41), mode="same")
     return 1.05 * np.exp(0.035 * slow / slow.std())
 
 
 def pack_instances(path: Path, instances: NDArray[np.uint8]) -> None:
-    """All label images, losslessly: ``np.load(path)`` then ``lzma.decompress`` (see README)."""
+    """Save all instance images without loss; bags/README.md shows how to read them."""
     packed = lzma.compress(instances.tobytes(), preset=6)
     shape = np.array(instances.shape)
     np.savez(path, lzma=np.frombuffer(packed, np.uint8), shape=shape)
 
 
 def parse_arguments() -> argparse.Namespace:
-    """Command line."""
-    here = Path(__file__).resolve().parent
+    """The options of the command line."""
     parser = argparse.ArgumentParser(description="Render the demonstration recording.")
-    parser.add_argument("--out", type=Path, default=here, help="folder to write into")
-    parser.add_argument("--name", default="demo_room")
-    parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--rays", type=int, default=96, help="gather rays a vertex for the light")
-    parser.add_argument("--jpeg-quality", type=int, default=75)
-    parser.add_argument("--jobs", type=int, default=2, help="processes that render frames")
-    parser.add_argument("--only", help="frames to render as pictures instead, e.g. 0,60,120")
+    parser.add_argument("--out", type=Path, default=BAGS, help="output folder (bags/)")
+    parser.add_argument("--name", default="demo_room", help="name of the recording")
+    parser.add_argument("--seed", type=int, default=7, help="seed of the room and all noise")
+    parser.add_argument("--rays", type=int, default=96, help="rays per vertex for indirect light")
+    parser.add_argument("--jpeg-quality", type=int, default=75, help="0 to 100")
+    parser.add_argument("--jobs", type=int, default=2, help="number of render processes")
+    parser.add_argument("--only", help="only save pictures of these frames, as in 0,60,120")
     parser.add_argument("--pictures", type=Path, help="folder for PNG pictures of the frames")
     parser.add_argument("--masks", type=Path, help="folder for uint16 PNG instance masks")
-    return parser.parse_args()
+    arguments = parser.parse_args()
+    if importlib.util.find_spec("embreex") is None:
+        parser.error("embreex, which casts the rays, is not installed; run: pip install embreex")
+    return arguments
 
 
 def main() -> int:
-    """Build, light, render, write."""
-    global _studio
+    """Build the room, compute its light, render the frames and write the files."""
+    global _renderer
     args = parse_arguments()
     started = time.monotonic()
     cv2.setNumThreads(1)
@@ -131,7 +138,7 @@ def main() -> int:
     light = bake(scene, args.seed, args.rays)
     poses = camera_poses(args.seed)
     gains = exposure_gains(len(poses), args.seed)
-    _studio = Studio(scene, light, poses, gains, args.seed, args.jpeg_quality)
+    _renderer = Renderer(scene, light, poses, gains, args.seed, args.jpeg_quality)
     print(f"light ready after {time.monotonic() - started:.0f} s", flush=True)
     for folder in (args.pictures, args.masks):
         if folder:
@@ -139,7 +146,7 @@ def main() -> int:
     if args.only:
         for index in (int(i) for i in args.only.split(",")):
             path = (args.pictures or Path()) / f"{index:06d}.png"
-            cv2.imwrite(str(path), _shoot(index).picture_bgr)
+            cv2.imwrite(str(path), _render(index).picture_bgr)
         return 0
 
     folder = args.out / args.name
@@ -147,10 +154,10 @@ def main() -> int:
         shutil.rmtree(folder)
     seen = SeenSurface()
     labels = np.zeros((len(poses), *scene_shape()), np.uint8)
-    # The children inherit the built scene: fork, not spawn.
+    # fork, because the child processes inherit the scene; spawn would build it again.
     pool = multiprocessing.get_context("fork").Pool(args.jobs)
     with pool, RecordingWriter(folder) as writer:
-        for index, frame in enumerate(pool.imap(_shoot, range(len(poses)))):
+        for index, frame in enumerate(pool.imap(_render, range(len(poses)))):
             writer.write(index, frame.jpeg, frame.depth_png, poses[index])
             seen.add(frame.instances, frame.clean_depth_m, poses[index])
             labels[index] = frame.instances

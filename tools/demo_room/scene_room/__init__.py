@@ -1,1 +1,1 @@
-"""A furnished room made of code: meshes, textures, light, camera, sensor and ground truth."""
+"""A generated furnished room: meshes, textures, light, camera, sensor and ground truth."""

@@ -1,4 +1,4 @@
-"""A hand-held walk round the room: where the camera is and where it looks, ten times a second."""
+"""Path of a hand-held camera around the room, at 10 Hz."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter1d
 
 RATE_HZ = 10.0
 
-# seconds, camera x y z, point looked at x y z (metres, world)
+# Each row: seconds, camera x y z, target x y z (metres, world). The camera points at the target.
 WAYPOINTS = np.array([
     [0.0, 0.75, -1.35, 1.52, -1.15, 0.45, 0.75],
     [1.3, 0.35, -1.20, 1.50, -1.20, 0.40, 0.75],
@@ -31,11 +31,12 @@ WAYPOINTS = np.array([
     [16.5, 0.70, -1.25, 1.52, -1.25, 0.20, 0.76],
     [17.0, 0.75, -1.35, 1.52, -1.15, 0.45, 0.75],
 ])  # fmt: skip
+# The camera stands still from the first to the second time.
 STILL_S = (3.4, 5.2)
 
 
 def camera_poses(seed: int, duration_s: float = 17.0) -> NDArray[np.float64]:
-    """T_world_camera (n, 4, 4), camera optical frame: x right, y down, z forward."""
+    """T_world_camera (n, 4, 4) of each frame. Optical frame: x right, y down, z forward."""
     rng = np.random.default_rng(seed)
     times = np.arange(int(round(duration_s * RATE_HZ)) + 1) / RATE_HZ
     fine = np.arange(0, duration_s + 1e-9, 0.02)

@@ -1,4 +1,4 @@
-"""Furniture and appliances in their own frames: z up from the floor, the front faces −y."""
+"""Furniture and appliances in their own frames: z = 0 is the floor, the front faces −y."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ Parts = list[tuple[Mesh, str]]
 
 
 def front(width: float, height: float, x: float, y: float, z: float, material: str) -> Parts:
-    """Picture that faces −y, its lower left corner at (x − width/2, y, z)."""
+    """Rectangle that faces −y. Its lower left corner is at (x − width/2, y, z)."""
     corner = np.array([x - width / 2, y, z])
     mesh = sheet(corner, np.array([width, 0, 0]), np.array([0, 0, height]), 0.04, fit=True)
     return [(mesh, material)]
 
 
 def dining_table(length: float = 1.5, depth: float = 0.88, height: float = 0.74) -> Parts:
-    """Four square tapering legs, aprons, a bevelled top with the grain along its length."""
+    """Table with four tapered legs. The grain of the top runs along its length."""
     top = box(length, depth, 0.035, 0.010, 0.02).moved(z=height - 0.035)
     top = top.mapped(
         lambda v, n: np.where(
@@ -51,7 +51,7 @@ def dining_table(length: float = 1.5, depth: float = 0.88, height: float = 0.74)
 
 
 def chair() -> Parts:
-    """Wooden chair with slatted, slightly reclined back and an upholstered seat; sits facing −y."""
+    """Wooden chair with a slatted, reclined back and an upholstered seat; faces −y."""
     wood: list[Mesh] = []
     for sx in (-1, 1):
         wood.append(tube(np.array([[sx * 0.19, -0.18, 0.0], [sx * 0.19, -0.18, 0.44]]), 0.019, 12))
@@ -105,7 +105,7 @@ def couch(width: float = 2.0) -> Parts:
 
 
 def pillow(material: str) -> Parts:
-    """Square scatter cushion standing on edge, leaning back."""
+    """Square cushion that stands on an edge and leans back."""
     mesh = puffed(box(0.42, 0.10, 0.42, 0.045, 0.025), 0.05)
     return [(mesh.turned("x", -20), material)]
 
@@ -171,7 +171,7 @@ def bookshelf(
     boards: tuple[float, ...] = (0.06, 0.42, 0.78, 1.14, 1.50),
     height: float = 1.62,
 ) -> Parts:
-    """Open shelf; ``boards`` are the heights of the boards' upper faces."""
+    """Open shelf. `boards` are the heights of the upper faces of the boards, metres."""
     wood: list[Mesh] = []
     for sx in (-1, 1):
         wood.append(box(0.022, depth, height, 0.003, 0.04).moved(sx * (width / 2 - 0.011)))
@@ -185,7 +185,7 @@ def bookshelf(
 
 
 def refrigerator() -> Parts:
-    """Two-door fridge, freezer below, bar handles."""
+    """Refrigerator with two doors and bar handles; the freezer is below."""
     parts: Parts = [(box(0.66, 0.60, 1.76, 0.012, 0.06).moved(0, 0.03), "white_enamel")]
     for z, height in ((0.05, 0.60), (0.66, 1.09)):
         parts.append((box(0.655, 0.06, height, 0.016, 0.05).moved(0, -0.30, z), "white_enamel"))
@@ -204,7 +204,7 @@ def refrigerator() -> Parts:
 
 
 def counter(length: float, sink_at: float, oven_at: float, depth: float = 0.60) -> Parts:
-    """Base cabinets with worktop; a cut-out for the sink and a bay for the oven (x of centres)."""
+    """Base cabinets and worktop, open for a sink and an oven at x = `sink_at` and `oven_at`."""
     height, sink_w, sink_d, bay = 0.90, 0.56, 0.42, 0.62
     parts: Parts = []
     left, right = -length / 2, length / 2
@@ -259,7 +259,7 @@ def counter(length: float, sink_at: float, oven_at: float, depth: float = 0.60) 
 
 
 def sink() -> Parts:
-    """Steel basin that hangs in the worktop (rim at z = 0.004) with a tall tap."""
+    """Steel basin in the worktop, with a tall tap. The rim is at z = 0.004."""
     width, deep = 0.58, 0.17
     steel: list[Mesh] = []
     for x, y, w, d in (
@@ -329,7 +329,7 @@ def microwave() -> Parts:
 
 
 def wall_cabinet(width: float, depth: float = 0.33, height: float = 0.66) -> Parts:
-    """Hanging cupboard with doors, its lower edge at z = 0."""
+    """Wall cupboard with doors. Its lower edge is at z = 0."""
     parts: Parts = [(box(width, depth, height, 0.003, 0.05), "cabinet_white")]
     count = max(1, round(width / 0.45))
     door = width / count
@@ -378,7 +378,7 @@ def floor_lamp() -> Parts:
 
 
 def pendant_lamp() -> Parts:
-    """Enamel shade hung from the ceiling; z = 0 is its lower rim, the cord goes up 0.75 m."""
+    """Enamel ceiling lamp. Its lower rim is at z = 0; its cord is 0.75 m long."""
     profile = [(0.19, 0.0), (0.185, 0.03), (0.15, 0.09), (0.08, 0.15), (0.03, 0.18), (0.012, 0.22)]
     shade = lathe(profile, 40, 24)
     inside = lathe([(r - 0.003, z) for r, z in profile[::-1]], 40, 24)
@@ -393,7 +393,7 @@ def pendant_lamp() -> Parts:
 
 
 def wall_clock() -> Parts:
-    """Round clock whose back lies in the plane y = 0, centre at z = 0."""
+    """Round clock with its back in the plane y = 0 and its centre at z = 0."""
     rim = lathe([(0.165, 0.0), (0.165, 0.03), (0.150, 0.036), (0.145, 0.02)], 48).turned("x", 90)
     angles = np.linspace(0, 2 * np.pi, 49)
     points = np.c_[0.148 * np.cos(angles), np.full(49, -0.02), 0.148 * np.sin(angles)]
@@ -405,7 +405,7 @@ def wall_clock() -> Parts:
 
 
 def painting(width: float = 0.84, height: float = 0.60) -> Parts:
-    """Framed picture whose back lies in the plane y = 0, lower edge at z = 0."""
+    """Framed picture with its back in the plane y = 0 and its lower edge at z = 0."""
     frame: list[Mesh] = []
     for z in (0.0, height - 0.035):
         frame.append(box(width, 0.03, 0.035, 0.006, 0.05).moved(0, -0.015, z))
@@ -418,7 +418,7 @@ def painting(width: float = 0.84, height: float = 0.60) -> Parts:
 
 
 def window(width: float, height: float, wall: float = 0.16) -> Parts:
-    """Frame, cross bars, sill and a garden behind, in a wall opening; inner wall face at y = 0."""
+    """Window in a wall whose inner face is at y = 0: frame, bars, sill and a garden behind."""
     white: list[Mesh] = []
     for z in (0.0, height - 0.05):
         white.append(box(width, 0.06, 0.05, 0.006, 0.05).moved(0, wall - 0.05, z))

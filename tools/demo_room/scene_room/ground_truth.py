@@ -1,4 +1,4 @@
-"""What is in the room and what the camera saw of it; relations after fixed rules."""
+"""Ground truth: the objects, their visible parts and the relations, by fixed rules."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from .render import CX, CY, FOCAL_PX, HEIGHT, WIDTH
 from .room import PlacedObject
 
+# An object with this many pixels is seen in a frame.
 SEEN_PX = 200
+# An object with a COCO class that is seen in this many frames is detectable.
 DETECTABLE_FRAMES = 5
 VOXEL_M = 0.02
 
 
 class SeenSurface:
-    """Counts pixels and frames of every object and keeps the 2 cm voxels that were in view."""
+    """Counts pixels and frames of each object, and collects its visible 2 cm voxels."""
 
     def __init__(self) -> None:
         self.frames_seen: dict[int, int] = defaultdict(int)
@@ -30,7 +32,7 @@ class SeenSurface:
         depth_m: NDArray[np.float32],
         T_world_camera: NDArray[np.float64],
     ) -> None:
-        """Account for one frame (clean depth)."""
+        """Add one frame. `depth_m` is without noise, 0 = no value."""
         ids, counts = np.unique(instances, return_counts=True)
         for object_id, count in zip(ids.tolist(), counts.tolist()):
             if object_id == 0:
@@ -48,7 +50,7 @@ class SeenSurface:
         )
 
     def centroids(self) -> dict[int, list[float]]:
-        """Mean of the seen voxels' centres by object id, metres, world."""
+        """Mean centre of the visible voxels by object id, metres, world."""
         if not self._voxels:
             return {}
         voxels = np.unique(np.concatenate(self._voxels), axis=0)
@@ -58,7 +60,7 @@ class SeenSurface:
 
 
 def describe_objects(objects: list[PlacedObject], seen: SeenSurface) -> list[dict[str, Any]]:
-    """One JSON-ready record an object; lengths in metres, world frame, z up."""
+    """One record per object for JSON. Lengths in metres, world frame, z up."""
     centroids = seen.centroids()
     records = []
     for item in objects:
@@ -96,15 +98,17 @@ def describe_objects(objects: list[PlacedObject], seen: SeenSurface) -> list[dic
 
 
 def find_relations(objects: list[PlacedObject]) -> list[dict[str, Any]]:
-    """Directed relations, one predicate an ordered pair, the first rule that applies.
+    """Directed relations. Each ordered pair gets the predicate of the first rule that applies.
 
-    1 in / on / attached to: what an object was put in, on or fixed to. 2 against: two
-    floor-standing pieces, gap ≤ 5 cm, sharing half of the shorter side and 0.3 m of height;
-    subject = the lower. 3 above / under: boxes overlap by half of the smaller, vertical gap
-    −2 cm … 1.2 m, furniture, wall-mounted things (with the 15 cm in front of them) and screens;
-    or a floor piece inside a table's footprint. 4 table with chair within 0.35 m; chair near it.
-    5 near: floor pieces within 0.5 m, or small things on one support within 0.10 m, mutual two
-    nearest.
+    1. in, on, attached to: the direct support of the subject.
+    2. against: two pieces of furniture on the floor with a gap of at most 5 cm. They share half of
+       the shorter side and 0.3 m of height. The subject is the lower one.
+    3. above, under: furniture, screens and objects on the wall (with the 15 cm in front of them).
+       The boxes overlap by half of the smaller one, with a vertical gap of −2 cm to 1.2 m. Also
+       furniture on the floor inside a table's footprint.
+    4. with: a table and a chair within 0.35 m. The chair is near the table.
+    5. near: furniture on the floor within 0.5 m, or small objects on one support within 0.1 m. Each
+       is one of the two nearest of the other.
     """
     found: dict[tuple[int, int], str] = {}
     by_name = {item.name: item for item in objects}
@@ -183,7 +187,7 @@ def find_relations(objects: list[PlacedObject]) -> list[dict[str, Any]]:
 
 
 def camera_record() -> dict[str, Any]:
-    """Intrinsics, pixel centres at integers."""
+    """The intrinsics. Pixel centres have integer coordinates."""
     return {"width": WIDTH, "height": HEIGHT, "fx": FOCAL_PX, "fy": FOCAL_PX, "cx": CX, "cy": CY}
 
 

@@ -1,8 +1,8 @@
-"""Light that does not depend on the viewer, computed once per vertex.
+"""Diffuse light, computed once per vertex. It does not depend on the viewer.
 
-Irradiance over π (so that radiance = albedo × value) from the sky through the window, the sun,
-the lamps and a soft ceiling panel, with shadows, and three bounces between surfaces, gathered
-along stratified cosine-weighted rays.
+The value is irradiance / π, so radiance = albedo × value. Direct light comes from the window, the
+sun, the lamps and the ceiling panels, with shadows. Indirect light bounces four times between
+surfaces, along stratified cosine-weighted rays.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from scipy.sparse import coo_matrix
 from .room import HALF_X, HEIGHT, WINDOW_H, WINDOW_W, WINDOW_Y, WINDOW_Z
 from .scene import Scene
 
+# Rays per call of the ray caster; bounds its memory.
 CHUNK = 400_000
+# Rays start this far from their surface, so that they do not hit it.
 OFFSET_M = 1.5e-3
 
 
 @dataclass(frozen=True)
 class AreaLight:
-    """Rectangle that emits on the side of ``along_u × along_v``; radiance in scene units."""
+    """Rectangle that emits towards `along_u × along_v`. Radiance in units of the scene."""
 
     corner: tuple[float, float, float]
     along_u: tuple[float, float, float]
@@ -46,7 +48,7 @@ SUN_IRRADIANCE = np.array([2.1, 1.85, 1.45])
 
 
 def bake(scene: Scene, seed: int, rays: int = 96, light_samples: int = 24) -> NDArray[np.float32]:
-    """Irradiance over π for every vertex, (n, 3) float32."""
+    """Irradiance / π of each vertex, (n, 3) float32."""
     rng = np.random.default_rng(seed)
     smoother = _neighbour_mean(scene)
     points, normals = scene.vertices, scene.normals
@@ -132,7 +134,7 @@ def _visible(
 def _gather_rays(
     scene: Scene, rng: np.random.Generator, rays: int
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Vertex that each ray sees (n, rays), the last index + 1 for none; and buried vertices."""
+    """Vertex that each ray hits (n, rays), n for none; and (n,) whether a vertex is buried."""
     count = len(scene.vertices)
     hits = np.full((count, rays), count, np.int32)
     backs = np.zeros(count, np.int32)
@@ -164,7 +166,7 @@ def _gather_rays(
 def _seen_vertices(
     scene: Scene, origins: NDArray, directions: NDArray
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Nearest vertex of the triangle that each ray hits, and whether it was hit from behind."""
+    """Nearest vertex of the triangle that each ray hits; and whether the ray hits its back."""
     result = scene.embree.run(
         origins.astype(np.float32), directions.astype(np.float32), query="INTERSECT", output=True
     )
@@ -181,7 +183,7 @@ def _seen_vertices(
 
 
 def _neighbour_mean(scene: Scene):
-    """Sparse (n, n): mean over a vertex and its neighbours, seams welded where normals agree."""
+    """Sparse (n, n) mean of a vertex and its neighbours. Seams with equal normals are joined."""
     key = np.round(np.hstack([scene.vertices * 1e4, scene.normals * 20])).astype(np.int64)
     _, first, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
     group = group.reshape(-1)
@@ -200,7 +202,7 @@ def _neighbour_mean(scene: Scene):
 
 
 def _fill_buried(values: NDArray, buried: NDArray[np.bool_], smoother) -> NDArray:
-    """Vertices inside other geometry take their light from their neighbours outside."""
+    """Copy light to vertices inside other objects from their neighbours outside."""
     values = values.copy()
     known = ~buried
     values[buried] = 0

@@ -1,4 +1,4 @@
-"""Materials by name: a texture, its tile size, and how the surface shines."""
+"""Materials by name: texture, tile size and reflection."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ from . import textures as tex
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks.
+    """Appearance of a surface.
 
-    texture: (H, W, 3) linear albedo or radiance. tile_m: metres one repeat covers (u, v).
-    f0: reflectance at normal incidence (0 = matt). roughness: spread of reflected rays.
-    emission: factor on the texture as emitted radiance. two_sided: lit from both sides (leaves).
-    sensed: False where a depth camera gets nothing back (the view through the window).
+    Attributes:
+        texture: (H, W, 3) linear albedo or radiance.
+        tile_m: size of one repetition of the texture along u and v, metres.
+        f0: reflectance at normal incidence; 0 = matt.
+        roughness: spread of reflected rays.
+        emission: emitted radiance = emission × texture.
+        two_sided: lit from both sides, like leaves.
+        sensed: False if a depth camera measures no depth, like the view through the window.
     """
 
     texture: NDArray[np.float32]
@@ -44,7 +48,7 @@ BOOK_COLOURS = (
 
 
 def build_materials(seed: int) -> dict[str, Material]:
-    """All materials of the room; the same seed gives the same textures."""
+    """All materials of the room by name. The same seed gives the same textures."""
     rng = np.random.default_rng(seed)
     unit = (1.0, 1.0)
     materials = {

@@ -1,7 +1,7 @@
-"""Triangle meshes made of code: boxes with rounded edges, lathe bodies, tubes, leaves.
+"""Generated triangle meshes: boxes with rounded edges, bodies of revolution, tubes, leaves.
 
-Every mesh carries vertices (n, 3) in metres, unit normals (n, 3), texture coordinates (n, 2)
-in metres (divided by the material's tile size when a room is assembled) and faces (m, 3).
+A mesh has vertices (n, 3) in metres, unit normals (n, 3), texture coordinates (n, 2) in metres and
+faces (m, 3). `scene.assemble` divides texture coordinates by the tile size of the material.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Mesh:
-    """One smooth or flat piece of surface."""
+    """A piece of surface."""
 
     vertices: Array
     normals: Array
@@ -34,18 +34,18 @@ class Mesh:
         return replace(self, vertices=self.vertices @ rotation.T, normals=self.normals @ rotation.T)
 
     def scaled(self, x: float, y: float, z: float) -> Mesh:
-        """Copy stretched along the axes; normals follow by the inverse."""
+        """Copy scaled along the axes. Normals are scaled by the inverse."""
         factors = np.array([x, y, z])
         normals = self.normals / factors
         return replace(self, vertices=self.vertices * factors, normals=_unit(normals))
 
     def deformed(self, function: Callable[[Array], Array]) -> Mesh:
-        """Copy with moved vertices and normals averaged anew over coincident vertices."""
+        """Copy with vertices `function(vertices)` and new normals, averaged at equal vertices."""
         vertices = function(self.vertices)
         return replace(self, vertices=vertices, normals=_smooth_normals(vertices, self.faces))
 
     def mapped(self, function: Callable[[Array, Array], Array]) -> Mesh:
-        """Copy with texture coordinates ``function(vertices, normals)``."""
+        """Copy with texture coordinates `function(vertices, normals)`."""
         return replace(self, uv=function(self.vertices, self.normals))
 
 
@@ -61,7 +61,7 @@ def axis_rotation(axis: str, degrees: float) -> Array:
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """One mesh of several, nothing welded."""
+    """One mesh of several. Equal vertices stay separate."""
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     return Mesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -72,7 +72,7 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def sheet(corner: Array, along_u: Array, along_v: Array, step: float, fit: bool = False) -> Mesh:
-    """Flat rectangle with normal ``along_u × along_v``; ``fit`` maps the texture to it once."""
+    """Flat rectangle with normal `along_u × along_v`. `fit` maps one texture to all of it."""
     corner, along_u, along_v = (np.asarray(a, float) for a in (corner, along_u, along_v))
     size_u, size_v = np.linalg.norm(along_u), np.linalg.norm(along_v)
     count_u, count_v = (max(1, int(np.ceil(s / step))) for s in (size_u, size_v))
@@ -115,10 +115,9 @@ def box(x: float, y: float, z: float, radius: float = 0.006, step: float = 0.05)
 
 
 def lathe(profile: list[tuple[float, float]], segments: int = 40, smooth: int = 0) -> Mesh:
-    """Body of revolution about z from (radius, height) points, outside to the right of the path.
+    """Body of revolution about z from (radius, height) points. The outside is right of the path.
 
-    A repeated point makes a sharp edge; ``smooth`` > 0 resamples the path as a spline with that
-    many points.
+    A repeated point makes a sharp edge. With `smooth` > 0 the path is a spline of `smooth` points.
     """
     path = np.array(profile, float)
     if smooth:
@@ -130,7 +129,7 @@ def lathe(profile: list[tuple[float, float]], segments: int = 40, smooth: int = 
 
 
 def tube(path: Array, radius: float | Array, segments: int = 10, step: float = 0.03) -> Mesh:
-    """Round bar along a polyline, with closed ends; ``radius`` may vary from point to point."""
+    """Round bar along a polyline, with closed ends. `radius` is one number or one per point."""
     path = np.asarray(path, float)
     radii = np.broadcast_to(np.asarray(radius, float), (len(path),))
     path, radii = _resample(path, radii, step)
@@ -182,7 +181,7 @@ def ball(radius: float, segments: int = 24) -> Mesh:
 
 
 def leaf(length: float, width: float, droop: float, fold: float = 0.15) -> Mesh:
-    """Pointed leaf from the origin along +x, bending down by ``droop`` at its tip."""
+    """Pointed leaf from the origin along +x, bent down by `droop` at its tip."""
     along, across = 12, 6
     s, t = np.meshgrid(np.linspace(0, 1, along + 1), np.linspace(-1, 1, across + 1))
     s, t = s.ravel(), t.ravel()
@@ -201,7 +200,7 @@ def leaf(length: float, width: float, droop: float, fold: float = 0.15) -> Mesh:
 
 
 def puffed(mesh: Mesh, amount: float) -> Mesh:
-    """Cushion from a box centred in x and y: faces swell by ``amount`` metres in their middle."""
+    """Cushion from a box that is centred in x and y. Faces bulge by `amount` metres."""
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     centre, half = (low + high) / 2, (high - low) / 2
 

@@ -1,4 +1,4 @@
-"""Frames into a rosbag2 recording (MCAP) with ROS 2 Jazzy's message types."""
+"""Writes frames into a rosbag2 recording (MCAP) with the message types of ROS 2 Jazzy."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .render import CX, CY, FOCAL_PX, HEIGHT, WIDTH
 START_NS = 1_750_000_000_000_000_000
 PERIOD_NS = 100_000_000
 CAMERA_FRAME, WORLD_FRAME = "camera_color_optical_frame", "world"
-# compressed_depth_image_transport puts its ConfigHeader first: int32 format (0 = inverse depth),
-# two float32 quantisation parameters; for 16UC1 nothing reads them.
+# compressed_depth_image_transport starts with its ConfigHeader: int32 format (0 = inverse depth)
+# and two float32 quantisation parameters. Readers of 16UC1 ignore them.
 COMPRESSED_DEPTH_HEADER = bytes(12)
 
 
 class RecordingWriter:
-    """Writes one message of each topic a frame, all with the frame's stamp."""
+    """Writes one message per topic and frame, all with the stamp of the frame."""
 
     def __init__(self, folder: Path) -> None:
         self._store = get_typestore(Stores.ROS2_JAZZY)
@@ -57,7 +57,7 @@ class RecordingWriter:
         depth_png: bytes,
         T_world_camera: NDArray[np.float64],
     ) -> None:
-        """Add frame ``index`` (0, 1, …)."""
+        """Write frame `index` (0, 1, …)."""
         types = self._store.types
         stamp_ns = START_NS + index * PERIOD_NS
         stamp = types["builtin_interfaces/msg/Time"](
@@ -129,7 +129,7 @@ class RecordingWriter:
 
 def depth_png(depth_mm: NDArray[np.uint16]) -> bytes:
     """Lossless 16-bit PNG."""
-    # Disparity steps repeat the same values: without a row filter the file is a third smaller.
+    # Neighbouring pixels have equal values. Without a row filter the file is a third smaller.
     options = [cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
     ok, data = cv2.imencode(".png", depth_mm, options)
     if not ok:
@@ -138,9 +138,9 @@ def depth_png(depth_mm: NDArray[np.uint16]) -> bytes:
 
 
 def quaternion_xyzw(rotation: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Unit quaternion of a rotation matrix, w ≥ 0."""
+    """Unit quaternion of a rotation matrix (3, 3), w ≥ 0."""
     r = rotation
-    # Bar-Itzhack: the eigenvector of the largest eigenvalue; eigh reads the lower triangle.
+    # Bar-Itzhack: the eigenvector of the largest eigenvalue. eigh reads the lower triangle.
     k = np.zeros((4, 4))
     k[0, 0] = r[0, 0] - r[1, 1] - r[2, 2]
     k[1, :2] = r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2]

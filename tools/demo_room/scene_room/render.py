@@ -1,7 +1,7 @@
-"""A frame of the room: colour by ray casting with baked light, depth and instance ids.
+"""Renders a frame of the room: colour, depth and instance ids.
 
-Colour averages several rays a pixel; shiny surfaces send one reflected ray each. Depth and
-instances come from one ray through the pixel's centre, so they belong to one surface each.
+Colour is the mean of several rays per pixel. A shiny surface reflects one ray. Depth and instance
+come from one ray through the centre of the pixel, so both belong to the same surface.
 """
 
 from __future__ import annotations
@@ -21,8 +21,13 @@ RAY_OFFSETS_PX = ((-0.33, -0.10), (0.10, 0.33), (0.23, -0.30))
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """radiance (H, W, 3) float32 linear; depth_m (H, W) float32, z along the optical axis, 0 where
-    nothing is sensed; instances (H, W) uint16 object ids; cos_incidence (H, W) float32.
+    """A rendered frame.
+
+    Attributes:
+        radiance: (H, W, 3) float32, linear.
+        depth_m: (H, W) float32, z along the optical axis; 0 = no value.
+        instances: (H, W) uint16 object ids; 0 = none.
+        cos_incidence: (H, W) float32, cosine between the ray and the surface normal.
     """
 
     radiance: NDArray[np.float32]
@@ -37,7 +42,7 @@ def render(
     T_world_camera: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> RenderedFrame:
-    """Render one view; three colour rays a pixel."""
+    """Render one view with three colour rays per pixel."""
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     total = np.zeros((HEIGHT * WIDTH, 3), np.float32)
     for x, y in RAY_OFFSETS_PX:
@@ -140,7 +145,7 @@ def _shade(
         out_normal[k, 0], out_normal[k, 1], out_normal[k, 2] = n0 * scale, n1 * scale, n2 * scale
         s = wa * uv[a, 0] + wb * uv[b, 0] + wc * uv[c, 0]
         t = wa * uv[a, 1] + wb * uv[b, 1] + wc * uv[c, 1]
-        # One pixel covers about distance / focal metres, stretched at grazing angles.
+        # A pixel covers about distance / focal length, and more at grazing angles.
         span = distance[k] / 525.0 / max(cosine, 0.25)
         texel = span * width[m, 0] / tile_m[m, 0]
         if tile_m[m, 0] == 1.0 and tile_m[m, 1] == 1.0:

@@ -1,4 +1,4 @@
-"""The furnished room: which objects stand where, and what they rest on or in."""
+"""The furnished room: the objects, their positions and their supports."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ WINDOW_Y, WINDOW_Z, WINDOW_W, WINDOW_H = 0.25, 0.95, 2.0, 1.25
 
 @dataclass
 class PlacedObject:
-    """One thing in the room. ``T`` of its own frame: ``position`` and a turn about z.
+    """One object of the room. Its pose is `position` and a rotation about z.
 
-    class_name: COCO's word, or None where COCO has none. parent: name of the object it was put
-    on, in or fixed to, with that predicate. kind: furniture, screen, wall, small or shell.
+    Attributes:
+        class_name: COCO class, or None if COCO has none.
+        kind: furniture, screen, wall, small or shell.
+        parts: meshes in the world frame, with the names of their materials.
+        parent: name of the direct support, or None.
+        predicate: relation to the support: on, in or attached to.
+        local_low, local_high: (3,) corners of the box in the object's frame, metres.
     """
 
     object_id: int
@@ -38,7 +43,7 @@ class PlacedObject:
 
 
 class RoomBuilder:
-    """Collects objects and gives them ids in the order in which they are put down."""
+    """Collects objects. Ids count from 1 in the order of the calls."""
 
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
@@ -58,7 +63,7 @@ class RoomBuilder:
         parent: str | None = None,
         predicate: str | None = None,
     ) -> None:
-        """Place an object in the world; its parts are given in its own frame."""
+        """Add an object at a pose in the world. `parts` are in the object's frame."""
         vertices = np.concatenate([mesh.vertices for mesh, _ in parts])
         placed = [(mesh.turned("z", yaw_deg).moved(*xyz), material) for mesh, material in parts]
         item = PlacedObject(
@@ -92,7 +97,7 @@ class RoomBuilder:
         label: str | None = None,
         kind: str = "small",
     ) -> None:
-        """Put an object on another: x, y in the base's frame, at its top or at ``height``."""
+        """Put an object on `base`: x and y in the frame of the base, at its top or at `height`."""
         support = self._by_name[base]
         z = support.local_high[2] if height is None else height
         offset = axis_rotation("z", support.yaw_deg) @ np.array([*local_xy, z + 0.0005])
@@ -104,7 +109,7 @@ class RoomBuilder:
 
 
 def build_room(seed: int) -> list[PlacedObject]:
-    """All objects of the room, the shell (floor, walls, ceiling) first."""
+    """All objects of the room. The shell (floor, walls, ceiling) is first."""
     room = RoomBuilder(seed)
     _shell(room)
     _dining(room)

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from .materials import Material
 from .room import PlacedObject
+
+if TYPE_CHECKING:
+    from embreex.rtcore_scene import EmbreeScene
 
 MIP_LEVELS = 6
 
 
 @dataclass(frozen=True)
 class TextureAtlas:
-    """All textures with their mip levels in one line of texels.
+    """All textures and their mip levels in one array of texels.
 
     texels (t, 3) float32; offset, height, width (materials, MIP_LEVELS) int64.
     """
@@ -31,7 +33,7 @@ class TextureAtlas:
 
 @dataclass(frozen=True)
 class Scene:
-    """World-frame triangles (metres) with what each needs for shading."""
+    """Triangles in the world frame (metres), their materials and textures, and two ray casters."""
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -40,7 +42,6 @@ class Scene:
     face_material: NDArray[np.int32]
     face_object: NDArray[np.int32]
     vertex_material: NDArray[np.int32]
-    material_names: list[str]
     f0: NDArray[np.float32]
     roughness: NDArray[np.float32]
     emission: NDArray[np.float32]
@@ -54,7 +55,7 @@ class Scene:
 
 
 def assemble(objects: list[PlacedObject], materials: dict[str, Material]) -> Scene:
-    """Flatten placed objects into one scene; emitters cast no shadows."""
+    """One scene of all objects. Emitters cast no shadows."""
     names = sorted({material for item in objects for _, material in item.parts})
     number = {name: i for i, name in enumerate(names)}
     used = [materials[name] for name in names]
@@ -81,10 +82,7 @@ def assemble(objects: list[PlacedObject], materials: dict[str, Material]) -> Sce
     )
     emission = np.array([m.emission for m in used], np.float32)
     vertices = vertices.astype(np.float32)
-    triangles = np.ascontiguousarray(vertices[faces])
-    embree, shadow = EmbreeScene(), EmbreeScene()
-    TriangleMesh(embree, triangles)
-    TriangleMesh(shadow, np.ascontiguousarray(triangles[emission[face_material] <= 2.0]))
+    triangles = vertices[faces]
     return Scene(
         vertices=vertices,
         normals=normals.astype(np.float32),
@@ -93,7 +91,6 @@ def assemble(objects: list[PlacedObject], materials: dict[str, Material]) -> Sce
         face_material=face_material.astype(np.int32),
         face_object=face_object.astype(np.int32),
         vertex_material=vertex_material.astype(np.int32),
-        material_names=names,
         f0=np.array([m.f0 for m in used], np.float32),
         roughness=np.array([m.roughness for m in used], np.float32),
         emission=emission,
@@ -102,9 +99,20 @@ def assemble(objects: list[PlacedObject], materials: dict[str, Material]) -> Sce
         tile_m=np.array([m.tile_m for m in used], np.float32),
         mean_albedo=np.array([m.texture.mean((0, 1)) for m in used], np.float32),
         atlas=_atlas(used),
-        embree=embree,
-        shadow_embree=shadow,
+        embree=_ray_caster(triangles),
+        shadow_embree=_ray_caster(triangles[emission[face_material] <= 2.0]),
     )
+
+
+def _ray_caster(triangles: NDArray[np.float32]) -> EmbreeScene:
+    """Embree's scene of triangles (n, 3, 3)."""
+    # Imported here, so that make_recording.py shows its help and a clear error without embreex.
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = EmbreeScene()
+    TriangleMesh(scene, np.ascontiguousarray(triangles))
+    return scene
 
 
 def _atlas(materials: list[Material]) -> TextureAtlas:

@@ -1,4 +1,4 @@
-"""What a real camera adds: exposure, grain and JPEG; a structured-light depth sensor's faults."""
+"""Noise of a real camera (exposure, grain, JPEG) and of a structured-light depth sensor."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from .render import FOCAL_PX, RenderedFrame
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """Parameters of the depth sensor; metres and pixels.
+    """Parameters of the depth sensor. The ground truth contains them under these names.
 
-    Axial deviation ``sigma_base_m + sigma_quadratic (z − 0.4)²``, correlated over a few pixels as
-    the matching window makes it; disparity in steps of ``disparity_step_px`` for ``baseline_m``.
+    The axial deviation is `sigma_base_m + sigma_quadratic (z − 0.4)²`. A matching window correlates
+    it over a few pixels. Disparity has steps of `disparity_step_px` at `baseline_m`.
     """
 
     sigma_base_m: float = 0.0008
@@ -33,14 +33,14 @@ class DepthNoise:
     max_depth_m: float = 4.6
 
     def as_dict(self) -> dict[str, float]:
-        """For the ground-truth file."""
+        """The parameters by name."""
         return asdict(self)
 
 
 def sense_depth(
     frame: RenderedFrame, noise: DepthNoise, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Millimetres (H, W) uint16, 0 = no value."""
+    """Noisy depth (H, W) uint16, millimetres; 0 = no value."""
     depth = frame.depth_m
     height, width = depth.shape
     jitter = [
@@ -58,9 +58,9 @@ def sense_depth(
     far = cv2.dilate(np.where(sampled > 0, sampled, 0).astype(np.float32), np.ones((3, 3)))
     edge = (far - near) > np.maximum(0.03, 0.03 * near)
     draw = _patches(rng, depth.shape, 1.4)
-    share = rng.random(depth.shape) ** 1.5
+    fraction = rng.random(depth.shape) ** 1.5
     flying = edge & (draw < noise.flying_share)
-    z = np.where(flying, near + share * (far - near), sampled)
+    z = np.where(flying, near + fraction * (far - near), sampled)
     holes = edge & (draw > 1 - noise.edge_hole_share)
 
     grain = cv2.GaussianBlur(
@@ -85,7 +85,7 @@ def sense_depth(
 def _patches(
     rng: np.random.Generator, shape: tuple[int, ...], size_px: float
 ) -> NDArray[np.float64]:
-    """Smooth random field, uniform in [0, 1]."""
+    """Smooth random field, uniformly distributed in [0, 1]."""
     field = cv2.GaussianBlur(rng.normal(size=shape).astype(np.float32), (0, 0), size_px)
     rank = np.empty(field.size)
     rank[np.argsort(field, axis=None)] = np.linspace(0, 1, field.size)
@@ -95,7 +95,7 @@ def _patches(
 def expose(
     radiance: NDArray[np.float32], gain: float, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """8-bit BGR picture: lens blur and fall-off, exposure, noise, a film-like curve."""
+    """8-bit BGR picture with lens blur, vignetting, exposure, noise and a tone curve."""
     height, width = radiance.shape[:2]
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     r2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
@@ -104,14 +104,14 @@ def expose(
     grain = rng.normal(size=light.shape).astype(np.float32)
     light = light + grain * np.sqrt(0.000045 * np.maximum(light, 0) + 0.0000018)
     light = np.maximum(light, 0)
-    # Filmic shoulder (Hable-like rational curve), then the display's gamma.
+    # A rational filmic curve, then the gamma of the display.
     curve = light * (2.51 * light + 0.03) / (light * (2.43 * light + 0.59) + 0.14)
     picture = np.clip(curve, 0, 1) ** (1 / 2.2) * 255
     return np.clip(np.round(picture), 0, 255).astype(np.uint8)[..., ::-1].copy()
 
 
 def jpeg(picture_bgr: NDArray[np.uint8], quality: int) -> bytes:
-    """Compressed picture."""
+    """The picture as JPEG. `quality` is 0 to 100."""
     ok, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert ok
     return bytes(data.tobytes())

@@ -1,4 +1,4 @@
-"""Small things in their own frames: z = 0 is what they stand on, the front faces −y."""
+"""Small objects in their own frames: they stand on z = 0, the front faces −y."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .meshes import Mesh, ball, box, join, lathe, leaf, sheet, tube
 
 
 def cup(material: str) -> Parts:
-    """Mug with a handle (towards +x) and coffee in it."""
+    """Mug of coffee with a handle towards +x."""
     r, h = 0.046, 0.104
     body = lathe(
         [
@@ -59,7 +59,7 @@ def bowl(material: str, radius: float = 0.14, height: float = 0.078) -> Parts:
 
 
 def wine_bottle() -> Parts:
-    """Green glass, label, foil."""
+    """Green wine bottle with a label and foil."""
     glass = lathe(
         [
             (1e-5, 0.0),
@@ -116,20 +116,6 @@ def soap_bottle() -> Parts:
     return [(body, "soap_blue"), (cap, "ceramic_white")]
 
 
-def wine_glass() -> Parts:
-    """Goblet with red wine; opaque, so that a depth camera sees it."""
-    foot = lathe(
-        [(0.034, 0.0), (0.034, 0.002), (0.006, 0.006), (0.0035, 0.02), (0.0035, 0.085)], 30
-    )
-    cupola = lathe(
-        [(0.0035, 0.085), (0.02, 0.095), (0.036, 0.125), (0.037, 0.15), (0.032, 0.185)], 36, 24
-    )
-    inner = lathe(
-        [(0.031, 0.185), (0.036, 0.15), (0.035, 0.13), (0.02, 0.10), (1e-5, 0.09)], 36, 24
-    )
-    return [(join(foot, cupola, inner), "ceramic_white")]
-
-
 def vase(material: str, height: float = 0.26) -> Parts:
     """Bellied vase with an open neck."""
     k = height / 0.26
@@ -152,7 +138,7 @@ def vase(material: str, height: float = 0.26) -> Parts:
 
 
 def flowers(rng: np.random.Generator, neck: float, count: int = 9, spread: float = 0.15) -> Parts:
-    """Bunch of tulips whose stems meet at z = 0 and rise about 0.2 m above ``neck``."""
+    """Bunch of tulips. The stems meet at z = 0 and end about 0.2 m above `neck`."""
     greens: list[Mesh] = []
     leaves: list[Mesh] = []
     petals: dict[str, list[Mesh]] = {"petal_red": [], "petal_yellow": [], "petal_white": []}
@@ -183,7 +169,7 @@ def flowers(rng: np.random.Generator, neck: float, count: int = 9, spread: float
 def potted_plant(
     rng: np.random.Generator, size: float, pot: str, leaves: int, stem: float = 0.35
 ) -> Parts:
-    """Pot with a leafy plant; ``size`` is about the total height."""
+    """Pot with a leafy plant. `size` is about the total height, metres."""
     r, h = 0.17 * size, 0.30 * size
     shell = lathe(
         [
@@ -249,7 +235,7 @@ def laptop(opening: float = 112.0) -> Parts:
 
 
 def book(index: int, thickness: float, height: float, depth: float) -> Parts:
-    """Upright book: spine faces −y, thickness along x."""
+    """Upright book. The spine faces −y; the thickness is along x."""
     cover, spine = f"cover_{index}", f"spine_{index}"
     t = 0.003
     pages = box(thickness - 2 * t, depth - 0.010, height - 0.008, 0.001, 0.05).moved(
@@ -274,7 +260,7 @@ def book(index: int, thickness: float, height: float, depth: float) -> Parts:
 
 
 def lying_book(index: int, thickness: float, height: float, depth: float) -> Parts:
-    """The same book on its back board, cover up, spine towards −x, head towards +y."""
+    """Lying book: cover up, spine towards −x, head towards +y."""
     parts = []
     for mesh, material in book(index, thickness, height, depth):
         turned = mesh.turned("z", -90).turned("x", -90).moved(0, -height / 2, thickness / 2)
@@ -284,7 +270,7 @@ def lying_book(index: int, thickness: float, height: float, depth: float) -> Par
 
 
 def fruit(material: str, radius: float) -> Parts:
-    """Orange or apple: a ball, dented at the top, with a stalk."""
+    """Orange or apple: a ball with a dent at the top and a stalk."""
 
     def dent(v: np.ndarray) -> np.ndarray:
         q = np.hypot(v[:, 0], v[:, 1]) / radius
@@ -302,7 +288,7 @@ def fruit(material: str, radius: float) -> Parts:
 
 
 def bananas() -> Parts:
-    """Bunch of three, joined at one end."""
+    """Three bananas, joined at one end."""
     parts: Parts = []
     for k in range(3):
         t = np.linspace(-0.95, 1.05, 15)

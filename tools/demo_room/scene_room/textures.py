@@ -1,4 +1,4 @@
-"""Procedural textures: linear-light albedo images (H, W, 3) float32 that tile where they repeat."""
+"""Procedural textures: images of linear albedo (H, W, 3) float32. Repeated textures tile."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ Image = NDArray[np.float32]
 
 
 def rgb(hex_colour: str) -> Image:
-    """'#rrggbb' in sRGB as linear light (3,)."""
+    """Linear RGB (3,) of '#rrggbb' in sRGB."""
     values = np.array([int(hex_colour[i : i + 2], 16) for i in (1, 3, 5)], np.float32) / 255
     return (values**2.2).astype(np.float32)
 
 
 def plain(colour: str) -> Image:
-    """One colour."""
+    """Texture of one colour."""
     return np.tile(rgb(colour), (4, 4, 1)).astype(np.float32)
 
 
@@ -29,7 +29,7 @@ def write(
     colour: list[float] | tuple[float, float, float],
     thickness: int,
 ) -> None:
-    """Write text into a float image (OpenCV writes into 8-bit ones only)."""
+    """Write text into a float image. OpenCV itself writes only into 8-bit images."""
     mask = np.zeros(image.shape[:2], np.uint8)
     cv2.putText(mask, text, origin, font, scale, 255, thickness, cv2.LINE_AA)
     weight = mask[..., None].astype(np.float32) / 255
@@ -69,7 +69,7 @@ def wood(rng: np.random.Generator, light: str, dark: str, rings: float = 7.0) ->
 
 
 def planks(rng: np.random.Generator, light: str, dark: str, rows: int = 8) -> Image:
-    """Floor boards running along v, staggered, each with its own tone and grain."""
+    """Staggered floor boards along v, each with its own tone and grain."""
     size = 1024
     image = np.zeros((size, size, 3), np.float32)
     width = size // rows
@@ -111,7 +111,7 @@ def fur(rng: np.random.Generator, colour: str) -> Image:
 
 
 def rug(rng: np.random.Generator) -> Image:
-    """Bordered carpet with diamonds, mapped once over its rectangle."""
+    """Carpet with a border and diamonds. One texture covers the whole carpet."""
     height, width = 512, 768
     image = np.tile(rgb("#8c2f2b"), (height, width, 1))
     cv2.rectangle(image, (24, 24), (width - 25, height - 25), rgb("#e2d3b4").tolist(), 16)
