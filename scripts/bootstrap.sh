@@ -1,11 +1,11 @@
 # shellcheck shell=bash
-# The environment of scripts/demo and scripts/test. Source it, then call `bootstrap run` or
-# `bootstrap test`. Afterwards .venv holds the requirements of pyproject.toml and the project
-# itself, PATH begins with .venv/bin, and the ROS variables are set. Nothing outside the checkout
-# changes, except pip's cache.
+# Makes the environment of scripts/demo and scripts/test. Source this file, then call
+# `bootstrap run` or `bootstrap test`. It installs the requirements of pyproject.toml and the
+# project into .venv, puts .venv/bin first on PATH and sets the ROS variables. Outside the checkout
+# it changes only pip's cache.
 #
-# Each slow step stores the hash of its input in .venv/.bootstrap. A start without changes does no
-# work; an interrupted start continues where it stopped.
+# Each slow step stores the hash of its input in .venv/.bootstrap. A second call without changes
+# does no work. A call after an interruption continues where the first one stopped.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$root/.venv"
@@ -19,17 +19,16 @@ fail() {
   exit 1
 }
 
-# quietly LABEL COMMAND...: run with one line on the terminal; the output is shown if it fails.
+# quietly LABEL COMMAND...: run the command and show one line. Show its output only if it fails.
 quietly() {
-  local label=$1 began=$SECONDS pid status=0 turn=0
+  local label=$1 began=$SECONDS pid status=0 turn=0 spinner='-\|/'
   shift
   "$@" >"$log" 2>&1 </dev/null 9>&- &
   pid=$!
-  trap 'kill "$pid" 2>/dev/null; say; fail "stopped; the next start continues from here"' INT TERM
+  trap 'kill "$pid" 2>/dev/null; say; fail "stopped; the next call continues here"' INT TERM
   if [ -t 2 ]; then
     while kill -0 "$pid" 2>/dev/null; do
-      printf '\r  %s %s … %d s ' "$(printf '%s' '|/-\' | cut -c $((turn % 4 + 1)))" "$label" \
-        $((SECONDS - began)) >&2
+      printf '\r  %s %s … %d s ' "${spinner:turn % 4:1}" "$label" $((SECONDS - began)) >&2
       turn=$((turn + 1))
       sleep 0.3
     done
@@ -57,8 +56,8 @@ forget_other_ros() {
     say "  ROS 2 ${ROS_DISTRO} is sourced but not usable here (expected: jazzy, with rclpy for" \
       "python3); using the project's own ROS 2 Jazzy instead"
   fi
-  # The wheels re-execute each interpreter once to set LD_LIBRARY_PATH; inherited from another
-  # environment, their guard would leave the variable pointing there.
+  # The ROS wheels start each interpreter twice to set LD_LIBRARY_PATH, and mark that with
+  # _ROS_WHEELS_BOOTSTRAP_COMPLETE. The mark of another environment would keep its LD_LIBRARY_PATH.
   if [ -n "${ROS_DISTRO:-}${_ROS_WHEELS_BOOTSTRAP_COMPLETE:-}" ]; then unset LD_LIBRARY_PATH; fi
   unset _ROS_WHEELS_BOOTSTRAP_COMPLETE ROS_DISTRO ROS_VERSION ROS_PYTHON_VERSION \
     AMENT_PREFIX_PATH COLCON_PREFIX_PATH CMAKE_PREFIX_PATH PYTHONPATH
@@ -67,7 +66,7 @@ forget_other_ros() {
 
 version_of() { "$1" -I -S -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null; }
 
-# Print a Python 3.10-3.13 that can make virtual environments.
+# Print the path of a Python 3.10-3.13 that can make virtual environments.
 find_python() {
   local candidate version seen=""
   for candidate in ${PYTHON:-} python3 python3.13 python3.12 python3.11 python3.10; do
@@ -84,7 +83,8 @@ find_python() {
     esac
   done
   seen=${seen:-, none}
-  fail "needs Python 3.10, 3.11, 3.12 or 3.13 with venv on PATH (or in \$PYTHON); found: ${seen#, }"
+  fail "found on PATH: ${seen#, }; expected Python 3.10, 3.11, 3.12 or 3.13 with venv: install one," \
+    "or set PYTHON to its path"
 }
 
 hash_of() { (cd "$root" && find "$@" -type f ! -name '*.py[cod]' ! -name '*.nb[ic]' -print0) |
@@ -92,7 +92,7 @@ hash_of() { (cd "$root" && find "$@" -type f ! -name '*.py[cod]' ! -name '*.nb[i
 
 is_current() { [ "$(cat "$stamps/$1" 2>/dev/null)" = "$2" ]; }
 
-# Make .venv. Make it again if the folder, the Python or the ROS has changed.
+# Make .venv. Make it again if the path of the checkout, the Python or the ROS has changed.
 make_venv() {
   local ros=$1 python=${PYTHON:-"$venv/bin/python"} options=()
   is_current venv "$root $ros $(version_of "$python")" && return
@@ -112,8 +112,8 @@ pip_install() { "$venv/bin/python" -m pip install --no-input --prefer-binary \
   --disable-pip-version-check "$@"; }
 
 # Install the requirements of a profile (run or test) from pyproject.toml. With
-# DEWORLDSG_TEST_MODELS set, test includes torch and transformers. A sourced ROS needs no ROS
-# wheels, but the numpy generation that its message types were compiled against.
+# DEWORLDSG_TEST_MODELS set, test includes torch and transformers. A sourced ROS needs no ROS wheels.
+# It needs the major version of numpy with which its message types were compiled.
 install_requirements() {
   local ros=$1 profile=$2 extras=(build run) arguments=() list expected
   [ "$ros" = sourced ] || extras+=(ros)
@@ -136,8 +136,7 @@ install_requirements() {
   echo "$expected" >"$stamps/$profile"
 }
 
-# Install the project from a clean copy, so that no build/ is left in the checkout and no module
-# deleted since the last build comes back.
+# Install the project from a clean copy. An old build/ would install deleted modules again.
 install_project() {
   local name expected sources=()
   for name in package.xml setup.py setup.cfg pyproject.toml README.md LICENSE \
@@ -156,34 +155,34 @@ install_project() {
   echo "$expected" >"$stamps/project"
 }
 
-# Each process of the graph takes 32 MB of shared memory for images (config/fastdds.xml).
+# Each node takes 32 MB of shared memory for images (config/fastdds.xml).
 check_shared_memory() {
   local free_mb
   free_mb=$(df -Pm /dev/shm 2>/dev/null | awk 'NR == 2 { print $4 }')
   if [ "${free_mb:-0}" -lt 256 ]; then
-    say "  /dev/shm has ${free_mb:-no} MB free, less than the 256 MB that lose no image;" \
-      "in a container: docker run --shm-size=512m"
+    say "  /dev/shm has ${free_mb:-0} MB free; images can be lost with less than 256 MB;" \
+      "in a container, use docker run --shm-size=512m"
   fi
 }
 
 bootstrap() {
   local profile=$1 ros=wheels
-  [ "$(uname -s)" = Linux ] || fail "needs Linux; this is $(uname -s)"
+  [ "$(uname -s)" = Linux ] || fail "this system is $(uname -s); expected Linux"
   unset VIRTUAL_ENV PYTHONHOME
   if jazzy_is_sourced; then
     ros=sourced
   else
-    [ "$(uname -m)" = x86_64 ] || fail "ROS 2 wheels exist for x86_64 only and this is $(uname -m):" \
+    [ "$(uname -m)" = x86_64 ] || fail "this machine is $(uname -m); ROS 2 wheels need x86_64:" \
       "install ROS 2 Jazzy and source its setup.bash first"
     forget_other_ros
   fi
   if [ -d "$venv" ] && [ ! -d "$stamps" ]; then
-    fail ".venv exists and was not made by this script; move it away"
+    fail "another program made .venv; move it away, then start again"
   fi
   mkdir -p "$stamps"
   if command -v flock >/dev/null; then
     exec 9>"$stamps/lock"
-    flock -n 9 || { say "  waiting for another start in this checkout …" && flock 9; }
+    flock -n 9 || { say "  waiting for another call in this checkout …" && flock 9; }
   fi
   make_venv "$ros"
   install_requirements "$ros" "$profile"
