@@ -1,15 +1,15 @@
-"""Compares the edges from chosen clips with the edges from all clips of every frame.
+"""Compare the edges with a clip budget with the edges from all clips of every frame.
 
-    python bench/clip_budget.py                                  the shipped recording
-    python bench/clip_budget.py --rooms FOLDER                   both rooms, recorded detections
+    python bench/clip_budget.py                                    the shipped recording
+    python bench/clip_budget.py --rooms FOLDER                     rooms with recorded detections
     python bench/clip_budget.py --set relations.max_clips_per_s=2  another budget
-    python bench/clip_budget.py --lead 0                         uncertain predictions
+    python bench/clip_budget.py --lead 0                           uncertain predictions
 
 Both sides get the same local graphs and images. Two edges are equal if the same directed pair has
-the same most probable predicate. The world model is `fake` unless --set changes it: the class pair
-decides the most probable predicate of every clip. With --lead 0 the clips of a class pair differ,
-and the predicates have nearly equal probabilities. The agreement then shows how much the mean of a
-few clips differs from the mean of all.
+the same most probable predicate. The default world model is `fake`: the class pair determines the
+most probable predicate of a clip. With --lead 0 the clips of a class pair differ, and the
+predicates have nearly equal probabilities. The agreement then shows how much the mean of a few
+clips differs from the mean of all.
 """
 
 from __future__ import annotations
@@ -40,16 +40,14 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import LocalGraph
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
-# The predicate of an edge is decided if its probability exceeds the second one by this.
+# The predicate of an edge is clear if its probability exceeds the second one by this.
 LEAD = 0.05
-
-
-# Clips that may wait on the side that encodes all clips of a frame at once.
+# Maximum queue of the side that encodes all clips of a frame at once.
 EVERY_CLIP_QUEUE_SIZE = 4096
 
 
 class Side:
-    """Merging and relations with one choice of clips."""
+    """Merging and relations with one budget of clips."""
 
     def __init__(
         self, config: Config, first: LocalGraph, lead: float | None, queue_size: int
@@ -62,8 +60,8 @@ class Side:
         self.reasoner.watch(LiveGraph(self.builder.graph))
         self.seconds = 0.0
 
-    def take(self, local: LocalGraph, rgb: np.ndarray) -> None:
-        """Process a frame."""
+    def process(self, local: LocalGraph, rgb: np.ndarray) -> None:
+        """Merge a frame and infer its relations."""
         self.builder.integrate(local)
         started_s = time.perf_counter()
         evidence = [self.reasoner.observe(local, rgb), *self.reasoner.drain()]
@@ -77,44 +75,49 @@ class Side:
 
 
 def recordings(rooms: Path | None, config: Config) -> Iterator[tuple[str, Recording, Pipeline]]:
-    """Each recording, and a pipeline without a world model for its local graphs."""
-    blind = msgspec.structs.replace(
+    """The name of each recording, the recording, and a pipeline without a world model."""
+    no_world_model = msgspec.structs.replace(
         config, relations=msgspec.structs.replace(config.relations, world_model="none")
     )
     if rooms is None:
         source = open_source(BAG, inputs=config.inputs)
-        yield "demo_room", Recording(source, config.inputs), Pipeline(blind)
+        yield "demo_room", Recording(source, config.inputs), Pipeline(no_world_model)
         return
     annotations = Annotations(rooms, "replica")
     for scan in sorted(folder.name for folder in (rooms / "data").iterdir()):
         source = open_source(annotations.scan_folder(scan))
         choice = FrontEndChoice("recorded")
-        front_end = build_front_end(choice, annotations, scan, source, blind)
-        yield scan, Recording(source, config.inputs), Pipeline(blind, front_end)
+        front_end = build_front_end(choice, annotations, scan, source, no_world_model)
+        yield scan, Recording(source, config.inputs), Pipeline(no_world_model, front_end)
 
 
 def compare(name: str, every: Side, chosen: Side, frames: int) -> None:
-    """Print one table row of numbers, and the numbers of clips."""
+    """Print how far the edges of both sides agree, and the numbers of clips."""
     reference, edges = every.edges(), chosen.edges()
     counters = chosen.reasoner.counters()
     all_clips, clips = every.reasoner.counters().encoded, counters.encoded
     shared = [pair for pair in reference if pair in edges]
     same = [pair for pair in shared if edges[pair].predicate == reference[pair].predicate]
-    decided = [pair for pair, edge in reference.items() if _lead(edge) > LEAD]
+    clear = [pair for pair, edge in reference.items() if _lead(edge) > LEAD]
     agreed = set(same)
     differences = [abs(edges[p].probability - reference[p].probability) for p in shared]
     kinds = Counter(edge.provenance for edge in reference.values())
     print(f"{name}: {frames} frames, {all_clips} clips, {len(reference)} edges {dict(kinds)}")
     print(f"  clips encoded        {clips} ({clips / all_clips:.1%})")
     print(f"  same edges           {len(same) / len(reference):.1%}", end="")
-    print(f" (same pairs {len(shared) / len(reference):.1%}, more {len(edges) - len(shared)})")
-    if decided:
-        share = sum(pair in agreed for pair in decided) / len(decided)
-        print(f"  of the {len(decided)} decided by more than {LEAD}: {share:.1%}")
-    print(f"  probability differs  mean {np.mean(differences):.4f}, most {max(differences):.4f}")
-    print(f"  a frame of relations {1e3 * chosen.seconds / frames:.1f} ms", end="")
+    print(
+        f" (same pairs {len(shared) / len(reference):.1%}, {len(edges) - len(shared)} other pairs)"
+    )
+    if clear:
+        fraction = sum(pair in agreed for pair in clear) / len(clear)
+        print(f"  of {len(clear)} with a lead above {LEAD}: {fraction:.1%}")
+    print(f"  probability differs  mean {np.mean(differences):.4f}, maximum {max(differences):.4f}")
+    print(f"  relations            {1e3 * chosen.seconds / frames:.1f} ms per frame", end="")
     print(f" (all: {1e3 * every.seconds / frames:.1f} ms)")
-    print(f"  not encoded: {counters.dropped}, {counters.pending} pending at the end", flush=True)
+    print(
+        f"  not encoded          {counters.dropped}, {counters.pending} pending at the end",
+        flush=True,
+    )
 
 
 def _lead(edge: wire.EdgeState) -> float:
@@ -124,10 +127,10 @@ def _lead(edge: wire.EdgeState) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", type=Path, help="data set in ReplicaSSG's layout")
+    parser.add_argument("--rooms", type=Path, help="data set in the layout of ReplicaSSG")
     parser.add_argument("--config", type=Path, help="parameter file")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.FIELD=VALUE")
-    parser.add_argument("--lead", type=float, help="extra logit of the fake's leading predicate")
+    parser.add_argument("--lead", type=float, help="extra logit of the top predicate of `fake`")
     parser.add_argument("--every", type=int, default=1, help="process every N-th frame")
     options = parser.parse_args()
     config = effective_config(options.config, ["relations.world_model=fake", *options.set])
@@ -147,7 +150,7 @@ def main() -> None:
                     Side(config, local, options.lead, QUEUE_SIZE),
                 ]
             for side in sides:
-                side.take(local, frame.rgb)
+                side.process(local, frame.rgb)
             frames += 1
         compare(name, *sides, frames)
 

@@ -1,11 +1,14 @@
-"""Time and memory of the merging stage (Eq. 5-7).
+"""Time and memory of merging (Eq. 5-7).
 
-Run as `python bench/merging.py`. The kernel and the np.linalg reference are measured turn by turn
-in one run, and the ratio given is the median of the paired ratios.
+    python bench/merging.py [--quick]
+
+The kernel and the np.linalg reference alternate within one run. The ratio is the median of the
+paired ratios. The times are processor times of one thread.
 """
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import sys
 import time
@@ -37,15 +40,15 @@ VOCABULARY = Vocabulary(
 )
 LOCAL_NODES = 12
 DENSITY_PER_M2 = 3.0
-POINTS = 200  # of the surface of each object, as lifting hands them on
-# A wall far behind everything: the surface rule compares it with nodes that are out of sight.
+POINTS = 200  # surface points per object, as from lifting
+# A wall behind all objects. The surface rule compares the depth of nodes with it.
 DEPTH = DepthGrid(
     np.full((60, 80), 60_000, np.uint16), 8, Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
 )
 
 
 class World:
-    """Objects of 5-50 cm on a floor that grows with their number, seen from all sides."""
+    """Objects of 5-50 cm at a constant density: the floor grows with their number."""
 
     def __init__(self, count: int, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -53,7 +56,7 @@ class World:
         self.means = rng.uniform((0, 0, 0), (side_m, side_m, 1.5), (count, 3))
         bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
         variances = rng.uniform(0.05, 0.5, (count, 1, 3)) ** 2 / 12
-        # The surface that a camera sees is thin in one direction.
+        # A visible surface is thin in one direction.
         variances[:, :, 2] = 0.005**2
         self.covariances = bases * variances @ bases.swapaxes(1, 2)
         self.covariances = (self.covariances + self.covariances.swapaxes(1, 2)) / 2
@@ -61,19 +64,19 @@ class World:
         self.classes = rng.integers(0, CLASSES, count)
 
     def surface_points(self, row: int, rng: np.random.Generator) -> np.ndarray:
-        """Points (k, 3) of an object's surface, spread evenly over a thin slab of its moments."""
+        """Surface points (POINTS, 3): uniform in a thin slab with the moments of the object."""
         spread = rng.uniform(-(3**0.5), 3**0.5, (POINTS, 3))
         return (self.means[row] + spread @ self.roots[row].T).astype(np.float32)
 
     def probabilities(self, rows: np.ndarray) -> np.ndarray:
-        """Class distributions (n, C) of an observation of these objects."""
+        """Class distributions (n, C) of observations of these objects."""
         probabilities = np.full((len(rows), CLASSES), 0.2 / CLASSES)
         probabilities[np.arange(len(rows)), self.classes[rows]] += 0.8
         return probabilities
 
 
 def graph_of(world: World) -> SceneGraph:
-    """One node an object; 5 edges a node."""
+    """A graph with one node per object and 5 edges per node."""
     graph = SceneGraph(VOCABULARY, "world")
     rows = np.arange(len(world.means))
     rng = np.random.default_rng(1)
@@ -87,7 +90,7 @@ def graph_of(world: World) -> SceneGraph:
 
 
 def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
-    """Frames of 12 objects each that are near one another, with millimetre noise."""
+    """Frames of 12 neighbouring objects with millimetre noise."""
     rng = np.random.default_rng(seed)
     frames = []
     for stamp_ns in range(1, count + 1):
@@ -144,7 +147,7 @@ def search_with_linalg(graph: SceneGraph, local: LocalGraph) -> list[int]:
 
 
 def milliseconds(call: Callable[[], object]) -> float:
-    # Time on the processor: what else runs on the machine is not counted.
+    # Processor time of this thread; other work on the machine does not count.
     start = time.thread_time()
     call()
     return (time.thread_time() - start) * 1e3
@@ -160,12 +163,13 @@ def bench_search(count: int, rounds: int) -> None:
         linalg.append(milliseconds(lambda frame=local: search_with_linalg(graph, frame)))
     ratio = statistics.median(slow / fast for slow, fast in zip(linalg, kernel))
     print(
-        f"search {LOCAL_NODES} x {count:6d}: kernel {statistics.median(kernel):7.3f} ms, "
+        f"search of {LOCAL_NODES} objects in {count} nodes: "
+        f"kernel {statistics.median(kernel):7.3f} ms, "
         f"np.linalg {statistics.median(linalg):8.2f} ms, ratio {ratio:6.0f}"
     )
 
 
-def bench_stage(association: Literal["paper", "surface"], count: int, rounds: int = 300) -> None:
+def bench_stage(association: Literal["paper", "surface"], count: int, rounds: int) -> None:
     world = World(count)
     frames = frames_of(world, rounds)
     tracemalloc.start()
@@ -185,22 +189,25 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     after = len(graph)
     dense = count**2 * PREDICATES * 8
     print(
-        f"{association} stage {LOCAL_NODES} x {before:6d} nodes ({after} after), "
+        f"{association} rule, {LOCAL_NODES} objects, {before} nodes ({after} at the end), "
         f"{len(graph.edges)} edges: "
         f"median {statistics.median(times):6.3f} ms, 95 % {sorted(times)[int(0.95 * rounds)]:6.3f} "
-        f"ms a frame; graph holds {held / 1e6:.1f} MB, peak {peak / 1e6:.1f} MB "
-        f"(a dense relation array would be {dense / 1e6:.0f} MB)"
+        f"ms per frame; memory of the graph {held / 1e6:.1f} MB, peak {peak / 1e6:.1f} MB "
+        f"(with a dense relation array {dense / 1e6:.0f} MB more)"
     )
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small graphs and few frames")
+    quick = parser.parse_args().quick
     warm_up()
-    for count, rounds in ((100, 200), (1000, 40), (10_000, 8)):
+    for count, rounds in ((100, 20),) if quick else ((100, 200), (1000, 40), (10_000, 8)):
         bench_search(count, rounds)
     for association in ("paper", "surface"):
         build_merging(MergingConfig(association=association)).warm_up()
-        for count in (300, 1000):
-            bench_stage(association, count)
+        for count in (100,) if quick else (300, 1000):
+            bench_stage(association, count, rounds=20 if quick else 300)
 
 
 if __name__ == "__main__":

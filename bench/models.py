@@ -1,8 +1,8 @@
-"""Times the paper's models at their published sizes, with random weights, on this device.
+"""Time of the paper's models at their published sizes, with random weights.
 
     python bench/models.py [--device auto|cpu|cuda] [--only NAME] [--turns 5]
 
-Prints the median and the least time of each model. The time does not depend on the weights. To add
+It prints the median and the minimum of each model. The time does not depend on the weights. To add
 a model, write a builder and add it to BUILDERS.
 """
 
@@ -37,7 +37,7 @@ CROP = (300, 400)  # height and width of a crop before resizing, pixels
 
 @dataclass(frozen=True)
 class Run:
-    """A timed call: its unit, and the number of units per call."""
+    """A call to time. One call processes `count` units."""
 
     call: Callable[[], object]
     unit: str
@@ -67,10 +67,10 @@ def vjepa2_of(layers: int, width: int, heads: int, mlp_ratio: float, size: int):
         )
         model = transformers.VJEPA2Model(config)
         model.predictor = torch.nn.Identity()
-        placed = _placed(model, choice)
+        network = _on_device(model, choice)
 
         def features(videos):
-            return placed(videos, skip_predictor=True).last_hidden_state.mean(1)
+            return network(videos, skip_predictor=True).last_hidden_state.mean(1)
 
         return _clips(choice, "vjepa2", width, size, vjepa2.clip_geometry(size), features)
 
@@ -84,10 +84,10 @@ def dinov2_of(layers: int, width: int, heads: int):
         config = transformers.Dinov2Config(
             hidden_size=width, num_hidden_layers=layers, num_attention_heads=heads, image_size=518
         )
-        placed = _placed(transformers.Dinov2Model(config), choice)
+        network = _on_device(transformers.Dinov2Model(config), choice)
 
         def features(videos):
-            tokens = placed(videos.flatten(0, 1)).last_hidden_state[:, 0]
+            tokens = network(videos.flatten(0, 1)).last_hidden_state[:, 0]
             return tokens.reshape(*videos.shape[:2], -1).mean(1)
 
         return _clips(choice, "dinov2", width, 224, dinov2.clip_geometry(224), features)
@@ -96,7 +96,7 @@ def dinov2_of(layers: int, width: int, heads: int):
 
 
 def rtdetr_of(depths: list[int], layer_type: str, widths: list[int], decoder_layers: int):
-    """A builder of RT-DETR at 640 pixels: the network, without reading the image."""
+    """A builder of RT-DETR at 640 pixels: the network without the preprocessing."""
 
     def build(choice: Choice) -> Run:
         backbone = transformers.RTDetrResNetConfig(
@@ -111,7 +111,7 @@ def rtdetr_of(depths: list[int], layer_type: str, widths: list[int], decoder_lay
             hidden_expansion=0.5 if layer_type == "basic" else 1.0,
             decoder_layers=decoder_layers,
         )
-        model = _placed(transformers.RTDetrForObjectDetection(config), choice)
+        model = _on_device(transformers.RTDetrForObjectDetection(config), choice)
         image = torch.rand(1, 3, 640, 640, device=choice.device, dtype=choice.dtype)
         return Run(lambda: model(image).logits.to("cpu"), "image")
 
@@ -119,14 +119,14 @@ def rtdetr_of(depths: list[int], layer_type: str, widths: list[int], decoder_lay
 
 
 def sam2_of(edge: int, boxes: int = 10):
-    """A builder of SAM 2.1 tiny: one encoding and `boxes` prompts."""
+    """A builder of SAM 2.1 tiny: one image and `boxes` prompts."""
 
     def build(choice: Choice) -> Run:
         config = transformers.Sam2Config()
         config.prompt_encoder_config.image_size = edge
         config.vision_config.backbone_config.image_size = [edge, edge]
         config.vision_config.backbone_feature_sizes = [[edge // n] * 2 for n in (4, 8, 16)]
-        model = _placed(transformers.Sam2Model(config), choice)
+        model = _on_device(transformers.Sam2Model(config), choice)
         image = torch.rand(1, 3, edge, edge, device=choice.device, dtype=choice.dtype)
         corners = torch.tensor([[0.1, 0.2, 0.6, 0.7]] * boxes, device=choice.device) * edge
 
@@ -139,7 +139,7 @@ def sam2_of(edge: int, boxes: int = 10):
     return build
 
 
-# Sizes as published: layers, width, heads, factor of the inner layers, pixels.
+# Published sizes: layers, width, heads, MLP ratio, pixels.
 BUILDERS: dict[str, Callable[[Choice], Run]] = {
     "rtdetr-r18-640": rtdetr_of([2, 2, 2, 2], "basic", [64, 128, 256, 512], 3),
     "rtdetr-r50-640": rtdetr_of([3, 4, 6, 3], "bottleneck", [256, 512, 1024, 2048], 6),
@@ -155,7 +155,7 @@ BUILDERS: dict[str, Callable[[Choice], Run]] = {
 }
 
 
-def _placed(model, choice: Choice):
+def _on_device(model, choice: Choice):
     return model.eval().requires_grad_(False).to(choice.device, choice.dtype)
 
 
@@ -165,7 +165,7 @@ def _clips(choice: Choice, family, width, size, geometry, features) -> Run:
     generator = np.random.default_rng(0)
     shape = (CLIP_LENGTH, *CROP, 3)
     clips = [generator.integers(0, 256, shape).astype(np.uint8) for _ in range(choice.batch_size)]
-    # The features are copied to the CPU: the call ends when the device has finished.
+    # The call copies the features to the CPU, so it ends when the device has finished.
     return Run(lambda: backbone.encode(clips), f"clip of {CLIP_LENGTH} frames", len(clips))
 
 
@@ -178,10 +178,10 @@ def device_name(device: torch.device) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument("--only", default="", help="models whose name contains this")
-    parser.add_argument("--turns", type=int, default=5)
-    parser.add_argument("--warm-up", type=int, default=1)
-    parser.add_argument("--batch-size", type=int, default=1)
+    parser.add_argument("--only", default="", help="only models whose name contains this")
+    parser.add_argument("--turns", type=int, default=5, help="number of measurements")
+    parser.add_argument("--warm-up", type=int, default=1, help="calls before the measurements")
+    parser.add_argument("--batch-size", type=int, default=1, help="clips per call")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     try:
@@ -191,7 +191,7 @@ def main() -> None:
     choice = Choice(device, choose_dtype(device), options.batch_size)
     dtype = str(choice.dtype).removeprefix("torch.")
     print(f"{device_name(device)}, torch {torch.__version__}, {dtype}")
-    print(f"{'model':18} {'median ms':>10} {'least ms':>10}   per")
+    print(f"{'model':18} {'median ms':>10} {'min ms':>10}   per")
     for name, build in BUILDERS.items():
         if options.only not in name:
             continue
@@ -199,8 +199,8 @@ def main() -> None:
         for _ in range(options.warm_up):
             run.call()
         times_ms = np.array([timed(run) for _ in range(options.turns)])
-        median_ms, least_ms = np.median(times_ms), times_ms.min()
-        print(f"{name:18} {median_ms:10.1f} {least_ms:10.1f}   {run.unit}", flush=True)
+        median_ms, min_ms = np.median(times_ms), times_ms.min()
+        print(f"{name:18} {median_ms:10.1f} {min_ms:10.1f}   {run.unit}", flush=True)
         del run
         gc.collect()
         if device.type == "cuda":

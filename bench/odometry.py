@@ -1,9 +1,9 @@
-"""RGB-D odometry against a recording's own poses: error a step, drift, time a frame.
-
-Both methods, with OpenCV's RGB-D odometry and with depth alone (the fallback for OpenCV 4), process
-every frame one after the other, so that the ratio of their times is paired.
+"""Error and time of RGB-D odometry on a recording with true poses.
 
     python bench/odometry.py RECORDING [--max-frames N]
+
+It compares two methods: colour and depth, and depth alone (the fallback for OpenCV 4). Both process
+each frame, one after the other, so the ratio of their times is paired.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Pose = Any
 
 
 class Tracked:
-    """Poses of one method and the true poses."""
+    """Estimated poses of one method, and the true poses."""
 
     def __init__(self, method: str, T_world_start: Pose) -> None:
         self.method = method
@@ -37,7 +37,7 @@ class Tracked:
         self.pairs: list[tuple[Pose, Pose]] = []
         self.times_ms: list[float] = []
 
-    def take(self, frame: RgbdFrame) -> None:
+    def track(self, frame: RgbdFrame) -> None:
         """Track a frame."""
         start = time.perf_counter()
         try:
@@ -55,25 +55,26 @@ class Tracked:
             for (a, x), (b, y) in zip(self.pairs, self.pairs[1:])
         ]
         step_mm = 1e3 * np.array([np.linalg.norm(step[:3, 3]) for step in steps])
-        turn_deg = np.array([rotation_angle_deg(step[:3, :3]) for step in steps])
+        rotation_deg = np.array([rotation_angle_deg(step[:3, :3]) for step in steps])
         true = np.array([a[:3, 3] for a, _ in self.pairs])
         off_m = np.array([np.linalg.norm(a[:3, 3] - x[:3, 3]) for a, x in self.pairs])
         path_m = np.linalg.norm(np.diff(true, axis=0), axis=1).sum()
         last, estimate = self.pairs[-1]
         print(
             f"{self.method:5}: step {np.median(step_mm):.2f} mm (p95 "
-            f"{np.percentile(step_mm, 95):.2f}), {np.median(turn_deg):.3f} deg; off by "
+            f"{np.percentile(step_mm, 95):.2f}), {np.median(rotation_deg):.3f} deg; "
+            f"drift "
             f"{off_m[-1]:.3f} m and {rotation_angle_deg(last[:3, :3].T @ estimate[:3, :3]):.2f} "
-            f"deg at the end of {path_m:.2f} m (at most {off_m.max():.3f} m); "
-            f"{np.median(self.times_ms):.0f} ms a frame; {self.odometry.lost} lost, "
+            f"deg after {path_m:.2f} m (maximum {off_m.max():.3f} m); "
+            f"{np.median(self.times_ms):.0f} ms per frame; {self.odometry.lost} lost, "
             f"{self.odometry.restarts} restarts"
         )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recording", type=Path)
-    parser.add_argument("--max-frames", type=int, default=0)
+    parser.add_argument("--max-frames", type=int, default=0, help="0 = all")
     options = parser.parse_args()
     recording = open_recording(options.recording)
     tracked: list[Tracked] = []
@@ -82,12 +83,12 @@ def main() -> None:
         count += 1
         tracked = tracked or [Tracked(m, frame.T_world_camera) for m in ("rgbd", "depth")]
         for method in tracked:
-            method.take(frame)
+            method.track(frame)
     print(f"{recording.name}, {count} frames")
     for method in tracked:
         method.report()
     a, b = (np.array(method.times_ms[1:]) for method in tracked)
-    print(f"rgbd / depth: {np.median(a / b):.2f} times the time")
+    print(f"time of rgbd / depth, paired: {np.median(a / b):.2f}")
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Times of the parts of perception on one 640x480 frame, the segmenter beside cv2.grabCut.
+"""Time of each part of perception on one 640x480 frame, and of cv2.grabCut.
 
     python bench/perception.py [IMAGE DEPTH_PNG_MM] [--rounds 15]
 
-Without an image, it draws a table with twelve objects. It prints wall-clock times and, in brackets,
-processor times of all threads, which other work on the machine does not change.
+The default image is a drawn table with twelve objects. It prints wall-clock times and, in brackets,
+processor times of all threads. Other work on the machine changes processor times little.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ UP_CAMERA = np.array([0.0, -0.9, -0.436])
 
 
 def drawn_scene() -> Frame:
-    """Twelve objects of 50 to 130 pixels on a slanted, grained table."""
+    """Twelve objects of 50 to 130 pixels on a slanted table with a texture."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     depth = 2.6 - 1.4 * v / HEIGHT
@@ -68,9 +68,9 @@ def drawn_scene() -> Frame:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("image", type=Path, nargs="?")
-    parser.add_argument("depth", type=Path, nargs="?")
-    parser.add_argument("--rounds", type=int, default=15)
+    parser.add_argument("image", type=Path, nargs="?", help="640x480 image")
+    parser.add_argument("depth", type=Path, nargs="?", help="16-bit PNG in millimetres")
+    parser.add_argument("--rounds", type=int, default=15, help="number of measurements")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     frame = drawn_scene()
@@ -89,14 +89,14 @@ def main() -> None:
     def segment() -> list:
         return segmenter.segment(frame.rgb, frame.depth_m, INTRINSICS, frame.boxes_xyxy)
 
-    masks = segment()  # compiles
+    masks = segment()  # compiles the kernels
     instances = instance_image(masks, classes, scores, (HEIGHT, WIDTH))
     objects = SegmentedObjects(names, scores, None, instances, frame.depth_m, INTRINSICS, UP_CAMERA)
     parts: dict[str, Callable[[], object]] = {
         "detector, 2 threads": lambda: detector.detect(frame.rgb, 0.4),
         "segmenter, 1 thread": segment,
         "grabCut, 1 thread": lambda: grab_cut(frame),
-        "label image": lambda: instance_image(masks, classes, scores, (HEIGHT, WIDTH)),
+        "instance image": lambda: instance_image(masks, classes, scores, (HEIGHT, WIDTH)),
         "relation head": lambda: head.relate(objects, max_relations=10),
     }
     wall: dict[str, list[float]] = {name: [] for name in parts}
@@ -112,7 +112,7 @@ def main() -> None:
         print(
             f"  {name}: {statistics.median(wall[name]) * 1e3:.2f} ms "
             f"({statistics.median(processor[name]) * 1e3:.2f}), "
-            f"best {min(wall[name]) * 1e3:.2f}"
+            f"minimum {min(wall[name]) * 1e3:.2f}"
         )
     ratio = statistics.median(
         slow / fast for slow, fast in zip(wall["grabCut, 1 thread"], wall["segmenter, 1 thread"])

@@ -1,8 +1,8 @@
-"""Time per frame of the paper's detector, relation head and segmenters, on a CPU or on CUDA.
-
-The networks have published sizes and random weights. They run in the backends of the package.
+"""Time per frame of the paper's detector, relation head and segmenters.
 
     python bench/perception_models.py [--device auto|cpu|cuda] [--only NAME …] [--repeat N]
+
+The networks have published sizes and random weights. They run in the backends of the package.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ Frame = Callable[[], Any]
 
 
 def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
-    """A detector of Visual Genome's classes, with a relation head in the same folder."""
+    """A detector with the classes of Visual Genome and a relation head in one folder."""
     backbone = changes.pop("backbone", {})
     config = transformers.RTDetrConfig(
         backbone_config=transformers.RTDetrResNetConfig(
@@ -62,7 +62,7 @@ def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
 
 
 def detecting(**changes: Any) -> Callable[[Path, str], Frame]:
-    """One image through an RT-DETR."""
+    """Detection in one image with an RT-DETR."""
 
     def build(folder: Path, device: str) -> Frame:
         detector = rtdetr(folder, device, **changes)
@@ -89,7 +89,7 @@ def relating(folder: Path, device: str) -> Frame:
 
 
 def segmenting(make: Callable[[], Any], backend: Any) -> Callable[[Path, str], Frame]:
-    """One image and the masks of 12 boxes."""
+    """The masks of 12 boxes in one image."""
 
     def build(folder: Path, device: str) -> Frame:
         make().save_pretrained(folder)
@@ -116,7 +116,7 @@ R18_DETECTOR = {
     "hidden_expansion": 0.5,
     "decoder_layers": 3,
 }
-# Each function saves a checkpoint in an empty folder and returns the call that is timed.
+# Each builder saves a checkpoint in an empty folder and returns the call to time.
 BUILDERS: dict[str, Callable[[Path, str], Frame]] = {
     "RT-DETR r18, 640": detecting(**R18_DETECTOR),
     "RT-DETR r50, 640": detecting(),
@@ -128,7 +128,7 @@ BUILDERS: dict[str, Callable[[Path, str], Frame]] = {
 
 
 def time_ms(frame: Frame, repeat: int) -> tuple[float, float]:
-    """Medians of wall and processor time. Backends return arrays on the CPU, so both are whole."""
+    """Median wall-clock and processor time. Backends return arrays on the CPU, after all work."""
     wall, processor = [], []
     for _ in range(repeat):
         started, used = time.perf_counter(), time.process_time()
@@ -139,10 +139,12 @@ def time_ms(frame: Frame, repeat: int) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=["auto", "cpu", "cuda"], default="auto")
-    parser.add_argument("--only", nargs="*", default=[], help="models whose name contains this")
-    parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="only models whose name contains one of these"
+    )
+    parser.add_argument("--repeat", type=int, default=5, help="number of measurements")
     arguments = parser.parse_args()
     transformers.utils.logging.disable_progress_bar()
     torch.manual_seed(0)

@@ -1,9 +1,10 @@
-"""Measures probes on drawn rooms, held out by room: accuracy, and their effect on edges.
+"""Accuracy of trained probes on drawn rooms, and their effect on edges.
 
     python bench/probe.py [--rooms 16] [--pairs 30] [--out FOLDER]
 
-The backbones are tiny and randomly initialised, so it needs no checkpoint. The rooms are those of
-`test/support/pair_rooms.py`. The numbers say nothing about published models.
+Some rooms are held out of training. The rooms are those of `test/support/pair_rooms.py`. The
+backbones are tiny and have random weights, so no checkpoint is needed. The results do not predict
+those of published models.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ DEFAULTS = RelationsConfig()
 
 
 def request_of(pair: PairClip) -> ClipRequest:
-    """The request that the stage would make for a pair: union crop, both directions."""
+    """The request of the relations stage for a pair: union crop, both directions."""
     height, width = pair.frames.shape[1:3]
     x1, y1, x2, y2 = union_box(*pair.boxes_xyxy, width, height)
     boxes = [box - np.array([x1, y1, x1, y1]) for box in pair.boxes_xyxy]
@@ -84,34 +85,39 @@ def on_and_off(model, pairs: list[PairClip], seed: int) -> dict[str, float]:
     classes = []
     for pair in pairs:
         request = request_of(pair)
-        answer = model.predict(request)
+        predictions = model.predict(request)
         rows = [(context.subject_class, context.object_class) for context in request.pairs]
-        prior.update(np.array(rows), answer)
+        prior.update(np.array(rows), predictions)
         classes.append(rows[0])
     truth = np.array([PREDICATES.index(pair.predicate) for pair in pairs])
     logits = ambiguous_logits(truth, generator)
     priors, has_prior = prior.lookup(np.array(classes))
-    seen = np.ones(len(pairs), bool)
+    has_visual = np.ones(len(pairs), bool)
     results = {}
     for name, active in (("off", np.zeros_like(has_prior)), ("on", has_prior)):
         edges = fuse_edges(
-            logits, seen, priors, active, DEFAULTS.fusion_alpha, DEFAULTS.entropy_threshold_nats
+            logits,
+            has_visual,
+            priors,
+            active,
+            DEFAULTS.fusion_alpha,
+            DEFAULTS.entropy_threshold_nats,
         ).probabilities
-        right = edges.argmax(axis=1) == truth
-        results[name] = float(right.mean())
+        correct = edges.argmax(axis=1) == truth
+        results[name] = float(correct.mean())
         results[f"probability {name}"] = float(edges[np.arange(len(truth)), truth].mean())
-        results[f"_{name}"] = right
+        results[f"_{name}"] = correct
     off, on = results.pop("_off"), results.pop("_on")
     return {
         **results,
-        "to right": int((on & ~off).sum()),
+        "to correct": int((on & ~off).sum()),
         "to wrong": int((off & ~on).sum()),
         "edges": len(pairs),
     }
 
 
 def blind(backbone: FrozenBackbone) -> FrozenBackbone:
-    """A backbone without features, to measure the value of the boxes alone."""
+    """A backbone without features, to measure the effect of the boxes alone."""
     identity = BackboneIdentity("blind", 1, backbone.identity.image_size, DEFAULTS.clip_length)
     return replace(
         backbone, identity=identity, features=lambda videos: videos.new_zeros((len(videos), 1))
@@ -120,10 +126,10 @@ def blind(backbone: FrozenBackbone) -> FrozenBackbone:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", type=int, default=16)
-    parser.add_argument("--pairs", type=int, default=30)
-    parser.add_argument("--held-out", type=int, default=4)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--rooms", type=int, default=16, help="number of rooms")
+    parser.add_argument("--pairs", type=int, default=30, help="pairs per room")
+    parser.add_argument("--held-out", type=int, default=4, help="rooms held out of training")
+    parser.add_argument("--out", type=Path, help="folder for checkpoints and probes")
     options = parser.parse_args()
     out = options.out or Path(tempfile.mkdtemp())
 
@@ -131,7 +137,7 @@ def main() -> None:
     clips = [labelled(pair, number) for number, pair in enumerate(pairs)]
     held = tuple(f"room {room}" for room in range(options.held_out))
     held_pairs = [pair for pair in pairs if pair.room in held]
-    print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of held-out rooms")
+    print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of them in held-out rooms")
     loaders = {
         "vjepa2": (vjepa2.load_backbone, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
         "dinov2": (
@@ -167,10 +173,10 @@ def main() -> None:
             )
             edges = on_and_off(ProbedWorldModel(backbone, load_probe(folder)), held_pairs, seed=5)
             print(
-                f"  ambiguous edges: right {edges['off']:.3f} off, {edges['on']:.3f} on; "
-                f"probability of the truth {edges['probability off']:.3f} off, "
-                f"{edges['probability on']:.3f} on; {edges['to right']} became right, "
-                f"{edges['to wrong']} wrong, of {edges['edges']}"
+                f"  ambiguous edges: correct {edges['off']:.3f} off, {edges['on']:.3f} on; "
+                f"probability of the true predicate {edges['probability off']:.3f} "
+                f"off, {edges['probability on']:.3f} on; {edges['to correct']} became correct, "
+                f"{edges['to wrong']} became wrong, of {edges['edges']}"
             )
 
 

@@ -1,9 +1,9 @@
-"""Agreement of the geometric relation head with the annotated relations of rendered rooms.
+"""Accuracy of the geometric relation head on the annotated relations of rendered rooms.
 
     python bench/relation_head.py DATASET [--step 8] [--masks truth|segmenter]
 
-Boxes and classes are those of the front end. Masks are perfect, or of the segmenter. A pair counts
-in a frame if it is annotated and both objects were detected.
+Boxes and classes are recorded detections. Masks are perfect, or those of the segmenter. A pair
+counts in a frame if it is annotated and both objects are detected.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--step", type=int, default=8, help="use every N-th frame")
-    parser.add_argument("--masks", choices=["truth", "segmenter"], default="truth")
-    parser.add_argument("--verbose", action="store_true", help="name each disagreement")
+    parser.add_argument("--masks", choices=["truth", "segmenter"], default="truth", help="masks")
+    parser.add_argument("--verbose", action="store_true", help="print each wrong predicate")
     arguments = parser.parse_args()
     head = GeometricRelationHead(REPLICA_SSG_PREDICATES)
     segmenter = RgbdSegmenter()
     for scene in sorted(arguments.dataset.glob("data/*")):
         truth = json.loads((scene / "gt.json").read_text())
         related = {(s, o): name for s, o, _, name in truth["relationships"]}
-        right: dict[str, list[bool]] = defaultdict(list)
+        correct: dict[str, list[bool]] = defaultdict(list)
         wrong: Counter[tuple[str, str]] = Counter()
-        kept, kept_related, kept_right = 0, 0, 0
+        kept, kept_related, kept_correct = 0, 0, 0
         for path in sorted((scene / "sequence").glob("frame-*.color.jpg"))[:: arguments.step]:
             frame = load(path)
             text = path.with_name(path.name.replace("color.jpg", "frontend.json")).read_text()
@@ -82,28 +82,28 @@ def main() -> None:
                 for o in ids:
                     if (s, o) in related:
                         name = related[s, o]
-                        answer = predicted.get((s, o), "nothing")
-                        right[name].append(answer == name)
-                        if answer != name:
-                            wrong[name, answer] += 1
+                        best = predicted.get((s, o), "nothing")
+                        correct[name].append(best == name)
+                        if best != name:
+                            wrong[name, best] += 1
                             if arguments.verbose:
                                 pair = frame.names[ids.index(s)], frame.names[ids.index(o)]
-                                print(path.stem, *pair, name, "->", answer)
+                                print(path.stem, *pair, name, "->", best)
             found = head.relate(objects, MAX_RELATIONS)
             for pair, name in best_predicates(found, ids, head.predicates):
                 kept += 1
                 kept_related += pair in related
-                kept_right += related.get(pair) == name
-        total = [ok for rows in right.values() for ok in rows]
+                kept_correct += related.get(pair) == name
+        total = [ok for rows in correct.values() for ok in rows]
         print(
-            f"{scene.name}: {np.mean(total):.3f} of {len(total)} related pairs right "
-            f"(mean over predicates {np.mean([np.mean(v) for v in right.values()]):.3f}); of the "
-            f"top {MAX_RELATIONS} a frame, {kept_related / max(kept, 1):.2f} are related pairs, "
-            f"{kept_right / max(kept, 1):.2f} with the right predicate"
+            f"{scene.name}: {np.mean(total):.3f} of {len(total)} related pairs correct "
+            f"(mean over predicates {np.mean([np.mean(v) for v in correct.values()]):.3f}); of the "
+            f"top {MAX_RELATIONS} per frame, {kept_related / max(kept, 1):.2f} are related pairs, "
+            f"{kept_correct / max(kept, 1):.2f} with the right predicate"
         )
-        for name, rows in sorted(right.items(), key=lambda item: -len(item[1])):
+        for name, rows in sorted(correct.items(), key=lambda item: -len(item[1])):
             missed = ", ".join(f"{b} {n}" for (a, b), n in wrong.most_common() if a == name)
-            print(f"  {name}: {np.mean(rows):.2f} of {len(rows)}; otherwise {missed or '-'}")
+            print(f"  {name}: {np.mean(rows):.2f} of {len(rows)}; instead {missed or '-'}")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Stage d: pairing and fusion against plain loops, and the time per frame without a world model.
+"""Time of pairing and fusion, and of plain loops; time per frame without a world model.
 
     python bench/relations.py
 
-The two sides of a comparison alternate within one run. The ratio is the median over the turns.
+The two sides of a comparison alternate within one run. The ratio is the median of paired ratios.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ ALPHA, ENTROPY_THRESHOLD_NATS, GEO_COST_THRESHOLD = 0.5, 1.0, 0.45
 
 
 def pairs_by_loop(boxes, depths):
+    """Neighbour pairs of Eq. 8 in a loop over pairs."""
     found = []
     for i in range(len(boxes)):
         for j in range(len(boxes)):
@@ -50,7 +51,7 @@ def pairs_by_loop(boxes, depths):
 
 
 def fuse_by_loop(logits, has_visual, priors, has_prior):
-    """Fusion in a loop over edges, with numpy over the predicates."""
+    """Fusion of Eq. 9-10 in a loop over edges, with numpy over the predicates."""
     edges = []
     for row in range(len(logits)):
         summed = logits[row] if has_visual[row] else np.zeros(logits.shape[1])
@@ -66,7 +67,7 @@ def fuse_by_loop(logits, has_visual, priors, has_prior):
 
 
 def paired(name: str, ours: Callable[[], object], loop: Callable[[], object], turns: int) -> None:
-    """Print the medians of both and the median of the ratios."""
+    """Print the median of each side and the median of the paired ratios."""
     times = np.array([[timed(ours), timed(loop)] for _ in range(turns)])
     ours_ms, loop_ms = 1e3 * np.median(times, axis=0)
     ratio = np.median(times[:, 1] / times[:, 0])
@@ -111,7 +112,7 @@ def local_graph(stamp_ns: int, count: int, generator: np.random.Generator) -> Lo
 
 
 def frame_costs(count: int, turns: int) -> None:
-    """Print the time of `observe` per frame, with clips queued but not encoded."""
+    """Print the time of `observe` per frame. It queues clips and encodes none."""
     generator = np.random.default_rng(2)
     config = RelationsConfig(world_model="fake")
     reasoner = RelationReasoner(config, build_world_model(config))
@@ -127,9 +128,9 @@ def frame_costs(count: int, turns: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--objects", type=int, default=12)
-    parser.add_argument("--edges", type=int, default=5000)
-    parser.add_argument("--turns", type=int, default=31)
+    parser.add_argument("--objects", type=int, default=12, help="objects per frame")
+    parser.add_argument("--edges", type=int, default=5000, help="edges of the graph")
+    parser.add_argument("--turns", type=int, default=31, help="number of measurements")
     options = parser.parse_args()
     generator = np.random.default_rng(1)
 

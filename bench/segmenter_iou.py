@@ -1,13 +1,13 @@
-"""IoU of the RGB-D segmenter with perfect masks, and its time.
+"""IoU of the RGB-D segmenter with perfect masks, and its time per frame.
 
     python bench/segmenter_iou.py DATASET [--step 8] [--time]
 
 DATASET is a folder in the layout of the rendered rooms: data/<scene>/sequence/frame-*.{color.jpg,
-depth.pgm,instance.png,frontend.json}. Boxes are those of the front end: each edge is off by 2 px.
-Masks of the visible part are perfect. Objects with more than 1 000 visible pixels count.
+depth.pgm,instance.png,frontend.json}. Boxes are recorded detections. Each edge is off by 2 px. The
+perfect masks cover the visible parts. Objects with more than 1000 visible pixels count.
 
-Times are processor times of one thread, which other work on the machine does not change.
-References: the box itself, and cv2.grabCut (colour only, three rounds, initialised with the box).
+Two references: the box itself, and cv2.grabCut (colour only, three rounds, initialised with the
+box). Times are processor times of one thread. Other work on the machine changes them little.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ GRABCUT_ROUNDS = 3
 
 @dataclass
 class Frame:
-    """One frame with its boxes and the perfect masks."""
+    """One frame, its boxes and their perfect masks."""
 
     scene: str
     rgb: np.ndarray
@@ -78,7 +78,7 @@ def whole_boxes(frame: Frame) -> list[MaskPatch]:
 
 
 def grab_cut(frame: Frame) -> list[MaskPatch]:
-    """cv2.grabCut in twice the box, one box at a time."""
+    """cv2.grabCut in a window of twice the box size, one box at a time."""
     patches = []
     height, width = frame.depth_m.shape
     bgr = np.ascontiguousarray(frame.rgb[..., ::-1])
@@ -116,7 +116,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--step", type=int, default=8, help="use every N-th frame")
-    parser.add_argument("--time", action="store_true", help="also time grabCut, paired")
+    parser.add_argument("--time", action="store_true", help="also run and time grabCut, paired")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     segmenter = RgbdSegmenter()
@@ -125,7 +125,7 @@ def main() -> None:
         return segmenter.segment(frame.rgb, frame.depth_m, INTRINSICS, frame.boxes_xyxy)
 
     methods: dict[str, Callable[[Frame], list[MaskPatch]]] = {
-        "this": ours,
+        "segmenter": ours,
         "box": whole_boxes,
     }
     if arguments.time:
@@ -139,7 +139,7 @@ def main() -> None:
             if not len(frame.boxes_xyxy):
                 continue
             if not boxes:
-                ours(frame)  # compiles
+                ours(frame)  # compiles the kernels
             boxes.append(len(frame.boxes_xyxy))
             for name, method in methods.items():
                 start = time.thread_time()
@@ -153,21 +153,21 @@ def main() -> None:
         for scene in sorted({scene for scene, *_ in rows}):
             print(f"  {scene} {np.mean([iou for s, _, iou in rows if s == scene]):.3f}")
     by_class = defaultdict(list)
-    for _, label, iou in results["this"]:
+    for _, label, iou in results["segmenter"]:
         by_class[label].append(iou)
     ranked = sorted(by_class.items(), key=lambda item: -len(item[1]))
     print("  " + ", ".join(f"{label} {np.mean(v):.2f} ({len(v)})" for label, v in ranked))
-    dozen = [t * 1e3 for t, n in zip(times["this"], boxes) if 11 <= n <= 13]
+    dozen = [t * 1e3 for t, n in zip(times["segmenter"], boxes) if 11 <= n <= 13]
     print(
-        f"processor time, one thread: median {statistics.median(times['this']) * 1e3:.1f} ms a "
-        f"frame of {statistics.mean(boxes):.1f} boxes; "
+        f"processor time, one thread: median {statistics.median(times['segmenter']) * 1e3:.1f} "
+        f"ms per frame of {statistics.mean(boxes):.1f} boxes; "
         f"{statistics.median(dozen):.1f} ms at 11 to 13 boxes ({len(dozen)} frames)"
     )
     if arguments.time:
         ratio = statistics.median(
-            other / this for this, other in zip(times["this"], times["grabCut"])
+            slow / fast for fast, slow in zip(times["segmenter"], times["grabCut"])
         )
-        print(f"grabCut / this, paired: {ratio:.0f}")
+        print(f"grabCut / segmenter, paired: {ratio:.0f}")
 
 
 if __name__ == "__main__":

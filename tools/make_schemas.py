@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Write msg_schemas/: one JSON Schema (2020-12) and one example of each message.
+"""Write msg_schemas/: a JSON Schema (2020-12) and an example of each message.
 
 python tools/make_schemas.py [FOLDER]
 """
@@ -26,11 +26,11 @@ EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
 
 
 def message_schema(name: str) -> dict[str, Any]:
-    """JSON Schema of a message, with its name as a constant."""
+    """The JSON Schema of a message. Its `schema.name` is a constant."""
     schema = wire.json_schema(wire.MESSAGES[name])
     definition = schema["$defs"][wire.MESSAGES[name].__name__]
     for described in schema["$defs"].values():
-        if "description" in described:  # a docstring; Python 3.13 removes its indentation
+        if "description" in described:  # a docstring; only Python 3.13 removes its indentation
             described["description"] = inspect.cleandoc(described["description"])
     definition["properties"]["schema"] = {
         "allOf": [
@@ -42,7 +42,7 @@ def message_schema(name: str) -> dict[str, Any]:
 
 
 def examples() -> dict[str, wire.Message]:
-    """A cup on a table, in each message."""
+    """Each message by name, about a cup on a table."""
     return {**_frame_examples(), **_graph_examples()}
 
 
@@ -83,7 +83,7 @@ def _frame_examples() -> dict[str, wire.Message]:
             ],
             relations=relations,
             drops={"few_mask_pixels": 1},
-            # The coarsest grid: one sample of 1.85 m in the middle of the image.
+            # The coarsest grid: one depth of 1.85 m in the middle of the image.
             depth_grid=wire.DepthGridState(640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07"),
         ),
         "relation_evidence": wire.RelationEvidenceMessage(
@@ -99,7 +99,7 @@ def _frame_examples() -> dict[str, wire.Message]:
 
 
 def _graph_examples() -> dict[str, wire.Message]:
-    """The graph, and its next update."""
+    """The graph and its next update."""
     return {
         "scene_graph": wire.SceneGraphMessage(
             **_head("scene_graph"),
@@ -180,7 +180,7 @@ def _cup_on_table() -> wire.EdgeState:
 
 
 def files() -> dict[str, str]:
-    """Text of each file in msg_schemas/, by file name."""
+    """The text of each file in msg_schemas/ by file name."""
     texts: dict[str, str] = {}
     for name, example in examples().items():
         texts[f"{name}.schema.json"] = _pretty(message_schema(name))

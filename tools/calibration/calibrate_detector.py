@@ -1,10 +1,10 @@
-"""Fit and check the calibration of NanoDet's class distribution.
+"""Fit the temperature of NanoDet's class distribution, and test it.
 
     python tools/calibration/calibrate_detector.py DATASET
 
-DATASET is a folder in the ReplicaSSG layout with gt.json and bb.txt per frame. Detections that
-cover a labelled object (IoU >= 0.5) of a class that COCO also has are samples. The temperature is
-fitted by likelihood on each scene and checked on the others.
+DATASET is a folder in the layout of ReplicaSSG, with gt.json per scene and bb.txt per frame. A
+sample is a detection that matches a labelled object (IoU >= 0.5) with a class that COCO contains.
+For each scene, the temperature with the maximum likelihood on the other scenes is tested.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
 from deworldsg_ros.scene.boxes import pairwise_iou
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
-# Replica classes that COCO also has.
+# COCO class of each Replica class that COCO contains.
 COCO_OF_REPLICA = {
     "backpack": "backpack",
     "bench": "bench",
@@ -47,7 +47,7 @@ COCO_OF_REPLICA = {
     "vase": "vase",
 }
 MATCH_IOU = 0.5
-SHELL = "shell"  # walls, floor, ceiling
+SHELL = "shell"  # kind of walls, floor and ceiling
 
 
 @dataclass
@@ -60,6 +60,7 @@ class Samples:
 
 
 def collect(scene: Path, detector: NanoDetDetector, step: int) -> Samples:
+    """The samples of one scene."""
     objects = {o["id"]: o for o in json.loads((scene / "gt.json").read_text())["objects"]}
     evidence, classes, instances = [], [], []
     for path in sorted((scene / "sequence").glob("frame-*.color.jpg"))[::step]:
@@ -87,21 +88,24 @@ def _beside(path: Path, suffix: str) -> Path:
 
 
 def negative_log_likelihood(probabilities: np.ndarray, classes: np.ndarray) -> float:
+    """Mean over samples."""
     return float(-np.log(probabilities[np.arange(len(classes)), classes]).mean())
 
 
 def expected_calibration_error(probabilities: np.ndarray, classes: np.ndarray) -> float:
-    confidence, right = probabilities.max(axis=1), probabilities.argmax(axis=1) == classes
+    """Mean difference of confidence and accuracy over ten bins of confidence."""
+    confidence, correct = probabilities.max(axis=1), probabilities.argmax(axis=1) == classes
     bins = np.minimum((confidence * 10).astype(int), 9)
     return float(
         sum(
-            (bins == b).mean() * abs(confidence[bins == b].mean() - right[bins == b].mean())
+            (bins == b).mean() * abs(confidence[bins == b].mean() - correct[bins == b].mean())
             for b in np.unique(bins)
         )
     )
 
 
 def fit(samples: Samples) -> float:
+    """The temperature with the maximum likelihood."""
     grid = np.arange(0.15, 2.0, 0.01)
     losses = [
         negative_log_likelihood(SoftmaxCalibration(t)(samples.evidence), samples.classes)
@@ -111,7 +115,7 @@ def fit(samples: Samples) -> float:
 
 
 def class_distances(probabilities: np.ndarray, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
-    """D_c (Eq. 5) of pairs of detections of one object, and of objects of different classes."""
+    """D_c (Eq. 5) of pairs of detections: of one object, and of two classes."""
     distance = 1.0 - probabilities @ probabilities.T
     upper = np.triu(np.ones_like(distance, dtype=bool), 1)
     same = (samples.instances[:, None] == samples.instances[None, :]) & upper
@@ -121,7 +125,7 @@ def class_distances(probabilities: np.ndarray, samples: Samples) -> tuple[np.nda
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("dataset", type=Path)
+    parser.add_argument("dataset", type=Path, help="folder in the layout of ReplicaSSG")
     parser.add_argument("--step", type=int, default=1, help="use every N-th frame")
     arguments = parser.parse_args()
     detector = NanoDetDetector()
@@ -134,7 +138,8 @@ def main() -> None:
             Samples(*(np.concatenate([getattr(s, f) for s in others]) for f in vars(held)))
         )
         print(
-            f"{name}: {len(held.classes)} detections, temperature of the others {temperature:.2f}"
+            f"{name}: {len(held.classes)} detections, temperature {temperature:.2f} "
+            "fitted on the other scenes"
         )
         normalised = held.evidence / held.evidence.sum(axis=1, keepdims=True)
         calibrated = SoftmaxCalibration(temperature)(held.evidence)
@@ -143,7 +148,7 @@ def main() -> None:
             print(
                 f"  {label}: NLL {negative_log_likelihood(p, held.classes):.3f}, "
                 f"ECE {expected_calibration_error(p, held.classes):.3f}, "
-                f"right {np.mean(p.argmax(axis=1) == held.classes):.3f}, "
+                f"accuracy {np.mean(p.argmax(axis=1) == held.classes):.3f}, "
                 f"D_c < 0.8: one object {np.mean(same < 0.8):.3f} "
                 f"(median {np.median(same):.2f}), "
                 f"different classes {np.mean(different < 0.8):.3f}"
