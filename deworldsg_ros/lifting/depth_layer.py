@@ -1,15 +1,17 @@
 """Depth refinement in the depth-distribution domain (Eq. 2), exact and in linear time.
 
-The equation speaks of sorted depths. Sorting is what costs, and it is almost never needed. Depths
-are counted in buckets narrower than half of the least possible threshold: a step that exceeds it
-passes over an empty bucket. Runs of buckets that are not empty are the *blocks*; clusters are cut
-between blocks only, where the least and greatest depth of each give the step exactly. d_ref comes
-out of the bucket that holds it. Only median(Δz) needs the sorted depths, and only where it could
-matter: at least half of the N - 1 steps are as large as their median, and all of them sum up to
-the range, so median(Δz) <= 2 range / (N - 1).
+The equation is defined on sorted depths. Sorting is expensive, and almost never necessary:
 
-All arithmetic is float64 on float32 depths, as in the definition; sums are compensated, so that
-the means do not depend on the order of the pixels.
+1. Depths are counted in buckets that are narrower than half of the smallest possible threshold. A
+   larger step leaves an empty bucket.
+2. Runs of non-empty buckets are the *blocks*. Clusters are cut between blocks only. The lowest and
+   highest depth of each block give the exact step.
+3. d_ref is found in the bucket that contains it.
+4. median(Δz) needs the sorted depths, but only if it can matter. At least half of the N - 1 steps
+   are as large as their median, and all steps sum to the range: median(Δz) <= 2 range / (N - 1).
+
+All arithmetic is float64 on float32 depths, as in the definition. Sums are compensated, so the
+means do not depend on the order of the pixels.
 """
 
 from __future__ import annotations
@@ -19,23 +21,23 @@ import numpy as np
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 
-MOST_BUCKETS = 1 << 16
-LEAST_BUCKETS = 64
+# With more buckets, sorting is faster.
+MAX_BUCKETS = 1 << 16
+MIN_BUCKETS = 64
 
 
 def dominant_layer(
     depths_m: Float32, gamma_base_m: float, alpha: float, beta: float
 ) -> tuple[float, float]:
-    """Least and greatest depth of the cluster that is kept (Eq. 2).
+    """Lowest and highest depth of the kept cluster, metres (Eq. 2).
 
-    d_ref = median(Z), Δ_thr = max(γ_base, α median(Δz), β d_ref). The sorted depths are cut
-    wherever a step exceeds Δ_thr; the cluster whose mean is nearest to d_ref is kept, the nearer
-    to the camera of two that tie. Every depth between the two that are returned is of that
-    cluster.
+    d_ref = median(Z), Δ_thr = max(γ_base, α median(Δz), β d_ref). The sorted depths are cut where a
+    step exceeds Δ_thr. The cluster whose mean is nearest to d_ref is kept; of two clusters with the
+    same distance, the one nearer to the camera. All depths between the two results belong to it.
 
     Args:
         depths_m: (N,) float32, contiguous, valid depths of one object in any order, N >= 1.
-        gamma_base_m: least separation, metres.
+        gamma_base_m: minimum separation of clusters, metres.
         alpha: factor of the median step of the sorted depths.
         beta: factor of the reference depth.
     """
@@ -45,7 +47,7 @@ def dominant_layer(
 
 @kernel
 def _extremes(depths: Float32) -> tuple[float, float]:
-    """Least and greatest depth; positive floats are in the order of their bits."""
+    """Lowest and highest depth; positive floats have the order of their bits."""
     bits = depths.view(np.int32)
     least = greatest = bits[0]
     for index in range(bits.size):
@@ -57,10 +59,10 @@ def _extremes(depths: Float32) -> tuple[float, float]:
 
 @kernel
 def _bucket_counts(depths: Float32, lowest: float, scale: float, buckets: int) -> Int64:
-    """Number of depths a bucket.
+    """Number of depths in each bucket.
 
-    int((depth - lowest) * scale) is monotone in the depth, rounding included: buckets are ordered
-    and never overlap.
+    int((depth - lowest) * scale) is monotone in the depth, even with rounding. So buckets are
+    ordered and never overlap.
     """
     counts = np.zeros(buckets, np.int64)
     last = np.uint64(buckets - 1)
@@ -71,7 +73,7 @@ def _bucket_counts(depths: Float32, lowest: float, scale: float, buckets: int) -
 
 @kernel
 def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> float:
-    """Median of depths that were counted in buckets."""
+    """Median of depths, from their counts in buckets."""
     rank, next_rank = (depths.size - 1) // 2, depths.size // 2
     while True:
         bucket = 0
@@ -79,7 +81,7 @@ def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> floa
             rank -= counts[bucket]
             next_rank -= counts[bucket]
             bucket += 1
-        wanted, last = np.uint64(bucket), np.uint64(counts.size - 1)
+        median_bucket, last = np.uint64(bucket), np.uint64(counts.size - 1)
         members = np.empty(counts[bucket] + 1, np.float32)
         member = np.uint64(0)
         above = np.float32(np.inf)
@@ -87,8 +89,8 @@ def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> floa
             depth = depths[index]
             at = min(np.uint64((np.float64(depth) - lowest) * scale), last)
             members[member] = depth
-            member += np.uint64(at == wanted)
-            if at > wanted:
+            member += np.uint64(at == median_bucket)
+            if at > median_bucket:
                 above = min(above, depth)
         depths = members[:-1]
         lowest, highest = _extremes(depths)
@@ -105,7 +107,7 @@ def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> floa
 
 @kernel
 def _blocks(depths: Float32, lowest: float, scale: float, counts: Int64) -> tuple[Float64, Float64]:
-    """Least and greatest depth of each run of buckets that are not empty."""
+    """Lowest and highest depth of each run of non-empty buckets."""
     block_of = np.empty(counts.size, np.uint64)
     blocks = 0
     for bucket in range(counts.size):
@@ -136,8 +138,9 @@ def _median_step(depths: Float32) -> float:
 
 @kernel
 def _mean_between(depths: Float32, low: float, high: float) -> float:
-    """Mean of the depths in [low, high]; the sum is compensated (Knuth), and so correctly rounded
-    while float64 holds what plain summation loses, which takes depths of 2^-14 to 2^14 m.
+    """Mean of the depths in [low, high].
+
+    The sum is compensated (Knuth). It is correctly rounded for depths of 2^-14 to 2^14 m.
     """
     total, lost, count = 0.0, 0.0, 0
     for index in range(depths.size):
@@ -155,10 +158,10 @@ def _mean_between(depths: Float32, low: float, high: float) -> float:
 def _nearest_cluster(
     depths: Float32, lows: Float64, highs: Float64, reference: float
 ) -> tuple[float, float]:
-    """The cluster whose mean is nearest to the reference, the first of those that tie.
+    """The cluster whose mean is nearest to the reference; the first one of a tie.
 
-    The reference lies in a cluster or between two, and the means are in order: only that cluster
-    and its neighbours can be nearest.
+    The reference lies in a cluster or between two, and the means are ordered. So only this cluster
+    and its neighbours are candidates.
     """
     at = 0
     while at < lows.size - 1 and highs[at] < reference:
@@ -181,8 +184,8 @@ def _dominant_layer(
     spread = highest - lowest
     steps = depths.size - 1
 
-    if 2.0 * spread / gamma_base < MOST_BUCKETS:
-        buckets = max(int(2.0 * spread / gamma_base) + 2, LEAST_BUCKETS)
+    if 2.0 * spread / gamma_base < MAX_BUCKETS:
+        buckets = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
         scale = buckets / spread
         counts = _bucket_counts(depths, lowest, scale, buckets)
         reference = _median(depths, lowest, scale, counts)
@@ -196,8 +199,8 @@ def _dominant_layer(
         reference = (lows[steps // 2] + lows[(steps + 1) // 2]) / 2.0
 
     threshold = max(gamma_base, beta * reference)
-    # The bound on median(Δz), and once more without the steps between blocks: two layers that lie
-    # far apart do not loosen that one.
+    # The bound on median(Δz), and the same bound without the steps between blocks: two distant
+    # layers do not loosen the second one.
     step_bound = 2.0 * spread / steps
     inside = 0.5 * steps - (lows.size - 1)
     if inside > 0:

@@ -27,10 +27,10 @@ def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64
 def estimate_gaussians(
     objects: Sequence[Pixels], intrinsics: Intrinsics, T_world_camera: Float64, ridge_m2: float
 ) -> tuple[Float64, Float64, Float64]:
-    """Sample mean and covariance of each object's points, world frame (Eq. 4), without the points.
+    """Sample mean and covariance of each object's points, world frame (Eq. 4).
 
-    The moments are taken in the camera frame, then μ → Rμ + t, Σ → RΣRᵀ; the ridge εI is the same
-    in both frames.
+    The moments are computed in the camera frame, then μ → Rμ + t, Σ → RΣRᵀ. The ridge εI is the
+    same in both frames. The points themselves are never stored.
 
     Args:
         objects: the final inliers of n objects, two pixels or more each.
@@ -69,8 +69,8 @@ def _camera_moments(
     cy: float,
 ) -> tuple[Float64, Float64]:
     count = depths_m.size
-    # Sums about a point of the object instead of the origin keep the digits that a covariance of
-    # square centimetres at metres of distance would lose. The middle pixel is as good as any.
+    # The sums are taken about a point of the object, not about the origin. A covariance of square
+    # centimetres at a distance of metres would lose its digits otherwise.
     middle = count // 2
     z0 = np.float64(depths_m[middle])
     x0 = (columns[middle] - cx) / fx * z0

@@ -1,4 +1,4 @@
-"""The pixels of one object that carry depth, as parallel arrays, and the images they come from."""
+"""Pixels of an object with valid depth, as parallel arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16
 
 @dataclass(frozen=True)
 class Pixels:
-    """N pixels of one object, row by row as in the image.
+    """N pixels of one object, in row order of the image.
 
     Attributes:
         columns: (N,) int32, u.
@@ -28,12 +28,12 @@ class Pixels:
         return len(self.depths_m)
 
     def within(self, lowest_m: float, highest_m: float) -> Pixels:
-        """Those whose depth lies in [lowest_m, highest_m]."""
+        """The pixels with depth in [lowest_m, highest_m], metres."""
         return Pixels(*_within(self.columns, self.rows, self.depths_m, lowest_m, highest_m))
 
 
 def valid_depth(depth_m: Float32) -> Float32:
-    """Depth image with 0 in place of NaN, infinity and negative values; (H, W) float32 metres."""
+    """Depth image (H, W) float32, metres; NaN, infinity and negative values become 0."""
     return _valid_depth(read_only(depth_m, np.float32))
 
 
@@ -42,11 +42,11 @@ def valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64
 
     Args:
         depth_m: (H, W) float32, 0 = invalid.
-        instances: (H, W) uint16, 0 = nothing, k = k-th object.
+        instances: (H, W) uint16, 0 = no object, k = k-th object.
         count: number of objects.
 
     Returns:
-        (count + 1,) int64: the k-th is that of object k, the 0th that of all values > count.
+        (count + 1,) int64: entry k belongs to object k, entry 0 to all ids above `count`.
     """
     return _valid_pixel_counts(
         read_only(depth_m, np.float32), read_only(instances, np.uint16), count
@@ -71,7 +71,7 @@ def _valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int6
     index = 0
     while index < labels.size:
         label = labels[index]
-        # Labels come in runs: count the run, then book it.
+        # Ids come in runs: each run is counted at once.
         valid, start = 0, index
         while index < labels.size and labels[index] == label:
             valid += depths[index] > 0

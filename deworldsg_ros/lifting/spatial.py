@@ -20,20 +20,20 @@ def spatial_inliers(
     """Pixels of each object whose depth is near the median of their 3x3 neighbourhood (Eq. 1).
 
     M_spatial = {p in M : |D(p) - D~(p)| < τ D~(p) + ε}. Invalid pixels count as 0 in the median
-    and are never inliers; the image's edge is replicated. Depths are float32, the comparison is
-    made in float64.
+    and are never inliers. The image border is replicated. Depths are float32, the comparison is in
+    float64.
 
     Args:
         depth_m: (H, W) float32 metres, 0 = invalid.
-        instances: (H, W) uint16, 0 = nothing, k = k-th object.
-        valid_counts: of `valid_pixel_counts`.
+        instances: (H, W) uint16, 0 = no object, k = k-th object.
+        valid_counts: result of `valid_pixel_counts`.
         tau: relative tolerance.
         epsilon_m: absolute tolerance, metres.
     """
     median_m = cv2.medianBlur(depth_m, 3)
-    # One more place an object than it has valid pixels: a rejected pixel is written too.
-    places = np.append(valid_counts[1:] + 1, 0)
-    starts = np.cumsum(places) - places
+    # One slot more than valid pixels for each object: the kernel also writes rejected pixels.
+    slots = np.append(valid_counts[1:] + 1, 0)
+    starts = np.cumsum(slots) - slots
     columns, rows, depths_m, ends = _scatter_inliers(
         read_only(depth_m, np.float32),
         read_only(median_m, np.float32),
@@ -57,8 +57,8 @@ def _scatter_inliers(
 ) -> tuple[Int32, Int32, Float32, UInt64]:
     """One pass over the image.
 
-    The inliers of object k, which has places from starts[k - 1] to starts[k], lie from
-    starts[k - 1] to ends[k - 1].
+    Object k has the slots starts[k - 1] to starts[k]; its inliers are in starts[k - 1] to
+    ends[k - 1].
     """
     objects = starts.size - 1
     ends = starts[:-1].astype(np.uint64)

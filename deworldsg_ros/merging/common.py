@@ -37,7 +37,7 @@ def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
     if local.frame_id != graph.frame_id:
         raise RefusedInput(
             "wrong_frame",
-            f"local graph is in frame {local.frame_id!r}: wanted {graph.frame_id!r}",
+            f"local graph is in frame {local.frame_id!r}: expected {graph.frame_id!r}",
         )
 
 

@@ -1,7 +1,7 @@
-"""How well two depth images fit, and a point-to-plane refinement of the motion between them.
+"""Fit of two depth images, and point-to-plane refinement of the motion between them.
 
-The refinement is projective ICP on a coarse grid: it needs a guess, reaches further than the image
-pyramid of the odometry when the camera turns fast, and costs a few milliseconds.
+The refinement is projective ICP on a coarse grid. It needs an initial guess and takes a few
+milliseconds. For fast rotations it reaches further than the image pyramid of the odometry.
 """
 
 from __future__ import annotations
@@ -10,28 +10,45 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deworldsg_ros.poses.motion import rigid_motion
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.rigid import point_to_plane, rigid_motion
 
-# Points are compared on every so many pixels; normals are taken from a finer grid.
+# Points are compared on every N-th pixel; normals are computed on a finer grid.
 POINT_STEP_PX = 8
 NORMAL_STEP_PX = 4
-# A point fits where its depth is within this, and this share of it, of what is seen there.
+# A point fits if its depth differs from the measured depth by less than FIT_M and FIT_FRACTION of
+# the depth.
 FIT_M = 0.03
-FIT_SHARE = 0.02
+FIT_FRACTION = 0.02
+# With fewer points, nothing is aligned.
 MIN_POINTS = 50
-# Correspondences further apart than this are left out, iteration by iteration.
+# Maximum distance of corresponding points, iteration by iteration: coarse first, then fine.
 REACHES_M = (0.3, 0.3, 0.3, 0.3, 0.2, 0.2, 0.1, 0.1, 0.05, 0.05)
-# Residuals well beyond this share of it count little (Cauchy): coarse first, then fine.
-RESIDUAL_SHARE = 0.3
-# Inverse depth is linear on a plane, however it is tilted: bent by more than this share of it,
-# neighbours are not one surface.
-BEND_SHARE = 0.04
+# Residuals beyond this fraction of the reach have small weights (Cauchy).
+OUTLIER_FRACTION = 0.3
+# On a plane, inverse depth is linear. If it bends by more than this fraction, the pixels do not
+# belong to one surface.
+MAX_BEND_FRACTION = 0.04
+# Damping of the normal equations, times the sum of the weights: directions that the geometry does
+# not constrain do not move.
+DAMPING = 1e-4
+
+
+class Surface(NamedTuple):
+    """Surface of a depth image on the normals' grid, camera frame.
+
+    Attributes:
+        points: (h, w, 3) float64, metres; NaN = no depth.
+        normals: (h, w, 3) float64, unit; NaN = unknown.
+    """
+
+    points: Float64
+    normals: Float64
 
 
 def points_of(depth_m: Float32, intrinsics: Intrinsics, step_px: int = POINT_STEP_PX) -> Float64:
-    """Points (n, 3) float64 of a depth image's valid pixels on a grid, camera frame, metres."""
+    """Points (n, 3) float64 of the valid pixels on a grid, camera frame, metres."""
     rows, columns = np.nonzero(depth_m[::step_px, ::step_px])
     z = depth_m[::step_px, ::step_px][rows, columns].astype(np.float64)
     return intrinsics.back_project(columns * step_px, rows * step_px, z)
@@ -40,28 +57,21 @@ def points_of(depth_m: Float32, intrinsics: Intrinsics, step_px: int = POINT_STE
 def fit_fraction(
     points_a: Float64, depth_b_m: Float32, T_b_a: Float64, intrinsics: Intrinsics
 ) -> float:
-    """Share of the points of camera a that lie on depth image b, of those that b sees.
+    """Fraction of the points (n, 3) of camera a, visible in camera b, that fit depth image b.
 
-    0 where too few can be compared.
+    0 if too few points can be compared.
     """
     moved = points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-    row, column, inside = _project(moved, intrinsics)
-    seen_m = depth_b_m[row[inside], column[inside]].astype(np.float64)
-    gap_m = np.abs(seen_m - moved[inside, 2])[seen_m > 0]
+    row, column, inside = _pixels_of(moved, intrinsics)
+    measured_m = depth_b_m[row[inside], column[inside]].astype(np.float64)
+    gap_m = np.abs(measured_m - moved[inside, 2])[measured_m > 0]
     if len(gap_m) < max(MIN_POINTS, len(points_a) // 8):
         return 0.0
-    return float(np.mean(gap_m < FIT_M + FIT_SHARE * seen_m[seen_m > 0]))
-
-
-class Surface(NamedTuple):
-    """Points (h, w, 3) of a depth image on the finer grid, and unit normals; NaN = unknown."""
-
-    points: Float64
-    normals: Float64
+    return float(np.mean(gap_m < FIT_M + FIT_FRACTION * measured_m[measured_m > 0]))
 
 
 def surface_of(depth_m: Float32, intrinsics: Intrinsics) -> Surface:
-    """The surface that a depth image shows."""
+    """Points and normals of a depth image (H, W), metres, 0 = invalid."""
     step = NORMAL_STEP_PX
     z = depth_m[::step, ::step].astype(np.float64)
     z[z <= 0] = np.nan
@@ -78,7 +88,7 @@ def surface_of(depth_m: Float32, intrinsics: Intrinsics) -> Surface:
         np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2 * middle),
         np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2 * middle),
     )
-    is_edge = bend > BEND_SHARE * middle
+    is_edge = bend > MAX_BEND_FRACTION * middle
     with np.errstate(invalid="ignore", divide="ignore"):
         normals[1:-1, 1:-1] = np.where(is_edge[..., None], np.nan, normal / length)
     return Surface(points, normals)
@@ -87,41 +97,47 @@ def surface_of(depth_m: Float32, intrinsics: Intrinsics) -> Surface:
 def refine(
     points_a: Float64, surface_b: Surface, T_b_a: Float64, intrinsics: Intrinsics
 ) -> Float64:
-    """T_b_a (4, 4) that lays points of camera a on the surface that camera b sees, from a guess.
+    """T_b_a (4, 4) that moves the points of camera a onto the surface of camera b.
 
-    What the geometry leaves open (along a bare wall) stays as it was guessed.
+    Directions that the geometry leaves open, such as along a bare wall, keep the initial guess.
+
+    Args:
+        points_a: (n, 3) metres, camera a.
+        surface_b: of camera b.
+        T_b_a: (4, 4) initial guess.
+        intrinsics: of camera b.
     """
     height, width = surface_b.points.shape[:2]
     for reach_m in REACHES_M:
         moved = points_a @ T_b_a[:3, :3].T + T_b_a[:3, 3]
-        row, column, inside = _project(moved, intrinsics)
+        row, column, inside = _pixels_of(moved, intrinsics)
         moved = moved[inside]
         row, column = (
             np.minimum((row[inside] + NORMAL_STEP_PX // 2) // NORMAL_STEP_PX, height - 1),
             np.minimum((column[inside] + NORMAL_STEP_PX // 2) // NORMAL_STEP_PX, width - 1),
         )
         gaps, normals = surface_b.points[row, column] - moved, surface_b.normals[row, column]
-        residuals = np.einsum("ij,ij->i", gaps, normals)
-        # Comparisons with NaN are false: what has no normal is left out.
-        near = np.abs(residuals) < reach_m
+        distances = np.einsum("ij,ij->i", gaps, normals)
+        # Comparisons with NaN are false: points without a normal are ignored.
+        near = np.abs(distances) < reach_m
         near &= np.linalg.norm(gaps, axis=1) < 2 * reach_m
         if np.count_nonzero(near) < MIN_POINTS:
             return T_b_a
-        normals, residuals = normals[near], residuals[near]
-        jacobian = np.hstack([np.cross(moved[near], normals), normals])
-        weights = 1.0 / (1.0 + (residuals / (RESIDUAL_SHARE * reach_m)) ** 2)
+        distances = distances[near]
+        jacobian, weights = point_to_plane(
+            moved[near], normals[near], distances, OUTLIER_FRACTION * reach_m
+        )
         weighted = jacobian * weights[:, None]
-        # Damped a little, so that what nothing constrains does not move.
-        hessian = jacobian.T @ weighted + 1e-4 * weights.sum() * np.eye(6)
-        step = np.linalg.solve(hessian, weighted.T @ residuals)
+        hessian = jacobian.T @ weighted + DAMPING * weights.sum() * np.eye(6)
+        step = np.linalg.solve(hessian, weighted.T @ distances)
         T_b_a = rigid_motion(step[3:], step[:3]) @ T_b_a
     return T_b_a
 
 
-def _project(points: Float64, intrinsics: Intrinsics) -> tuple[Int64, Int64, Bool]:
-    """Row and column of the pixel of each point, and whether it is in the image."""
+def _pixels_of(points: Float64, intrinsics: Intrinsics) -> tuple[Int64, Int64, Bool]:
+    """Row and column of the pixel of each point (n, 3), and whether it is in the image."""
     z = np.where(points[:, 2] > 1e-3, points[:, 2], np.inf)
-    column = np.rint(intrinsics.fx * points[:, 0] / z + intrinsics.cx).astype(np.int64)
-    row = np.rint(intrinsics.fy * points[:, 1] / z + intrinsics.cy).astype(np.int64)
+    uv = intrinsics.project(np.column_stack((points[:, :2], z)))
+    column, row = np.rint(uv).astype(np.int64).T
     inside = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
     return row, column, inside & np.isfinite(z)

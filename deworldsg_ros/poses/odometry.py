@@ -25,10 +25,10 @@ from deworldsg_ros.poses.depth_alignment import (
     refine,
     surface_of,
 )
-from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics, check_pose, interpolate_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.rigid import rotation_angle_deg
 
 # Pose of the first camera unless one is given: at the origin, looking along x, z up (REP 103).
 LEVEL_CAMERA = np.array(

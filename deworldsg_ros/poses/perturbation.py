@@ -1,4 +1,4 @@
-"""Poses made worse on purpose, seeded: drift, jitter and jumps."""
+"""Perturbation of poses, seeded: drift, jitter and jumps."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from deworldsg_ros.poses.motion import rigid_motion
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.rigid import rigid_motion
 
 
 @dataclass(frozen=True)
 class PoseNoise:
-    """How poses are made worse.
+    """Errors that are added to poses.
 
     Attributes:
-        jitter_m: standard deviation of each axis of the position, independent each frame.
-        jitter_deg: standard deviation of the rotation about each axis, independent each frame.
-        drift_m_per_m: translation error that a metre of the path adds, in a direction of the
-            camera that stays the same, as of a wrong scale or calibration.
-        drift_deg_per_m: rotation error that a metre of the path adds, about such an axis.
-        jump_probability: share of frames whose pose is somewhere else for that frame alone.
-        jump_m: how far such a frame is off.
-        seed: of all of it.
+        jitter_m: standard deviation of each position axis, independent in each frame.
+        jitter_deg: standard deviation of the rotation about each axis, independent in each frame.
+        drift_m_per_m: translation error for each metre of the path, in a constant direction of the
+            camera frame, as from a wrong scale or calibration.
+        drift_deg_per_m: rotation error for each metre of the path, about a constant axis.
+        jump_probability: fraction of frames with a wrong position in that frame only.
+        jump_m: position error of such a frame.
+        seed: of the random numbers.
 
     Raises:
-        ConfigurationError: for what is negative, not finite, or a probability above 1.
+        ConfigurationError: for a value that is negative or not finite, or a probability above 1.
     """
 
     jitter_m: float = 0.0
@@ -44,25 +44,25 @@ class PoseNoise:
         for field in fields(self):
             value = getattr(self, field.name)
             if not math.isfinite(value) or value < 0:
-                raise ConfigurationError(f"pose noise {field.name} is {value}: wanted >= 0")
+                raise ConfigurationError(f"pose noise {field.name} is {value}: expected >= 0")
         if self.jump_probability > 1:
             raise ConfigurationError(
-                f"pose noise jump_probability is {self.jump_probability}: wanted at most 1"
+                f"pose noise jump_probability is {self.jump_probability}: expected <= 1"
             )
 
 
 def parse_noise(text: str) -> PoseNoise:
-    """Noise of ``name=number,name=number,…``; raises ConfigurationError."""
+    """PoseNoise from ``name=number,name=number,…``; raises ConfigurationError."""
     values = parse_numbers(text, [field.name for field in fields(PoseNoise)], "pose noise")
     seed = int(values.pop("seed", 0))
     return PoseNoise(**values, seed=seed)
 
 
 def parse_numbers(text: str, names: Sequence[str], what: str) -> dict[str, float]:
-    """Numbers by name of ``name=number,name=number,…``.
+    """Numbers by name from ``name=number,name=number,…``.
 
     Raises:
-        ConfigurationError: says `what` it is of and which names there are.
+        ConfigurationError: names `what`, the word, and the allowed names.
     """
     values: dict[str, float] = {}
     for word in filter(None, text.split(",")):
@@ -73,23 +73,23 @@ def parse_numbers(text: str, names: Sequence[str], what: str) -> dict[str, float
             values[name.strip()] = float(number)
         except ValueError as error:
             raise ConfigurationError(
-                f"{what} '{word}': wanted NAME=NUMBER, NAME one of {', '.join(names)}"
+                f"{what} '{word}': expected NAME=NUMBER, NAME one of {', '.join(names)}"
             ) from error
     return values
 
 
 def perturb_poses(frames: Iterable[RgbdFrame], noise: PoseNoise) -> Iterator[RgbdFrame]:
-    """The frames with worse poses; the same noise and frames give the same poses."""
+    """The frames with perturbed poses; the same noise and frames give the same poses."""
     perturbation = Perturbation(noise)
     for frame in frames:
         yield replace(frame, T_world_camera=perturbation.apply(frame.T_world_camera))
 
 
 class Perturbation:
-    """Makes one pose after another worse.
+    """Perturbs one pose after another.
 
     Args:
-        noise: how much.
+        noise: the errors.
     """
 
     def __init__(self, noise: PoseNoise) -> None:
@@ -101,7 +101,7 @@ class Perturbation:
         self._drifted = np.eye(4)
 
     def apply(self, T_world_camera: Float64) -> Float64:
-        """The next pose (4, 4), made worse; the first one only jitters."""
+        """The next pose (4, 4), perturbed; the first one has no drift."""
         noise, rng = self._noise, self._rng
         if self._before is None:
             self._drifted = T_world_camera
@@ -114,7 +114,7 @@ class Perturbation:
             )
             self._drifted = self._drifted @ step @ error
         self._before = T_world_camera
-        # All numbers are drawn every time, so that one kind of noise does not change another.
+        # All numbers are drawn in each frame: one kind of noise does not change another.
         jitter = rigid_motion(
             noise.jitter_m * rng.normal(size=3), np.radians(noise.jitter_deg) * rng.normal(size=3)
         )

@@ -1,7 +1,7 @@
-"""Trajectory files: TUM, KITTI, and a folder of pose files a frame (3RScan, ORB-SLAM3 on it).
+"""Trajectory files: TUM, KITTI, and folders with one pose file for each frame (3RScan).
 
-All of them are poses of the colour camera, camera to world, metres. TUM has stamps, at which poses
-are interpolated; KITTI has one line an image, in order; pose files have the frame's number.
+All formats contain poses of the colour camera, camera to world, metres. TUM poses have stamps and
+are interpolated. KITTI has one line for each image, in order. Pose files have the frame number.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class TrajectoryError(DeWorldSGError):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses by stamp, by frame number or by place in the sequence.
+    """Poses by stamp, by frame number or by position in the sequence.
 
     Attributes:
         kind: the format it was read from.
-        keys: ascending; nanoseconds (TUM), frame numbers (pose files) or places from 0 (KITTI).
+        keys: ascending; nanoseconds (TUM), frame numbers (pose files) or positions from 0 (KITTI).
         T_world_cameras: (n, 4, 4) float64.
-        missing: frames that the file lists without a valid pose, as trackers do when lost.
+        missing: number of frames without a valid pose, as written by a tracker that was lost.
     """
 
     kind: str
@@ -53,18 +53,18 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.keys)
 
-    def at(self, stamp_ns: int, number: int, place: int, slop_ns: int) -> Float64 | None:
-        """The pose (4, 4) of an image, None where there is none.
+    def at(self, stamp_ns: int, number: int, position: int, slop_ns: int) -> Float64 | None:
+        """The pose (4, 4) of an image; None if there is none.
 
         Args:
             stamp_ns: of the image.
-            number: of its frame, in file names.
-            place: in the sequence, from 0.
-            slop_ns: most time to a pose that stands for it, on both sides to interpolate.
+            number: of its frame, from the file names.
+            position: in the sequence, from 0.
+            slop_ns: maximum time to a pose; interpolation needs poses within it on both sides.
         """
         if self.kind == "tum":
             return self._at_stamp(stamp_ns, slop_ns)
-        key = place if self.kind == "kitti" else number
+        key = position if self.kind == "kitti" else number
         row = bisect_left(self.keys, key)
         return self.T_world_cameras[row] if self.keys[row : row + 1] == (key,) else None
 
@@ -88,28 +88,28 @@ def read_trajectory(path: Path, kind: str = "auto") -> Trajectory:
 
     Args:
         path: file, or folder of frame-NNNNNN.pose.txt or .slam.pose.txt.
-        kind: tum, kitti, 3rscan, slam, or auto = by looking.
+        kind: tum, kitti, 3rscan, slam; auto = by the columns or the file names.
 
     Raises:
-        TrajectoryError: names the file, the line, what was seen and what was wanted.
+        TrajectoryError: names the file, the line, the value and the expected one.
     """
     if kind not in ("auto", *FORMATS):
-        raise TrajectoryError(f"trajectory format '{kind}': wanted auto, {', '.join(FORMATS)}")
+        raise TrajectoryError(f"trajectory format '{kind}': expected auto, {', '.join(FORMATS)}")
     if path.is_dir():
         if kind not in ("auto", *SUFFIXES):
-            raise TrajectoryError(f"trajectory {path} is a folder: wanted a file for {kind}")
+            raise TrajectoryError(f"trajectory {path} is a folder: expected a file for {kind}")
         return _read_folder(path, kind)
     if kind in SUFFIXES:
         raise TrajectoryError(
-            f"trajectory {path}: wanted the folder that holds frame-NNNNNN{SUFFIXES[kind]}"
+            f"trajectory {path}: expected the folder that contains frame-NNNNNN{SUFFIXES[kind]}"
         )
     lines = _lines(path)
     if kind == "auto":
         number, words = lines[0]
         if len(words) not in COLUMNS:
             raise TrajectoryError(
-                f"{path}, line {number} has {len(words)} values: wanted 8 (TUM: stamp tx ty tz qx "
-                "qy qz qw) or 12 (KITTI: 3x4 matrix, row by row)"
+                f"{path}, line {number} has {len(words)} values: expected 8 (TUM: stamp tx ty tz "
+                "qx qy qz qw) or 12 (KITTI: 3x4 matrix, row by row)"
             )
         kind = COLUMNS[len(words)]
     return _read_tum(path, lines) if kind == "tum" else _read_kitti(path, lines)
@@ -132,7 +132,7 @@ Line = tuple[int, list[str]]
 
 
 def _lines(path: Path) -> list[Line]:
-    """Numbers and words of the lines that are no comments."""
+    """Line numbers and words of all lines except comments."""
     try:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -143,23 +143,23 @@ def _lines(path: Path) -> list[Line]:
         if (words := line.split("#")[0].replace(",", " ").split())
     ]
     if not lines:
-        raise TrajectoryError(f"trajectory {path} lists nothing: wanted a pose a line")
+        raise TrajectoryError(f"trajectory {path} has no poses: expected one in each line")
     return lines
 
 
-def _pose(path: Path, line: Line, wanted: str, make: Callable[[Float64], Float64]) -> Float64:
-    """The pose of a line's numbers; raises TrajectoryError."""
+def _pose(path: Path, line: Line, expected: str, make: Callable[[Float64], Float64]) -> Float64:
+    """The pose from the numbers of a line; raises TrajectoryError."""
     number, words = line
     try:
         return make(np.array(words, np.float64))
     except (ValueError, RefusedInput) as error:
         raise TrajectoryError(
-            f"{path}, line {number}: '{' '.join(words)}': {error}; wanted {wanted}"
+            f"{path}, line {number}: '{' '.join(words)}': {error}; expected {expected}"
         ) from error
 
 
 def _read_tum(path: Path, lines: list[Line]) -> Trajectory:
-    wanted = "stamp tx ty tz qx qy qz qw, seconds and metres, with a unit quaternion"
+    expected = "stamp tx ty tz qx qy qz qw, seconds and metres, with a unit quaternion"
     keys: list[int] = []
     poses = []
     for number, words in lines:
@@ -167,38 +167,38 @@ def _read_tum(path: Path, lines: list[Line]) -> Trajectory:
             stamp_ns = int(Decimal(words[0]) * 10**9)
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise TrajectoryError(
-                f"{path}, line {number}: '{words[0]}' is no stamp: wanted {wanted}"
+                f"{path}, line {number}: '{words[0]}' is no stamp: expected {expected}"
             ) from error
-        _check_count(path, (number, words), 8, wanted)
+        _check_count(path, (number, words), 8, expected)
         if keys and stamp_ns <= keys[-1]:
             raise TrajectoryError(
                 f"{path}, line {number}: stamp {words[0]} is not later than the one before: "
-                "wanted ascending stamps"
+                "expected ascending stamps"
             )
         keys.append(stamp_ns)
         poses.append(
-            _pose(path, (number, words[1:]), wanted, lambda v: pose_from_quaternion(v[:3], v[3:]))
+            _pose(path, (number, words[1:]), expected, lambda v: pose_from_quaternion(v[:3], v[3:]))
         )
     return Trajectory("tum", tuple(keys), np.array(poses))
 
 
 def _read_kitti(path: Path, lines: list[Line]) -> Trajectory:
-    wanted = "12 numbers, the 3x4 matrix of a rigid transform row by row"
+    expected = "12 numbers, the 3x4 matrix of a rigid transform row by row"
     poses = []
     for line in lines:
-        _check_count(path, line, 12, wanted)
-        poses.append(_pose(path, line, wanted, _matrix))
+        _check_count(path, line, 12, expected)
+        poses.append(_pose(path, line, expected, _matrix))
     return Trajectory("kitti", tuple(range(len(poses))), np.array(poses))
 
 
-def _check_count(path: Path, line: Line, count: int, wanted: str) -> None:
+def _check_count(path: Path, line: Line, count: int, expected: str) -> None:
     number, words = line
     if len(words) != count:
-        raise TrajectoryError(f"{path}, line {number} has {len(words)} values: wanted {wanted}")
+        raise TrajectoryError(f"{path}, line {number} has {len(words)} values: expected {expected}")
 
 
 def _matrix(values: Float64) -> Float64:
-    """A rigid transform of 12 or 16 numbers, with a rotation that is exactly one."""
+    """A rigid transform from 12 or 16 numbers, with an exact rotation."""
     T = np.eye(4)
     T[:3] = values.reshape(-1, 4)[:3]
     check_pose(T)
@@ -212,21 +212,21 @@ def _read_folder(path: Path, kind: str) -> Trajectory:
     files = sorted((int(m[1]), file) for file, m in found if bool(m[2]) == (kind == "slam"))
     if not files:
         raise TrajectoryError(
-            f"trajectory {path}: no frame-NNNNNN{SUFFIXES[kind]} in it: wanted one a frame"
+            f"trajectory {path}: no frame-NNNNNN{SUFFIXES[kind]} in it, expected one for each frame"
         )
     keys, poses, missing = [], [], 0
     for number, file in files:
         words = [word for _, line in _lines(file) for word in line]
         if len(words) != 16:
-            raise TrajectoryError(f"{file} has {len(words)} values: wanted a 4x4 matrix")
+            raise TrajectoryError(f"{file} has {len(words)} values: expected a 4x4 matrix")
         try:
             poses.append(_matrix(np.array(words, np.float64)))
         except ValueError as error:
-            raise TrajectoryError(f"{file}: {error}; wanted a 4x4 matrix") from error
-        except RefusedInput:  # -inf or NaN: the tracker was lost
+            raise TrajectoryError(f"{file}: {error}; expected a 4x4 matrix") from error
+        except RefusedInput:  # -inf or NaN: the tracker had lost the camera
             missing += 1
             continue
         keys.append(number)
     if not keys:
-        raise TrajectoryError(f"trajectory {path}: not one of its {missing} poses is valid")
+        raise TrajectoryError(f"trajectory {path}: none of its {missing} poses is valid")
     return Trajectory(kind, tuple(keys), np.array(poses), missing)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.rigid import rotation_angle_deg
 
 # Between two frames at 10 Hz this is 10 m/s: faster than a person walks or an indoor robot drives,
 # and shorter than the jump of a tracker that lost itself.

@@ -1,4 +1,4 @@
-"""Frames with drifting poses are laid on the graph: a motion is found, and it stays in place."""
+"""Alignment of frames with the graph: motions are found, and drift is corrected."""
 
 from __future__ import annotations
 
@@ -37,43 +37,43 @@ def planes_of(points: np.ndarray) -> np.ndarray:
     return np.concatenate((points, np.eye(3)[side]), axis=1)
 
 
-def transform(turn_deg: tuple[float, float, float], shift_m: tuple[float, float, float]):
+def transform(rotation_deg: tuple[float, float, float], translation_m: tuple[float, float, float]):
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
-    T[:3, 3] = shift_m
+    T[:3, :3] = Rotation.from_rotvec(rotation_deg, degrees=True).as_matrix()
+    T[:3, 3] = translation_m
     return T
 
 
 def test_a_small_motion_is_found() -> None:
     planes = planes_of(box(0, 0, 0).astype(np.float64))
     camera = np.array([-1.0, -1.0, -1.0])
-    turn, shift = np.deg2rad([0.8, -0.5, 0.6]), np.array([0.02, -0.015, 0.01])
+    rotation, translation = np.deg2rad([0.8, -0.5, 0.6]), np.array([0.02, -0.015, 0.01])
     points = np.random.default_rng(1).permutation(planes[:, :3])[:500]
-    away = Rotation.from_rotvec(turn).inv().apply(points - camera - shift) + camera
-    found_turn, found_shift = register(away, planes, camera)
-    placed = Rotation.from_rotvec(found_turn).apply(away - camera) + found_shift + camera
+    away = Rotation.from_rotvec(rotation).inv().apply(points - camera - translation) + camera
+    found_rotation, found_translation = register(away, planes, camera)
+    placed = Rotation.from_rotvec(found_rotation).apply(away - camera) + found_translation + camera
     assert np.abs(placed - points).max() < 0.01
     assert np.abs(away - points).max() > 0.03
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((500, 3), 9.0)])
-def test_what_meets_nothing_is_left_where_it_is(points: np.ndarray) -> None:
-    turn, shift = register(points, planes_of(box(0, 0, 0).astype(np.float64)), CAMERA)
-    assert not turn.any()
-    assert not shift.any()
+def test_points_without_planes_are_not_moved(points: np.ndarray) -> None:
+    rotation, translation = register(points, planes_of(box(0, 0, 0).astype(np.float64)), CAMERA)
+    assert not rotation.any()
+    assert not translation.any()
 
 
-def test_what_a_plane_does_not_tell_is_not_made_up() -> None:
+def test_a_single_plane_leaves_tangential_motion_at_zero() -> None:
     floor = slab((0.0, 0.0, 0.0), (1.0, 1.0, 0.001)).astype(np.float64)
     planes = np.concatenate((floor, np.tile([0.0, 0, 1], (len(floor), 1))), axis=1)
     camera = np.array([0.0, 0.0, 1.0])
-    turn, shift = register(floor[:500] + (0.03, 0.03, 0.03), planes, camera)
-    assert shift[2] == pytest.approx(-0.03, abs=0.005)
-    assert np.abs(shift[:2]).max() < 1e-3
-    assert abs(turn[2]) < 1e-3
+    rotation, translation = register(floor[:500] + (0.03, 0.03, 0.03), planes, camera)
+    assert translation[2] == pytest.approx(-0.03, abs=0.005)
+    assert np.abs(translation[:2]).max() < 1e-3
+    assert abs(rotation[2]) < 1e-3
 
 
-def test_a_moved_graph_is_that_of_a_moved_camera() -> None:
+def test_a_moved_local_graph_equals_one_of_a_moved_camera() -> None:
     local = frame(1, *BOXES)
     T = transform((10, 20, 30), (1, 2, 3))
     there = moved(local, T)
@@ -87,16 +87,16 @@ def test_a_moved_graph_is_that_of_a_moved_camera() -> None:
 
 
 def drift(config: MergingConfig, frames: int = 60) -> SceneGraph:
-    """The boxes, seen under poses that turn by a tenth of a degree and slip 2 mm a frame."""
+    """The boxes under poses that drift by 0.1 degree and 2 mm in each frame."""
     graph = SceneGraph(VOCABULARY, "world")
     merging = SurfaceMerging(config)
     for stamp in range(1, frames + 1):
-        told = transform((0, 0.1 * stamp, 0), (0.002 * stamp, 0, 0.001 * stamp))
-        merging.merge(graph, moved(frame(stamp, *BOXES), told))
+        drifted = transform((0, 0.1 * stamp, 0), (0.002 * stamp, 0, 0.001 * stamp))
+        merging.merge(graph, moved(frame(stamp, *BOXES), drifted))
     return graph
 
 
-def test_a_graph_stays_in_place_under_poses_that_drift() -> None:
+def test_alignment_corrects_drift() -> None:
     config = MergingConfig()
     truth = np.array([points.mean(axis=0) for points, _ in BOXES])
 
@@ -104,14 +104,14 @@ def test_a_graph_stays_in_place_under_poses_that_drift() -> None:
         means = graph.nodes.means[graph.nodes.confirmed]
         return np.linalg.norm(means[:, None] - truth, axis=2).min(axis=1)
 
-    as_told = drift(config)
+    uncorrected = drift(config)
     aligned = drift(msgspec.structs.replace(config, align_poses=True))
     assert len(errors_m(aligned)) == len(BOXES)
     assert errors_m(aligned).max() < 0.03
-    assert errors_m(as_told).max() > 0.06
+    assert errors_m(uncorrected).max() > 0.06
 
 
-def test_poses_that_are_right_are_kept() -> None:
+def test_correct_poses_are_not_changed() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     alignment = PoseAlignment()
     merging = SurfaceMerging(MergingConfig())

@@ -1,4 +1,4 @@
-"""The merging stage against the obvious reference, and what must hold of any such stage."""
+"""The paper's rule against a plain reference, and its invariants."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def frame_of(stamp_ns: int, *gaussians: tuple, classes: np.ndarray = CERTAIN, **
 
 @given(seeds)
 @settings(max_examples=80)
-def test_the_whole_rule_is_that_of_the_reference(seed: int) -> None:
+def test_the_rule_equals_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frames = random_local_graphs(rng, 12)
     config = MergingConfig()
@@ -76,7 +76,7 @@ def test_the_whole_rule_is_that_of_the_reference(seed: int) -> None:
 
 @given(seeds)
 @settings(max_examples=30)
-def test_the_world_frame_does_not_matter(seed: int) -> None:
+def test_the_result_does_not_depend_on_the_world_frame(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frames = random_local_graphs(rng, 8)
     reference = ReferenceMerging(0.7, 0.8)
@@ -100,7 +100,7 @@ def test_the_world_frame_does_not_matter(seed: int) -> None:
 
 @given(seeds)
 @settings(max_examples=30)
-def test_what_always_holds(seed: int) -> None:
+def test_invariants_of_the_graph(seed: int) -> None:
     frames = random_local_graphs(np.random.default_rng(seed), 15)
     graph, ids = merge_all(frames)
     nodes = graph.nodes
@@ -119,7 +119,7 @@ def test_what_always_holds(seed: int) -> None:
         assert 0 not in graph.nodes_of_frame(local.stamp_ns)
 
 
-def test_a_still_camera_ends_with_one_node_an_object_after_200_frames() -> None:
+def test_a_still_camera_gives_one_node_for_each_object() -> None:
     rng = np.random.default_rng(7)
     objects = 12
     centres = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0), [0.5]), -1).reshape(-1, 3)
@@ -203,7 +203,7 @@ def test_the_nearest_node_wins_and_of_equals_the_oldest() -> None:
     assert merging.merge(graph, frame_of(1, gaussian((0, 0, 0), 0.2))) == [2]
 
 
-def test_a_bridge_joins_two_nodes_and_the_older_id_lives() -> None:
+def test_an_object_between_two_nodes_merges_them_into_the_older_id() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     merging = PaperMerging(MergingConfig())
     apart = frame_of(1, gaussian((0, 0, 0)), gaussian((0.25, 0, 0)), gaussian((3, 0, 0)))
@@ -227,7 +227,7 @@ def test_a_bridge_joins_two_nodes_and_the_older_id_lives() -> None:
     assert graph.edges[3, 1].visual_logits.tolist() == [4.0, 5.0, 6.0]
 
 
-def test_rows_of_one_frame_that_become_one_node_share_their_relations() -> None:
+def test_relations_of_rows_that_become_one_node_are_summed() -> None:
     local = frame_of(
         1,
         gaussian((0, 0, 0)),
@@ -253,7 +253,7 @@ def test_an_empty_frame_is_remembered() -> None:
 def test_another_vocabulary_or_frame_is_refused() -> None:
     graph = SceneGraph(VOCABULARY, "world")
     merging = PaperMerging(MergingConfig())
-    with pytest.raises(RefusedInput, match="wanted 'world'") as refused:
+    with pytest.raises(RefusedInput, match="expected 'world'") as refused:
         merging.merge(graph, frame_of(1, frame_id="map"))
     assert refused.value.reason == "wrong_frame"
     other = local_graph(

@@ -9,10 +9,10 @@ import pytest
 from support.corner_room import INTRINSICS, LEVEL, corner_frame, turned, walk
 
 from deworldsg_ros.poses.depth_alignment import fit_fraction, points_of, refine, surface_of
-from deworldsg_ros.poses.motion import rigid_motion, rotation_angle_deg
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, check_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.rigid import rigid_motion, rotation_angle_deg
 
 
 def track(odometry: RgbdOdometry, frame: RgbdFrame) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Poses made worse on purpose: as much as asked for, the same every time, and jumps kept out."""
+"""Perturbed poses: the requested errors, reproducible, and jumps refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from support.corner_room import corner_frame, walk
 
 from deworldsg_ros.poses.frames import track_poses
-from deworldsg_ros.poses.motion import rotation_angle_deg
 from deworldsg_ros.poses.perturbation import (
     Perturbation,
     PoseNoise,
@@ -22,12 +21,13 @@ from deworldsg_ros.poses.perturbation import (
 from deworldsg_ros.recordings.posing import gate_jumps
 from deworldsg_ros.scene.camera import RgbdFrame, check_pose, invert_pose
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.rigid import rotation_angle_deg
 
 STEPS = 400
 
 
 def line(count: int = STEPS, step_m: float = 0.05) -> list[np.ndarray]:
-    """A camera that goes straight ahead."""
+    """A camera that moves straight ahead."""
     poses = [np.eye(4) for _ in range(count)]
     for index, T in enumerate(poses):
         T[2, 3] = index * step_m
@@ -39,7 +39,7 @@ def apply(noise: PoseNoise, poses: list[np.ndarray]) -> list[np.ndarray]:
     return [perturbation.apply(T) for T in poses]
 
 
-def test_no_noise_changes_nothing() -> None:
+def test_zero_noise_changes_no_pose() -> None:
     for T, same in zip(walk(30), apply(PoseNoise(), walk(30))):
         np.testing.assert_allclose(same, T, atol=1e-12)
 
@@ -48,7 +48,7 @@ def test_no_noise_changes_nothing() -> None:
 @given(
     st.integers(0, 2**31), st.floats(0, 0.1), st.floats(0, 5), st.floats(0, 0.1), st.floats(0, 5)
 )
-def test_poses_stay_rigid_and_a_seed_is_a_run(
+def test_perturbed_poses_are_rigid_and_reproducible(
     seed: int, jitter_m: float, jitter_deg: float, drift_m: float, drift_deg: float
 ) -> None:
     noise = PoseNoise(jitter_m, jitter_deg, drift_m, drift_deg, 0.1, 2.0, seed)
@@ -86,7 +86,7 @@ def moving(poses: list[np.ndarray]) -> list[RgbdFrame]:
     return [corner_frame(T, stamp_ns) for stamp_ns, T in enumerate(poses)]
 
 
-def test_jumps_last_a_frame_and_none_gets_through_the_gate() -> None:
+def test_jumps_last_one_frame_and_the_gate_refuses_them() -> None:
     frames = moving(walk(40))
     noise = PoseNoise(jump_probability=0.2, jump_m=3.0, seed=4)
     worse = list(perturb_poses(frames, noise))
@@ -105,17 +105,17 @@ def test_jumps_last_a_frame_and_none_gets_through_the_gate() -> None:
     assert len(refusals) == len(jumped)
 
 
-def test_noise_is_told_in_words() -> None:
+def test_noise_is_parsed_from_text() -> None:
     assert parse_noise("") == PoseNoise()
-    told = parse_noise("jitter_m=0.02,jitter_deg=1,drift_m_per_m=0.01,seed=3")
-    assert told == PoseNoise(0.02, 1.0, 0.01, seed=3)
+    noise = parse_noise("jitter_m=0.02,jitter_deg=1,drift_m_per_m=0.01,seed=3")
+    assert noise == PoseNoise(0.02, 1.0, 0.01, seed=3)
     for text, message in (
         ("jitter=1", "NAME one of jitter_m"),
-        ("jitter_m", "wanted NAME=NUMBER"),
-        ("jitter_m=a", "wanted NAME=NUMBER"),
-        ("jitter_m=-1", "jitter_m is -1.0: wanted >= 0"),
+        ("jitter_m", "expected NAME=NUMBER"),
+        ("jitter_m=a", "expected NAME=NUMBER"),
+        ("jitter_m=-1", "jitter_m is -1.0: expected >= 0"),
         ("jitter_m=nan", "jitter_m is nan"),
-        ("jump_probability=2", "wanted at most 1"),
+        ("jump_probability=2", "expected <= 1"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             parse_noise(text)

@@ -1,4 +1,4 @@
-"""Trajectory files: read, validated, interpolated, and in place of a recording's own poses."""
+"""Trajectory files: reading, validation, interpolation, and use with a recording."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def written(path: Path, *lines: str) -> Path:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+def test_a_written_trajectory_is_read_back(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     poses = [random_pose(rng) for _ in range(5)]
     stamps_ns = np.cumsum(rng.integers(1, 10**10, 5)).tolist()
@@ -57,7 +59,7 @@ def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, seed:
         np.testing.assert_allclose(trajectory.at(stamp_ns_, 0, 0, 0), T, atol=1e-7)
 
 
-def test_tum_is_interpolated_where_poses_are_near_on_both_sides(tmp_path: Path) -> None:
+def test_tum_poses_are_interpolated_between_two_near_stamps(tmp_path: Path) -> None:
     half = np.sqrt(0.5)
     path = written(
         tmp_path / "t.txt", "# comment", "1.0 0 0 0 0 0 0 1", f"1.1 1 0 0 0 0 {half} {half}"
@@ -75,7 +77,7 @@ def test_tum_is_interpolated_where_poses_are_near_on_both_sides(tmp_path: Path) 
     assert trajectory.at(1 * S + 60_000_000, 0, 0, 50_000_000)[0, 3] == 1.0
 
 
-def test_kitti_is_by_place_and_pose_files_are_by_number(tmp_path: Path) -> None:
+def test_kitti_poses_have_positions_and_pose_files_have_numbers(tmp_path: Path) -> None:
     trajectory = read_trajectory(written(tmp_path / "k.txt", KITTI_LINE, KITTI_LINE))
     assert trajectory.kind == "kitti"
     assert trajectory.at(0, 99, 1, 0)[:3, 3].tolist() == [4.0, 5.0, 6.0]
@@ -96,29 +98,33 @@ def test_kitti_is_by_place_and_pose_files_are_by_number(tmp_path: Path) -> None:
 
 
 BAD = {
-    "empty": ("auto", ["# nothing"], "lists nothing"),
-    "columns": ("auto", ["1 2 3"], "line 1 has 3 values: wanted 8"),
-    "short": ("tum", [TUM_LINE, "2 1 2"], "line 2 has 3 values: wanted stamp"),
-    "nan": ("tum", ["1 nan 2 3 0 0 0 1"], "line 1: 'nan 2 3 0 0 0 1': .*wanted"),
+    "empty": ("auto", ["# nothing"], "has no poses"),
+    "columns": ("auto", ["1 2 3"], "line 1 has 3 values: expected 8"),
+    "short": ("tum", [TUM_LINE, "2 1 2"], "line 2 has 3 values: expected stamp"),
+    "nan": ("tum", ["1 nan 2 3 0 0 0 1"], "line 1: 'nan 2 3 0 0 0 1': .*expected"),
     "word": ("tum", ["1 x 2 3 0 0 0 1"], "line 1: 'x 2 3 0 0 0 1'"),
     "stamp": ("tum", ["one 1 2 3 0 0 0 1"], "line 1: 'one' is no stamp"),
-    "zero quaternion": ("tum", ["1 1 2 3 0 0 0 0"], "norm 0.0000: wanted 1"),
+    "zero quaternion": ("tum", ["1 1 2 3 0 0 0 0"], "norm 0.0000: expected 1"),
     "order": ("tum", [TUM_LINE, TUM_LINE], "line 2: stamp 1.5 is not later"),
     "mirror": ("kitti", ["-1 0 0 4 0 1 0 5 0 0 1 6"], "line 1: .*right-handed"),
-    "mixed": ("auto", [KITTI_LINE, TUM_LINE], "line 2 has 8 values: wanted 12 numbers"),
-    "format": ("bvh", [TUM_LINE], "format 'bvh': wanted auto, tum"),
-    "no folder": ("slam", [TUM_LINE], r"wanted the folder that holds frame-NNNNNN.slam.pose.txt"),
+    "mixed": ("auto", [KITTI_LINE, TUM_LINE], "line 2 has 8 values: expected 12 numbers"),
+    "format": ("bvh", [TUM_LINE], "format 'bvh': expected auto, tum"),
+    "no folder": (
+        "slam",
+        [TUM_LINE],
+        r"expected the folder that contains frame-NNNNNN.slam.pose.txt",
+    ),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_wrong_is_told_by_file_and_line(tmp_path: Path, case: str) -> None:
+def test_errors_name_file_and_line(tmp_path: Path, case: str) -> None:
     kind, lines, message = BAD[case]
     with pytest.raises(TrajectoryError, match=message):
         read_trajectory(written(tmp_path / "t.txt", *lines), kind)
 
 
-def test_missing_files_and_bad_folders_are_told(tmp_path: Path) -> None:
+def test_missing_files_and_bad_folders_are_refused(tmp_path: Path) -> None:
     with pytest.raises(TrajectoryError, match=r"t\.txt: cannot be read"):
         read_trajectory(tmp_path / "t.txt")
     with pytest.raises(TrajectoryError, match=r"no frame-NNNNNN\.pose\.txt in it"):
@@ -142,7 +148,7 @@ def frames_with(path: Path, choice: PoseChoice, config: Config | None = None):  
     return recording, frames, refusals
 
 
-def test_a_trajectory_takes_the_place_of_a_bags_poses(tmp_path: Path) -> None:
+def test_a_trajectory_replaces_the_poses_of_a_bag(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", camera_items(6))
     lines = [f"{stamp_ns(k) / S:.9f} {k / 10} 0 0 0 0 0 1" for k in range(6) if k not in (2, 3, 4)]
     path = written(tmp_path / "t.txt", *lines)
@@ -158,7 +164,7 @@ def test_a_trajectory_takes_the_place_of_a_bags_poses(tmp_path: Path) -> None:
     assert frames[0].T_world_camera[0, 3] == 0.0
 
 
-def test_a_bag_without_poses_is_refused_until_they_come_from_elsewhere(tmp_path: Path) -> None:
+def test_a_bag_without_poses_needs_another_source_of_poses(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", camera_items(3, with_pose=False))
     with pytest.raises(RecordingError, match="no pose topic"):
         open_source(bag)
@@ -170,7 +176,7 @@ def test_a_bag_without_poses_is_refused_until_they_come_from_elsewhere(tmp_path:
 
 
 def scan(folder: Path, *, poses: bool) -> Path:
-    """A scan of 3RScan with four frames, SLAM's poses, and its own only where asked for."""
+    """A scan of 3RScan: four frames, poses of SLAM, and optionally its own poses."""
     sequence = folder / "sequence"
     sequence.mkdir(parents=True)
     K = np.eye(4)
@@ -197,15 +203,15 @@ def scan(folder: Path, *, poses: bool) -> Path:
 
 
 @pytest.mark.parametrize("poses", [True, False])
-def test_slams_pose_files_of_a_scan_turn_with_its_images(tmp_path: Path, poses: bool) -> None:
+def test_slam_poses_of_a_scan_are_rotated_with_its_images(tmp_path: Path, poses: bool) -> None:
     folder = scan(tmp_path / "data" / "scan", poses=poses)
     recording, frames, _ = frames_with(folder, PoseChoice(folder / "sequence", "slam"))
     assert len(frames) == 3
     assert recording.drops["no_pose"] == 1
-    wanted = pose(0)
-    wanted[0, 3] += 10.0
-    wanted[:3, :3] = wanted[:3, :3] @ ROTATED_AXES
-    np.testing.assert_allclose(frames[0].T_world_camera, wanted, atol=1e-9)
+    expected = pose(0)
+    expected[0, 3] += 10.0
+    expected[:3, :3] = expected[:3, :3] @ ROTATED_AXES
+    np.testing.assert_allclose(frames[0].T_world_camera, expected, atol=1e-9)
 
 
 def test_a_scan_without_poses_has_no_frames_of_its_own(tmp_path: Path) -> None:
@@ -214,7 +220,7 @@ def test_a_scan_without_poses_has_no_frames_of_its_own(tmp_path: Path) -> None:
     assert recording.drops["missing_file"] == 4
 
 
-def test_poses_come_from_one_place() -> None:
+def test_poses_have_one_source() -> None:
     with pytest.raises(ConfigurationError, match="expected only one"):
         PoseChoice(Path("t.txt"), odometry=True)
 
@@ -245,4 +251,4 @@ def test_run_takes_a_trajectory_and_writes_the_poses_used(tmp_path: Path, root_d
     assert "nothing.txt: cannot be read" in bad.stderr
     noisy = deworldsg(tmp_path, "run", bag, "--out", out, "--pose-noise", "wobble=1")
     assert noisy.returncode == 2
-    assert "pose noise 'wobble=1': wanted NAME=NUMBER" in noisy.stderr
+    assert "pose noise 'wobble=1': expected NAME=NUMBER" in noisy.stderr
