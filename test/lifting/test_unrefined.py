@@ -22,7 +22,7 @@ def lift(depth_m: np.ndarray, instances: np.ndarray, boxes: list, **settings: ob
         "camera",
         40,
         30,
-        Vocabulary(("thing",), ()),
+        Vocabulary(("object",), ()),
         np.array(boxes, np.float64).reshape(-1, 4),
         np.ones((count, 1)),
         np.ones(count),

@@ -11,7 +11,7 @@ INTRINSICS = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
 LEVEL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-# Axis and place of each wall.
+# Axis and position of each wall, metres.
 WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
@@ -28,9 +28,9 @@ def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
     )
     directions = rays @ T_world_camera[:3, :3].T
     depth = np.full(u.shape, np.inf)
-    for axis, place in WALLS:
+    for axis, position in WALLS:
         with np.errstate(divide="ignore", invalid="ignore"):
-            hit = (place - T_world_camera[axis, 3]) / directions[..., axis]
+            hit = (position - T_world_camera[axis, 3]) / directions[..., axis]
         depth = np.where((hit > 0.1) & (hit < depth), hit, depth)
     points = T_world_camera[:3, 3] + depth[..., None] * directions
     waves = [np.sin(points @ direction + phase) for direction, phase in WAVES]

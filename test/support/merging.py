@@ -81,7 +81,7 @@ def local_graph(
 
 
 def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGraph]:
-    """Frames that see a few objects again and again, noisily: they merge, split and chain."""
+    """Noisy frames of a few objects that are observed repeatedly."""
     objects = int(rng.integers(2, 9))
     means = rng.uniform(-1, 1, (objects, 3))
     covariances = random_covariances(rng, objects, 0.02, 0.6)
@@ -116,7 +116,7 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
 
 
 def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> None:
-    """Everything that stages do to a graph, in random order."""
+    """All changes that stages make to a graph, in random order."""
     for _ in range(edits):
         stamp_ns = int(rng.integers(0, 10**12))
         live = graph.nodes.ids.tolist()

@@ -36,7 +36,7 @@ def may_merge(
 
 
 class ReferenceMerging:
-    """Nodes and edges by id; `closest_call` says how near any decision was to its threshold."""
+    """Nodes and edges by id; `closest_call` is the least distance of a decision to a threshold."""
 
     def __init__(self, hellinger_threshold: float, class_distance_threshold: float) -> None:
         self.hellinger_threshold = hellinger_threshold
@@ -48,7 +48,7 @@ class ReferenceMerging:
         self.closest_call = math.inf
 
     def merge(self, local: LocalGraph) -> list[int]:
-        placed = []
+        assigned = []
         for row in range(len(local)):
             observed = {
                 "mean": local.means_world[row],
@@ -64,38 +64,41 @@ class ReferenceMerging:
                 self.nodes[node_id] = observed
             else:
                 self.nodes[node_id] = self.fused(self.nodes[node_id], observed)
-                node_id = self.merge_on(node_id)
-            placed.append(node_id)
-        placed = [self.resolve(node_id) for node_id in placed]
+                node_id = self.merge_repeatedly(node_id)
+            assigned.append(node_id)
+        assigned = [self.resolve(node_id) for node_id in assigned]
         seen_now = set()
         for (subject, object_), logits in zip(local.relations.pairs, local.relations.logits):
-            pair = (placed[subject], placed[object_])
+            pair = (assigned[subject], assigned[object_])
             if pair[0] == pair[1]:
                 continue
             edge = self.edges.setdefault(pair, {"logits": np.zeros(len(logits)), "frames": 0})
             edge["logits"] = edge["logits"] + logits
             edge["frames"] += pair not in seen_now
             seen_now.add(pair)
-        return placed
+        return assigned
 
-    def merge_on(self, node_id: int) -> int:
+    def merge_repeatedly(self, node_id: int) -> int:
         while True:
             others = {other: node for other, node in self.nodes.items() if other != node_id}
             other_id = self.find(self.nodes[node_id], others)
             if other_id is None:
                 return node_id
-            keep, gone = sorted((node_id, other_id))
-            self.nodes[keep] = self.fused(self.nodes[keep], self.nodes.pop(gone))
-            self.merged_into[gone] = keep
+            kept, removed = sorted((node_id, other_id))
+            self.nodes[kept] = self.fused(self.nodes[kept], self.nodes.pop(removed))
+            self.merged_into[removed] = kept
             edges, self.edges = self.edges, {}
             for (subject, object_), edge in edges.items():
-                pair = (keep if subject == gone else subject, keep if object_ == gone else object_)
+                pair = (
+                    kept if subject == removed else subject,
+                    kept if object_ == removed else object_,
+                )
                 if pair[0] == pair[1]:
                     continue
                 known = self.edges.setdefault(pair, {"logits": 0.0, "frames": 0})
                 known["logits"] = known["logits"] + edge["logits"]
                 known["frames"] += edge["frames"]
-            node_id = keep
+            node_id = kept
 
     def find(self, observed: dict, nodes: dict[int, dict]) -> int | None:
         passing = []

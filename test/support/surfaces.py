@@ -13,7 +13,7 @@ CUP, TABLE, CHAIR = 0, 1, 2
 
 
 def slab(centre: tuple[float, float, float], size: tuple[float, float, float]) -> np.ndarray:
-    """Points on the surface of a thin box, 5 mm of noise, a thousand a square metre and more."""
+    """Points on the surface of a thin box, with 3 mm of noise."""
     rng = np.random.default_rng(abs(hash((centre, size))) % 2**32)
     count = int(np.clip(2000 * max(size[0] * size[1], size[1] * size[2], 0.05), 100, 4000))
     points = rng.uniform(-0.5, 0.5, (count, 3)) * size + centre
@@ -50,12 +50,12 @@ def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph
 
 WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))
 CAMERA = Intrinsics(300.0, 300.0, 319.5, 239.5, 640, 480)
-WALL_M = 1.0  # the table top, seen from in front; cups float before it
+WALL_M = 1.0  # distance of the table top, which faces the camera; cups are in front of it
 HERE = slab((0.3, 0.1, 0.7), (0.08, 0.08, 0.06))
 
 
 def depth_grid(*surfaces: np.ndarray, background_m: float = WALL_M) -> DepthGrid:
-    """What a camera at the origin that looks along z sees of points before a wall."""
+    """Depth of points before a wall, from a camera at the origin that looks along z."""
     depth_mm = np.full((60, 80), background_m * 1000, np.uint16)
     for points in surfaces:
         columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)
