@@ -1,8 +1,4 @@
-<<<<<<< HEAD
 """Time of lifting and of its plain reference, on 12 masks of 640x480 (134 k mask pixels).
-=======
-"""CPU time of the lifting stage on 12 masks of 640x480 (134 k mask pixels), and of the reference.
->>>>>>> 75da86f (test(merging): plain English in references and benches)
 
     python bench/lifting.py [ROUNDS]
 
