@@ -28,7 +28,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str, option("detector: nanodet (shipped weights, COCO classes) or rtdetr (the paper's)")
     ] = "nanodet"
     segmenter: Annotated[
-        str, option("segmenter of the boxes: rgbd (no weights), sam2 (the paper's) or sam")
+        str, option("segmenter of the detected boxes: rgbd (no weights), sam2 (the paper's) or sam")
     ] = "rgbd"
     relation_head: Annotated[
         str, option("relation head: geometric (no weights) or egtr (the paper's, needs rtdetr)")
@@ -60,14 +60,17 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = True
     detector_path: Annotated[
         str,
-        option("checkpoint of rtdetr, and of egtr beside it: a folder, or a hub id in the cache"),
+        option("checkpoint of rtdetr and egtr: a folder, or a hub id in the local cache"),
     ] = ""
     segmenter_path: Annotated[
-        str, option("checkpoint of sam2 or sam: a folder, or a hub id in the cache")
+        str, option("checkpoint of sam2 or sam: a folder, or a hub id in the local cache")
     ] = ""
     device: Annotated[
         Literal["auto", "cpu", "cuda"],
-        option("device of all networks on torch, world models too; auto = CUDA if available"),
+        option(
+            "device of all networks on torch, also of world models; auto = CUDA if available, else "
+            "the CPU"
+        ),
     ] = "auto"
     threads: Annotated[int, option("CPU threads of the networks; 0 = all cores", ge=0, le=64)] = 2
 
@@ -79,16 +82,17 @@ class LiftingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         0.05
     )
     gamma_base_m: Annotated[
-        float, option("least separation of depth clusters, metres, Eq. 2", gt=0, le=10)
+        float, option("minimum gap between depth clusters, metres, Eq. 2", gt=0, le=10)
     ] = 0.03
     covariance_ridge_m2: Annotated[
-        float, option("ridge of the covariance, square metres, Eq. 4", gt=0, le=1)
+        float,
+        option("value added to the diagonal of a covariance, square metres, Eq. 4", gt=0, le=1),
     ] = 1e-6
     pixels: Annotated[
         Literal["refined", "mask", "box"],
         option(
-            "pixels of an object: depth-refined mask (Eq. 1-2), mask without refinement, or box "
-            "without refinement; the latter two are the paper's ablation"
+            "pixels of an object: refined = mask with depth refinement (Eq. 1-2), mask = mask "
+            "only, box = box only; mask and box are the paper's ablation"
         ),
     ] = "refined"
 
@@ -116,7 +120,7 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = 0.3
     confirm_observations: Annotated[
-        int, option("observations that confirm a node (surface rule)", ge=1, le=1000)
+        int, option("minimum observations of a confirmed node (surface rule)", ge=1, le=1000)
     ] = 3
     align_poses: Annotated[
         bool,
@@ -134,7 +138,7 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = "none"
     geo_cost_threshold: Annotated[
         float,
-        option("geometric cost below which two objects are neighbours, Eq. 8", gt=0, le=100),
+        option("geometric cost below which two objects are a neighbour pair, Eq. 8", gt=0, le=100),
     ] = 0.45
     clip_length: Annotated[int, option("frames per clip", ge=1, le=256)] = 16
     entropy_threshold_nats: Annotated[
@@ -145,16 +149,16 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     edge_belief: Annotated[
         Literal["paper", "robust"],
         option(
-            "how an edge's evidence is combined: paper = sum of logits, each direction by itself "
-            "(Eq. 9); robust = each frame is bounded by an outlier model, and the two directions "
-            "do not contradict each other"
+            "evidence of an edge: paper = sum of logits, each direction separately (Eq. 9); robust "
+            "= the evidence of each frame is bounded, and the two directions cannot contradict "
+            "each other"
         ),
     ] = "robust"
     max_clips_per_s: Annotated[
         float,
         option(
-            "clips encoded per second, by image stamps, the most uncertain pairs first; 0 = every "
-            "clip of every frame, as in the paper",
+            "maximum rate of clips for the world model, Hz, by image stamps; the most uncertain "
+            "pairs come first; 0 = every clip of every frame, as in the paper",
             ge=0,
             le=1000,
         ),
@@ -200,7 +204,7 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Literal["auto", "z", "y", "-y"],
         option(
             "axis of the world frame that points up; auto = z (the ROS convention) if the camera "
-            "poses agree with it, else the axis that they suggest"
+            "poses agree with it, else the axis estimated from the poses"
         ),
     ] = "auto"
     slop_s: Annotated[
@@ -215,7 +219,7 @@ class InputsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pose_slop_s: Annotated[
         float,
         option(
-            "maximum time between an image and the poses that are interpolated for it, seconds; "
+            "maximum time between an image and the poses around it, seconds; "
             "the default is one period of a 10 Hz localisation",
             ge=0,
             le=10,
@@ -244,7 +248,10 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     publish_tf: Annotated[
         bool,
-        option("also publish the pose of the root of the camera's static TF tree (needs tf2_msgs)"),
+        option(
+            "also publish to /tf the pose of the frame that the camera is mounted on (needs "
+            "tf2_msgs)"
+        ),
     ] = False
 
 
@@ -255,7 +262,10 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         float, option("maximum rate of /scene_graph and its updates, Hz", gt=0, le=1000)
     ] = 5.0
     top_k: Annotated[
-        int, option("most probable classes or predicates in each node or edge", ge=1, le=1000)
+        int,
+        option(
+            "number of classes per node and predicates per edge, most probable first", ge=1, le=1000
+        ),
     ] = 5
     include_tentative: Annotated[
         bool, option("publish tentative nodes too (the paper has none)")

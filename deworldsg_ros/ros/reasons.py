@@ -20,7 +20,7 @@ REASONS: dict[str, str] = {
     "invalid_pose": "A pose contains NaN or infinity, or its quaternion is not of length 1. Check "
     "the source of the poses.",
     "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "
-    "start. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
+    "session. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
     "pose_jump": "The camera moved more than 1 m between two frames, or rotated faster than 360 "
     "degrees per second. Check the poses; a new position is accepted after five consistent frames.",
     "no_pose": "No pose is within `inputs.pose_slop_s` of the image. Check the rate and the clock "
@@ -28,17 +28,17 @@ REASONS: dict[str, str] = {
     "no_transform": "The odometry describes another frame than the camera's, and TF does not "
     "connect the two. Publish that transform; if the poses are the camera's, set "
     "`inputs.pose_source` to odometry.",
-    "odometry_lost": "The odometry could not align a frame, which gets no pose. Move the camera "
-    "more slowly, and keep it unobstructed.",
+    "odometry_lost": "The odometry could not align a frame. The frame gets no pose. Move the "
+    "camera more slowly, and keep it unobstructed.",
     # Models
-    "detector_error": "The detector failed on an image, which gives no frame graph. Read the "
+    "detector_error": "The detector failed on an image. The image gives no frame graph. Read the "
     "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
-    "segmenter_error": "The segmenter failed on an image, whose frame graph is empty. Read the "
+    "segmenter_error": "The segmenter failed on an image. Its frame graph is empty. Read the "
     "traceback in the log; if memory is short, choose a smaller checkpoint or another device.",
-    "relation_head_error": "The relation head failed on an image, whose frame graph has no "
+    "relation_head_error": "The relation head failed on an image. Its frame graph has no "
     "relations. Read the traceback in the log; if memory is short, choose a smaller checkpoint or "
     "another device.",
-    "world_model_error": "The world model failed on a clip, which gives no prediction. Read the "
+    "world_model_error": "The world model failed on a clip. The clip gives no prediction. Read the "
     "message in the log; if memory is short, choose another device.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
@@ -51,9 +51,9 @@ REASONS: dict[str, str] = {
     "process.",
     "stale": "A message is not newer than the last one on its topic. Look for a second publisher.",
     "time_jump": "Stamps went back by more than a second, because a recording was restarted. "
-    "Nothing has to be done.",
-    "overrun": "A node processes fewer frames than arrive, and dropped the oldest in its queue. "
-    "Lower the camera's frame rate, or choose a faster model.",
+    "No action is needed.",
+    "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
+    "queue. Lower the camera's frame rate, or choose a faster model.",
     "unmatched_rgb": "An RGB image belongs to no local graph, because its frame was dropped "
     "before. See the other reasons.",
     "unmatched_depth": "A depth image belongs to no RGB image or frame graph. This is harmless if "
