@@ -70,7 +70,7 @@ class EgtrNetwork(nn.Module):
                 f"{where}: triplet_dist has shape {shape}, "
                 f"expected (classes, classes, {predicates})"
             )
-        network = EgtrNetwork(width, layers, predicates, shape)  # type: ignore[arg-type]
+        network = EgtrNetwork(width, layers, predicates, shape)
         check_names(parameters, network.state_dict(), where)
         try:
             network.load_state_dict(parameters)

@@ -163,16 +163,13 @@ def read_tensors(path: Path, key: str = "") -> dict[str, torch.Tensor]:
     return content
 
 
-def check_names(
-    found: Collection[str], expected: Collection[str], where: str, most: int = 5
-) -> None:
+def check_names(found: Collection[str], expected: Collection[str], where: str) -> None:
     """Compare names of parameters.
 
     Args:
         found: names in a file.
         expected: names of the network.
         where: origin of the parameters, for messages.
-        most: missing and unknown names listed in the message.
 
     Raises:
         ConfigurationError: names are missing or unknown.
@@ -182,7 +179,7 @@ def check_names(
         "unknown": sorted(set(found) - set(expected)),
     }
     parts = [
-        f"{len(names)} {kind} ({', '.join(names[:most])}{', …' if len(names) > most else ''})"
+        f"{len(names)} {kind} ({', '.join(names[:5])}{', …' if len(names) > 5 else ''})"
         for kind, names in differences.items()
         if names
     ]

@@ -144,6 +144,6 @@ def relative_box_pair(
     return fractions
 
 
-def _some(names: list[str], most: int = 5) -> str:
-    listed = ", ".join(f"'{name}'" for name in names[:most])
-    return listed if len(names) <= most else f"{listed} and {len(names) - most} more"
+def _some(names: list[str]) -> str:
+    listed = ", ".join(f"'{name}'" for name in names[:5])
+    return listed if len(names) <= 5 else f"{listed} and {len(names) - 5} more"

@@ -104,7 +104,6 @@ class ScanOutcome:
         device: device of the measured times.
         drops: number of frames and objects left out, by reason.
         over_time: checkpoints.
-        graph_path: file of the graph.
     """
 
     scan: str
@@ -116,7 +115,6 @@ class ScanOutcome:
     times_ms: dict[str, float]
     drops: dict[str, int]
     over_time: list[Checkpoint] = field(default_factory=list)
-    graph_path: Path | None = None
     total_ms: dict[str, float] = field(default_factory=dict)
     device: str = ""
 
@@ -172,7 +170,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     if not frames:
         raise EvaluationError(f"scan {task.scan}: all frames were refused: {dict(refused)}")
     graph = pipeline.graph()
-    path = _write(task, graph)
+    _write(task, graph)
     return ScanOutcome(
         scan=task.scan,
         result=score(graph),
@@ -187,7 +185,6 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
         },
         drops=dict(recording.drops + refused + pipeline.drops),
         over_time=over_time,
-        graph_path=path,
         total_ms=total_ms(pipeline.times_s),
         device=device_name(),
     )
@@ -226,11 +223,11 @@ def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:
     )
 
 
-def _write(task: ScanTask, graph: wire.SceneGraphMessage) -> Path:
+def _write(task: ScanTask, graph: wire.SceneGraphMessage) -> None:
     folder = task.out / task.scan
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CONFIG_FILE).write_text(to_yaml(task.config), encoding="utf-8")
-        return write_graph(folder, graph)
+        write_graph(folder, graph)
     except OSError as error:
         raise EvaluationError(f"--out {task.out}: cannot be written ({error.strerror})") from error

@@ -65,7 +65,7 @@ class Stopped(Exception):
     """SIGINT or SIGTERM arrived."""
 
 
-class ReplayNode(Node):  # type: ignore[misc]
+class ReplayNode(Node):
     """Publishes a recording; `replay` runs from the first message to the last.
 
     Args:

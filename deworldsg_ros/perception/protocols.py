@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt8, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import Relations
@@ -70,12 +68,6 @@ class MaskPatch:
         """The slices of the image that the patch covers."""
         height, width = self.pixels.shape
         return slice(self.top, self.top + height), slice(self.left, self.left + width)
-
-    def to_image(self, shape: tuple[int, int]) -> Bool:
-        """The mask on the whole image, (H, W) bool."""
-        image = np.zeros(shape, dtype=bool)
-        image[self.window] = self.pixels
-        return image
 
 
 class Detector(Protocol):

@@ -34,7 +34,7 @@ LOG_PERIOD_S = 10.0
 SPIN_PERIOD_S = 0.2
 
 
-class StageNode(Node):  # type: ignore[misc]
+class StageNode(Node):
     """A node around one stage.
 
     Callbacks made by `guarded` never raise. Refused input is counted under its reason; an

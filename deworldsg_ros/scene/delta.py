@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping
 from deworldsg_ros.scene import wire
 
 
-def empty_scene_graph(frame_id: str, stamp_ns: int = 0) -> wire.SceneGraphMessage:
+def empty_scene_graph(frame_id: str) -> wire.SceneGraphMessage:
     """The empty snapshot before the first update: sequence 0."""
     return wire.SceneGraphMessage(
         schema=wire.schema_of(wire.SceneGraphMessage),
-        stamp=wire.stamp_from_ns(stamp_ns),
+        stamp=wire.stamp_from_ns(0),
         frame_id=frame_id,
         sequence=0,
         nodes=[],

@@ -12,7 +12,7 @@ from deworldsg_ros.scene.rigid import rotation_angle_deg
 # and shorter than the jump of a tracker that lost itself.
 MAX_STEP_M = 1.0
 # Hands and heads rotate at up to about 300 degrees a second, and images blur far below that.
-MAX_TURN_DEG_S = 360.0
+MAX_ROTATION_DEG_S = 360.0
 # The rotation rate of frames that are closer in time is computed with this interval: over a few
 # milliseconds, the noise of the poses exceeds the motion of the camera.
 MIN_INTERVAL_S = 1 / 15
@@ -24,7 +24,7 @@ class JumpGate:
     """Refuses a frame whose camera jumped; accepts a new position that persists.
 
     A frame jumped if, since the last accepted frame, the camera moved more than `MAX_STEP_M` or
-    rotated faster than `MAX_TURN_DEG_S`. After `RELOCALISED_AFTER_FRAMES` consecutive frames
+    rotated faster than `MAX_ROTATION_DEG_S`. After `RELOCALISED_AFTER_FRAMES` consecutive frames
     without a jump between them, the tracker has relocalised and the new position is accepted.
     """
 
@@ -61,9 +61,9 @@ def _jump(before: tuple[int, Float64], now: tuple[int, Float64]) -> str:
         )
     elapsed_s = max((now[0] - before[0]) / 1e9, MIN_INTERVAL_S)
     turn_deg = rotation_angle_deg(before[1][:3, :3].T @ now[1][:3, :3])
-    if turn_deg > MAX_TURN_DEG_S * elapsed_s:
+    if turn_deg > MAX_ROTATION_DEG_S * elapsed_s:
         return (
             f"rotated {turn_deg:.0f} degrees in the {elapsed_s:.2f} s since the last accepted "
-            f"frame: expected at most {MAX_TURN_DEG_S:g} a second"
+            f"frame: expected at most {MAX_ROTATION_DEG_S:g} a second"
         )
     return ""

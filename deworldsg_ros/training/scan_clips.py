@@ -26,7 +26,6 @@ def cut_clips(
     *,
     clip_length: int,
     clips_per_pair: int,
-    min_side_px: float = 10.0,
     rotated: bool = False,
 ) -> list[LabelledClip]:
     """Clips of each related pair, spread evenly over the frames in which both are visible.
@@ -38,7 +37,6 @@ def cut_clips(
         relations: subject id, object id, predicate.
         clip_length: T.
         clips_per_pair: maximum number of clips per pair.
-        min_side_px: least side of the box of a visible object, pixels.
         rotated: whether boxes and sizes are those of the images rotated by 90 degrees clockwise.
     """
     width, height = image_size
@@ -47,7 +45,7 @@ def cut_clips(
         visible = [
             index
             for index, (_, boxes) in enumerate(frames)
-            if all(_is_visible(boxes.get(end), min_side_px) for end in (subject, object_))
+            if all(_is_visible(boxes.get(end)) for end in (subject, object_))
         ]
         for index in _spread(visible, clips_per_pair):
             boxes = frames[index][1]
@@ -94,8 +92,9 @@ def read_boxes(path: Path) -> dict[int, Float64]:
     return boxes
 
 
-def _is_visible(box_xyxy: Float64 | None, min_side_px: float) -> bool:
-    return box_xyxy is not None and bool((box_xyxy[2:] - box_xyxy[:2]).min() >= min_side_px)
+def _is_visible(box_xyxy: Float64 | None) -> bool:
+    """Whether an object has a box of at least 10 pixels a side."""
+    return box_xyxy is not None and bool((box_xyxy[2:] - box_xyxy[:2]).min() >= 10.0)
 
 
 def _spread(indices: list[int], count: int) -> list[int]:

@@ -38,7 +38,6 @@ def split_by_group(
     *,
     held_out_share: float,
     held_out_groups: Sequence[str] = (),
-    validation_share: float = 0.15,
     seed: int = 0,
 ) -> Split:
     """Split clips so that early stopping uses no held-out room.
@@ -48,7 +47,6 @@ def split_by_group(
         pairs: pair of objects of each clip.
         held_out_share: fraction of the groups to hold out, at least one group.
         held_out_groups: hold out exactly these groups instead.
-        validation_share: fraction of the rest for validation.
         seed: of the random choice.
 
     Raises:
@@ -77,7 +75,8 @@ def split_by_group(
         raise ConfigurationError(
             "the training clips have one pair of objects: expected at least two pairs"
         )
-    validating = np.isin(units, sorted(_choose(generator, candidates, validation_share)))
+    # 15 % of the rest decide when the training stops.
+    validating = np.isin(units, sorted(_choose(generator, candidates, 0.15)))
     validating &= ~held_out
     return Split(
         np.flatnonzero(~held_out & ~validating).astype(np.int64),
@@ -88,7 +87,7 @@ def split_by_group(
     )
 
 
-def _choose(generator: np.random.Generator, names: Sequence[str], share: float) -> set[str]:
+def _choose(generator: np.random.Generator, names: Sequence[str], fraction: float) -> set[str]:
     """A fraction of the names, at least one and never all."""
-    count = min(max(1, round(share * len(names))), len(names) - 1)
+    count = min(max(1, round(fraction * len(names))), len(names) - 1)
     return {names[index] for index in generator.permutation(len(names))[:count].tolist()}

@@ -100,9 +100,7 @@ def _outside(boxes: Float64, frame: Float64) -> Float64:
     return np.asarray(below + np.maximum(boxes[:, 2:] - frame[2:], 0.0).sum(axis=1))
 
 
-def _covered(boxes: Float64, points: Float64, margin: float = 3.0) -> Float64:
-    """(n,) number of points that each box covers, with a margin."""
-    inside = (points[None] > boxes[:, None, :2] - margin) & (
-        points[None] < boxes[:, None, 2:] + margin
-    )
+def _covered(boxes: Float64, points: Float64) -> Float64:
+    """(n,) number of points that each box covers, with a margin of 3 pixels."""
+    inside = (points[None] > boxes[:, None, :2] - 3.0) & (points[None] < boxes[:, None, 2:] + 3.0)
     return np.asarray(inside.all(axis=2).sum(axis=1), np.float64)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.perception import on_image
 
 from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch
@@ -17,7 +18,7 @@ def pixelwise(masks, classes, scores):
     labels = np.zeros(SHAPE, np.uint16)
     for y in range(SHAPE[0]):
         for x in range(SHAPE[1]):
-            claims = [k for k, mask in enumerate(masks) if mask.to_image(SHAPE)[y, x]]
+            claims = [k for k, mask in enumerate(masks) if on_image(mask, SHAPE)[y, x]]
             if len({classes[k] for k in claims}) == 1:
                 labels[y, x] = 1 + max(claims, key=lambda k: (scores[k], -k))
     return labels

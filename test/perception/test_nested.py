@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.perception import on_image
 
 from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
@@ -32,7 +33,7 @@ def test_the_lit_part_of_a_screen_is_joined_with_the_screen(scores):
     objects, masks = detections(*rows)
     joined, joined_masks = join_nested(objects, masks, depth_of(masks, (2.0, 2.01)))
     assert joined.boxes_xyxy.tolist() == [OUTER] and joined.scores.tolist() == [0.8]
-    image = joined_masks[0].to_image((80, 100))
+    image = on_image(joined_masks[0], (80, 100))
     assert image.sum() == 81 * 61
     # The input is unchanged.
     assert objects.boxes_xyxy.tolist() == [row[0] for row in rows]

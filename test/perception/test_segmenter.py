@@ -12,6 +12,7 @@ from support.perception import (
     TABLE_TOP,
     Slab,
     box_of,
+    on_image,
     overlap,
     render,
 )
@@ -53,7 +54,7 @@ def test_the_masks_of_a_cup_and_its_table_are_separate():
     masks = segment(rgb, depth_m, [table_box, box_of(cup)])
     assert overlap(masks[1], cup) > 0.85
     assert overlap(masks[0], table) > 0.85
-    assert not (masks[0].to_image(SHAPE) & masks[1].to_image(SHAPE)).any()
+    assert not (on_image(masks[0], SHAPE) & on_image(masks[1], SHAPE)).any()
 
 
 def test_a_box_of_the_cup_alone_excludes_the_table():
@@ -85,7 +86,7 @@ def test_holes_in_the_depth_are_filled(fraction):
     depth_m[holes] = 0
     (mask,) = segment(rgb, depth_m, [box_of(owner == 1)])
     assert overlap(mask, owner == 1) > 0.75
-    assert mask.to_image(SHAPE)[y, x]
+    assert on_image(mask, SHAPE)[y, x]
 
 
 @pytest.mark.parametrize("invalid", [0.0, np.nan, np.inf, -1.0])
@@ -109,7 +110,7 @@ def test_without_valid_depth_colour_is_used(invalid):
 def test_boxes_at_and_beyond_the_border(box):
     rgb, depth_m, _ = render([TABLE_TOP], 0.002)
     (mask,) = segment(rgb, depth_m, [box])
-    image = mask.to_image(SHAPE)
+    image = on_image(mask, SHAPE)
     rows, columns = np.nonzero(image)
     if len(rows):
         assert columns.min() >= round(box[0]) and columns.max() <= round(box[2])
@@ -121,11 +122,11 @@ def test_masks_are_disjoint_and_in_the_order_of_the_boxes():
     rgb, depth_m, owner = render(slabs, 0.003)
     boxes = np.stack([box_of(owner == k) for k in (1, 2, 3)])
     masks = segment(rgb, depth_m, boxes)
-    assert sum(m.to_image(SHAPE).astype(int) for m in masks).max() == 1
+    assert sum(on_image(m, SHAPE).astype(int) for m in masks).max() == 1
     order = [2, 0, 1]
     shuffled = segment(rgb, depth_m, boxes[order])
     for position, row in enumerate(order):
-        assert np.array_equal(shuffled[position].to_image(SHAPE), masks[row].to_image(SHAPE))
+        assert np.array_equal(on_image(shuffled[position], SHAPE), on_image(masks[row], SHAPE))
 
 
 def test_segmentation_is_deterministic_and_keeps_its_input():

@@ -87,8 +87,15 @@ def box_of(mask: np.ndarray) -> np.ndarray:
     return np.array([columns.min(), rows.min(), columns.max(), rows.max()], dtype=float)
 
 
+def on_image(patch: MaskPatch, shape: tuple[int, int]) -> np.ndarray:
+    """The mask on the whole image, (H, W) bool."""
+    image = np.zeros(shape, dtype=bool)
+    image[patch.window] = patch.pixels
+    return image
+
+
 def overlap(patch: MaskPatch, truth: np.ndarray) -> float:
-    mask = patch.to_image(truth.shape)
+    mask = on_image(patch, truth.shape)
     return float((mask & truth).sum() / (mask | truth).sum())
 
 

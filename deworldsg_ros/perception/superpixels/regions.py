@@ -201,7 +201,7 @@ def _edge_weight(
         square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
     elif here > 0 or there > 0:
         square += np.float32(HOLE_STEP * HOLE_STEP)
-    return np.sqrt(square)  # type: ignore[no-any-return]
+    return np.sqrt(square)
 
 
 @kernel

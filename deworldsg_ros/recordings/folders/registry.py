@@ -35,11 +35,6 @@ def _datasets() -> dict[str, type[Dataset]]:
     return dict(sorted(found.items()))
 
 
-def dataset_names() -> list[str]:
-    """Names of the known data sets."""
-    return list(_datasets())
-
-
 def detect_dataset(path: Path) -> str | None:
     """Name of the data set of a folder; None if it is of none of them.
 

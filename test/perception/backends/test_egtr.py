@@ -217,9 +217,9 @@ def test_missing_class_pair_statistics_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"proj_q.1.weight": None}, "missing: proj_q.1.weight"),
-        ({"rel_predictor.layers.2.weight": None}, "missing: rel_predictor.layers.2.weight"),
-        ({"proj_v.0.weight": torch.zeros(2)}, "1 unknown: proj_v.0.weight"),
+        ({"proj_q.1.weight": None}, r"1 missing \(proj_q.1.weight\)"),
+        ({"rel_predictor.layers.2.weight": None}, r"1 missing \(rel_predictor.layers.2.weight\)"),
+        ({"proj_v.0.weight": torch.zeros(2)}, r"1 unknown \(proj_v.0.weight\)"),
         ({"rel_predictor_gate.bias": torch.zeros(2)}, "size mismatch for rel_predictor_gate.bias"),
         ({"triplet_dist": torch.zeros(2, 2)}, r"triplet_dist has shape \(2, 2\)"),
     ],

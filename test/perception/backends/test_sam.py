@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.perception import on_image
 from support.torch_models import (
     image,
     save_rtdetr,
@@ -48,7 +49,7 @@ def segmenter(folders, name, **changes):
 
 def masks(backend, rgb, boxes=BOXES):
     found = backend.segment(rgb, DEPTH, INTRINSICS, boxes)
-    return np.array([patch.to_image(rgb.shape[:2]) for patch in found])
+    return np.array([on_image(patch, rgb.shape[:2]) for patch in found])
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -126,7 +127,7 @@ def test_half_precision_runs_through(folders, name):
 
 def test_pixels_in_masks_of_two_classes_belong_to_no_object(folders):
     found = segmenter(folders, "sam2").segment(image(HEIGHT, WIDTH), DEPTH, INTRINSICS, BOXES[:2])
-    one, two = (patch.to_image((HEIGHT, WIDTH)) for patch in found)
+    one, two = (on_image(patch, (HEIGHT, WIDTH)) for patch in found)
     labels = instance_image(found, np.array([0, 1]), np.array([0.9, 0.8]), (HEIGHT, WIDTH))
     assert (one & two).any()
     assert not labels[one & two].any()
@@ -139,14 +140,14 @@ def test_a_patch_contains_all_pixels_of_the_mask(pixels):
     for row, column in pixels:
         mask[row, column] = True
     patch = as_patch(mask)
-    assert np.array_equal(patch.to_image(mask.shape), mask)
+    assert np.array_equal(on_image(patch, mask.shape), mask)
     assert patch.pixels.size <= mask.size
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(folders, tmp_path):
-    with pytest.raises(ConfigurationError, match="of sam: wanted sam2 or sam2_video"):
+    with pytest.raises(ConfigurationError, match="of sam: expected sam2 or sam2_video"):
         Sam2Segmenter(settings(segmenter_path=str(folders["sam"])))
-    with pytest.raises(ConfigurationError, match="of rt_detr: wanted sam"):
+    with pytest.raises(ConfigurationError, match="of rt_detr: expected sam"):
         SamSegmenter(settings(segmenter_path=str(save_rtdetr(tmp_path))))
 
 

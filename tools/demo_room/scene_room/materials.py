@@ -119,6 +119,6 @@ def build_materials(seed: int) -> dict[str, Material]:
     }
     for i, (base, ink, title) in enumerate(BOOK_COLOURS):
         materials[f"cover_{i}"] = Material(tex.book_cover(rng, base, ink, title), unit, 0.02, 0.3)
-        materials[f"spine_{i}"] = Material(tex.book_spine(rng, base, ink, title), unit, 0.02, 0.3)
+        materials[f"spine_{i}"] = Material(tex.book_spine(base, ink, title), unit, 0.02, 0.3)
         materials[f"cloth_{i}"] = Material(tex.plain(base), unit, 0.02, 0.3)
     return materials

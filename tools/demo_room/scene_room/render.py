@@ -112,7 +112,7 @@ def _shade_hits(
     return _shade(
         hit["primID"], hit["u"], hit["v"], hit["tfar"], directions,
         scene.faces, scene.face_material, scene.normals, scene.uv, light,
-        scene.f0, scene.emission, scene.two_sided, scene.tile_m,
+        scene.f0, scene.emission, scene.tile_m,
         atlas.texels, atlas.offset, atlas.height, atlas.width,
     )  # fmt: skip
 
@@ -120,7 +120,7 @@ def _shade_hits(
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def _shade(
     face, u, v, distance, directions, faces, face_material, normals, uv, light,
-    f0, emission, two_sided, tile_m, texels, offset, height, width,
+    f0, emission, tile_m, texels, offset, height, width,
 ):  # fmt: skip
     count = face.shape[0]
     colour = np.zeros((count, 3), np.float32)

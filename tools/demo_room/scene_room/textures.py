@@ -191,7 +191,7 @@ def book_cover(rng: np.random.Generator, base: str, ink: str, title: str) -> Ima
     return np.flipud(np.clip(image * tone[..., None], 0.01, 0.9)).astype(np.float32)
 
 
-def book_spine(rng: np.random.Generator, base: str, ink: str, title: str) -> Image:
+def book_spine(base: str, ink: str, title: str) -> Image:
     """Spine (u across, v up) with bands and a title that reads downwards."""
     height, width = 384, 64
     lying = np.tile(rgb(base), (width, height, 1))
