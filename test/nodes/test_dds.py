@@ -96,7 +96,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, recording_path: Path) -> Itera
                 DiagnosticArray, "/diagnostics", result.watch_diagnostics, 10
             )
             camera = Camera(me, messages)
-            camera.wait_for_listeners()
+            camera.wait_for_subscribers()
             for count, _ in enumerate(camera.frames(), 1):
                 me.spin_until(lambda n=count: len(result.evidence) >= n - 3, LIMIT_S, "evidence")
             me.spin_until(lambda: len(result.evidence) >= FRAMES, LIMIT_S, "all evidence")

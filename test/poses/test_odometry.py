@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.corner_room import INTRINSICS, LEVEL, corner_frame, turned, walk
+from support.corner_room import INTRINSICS, LEVEL, camera_at, corner_frame, walk
 
 from deworldsg_ros.poses.depth_alignment import fit_fraction, points_of, refine, surface_of
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
@@ -56,7 +56,7 @@ def test_a_camera_that_stands_still_does_not_drift() -> None:
 
 def test_the_first_pose_is_level_or_the_given_one() -> None:
     np.testing.assert_array_equal(track(RgbdOdometry(), corner_frame(LEVEL)), LEVEL_CAMERA)
-    start = turned(30.0, 1.0, 2.0, 3.0)
+    start = camera_at(30.0, 1.0, 2.0, 3.0)
     np.testing.assert_array_equal(track(RgbdOdometry(start), corner_frame(LEVEL)), start)
     with pytest.raises(RefusedInput, match="pose"):
         RgbdOdometry(np.diag([1.0, 2.0, 1.0, 1.0]))
@@ -82,7 +82,7 @@ def test_the_first_frame_needs_depth() -> None:
 def test_tracking_restarts_at_the_last_pose_after_several_lost_frames() -> None:
     odometry = RgbdOdometry(LEVEL, restart_after=3)
     track(odometry, corner_frame(LEVEL))
-    elsewhere = corner_frame(turned(75.0, -0.8))
+    elsewhere = corner_frame(camera_at(75.0, -0.8))
     for number in (1, 2, 3):
         assert f"lost frame {number} in a row" in lose(odometry, elsewhere)
     np.testing.assert_array_equal(track(odometry, elsewhere), LEVEL)
@@ -91,12 +91,12 @@ def test_tracking_restarts_at_the_last_pose_after_several_lost_frames() -> None:
 
 
 def test_new_intrinsics_continue_from_the_last_pose() -> None:
-    odometry = RgbdOdometry(turned(0.0, 1.0))
+    odometry = RgbdOdometry(camera_at(0.0, 1.0))
     track(odometry, corner_frame(LEVEL))
     frame = corner_frame(LEVEL)
     half = Intrinsics(75.0, 75.0, 39.5, 29.5, 80, 60)
     estimate = odometry.track(frame.rgb[::2, ::2], frame.depth_m[::2, ::2], half)
-    np.testing.assert_array_equal(estimate, turned(0.0, 1.0))
+    np.testing.assert_array_equal(estimate, camera_at(0.0, 1.0))
     assert odometry.restarts == 1
 
 
@@ -104,7 +104,7 @@ def test_depth_fits_itself_and_no_other_view() -> None:
     depth_m = corner_frame(LEVEL).depth_m
     points = points_of(depth_m, INTRINSICS)
     assert fit_fraction(points, depth_m, np.eye(4), INTRINSICS) == 1.0
-    T = turned(3.0, 0.1)
+    T = camera_at(3.0, 0.1)
     moved = corner_frame(T).depth_m
     assert fit_fraction(points, moved, invert_pose(T) @ LEVEL, INTRINSICS) > 0.95
     assert fit_fraction(points, moved, np.eye(4), INTRINSICS) < 0.6
@@ -114,7 +114,7 @@ def test_depth_fits_itself_and_no_other_view() -> None:
 
 
 def test_a_wrong_guess_is_refined() -> None:
-    start, T = turned(20.0, 1.2, -0.8), turned(26.0, 1.28, -0.83)
+    start, T = camera_at(20.0, 1.2, -0.8), camera_at(26.0, 1.28, -0.83)
     truth = invert_pose(T) @ start
     points = points_of(corner_frame(start).depth_m, INTRINSICS)
     surface = surface_of(corner_frame(T).depth_m, INTRINSICS)
@@ -128,13 +128,13 @@ def test_refinement_without_surfaces_keeps_the_guess() -> None:
     depth_m = corner_frame(LEVEL).depth_m
     points = points_of(depth_m, INTRINSICS)
     no_surface = surface_of(np.zeros_like(depth_m), INTRINSICS)
-    guess = turned(2.0, 0.1)
+    guess = camera_at(2.0, 0.1)
     np.testing.assert_array_equal(refine(points, no_surface, guess, INTRINSICS), guess)
 
 
 @pytest.mark.skipif(not HAS_ODOMETRY, reason="OpenCV before 5")
 def test_a_fast_rotation_is_tracked() -> None:
-    poses = [turned(9.0 * k, 1.2 + 0.03 * k, -0.8 - 0.02 * k) for k in range(5)]
+    poses = [camera_at(9.0 * k, 1.2 + 0.03 * k, -0.8 - 0.02 * k) for k in range(5)]
     odometry = RgbdOdometry(poses[0])
     for T in poses:
         error = invert_pose(T) @ track(odometry, corner_frame(T))

@@ -128,7 +128,7 @@ def test_compressed_colour() -> None:
 
 @pytest.mark.parametrize("description", ["16UC1; compressedDepth png", "16UC1; compressedDepth"])
 def test_compressed_depth_of_counts(description: str) -> None:
-    message = compressed(compressed_depth(COUNTS, "16UC1"), description)
+    message = compressed(compressed_depth(COUNTS), description)
     np.testing.assert_array_equal(
         depth_from_message(message, **DEPTH), COUNTS.astype(np.float32) * np.float32(0.001)
     )
@@ -147,7 +147,7 @@ def test_compressed_depth_of_metres_is_quantised_inverse_depth() -> None:
     metres = np.linspace(0.5, 9.5, 35, dtype=np.float32).reshape(5, 7)
     counts = (a / metres + b).astype(np.uint16)
     counts[0, 0] = 0
-    data = compressed_depth(counts, "32FC1", a, b)
+    data = compressed_depth(counts, a, b)
     result = depth_from_message(compressed(data, "32FC1; compressedDepth png"), **DEPTH)
     assert result[0, 0] == 0
     np.testing.assert_allclose(result.ravel()[1:], metres.ravel()[1:], rtol=2e-3)

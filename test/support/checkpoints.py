@@ -1,4 +1,4 @@
-"""Small checkpoints of the real architectures, saved in the real format."""
+"""Small checkpoints of world models and probes: real architectures and file formats."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CLIP_LENGTH = 4
 
 
 def save_vjepa2(folder, seed=0, **changes):
-    """A V-JEPA 2 of 48 features at 32 pixels."""
+    """Save a V-JEPA 2 with 48 features and 32 pixels and return its folder."""
     torch.manual_seed(seed)
     settings = {
         "crop_size": 32,
@@ -43,7 +43,7 @@ def save_vjepa2(folder, seed=0, **changes):
 
 
 def save_dinov2(folder, seed=0, **changes):
-    """A DINOv2 of 48 features, trained at 56 pixels."""
+    """Save a DINOv2 with 48 features and 56 pixels and return its folder."""
     torch.manual_seed(seed)
     settings = {
         "hidden_size": 48,
@@ -57,12 +57,13 @@ def save_dinov2(folder, seed=0, **changes):
 
 
 def config_of(family, folder, **changes):
+    """Options of the relations stage with this checkpoint."""
     settings = {"clip_length": CLIP_LENGTH, "world_model_path": str(folder)}
     return RelationsConfig(world_model=family, **{**settings, **changes})
 
 
 def save_random_probe(folder, backbone: BackboneIdentity, **changes):
-    """An untrained probe."""
+    """Save an untrained probe and return its folder."""
     torch.manual_seed(1)
     card = ProbeCard(backbone, VOCABULARY.predicates, **changes)
     probe = Probe(card, build_network(card).eval())
@@ -71,11 +72,13 @@ def save_random_probe(folder, backbone: BackboneIdentity, **changes):
 
 
 def clip(seed=0, height=40, width=50, length=CLIP_LENGTH):
+    """Random frames (length, height, width, 3) uint8."""
     generator = np.random.default_rng(seed)
     return generator.integers(0, 256, (length, height, width, 3)).astype(np.uint8)
 
 
 def request(seed=0, **shape):
+    """A request for both directions of one pair."""
     names = VOCABULARY.classes
     boxes = np.array([0.0, 0, 20, 30]), np.array([10.0, 5, 50, 40])
     pairs = tuple(

@@ -1,4 +1,4 @@
-"""Run the command line in its own process, as a user does."""
+"""Runs the command line in its own process, as a user does."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ COMMAND = [sys.executable, "-m", "deworldsg_ros.cli"]
 
 
 def environment(folder: Path) -> dict[str, str]:
+    """Environment variables of the command. ROS logs go to `folder`."""
     return {
         **os.environ,
         "PYTHONPATH": str(ROOT),
@@ -28,7 +29,7 @@ def environment(folder: Path) -> dict[str, str]:
 def deworldsg(
     folder: Path, *arguments: object, limit_s: float = 60.0
 ) -> subprocess.CompletedProcess[str]:
-    """Run it to its end; SIGINT at the time limit, so that the demo can end its nodes."""
+    """Run a command to its end. At the time limit, SIGINT lets the demo end its nodes."""
     process = start(folder, *arguments)
     try:
         out, err = process.communicate(timeout=limit_s)
@@ -40,6 +41,7 @@ def deworldsg(
 
 
 def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
+    """Start a command in `folder`."""
     return subprocess.Popen(
         [*COMMAND, *map(str, arguments)],
         cwd=folder,
@@ -51,7 +53,7 @@ def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
 
 
 def first_frames(source: Source, count: int, path: Path) -> Path:
-    """An MCAP file of the first frames of a recording."""
+    """Write the first frames of a recording to an MCAP file and return its path."""
 
     def messages():
         last_ns = None

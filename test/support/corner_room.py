@@ -1,4 +1,4 @@
-"""A made-up corner of a room, seen from anywhere: three textured walls, rendered exactly."""
+"""Exact RGB-D frames of the corner of a room: two textured walls and a floor."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 
 INTRINSICS = Intrinsics(150.0, 150.0, 79.5, 59.5, 160, 120)
-# Looks along +x at a wall 3 m away, level; a floor below and a wall to the left.
+# A level camera that points along +x. The walls are in front and to the left, the floor below.
 LEVEL = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-# Axis and position of each wall, metres.
+# Axis and position of the walls and the floor, metres.
 WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
 def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
-    """What the camera sees."""
+    """The exact frame at a camera pose."""
     v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
     rays = np.stack(
         [
@@ -28,9 +28,9 @@ def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
     )
     directions = rays @ T_world_camera[:3, :3].T
     depth = np.full(u.shape, np.inf)
-    for axis, position in WALLS:
+    for axis, position_m in WALLS:
         with np.errstate(divide="ignore", invalid="ignore"):
-            hit = (position - T_world_camera[axis, 3]) / directions[..., axis]
+            hit = (position_m - T_world_camera[axis, 3]) / directions[..., axis]
         depth = np.where((hit > 0.1) & (hit < depth), hit, depth)
     points = T_world_camera[:3, 3] + depth[..., None] * directions
     waves = [np.sin(points @ direction + phase) for direction, phase in WAVES]
@@ -45,8 +45,8 @@ def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
     )
 
 
-def turned(yaw_deg: float, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> np.ndarray:
-    """The level camera, turned to the left and moved."""
+def camera_at(yaw_deg: float, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> np.ndarray:
+    """Pose of a level camera, rotated to the left by `yaw_deg` and translated."""
     angle = np.radians(yaw_deg)
     T = np.eye(4)
     T[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
@@ -55,10 +55,10 @@ def turned(yaw_deg: float, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0)
 
 
 def walk(count: int) -> list[np.ndarray]:
-    """Poses of a camera that walks forward and looks around, 2-3 cm and about 1 degree a frame."""
+    """Poses of a camera that moves forward and rotates, 2-3 cm and about 1 degree per frame."""
     steps = np.arange(count)
     return [
-        turned(8 * np.sin(0.15 * k), 0.02 * k, 0.05 * np.sin(0.3 * k), 0.01 * np.sin(0.5 * k))
+        camera_at(8 * np.sin(0.15 * k), 0.02 * k, 0.05 * np.sin(0.3 * k), 0.01 * np.sin(0.5 * k))
         for k in steps
     ]
 

@@ -1,4 +1,4 @@
-"""Tiny data sets in the official layouts, made by the tests."""
+"""Tiny data sets in the official layouts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def write_json(path: Path, content: Any) -> None:
 def write_ply(
     path: Path, points: np.ndarray, ids: np.ndarray, form: str = "ascii", dtype: str = "float"
 ) -> None:
-    """A PLY with an element before the vertices and faces with lists after them."""
+    """Write a PLY file with another element before the vertices and faces after them."""
     header = (
         f"ply\nformat {form} 1.0\ncomment made by a test\n"
         "element sensor 1\nproperty list uchar int numbers\n"
@@ -73,9 +73,12 @@ def write_dataset(
     *,
     layout: str = "replica",
     split_scans: Sequence[str] | None = None,
-    spacing_m: float = 1.0,
 ) -> Path:
-    """Each scan is (objects (label, id), relations); an object is a line of points at x = id."""
+    """Write a data set and return its root.
+
+    A scan is a list of objects (label, id) and a list of relations (subject, object, predicate).
+    `surface` contains the points of an object.
+    """
     lists, objects, relations, mapping, keys = NAMES[layout]
     labels = {name: name for name in CLASSES} | {"wall": "wall"}
     write_json(root / mapping, dict(zip(keys, (labels, CLASSES, PREDICATES))))
@@ -84,7 +87,7 @@ def write_dataset(
         for scan, content in scans.items()
     ]
     write_json(root / objects, {"scans": listed})
-    # The third field of a relation is wrong on purpose: nobody may read it.
+    # The third field of a relation is wrong on purpose. No reader may use it.
     related = [
         {"scan": scan, "relationships": [[s, o, 99, name] for s, o, name in content[1]]}
         for scan, content in scans.items()
@@ -97,26 +100,27 @@ def write_dataset(
         (root / lists / f"{name}_scans.txt").write_text(text)
     for scan, content in scans.items():
         ids = np.repeat([i for _, i in content[0]], 20)
-        points = surface(ids, spacing_m)
+        points = surface(ids)
         write_ply(root / "data" / scan / "labels.instances.annotated.v2.ply", points, ids)
     return root
 
 
-def surface(ids: np.ndarray, spacing_m: float = 1.0) -> np.ndarray:
-    """Twenty points 5 cm apart along y for each object, at x = id * spacing."""
+def surface(ids: np.ndarray) -> np.ndarray:
+    """Points (n, 3) of the objects `ids` (n,): x = id metres, and steps of 5 cm along y."""
     points = np.zeros((len(ids), 3))
-    points[:, 0] = np.asarray(ids) * spacing_m
+    points[:, 0] = np.asarray(ids)
     points[:, 1] = 0.05 * (np.arange(len(ids)) % 20)
     return points
 
 
 def segment(object_id: int, count: int = 10, offset: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """Points on the surface of one object."""
+    """The first points on the surface of one object, translated by `offset`."""
     return surface(np.repeat(object_id, 20))[:count] + np.asarray(offset, float)
 
 
-def one_hot(place: int, count: int = 3) -> list[float]:
-    return [float(index == place) for index in range(count)]
+def one_hot(index: int) -> list[float]:
+    """A certain distribution over three classes or predicates."""
+    return np.eye(3)[index].tolist()
 
 
 def write_predictions(
@@ -125,7 +129,7 @@ def write_predictions(
     class_count: int,
     predicate_count: int,
 ) -> None:
-    """Write predictions in the open format."""
+    """Write predictions in the project's open format."""
     scans = {
         scan: {
             "nodes": [

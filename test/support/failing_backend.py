@@ -1,4 +1,4 @@
-"""A detector, segmenter and relation head that fails on demand."""
+"""A test double of the detector, the segmenter and the relation head. Each can fail."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SHAPE = (40, 50)
 
 
 class Backend:
-    """All three backends in one; `failing` names the one that raises."""
+    """All three backends in one class. The part named `failing` raises."""
 
     classes = ("table", "cup")
     predicates = ("on", "near")

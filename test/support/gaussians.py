@@ -1,4 +1,4 @@
-"""Gaussians of points as Eq. 4 defines them."""
+"""The Gaussian of points by Eq. 4."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ seeds = st.integers(0, 2**32 - 1)
 def random_covariances(
     rng: np.random.Generator, count: int, thinnest_m: float = 1e-3, largest_m: float = 1.0
 ) -> NDArray[np.float64]:
-    """(n, 3, 3) with standard deviations spread evenly in magnitude."""
+    """Covariances (n, 3, 3). The logarithms of their standard deviations are uniform."""
     bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
     deviations = np.exp(rng.uniform(np.log(thinnest_m), np.log(largest_m), (count, 1, 3)))
     covariances = bases * deviations**2 @ bases.swapaxes(1, 2)
@@ -25,6 +25,7 @@ def random_covariances(
 
 
 def random_pose(rng: np.random.Generator) -> NDArray[np.float64]:
+    """A rigid transform (4, 4)."""
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     pose = np.eye(4)
     pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
@@ -32,11 +33,9 @@ def random_pose(rng: np.random.Generator) -> NDArray[np.float64]:
     return pose
 
 
-def random_classes(
-    rng: np.random.Generator, count: int, classes: int = 4, sharpness: float = 3.0
-) -> NDArray[np.float64]:
-    """(n, C) distributions, from flat to nearly certain."""
-    logits = rng.normal(0, sharpness, (count, classes))
+def random_classes(rng: np.random.Generator, count: int, classes: int = 4) -> NDArray[np.float64]:
+    """Class distributions (n, C), from uniform to nearly certain."""
+    logits = rng.normal(0, 3.0, (count, classes))
     powers = np.exp(logits - logits.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
 
@@ -53,6 +52,7 @@ def local_graph(
     vocabulary: Vocabulary = VOCABULARY,
     frame_id: str = "world",
 ) -> LocalGraph:
+    """A local graph of these Gaussians and class distributions."""
     count = len(means)
     predicates = len(vocabulary.predicates)
     pair_array = np.array(pairs or [], np.int64).reshape(-1, 2)
@@ -81,7 +81,7 @@ def local_graph(
 
 
 def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGraph]:
-    """Noisy frames of a few objects that are observed repeatedly."""
+    """Noisy observations of a few objects. Nodes merge, also in chains, and separate."""
     objects = int(rng.integers(2, 9))
     means = rng.uniform(-1, 1, (objects, 3))
     covariances = random_covariances(rng, objects, 0.02, 0.6)
@@ -116,7 +116,7 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
 
 
 def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> None:
-    """All changes that stages make to a graph, in random order."""
+    """Apply all edits that stages make to a graph, in random order."""
     for _ in range(edits):
         stamp_ns = int(rng.integers(0, 10**12))
         live = graph.nodes.ids.tolist()

@@ -1,4 +1,4 @@
-"""Node processes, and a camera that replays a recording to them, for tests."""
+"""Node processes, and a camera that publishes a recording to them."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ TOPICS = {
     Role.CAMERA_INFO: "rgb/camera_info",
     Role.POSE: "camera/pose",
 }
-# Number of subscribers among the four nodes.
-LISTENERS = {Role.RGB: 2, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
+# Number of the nodes that subscribe to each topic.
+SUBSCRIBERS = {Role.RGB: 2, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
 
 
 class NodeProcess:
-    """One node process, ended by SIGINT, then SIGTERM, then SIGKILL."""
+    """One node process."""
 
     def __init__(self, name: str, folder: Path, *arguments: str) -> None:
         self.name = name
         self.log_path = folder / f"{name}.log"
-        # This checkout first, before the paths of a sourced ROS 2.
+        # This checkout precedes the paths of a sourced ROS 2.
         python_path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = {
             **os.environ,
@@ -62,31 +62,31 @@ class NodeProcess:
 
     @property
     def log(self) -> str:
-        """Its output."""
+        """The output of the process."""
         return self.log_path.read_text()
 
     @property
     def alive(self) -> bool:
-        """Whether it still runs."""
+        """Whether the process runs."""
         return self._process.poll() is None
 
     def wait_ready(self, limit_s: float = 150.0) -> None:
-        """Wait until it logs that it is ready."""
+        """Wait until the node logs that it is ready."""
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log
 
     def wait(self, limit_s: float) -> int:
-        """The exit code."""
+        """Wait for the end of the process; returns its exit code."""
         return self._process.wait(limit_s)
 
     def interrupt(self, limit_s: float = 20.0) -> int:
-        """Send SIGINT; the exit code."""
+        """Send SIGINT and wait; returns the exit code."""
         if self.alive:
             self._process.send_signal(signal.SIGINT)
         return self._process.wait(limit_s)
 
     def end(self) -> None:
-        """End it, by SIGKILL if necessary."""
+        """End the process with SIGINT, then SIGTERM, then SIGKILL."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             if not self.alive:
                 return
@@ -96,7 +96,7 @@ class NodeProcess:
 
 
 def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None:
-    """Wait for a condition; the failure names it."""
+    """Wait for a condition. `what` names it if the time is over."""
     end_s = time.monotonic() + limit_s
     while not condition():
         assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
@@ -115,14 +115,14 @@ class Peer:
         self.also_spin: list[SingleThreadedExecutor] = []
 
     def spin_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
-        """Run callbacks until a condition holds."""
+        """Run callbacks until a condition is true. `what` names it if the time is over."""
         end_s = time.monotonic() + limit_s
         while not condition():
             assert time.monotonic() < end_s, f"waited {limit_s:g} s for {what}"
             self._spin_once()
 
     def spin_for(self, duration_s: float) -> None:
-        """Run callbacks for a while."""
+        """Run callbacks for a duration."""
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
             self._spin_once()
@@ -151,7 +151,7 @@ class Peer:
 
 @contextlib.contextmanager
 def peer(name: str = "test_peer") -> Iterator[Peer]:
-    """A peer, closed at the end."""
+    """A peer that is closed at the end."""
     made = Peer(name)
     try:
         yield made
@@ -160,7 +160,7 @@ def peer(name: str = "test_peer") -> Iterator[Peer]:
 
 
 class Camera:
-    """Publishes the messages of a recording byte for byte."""
+    """Publishes the unchanged messages of a recording."""
 
     def __init__(self, peer: Peer, messages: list[RawRoleMessage]) -> None:
         self._peer = peer
@@ -171,19 +171,19 @@ class Camera:
             for role, kind in kinds.items()
         }
 
-    def wait_for_listeners(self, limit_s: float = 30.0) -> None:
+    def wait_for_subscribers(self, limit_s: float = 30.0) -> None:
         """Wait until all nodes have subscribed, so that no message is lost."""
         self._peer.spin_until(
             lambda: all(
-                publisher.get_subscription_count() >= LISTENERS[role]
+                publisher.get_subscription_count() >= SUBSCRIBERS[role]
                 for role, publisher in self._publishers.items()
             ),
             limit_s,
-            "the nodes to listen to the camera",
+            "the nodes to subscribe to the camera",
         )
 
     def frames(self) -> Iterator[int]:
-        """Publish frame by frame; yields the stamp of each RGB image after its messages."""
+        """Publish one frame after the other. Yields the stamp of a frame after its messages."""
         stamps_ns = sorted({item.stamp_ns for item in self._messages})
         for stamp_ns in stamps_ns:
             for item in self._messages:

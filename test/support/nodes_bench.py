@@ -1,4 +1,4 @@
-"""One node in the process of the test, its DDS inputs, and messages for them."""
+"""A node in the process of the test, publishers on its input topics, and valid messages."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ LIMIT_S = 20.0
 
 
 def stamped(message: Any, stamp_ns: int, frame_id: str = "camera") -> Any:
+    """The message, with this stamp and frame."""
     set_stamp(message, stamp_ns)
     message.header.frame_id = frame_id
     return message
@@ -114,7 +115,7 @@ def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
 
 
 class Bench:
-    """One node in this process, with publishers on its input topics."""
+    """A node in the process of the test, and a peer with publishers on its input topics."""
 
     def __init__(
         self,
@@ -124,7 +125,7 @@ class Bench:
         **options: Any,
     ) -> None:
         self.peer = Peer("bench")
-        # Its own context, as in its own process: a context allows one type per topic.
+        # The node has its own context, because a context allows one message type per topic.
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
         self.node = make(context=self._context, **options)
@@ -139,11 +140,11 @@ class Bench:
         self.peer.spin_until(
             lambda: all(p.get_subscription_count() > 0 for p in self._publishers.values()),
             LIMIT_S,
-            "the node to listen",
+            "the node to subscribe",
         )
 
     def send(self, **messages: Any) -> None:
-        """Publish messages on topics, named with __ for /."""
+        """Publish messages. A keyword is a topic with __ for /."""
         for name, message in messages.items():
             if isinstance(message, msgspec.Struct):
                 message = String(data=wire.encode(message))
@@ -152,19 +153,22 @@ class Bench:
             self._publishers[name.replace("__", "/")].publish(message)
 
     def next_stamp(self) -> int:
+        """The stamp of the next frame, nanoseconds."""
         self.stamp_ns += STEP_NS
         return self.stamp_ns
 
     def products(self) -> int:
         """A number that grows with every processed frame."""
-        if isinstance(self.node, GraphNode):  # its output depends on the merging rule
+        if isinstance(self.node, GraphNode):  # the merging rule decides whether it publishes
             return self.node._newest_ns
         return self.node.health.products
 
     def expect(self, condition: Callable[[], bool], what: str) -> None:
+        """Run callbacks until a condition is true."""
         self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")
 
     def refuses(self, reason: str, provoke: Callable[[], None], number: int = 1) -> None:
+        """Expect `number` refusals for a reason after `provoke`."""
         before = self.node.health.drops.get(reason, 0)
         provoke()
         self.expect(
@@ -194,7 +198,10 @@ CAMERA = {
 
 
 def send_frame(at: Bench, **changes: Any) -> None:
-    """A complete frame, with some messages changed (a function of the stamp) or left out."""
+    """Send a complete frame.
+
+    `changes` replaces the maker of a message (a function of the stamp); None omits the message.
+    """
     stamp_ns = at.next_stamp()
     makers = {
         "rgb__camera_info": camera_info,
@@ -207,17 +214,19 @@ def send_frame(at: Bench, **changes: Any) -> None:
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:
-    """Valid input gives a product."""
+    """Expect a product after valid input."""
     before = at.products()
     send()
     at.expect(lambda: at.products() > before, "a product")
 
 
 def changed(make: Callable[[int], Any], **fields: Any) -> Callable[[int], Any]:
-    def changing(stamp_ns: int) -> Any:
+    """A maker of messages with some fields changed."""
+
+    def make_changed(stamp_ns: int) -> Any:
         message = make(stamp_ns)
         for name, value in fields.items():
             setattr(message, name, value)
         return message
 
-    return changing
+    return make_changed

@@ -1,7 +1,7 @@
-"""Drawn rooms of shaded boxes: clips of pairs with a known predicate, for the tests of probes.
+"""Drawn rooms of shaded boxes: clips of object pairs with a known predicate.
 
-Each room has its own walls, floor and materials. A small and a large box stand in one of five
-relations, seen by a moving camera. Colours and textures do not depend on the relation.
+Each room has its own wall, floor and colours. A moving camera observes a small and a large box in
+one of five relations. Colours and textures do not depend on the relation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CLASS_PAIRS = {
 
 @dataclass(frozen=True)
 class Solid:
-    """An axis-aligned box: corners in metres, z up; a colour; hollow above, or on legs."""
+    """An axis-aligned box: corners in metres, z up. `kind` is solid, hollow (no top) or legs."""
 
     low: np.ndarray
     high: np.ndarray
@@ -53,7 +53,7 @@ class PairClip:
 
 
 def render_room(seed: int, pair_count: int, length: int = 16) -> list[PairClip]:
-    """`pair_count` pairs of one room, predicates in turn; the same for the same seed."""
+    """Pairs of one room with alternating predicates. The same seed gives the same clips."""
     generator = np.random.default_rng([seed, 7])
     background = _background(generator)
     clips = []
@@ -61,7 +61,7 @@ def render_room(seed: int, pair_count: int, length: int = 16) -> list[PairClip]:
         predicate = PREDICATES[number % len(PREDICATES)]
         pairs = CLASS_PAIRS[predicate]
         subject_class, object_class = pairs[generator.integers(len(pairs))]
-        solids = _place(predicate, generator)
+        solids = _arrange(predicate, generator)
         yaw = generator.uniform(-0.5, 0.5) + np.linspace(0, generator.uniform(-0.35, 0.35), length)
         distance = generator.uniform(2.2, 3.0)
         frames, boxes = [], None
@@ -76,8 +76,8 @@ def render_room(seed: int, pair_count: int, length: int = 16) -> list[PairClip]:
     return clips
 
 
-def _place(predicate: str, generator: np.random.Generator) -> tuple[Solid, Solid]:
-    """Subject and object."""
+def _arrange(predicate: str, generator: np.random.Generator) -> tuple[Solid, Solid]:
+    """Subject and object in a random arrangement with this predicate."""
     colours = generator.uniform(40, 240, (2, 3))
     size = generator.uniform([0.2, 0.2, 0.15], [0.35, 0.35, 0.35])
     large = generator.uniform([0.8, 0.6, 0.5], [1.1, 0.8, 0.7])
@@ -105,7 +105,7 @@ def _place(predicate: str, generator: np.random.Generator) -> tuple[Solid, Solid
 
 
 def _background(generator: np.random.Generator) -> np.ndarray:
-    """Wall above, floor below, each with its own texture."""
+    """A textured wall above a textured floor."""
     image = np.zeros((HEIGHT, WIDTH, 3))
     horizon = HEIGHT // 2 + int(generator.integers(-8, 8))
     for rows in (slice(0, horizon), slice(horizon, HEIGHT)):
@@ -119,7 +119,7 @@ def _background(generator: np.random.Generator) -> np.ndarray:
 
 
 def _render(background, solids, yaw, distance):
-    """One frame and both visible boxes; faces are drawn from far to near."""
+    """One frame and the image boxes of both solids. Faces are drawn from far to near."""
     eye = np.array([distance * np.sin(yaw), -distance * np.cos(yaw), 1.3])
     forward = np.array([0, 0, 0.35]) - eye
     forward /= np.linalg.norm(forward)
@@ -151,7 +151,7 @@ def _render(background, solids, yaw, distance):
 
 
 def _parts(solid: Solid) -> list[Solid]:
-    """The plain boxes of which a solid consists."""
+    """The solid boxes that form a solid of any kind."""
     low, high = solid.low, solid.high
     thick = 0.05
 
@@ -183,7 +183,7 @@ def _corners(solid: Solid) -> np.ndarray:
 
 
 def _faces(solid: Solid):
-    """The six faces: corners in order around, and the outward normal."""
+    """The six faces: four corners in order, and the outward normal."""
     corners = _corners(solid).reshape(2, 2, 2, 3)
     for axis in range(3):
         for end in (0, 1):

@@ -1,4 +1,4 @@
-"""Synthetic RGB-D scenes with known masks, and slow references."""
+"""Synthetic RGB-D scenes with known masks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from deworldsg_ros.scene.camera import Intrinsics
 WIDTH, HEIGHT = 320, 240
 INTRINSICS = Intrinsics(262.5, 262.5, 159.5, 119.5, WIDTH, HEIGHT)
 SHAPE = (HEIGHT, WIDTH)
-# The camera looks down by this angle.
+# The camera points down by this angle.
 PITCH = np.radians(30.0)
 UP_CAMERA = np.array([0.0, -np.cos(PITCH), -np.sin(PITCH)])
 CAMERA_HEIGHT_M = 1.5
@@ -20,7 +20,7 @@ CAMERA_HEIGHT_M = 1.5
 
 @dataclass
 class Slab:
-    """An axis-aligned box in a frame with z up whose origin is on the floor below the camera.
+    """An axis-aligned box. Its frame has z up and its origin on the floor below the camera.
 
     Attributes:
         low, high: (3,) metres; x right, y forward, z up.
@@ -33,7 +33,7 @@ class Slab:
 
 
 def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """RGB, depth and (H, W) owner of each pixel: k = k-th slab from 1, 0 = floor or back wall."""
+    """RGB, depth and the slab of each pixel (H, W), counted from 1; 0 = floor or back wall."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     rays_camera = np.stack(
         [
@@ -64,7 +64,7 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
         enter, leave = np.minimum(near, far), np.maximum(near, far)
         t = enter.max(axis=2)
         hit = (t < leave.min(axis=2)) & (t > 0) & (t < depth)
-        # The brightness of a face depends on its direction, as in a lit room.
+        # The brightness of a face depends on its direction.
         shade = np.array([0.8, 0.9, 1.0])[enter.argmax(axis=2)]
         depth[hit] = t[hit]
         owner[hit] = max(number - 1, 0)
@@ -75,14 +75,15 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
     return rgb, depth.astype(np.float32), owner
 
 
-def segmented(names, instances, depth_m, up_camera=UP_CAMERA):
-    """Objects of equal scores for a relation head."""
+def segmented(names, instances, depth_m):
+    """Objects with equal scores for a relation head."""
     scores = np.full(len(names), 0.8)
     instances = instances.astype(np.uint16)
-    return SegmentedObjects(names, scores, None, instances, depth_m, INTRINSICS, up_camera)
+    return SegmentedObjects(names, scores, None, instances, depth_m, INTRINSICS, UP_CAMERA)
 
 
 def box_of(mask: np.ndarray) -> np.ndarray:
+    """Box (4,) of a mask: x1, y1, x2, y2, pixels."""
     rows, columns = np.nonzero(mask)
     return np.array([columns.min(), rows.min(), columns.max(), rows.max()], dtype=float)
 
@@ -95,6 +96,7 @@ def on_image(patch: MaskPatch, shape: tuple[int, int]) -> np.ndarray:
 
 
 def overlap(patch: MaskPatch, truth: np.ndarray) -> float:
+    """IoU of a mask and the true mask."""
     mask = on_image(patch, truth.shape)
     return float((mask & truth).sum() / (mask | truth).sum())
 

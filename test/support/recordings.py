@@ -1,4 +1,4 @@
-"""Small recordings of a moving camera, in every form that bags and folders have."""
+"""Small recordings of a moving camera: bags and folders in all layouts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def stamp_ns(index: int) -> int:
 
 
 def rgb_pixels(index: int) -> np.ndarray:
-    """Smooth, so that JPEG changes it little."""
+    """A smooth image, so that JPEG changes it little."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return np.stack([rows * 4, columns * 3, np.full_like(rows, 40 + index)], axis=2).astype(
         np.uint8
@@ -48,11 +48,9 @@ def encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
     return bytes(cv2.imencode(suffix, pixels)[1])
 
 
-def raw_image(
-    index: int, pixels: np.ndarray, encoding: str, offset_ns: int = 0, frame_id: str = CAMERA
-) -> Any:
+def raw_image(index: int, pixels: np.ndarray, encoding: str) -> Any:
     return typestore().types[ros.IMAGE](
-        header=ros.header(stamp_ns(index) + offset_ns, frame_id),
+        header=ros.header(stamp_ns(index), CAMERA),
         height=pixels.shape[0],
         width=pixels.shape[1],
         encoding=encoding,
@@ -62,11 +60,9 @@ def raw_image(
     )
 
 
-def pose_message(index: int, offset_ns: int = 0, T_camera_child: Any = None) -> RoleMessage:
+def pose_message(index: int, T_camera_child: Any = None) -> RoleMessage:
     T = pose(index) if T_camera_child is None else pose(index) @ T_camera_child
-    return ros.pose_stamped(
-        stamp_ns(index) + offset_ns, WORLD, T[:3, 3], quaternion_from_rotation(T[:3, :3])
-    )
+    return ros.pose_stamped(stamp_ns(index), WORLD, T[:3, 3], quaternion_from_rotation(T[:3, :3]))
 
 
 def odometry(index: int, child: str = CAMERA, T_camera_child: Any = None) -> Any:
@@ -106,7 +102,7 @@ Item = tuple[str, str, int, Any]
 
 
 def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True) -> list[Item]:
-    """(topic, type, log time, message) of a camera; raw depth is in metres."""
+    """(topic, type, log time, message) of a camera. Raw depth is in metres."""
     items: list[Item] = []
     for index in range(count):
         time_ns = stamp_ns(index)
@@ -132,7 +128,7 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
 
 
 def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
-    """Write a rosbag2 folder with the items: messages, or their bytes."""
+    """Write a rosbag2 folder. The messages of the items may be serialized."""
     plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
     connections: dict[str, Any] = {}
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
@@ -145,13 +141,13 @@ def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Pat
     return folder
 
 
-def write_seven_scenes(folder: Path, count: int, step: int = 4) -> Path:
-    """A registered 7-Scenes folder; frame k has index k * step."""
+def write_seven_scenes(folder: Path, count: int) -> Path:
+    """Write a folder in the layout of 7-Scenes with registered depth. Every 4th frame exists."""
     folder.mkdir()
     K = INTRINSICS.matrix
     (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, r)) for r in K))
     for index in range(count):
-        stem = folder / f"frame-{index * step:06d}"
+        stem = folder / f"frame-{4 * index:06d}"
         bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
         stem.with_suffix(".color.jpg").write_bytes(encoded(bgr, ".jpg"))
         stem.with_suffix(".depth.png").write_bytes(encoded(depth_mm(index)))

@@ -1,6 +1,6 @@
-"""Plain reference of Eq. 1-4: full-frame masks, sorting, np.cov. Clear and slow.
+"""Plain reference of Eq. 1-4: full-frame masks, sorting, np.cov. It is slow.
 
-The kernels must find exactly the same inliers. bench/lifting.py compares their speed. Depths are
+The kernels must find exactly the same inliers. bench/lifting.py compares the times. Depths are
 float32; all other numbers are float64.
 """
 
@@ -19,6 +19,8 @@ from deworldsg_ros.scene.camera import Intrinsics
 
 @dataclass(frozen=True)
 class ReferenceObject:
+    """One lifted object."""
+
     inliers: np.ndarray  # (H, W) bool
     mean: np.ndarray
     covariance: np.ndarray
@@ -26,6 +28,7 @@ class ReferenceObject:
 
 
 def median_3x3(depth_m: np.ndarray) -> np.ndarray:
+    """Median of each 3x3 neighbourhood, with repeated borders."""
     padded = np.pad(depth_m, 1, mode="edge")
     return np.median(np.lib.stride_tricks.sliding_window_view(padded, (3, 3)), axis=(2, 3))
 
@@ -36,7 +39,7 @@ PAPER, PRINTED = LiftingConfig(), LiftingConstants()
 def depth_layers(
     depths_m: np.ndarray, gamma_base_m: float, alpha: float, beta: float
 ) -> list[np.ndarray]:
-    """Eq. 2: the sorted depths, cut where a step exceeds the threshold."""
+    """Eq. 2: the sorted depths, split at steps above the threshold."""
     ordered = np.sort(depths_m.astype(np.float64))
     steps = np.diff(ordered)
     threshold = max(
@@ -53,6 +56,7 @@ def kept_layer(
     alpha: float = PRINTED.alpha,
     beta: float = PRINTED.beta,
 ) -> tuple[float, float]:
+    """Eq. 3: limits of the layer whose mean is nearest to the median depth."""
     layers = depth_layers(depths_m, gamma_base_m, alpha, beta)
     reference = np.median(depths_m.astype(np.float64))
     distances = [abs(math.fsum(layer) / len(layer) - reference) for layer in layers]
@@ -71,7 +75,7 @@ def reference_lift(
     constants: LiftingConstants = PRINTED,
     fast_median: bool = False,
 ) -> list[ReferenceObject | str]:
-    """For each object, the lifted object or the reason for dropping it."""
+    """The lifted object, or the reason of its refusal, for each of `count` objects."""
     valid = np.isfinite(depth_m) & (depth_m > 0)
     depth = np.where(valid, depth_m, np.float32(0))
     median = cv2.medianBlur(depth, 3) if fast_median else median_3x3(depth)

@@ -36,7 +36,7 @@ def may_merge(
 
 
 class ReferenceMerging:
-    """Nodes and edges by id; `closest_call` is the least distance of a decision to a threshold."""
+    """Nodes and edges by id; `smallest_margin` is the minimum distance to a threshold."""
 
     def __init__(self, hellinger_threshold: float, class_distance_threshold: float) -> None:
         self.hellinger_threshold = hellinger_threshold
@@ -45,7 +45,7 @@ class ReferenceMerging:
         self.edges: dict[tuple[int, int], dict] = {}
         self.merged_into: dict[int, int] = {}
         self.next_id = 1
-        self.closest_call = math.inf
+        self.smallest_margin = math.inf
 
     def merge(self, local: LocalGraph) -> list[int]:
         assigned = []
@@ -110,8 +110,8 @@ class ReferenceMerging:
             class_distance = 1 - sum(
                 p * q for p, q in zip(observed["classes"].tolist(), node["classes"].tolist())
             )
-            self.closest_call = min(
-                self.closest_call,
+            self.smallest_margin = min(
+                self.smallest_margin,
                 abs(distance - self.hellinger_threshold),
                 abs(class_distance - self.class_distance_threshold),
             )
@@ -122,7 +122,7 @@ class ReferenceMerging:
                 passing.append((distance, node_id))
         passing.sort()
         if len(passing) > 1:
-            self.closest_call = min(self.closest_call, passing[1][0] - passing[0][0])
+            self.smallest_margin = min(self.smallest_margin, passing[1][0] - passing[0][0])
         return passing[0][1] if passing else None
 
     def resolve(self, node_id: int) -> int:

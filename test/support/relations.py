@@ -47,7 +47,7 @@ def pair_graph(stamp_ns: int) -> LocalGraph:
 
 
 def crowd_graph(stamp_ns: int, count: int) -> LocalGraph:
-    """Objects in a row; all are neighbours of each other."""
+    """Objects in a row. All are neighbours of one another."""
     left = np.linspace(0, 40, count)
     boxes = np.stack([left, np.full(count, 10.0), left + 8, np.full(count, 20.0)], axis=1)
     return local_graph(stamp_ns, boxes, np.full(count, 2.0), np.arange(count) % 3)
@@ -65,13 +65,13 @@ def picture(stamp_ns: int) -> np.ndarray:
 
 
 def config(**changes) -> RelationsConfig:
-    """The fake world model with clips of 4 frames, and a budget that no test uses up."""
+    """The fake world model with clips of 4 frames, and a budget above all needs of the tests."""
     settings = {"world_model": "fake", "clip_length": 4, "max_clips_per_s": 1000.0}
     return RelationsConfig(**{**settings, **changes})
 
 
 class RecordingModel(FakeWorldModel):
-    """The fake world model; it records its requests."""
+    """A fake world model that records its requests."""
 
     def __init__(self, clip_length: int = 4) -> None:
         super().__init__(clip_length)
@@ -83,7 +83,7 @@ class RecordingModel(FakeWorldModel):
 
 
 class GatedModel(RecordingModel):
-    """A world model that returns from a clip only when the test allows it."""
+    """A world model that waits for the permission of the test before each prediction."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -106,7 +106,7 @@ class FusedEdge:
 
 
 def fuse_edge(visual_logits, prior, alpha, entropy_threshold_nats) -> FusedEdge | None:
-    """`fuse_edges` for one edge; None for logits or prior = there is none, None = no edge."""
+    """`fuse_edges` for one edge. Logits and prior may be None. Returns None without an edge."""
     known = visual_logits if visual_logits is not None else prior
     if known is None:
         return None
@@ -129,6 +129,6 @@ def provenances(fused: FusedEdges) -> list[str]:
 
 
 def mean_of(prior: ClassPairPrior, subject_class: int, object_class: int) -> np.ndarray | None:
-    """The prior of one class pair; None if it has none."""
+    """The prior of one class pair, or None."""
     priors, has_prior = prior.lookup(np.array([[subject_class, object_class]]))
     return priors[0] if has_prior[0] else None

@@ -1,4 +1,4 @@
-"""Scripted frames of three objects, and a perceiver that knows them."""
+"""Synthetic frames of three objects, and a perceiver with their true detections."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 CONFIGURATIONS = Path(__file__).resolve().parents[2] / "config"
-# Every object is published as soon as it is seen, which makes for short tests.
+# The paper publishes a node after one observation, so tests need few frames.
 PAPER = load_config(CONFIGURATIONS / "paper.yaml")
 VOCABULARY = Vocabulary(("cup", "table", "chair"), ("on", "near", "under"))
 INTRINSICS = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
-# Box in the image, depth and class of each object; the cup is close to the table, the chair far.
+# Box in the image, depth and class of each object; the cup is close to the table.
 OBJECTS = (((60, 40, 80, 60), 1.0, 0), ((20, 60, 90, 100), 1.1, 1), ((110, 20, 150, 110), 2.5, 2))
 
 
 class Scripted:
-    """A perceiver that knows the objects, and sees the cup on the table."""
+    """A perceiver with the true detections and one relation between the cup and the table."""
 
     def __init__(self, logits: tuple[float, ...] = (3.0, -3.0, -3.0)) -> None:
         self.logits = np.array([logits])
@@ -47,7 +47,7 @@ class Scripted:
 
 
 def frame(index: int) -> RgbdFrame:
-    """Frame of a still camera; millimetre noise differs from frame to frame."""
+    """Frame of a fixed camera. The millimetre noise depends on the index."""
     rng = np.random.default_rng(index)
     depth_m = np.zeros((120, 160), np.float32)
     for (x1, y1, x2, y2), distance_m, _ in reversed(OBJECTS):

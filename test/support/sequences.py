@@ -1,4 +1,4 @@
-"""Tiny scans in the layout of 3RScan: a camera in front of coloured blocks."""
+"""Tiny scans in the layout of 3RScan: a camera in front of three blocks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deworldsg_ros.scene.camera import Intrinsics
 
 WIDTH, HEIGHT = 96, 64
 CAMERA = Intrinsics(80.0, 80.0, 47.5, 31.5, WIDTH, HEIGHT)
-# Object id, class, pixel columns of its block; all between rows 20 and 50, 2 m away.
+# Object id, class and pixel columns of each block.
 BLOCKS = ((1, "chair", 4, 34), (2, "table", 40, 62), (3, "book", 68, 92))
 ROWS = (20, 50)
 DEPTH_M, BACKGROUND_M = 2.0, 4.0
@@ -55,14 +55,13 @@ def write_sequence(
     scan: Path,
     frames: int = 3,
     *,
-    color: Intrinsics = CAMERA,
     depth: Intrinsics = CAMERA,
     depth_image: np.ndarray | None = None,
 ) -> Path:
-    """Frames of a camera that moves along x by 1 cm per frame."""
+    """Write frames of a camera that moves along x by 1 cm per frame; returns `scan`."""
     sequence = scan / "sequence"
-    write_info(sequence / "_info.txt", color, depth)
-    picture = np.full((color.height, color.width, 3), 90, np.uint8)
+    write_info(sequence / "_info.txt", CAMERA, depth)
+    picture = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     picture[:5, :10] = (255, 0, 0)
     for number in range(frames):
         stem = sequence / f"frame-{number:06d}"
@@ -75,7 +74,7 @@ def write_sequence(
 
 
 def write_surface(scan: Path) -> None:
-    """The blocks as the first frame sees them, as annotated surface points."""
+    """Write the annotated surface points of the blocks that are visible in the first frame."""
     rows, columns = np.nonzero(instance_image())
     x = (columns - CAMERA.cx) / CAMERA.fx * DEPTH_M
     y = (rows - CAMERA.cy) / CAMERA.fy * DEPTH_M
@@ -89,12 +88,12 @@ def write_surface(scan: Path) -> None:
 
 
 def write_front_end(sequence: Path, number: int, flip: bool = False) -> None:
-    """Recorded detections of all blocks, the second best first in the file."""
+    """Write detections of all blocks. They are not sorted by score."""
     stem = f"frame-{number:06d}"
     detections = []
     for number_in_file, (object_id, _, left, right) in enumerate(BLOCKS):
-        place = {1: 1, 2: 2, 3: 0}[object_id]
-        top = 2 - place if flip else place
+        class_index = {1: 1, 2: 2, 3: 0}[object_id]
+        top = 2 - class_index if flip else class_index
         score = 0.8 + 0.05 * number_in_file
         detections.append(
             {
@@ -115,11 +114,11 @@ def write_front_end(sequence: Path, number: int, flip: bool = False) -> None:
     (sequence / f"{stem}{suffix}").write_text(json.dumps(content))
 
 
-def write_room(root: Path, scan: str = "room_0", frames: int = 3) -> Path:
-    """A data set with one rendered room; returns its root."""
+def write_room(root: Path, frames: int = 3) -> Path:
+    """Write a data set with one rendered room, `room_0`; returns its root."""
     objects = [(name, number) for number, name, _, _ in BLOCKS]
-    write_dataset(root, {scan: (objects, RELATIONS)})
-    folder = write_sequence(root / "data" / scan, frames)
+    write_dataset(root, {"room_0": (objects, RELATIONS)})
+    folder = write_sequence(root / "data" / "room_0", frames)
     write_surface(folder)
     for number in range(frames):
         path = folder / "sequence" / f"frame-{number:06d}.instance.png"
@@ -130,7 +129,7 @@ def write_room(root: Path, scan: str = "room_0", frames: int = 3) -> Path:
 
 
 def write_ground_truth(folder: Path) -> None:
-    """gt.json of the blocks, with one object that cannot be detected and one without a class."""
+    """Write gt.json with the blocks, an undetectable object and an object without a class."""
     objects = []
     for number, name, left, right in BLOCKS:
         low, high = ((left - CAMERA.cx) / 80 * 2, (right - 1 - CAMERA.cx) / 80 * 2)

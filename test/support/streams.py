@@ -14,7 +14,7 @@ from deworldsg_ros.scene.camera import quaternion_from_rotation
 WIDTH, HEIGHT = 8, 6
 K = (10.0, 0.0, 4.0, 0.0, 10.0, 3.0, 0.0, 0.0, 1.0)
 MS = 10**6
-# Nanoseconds that do not fit a float64 exactly.
+# A stamp that float64 cannot represent exactly.
 T0 = 1_700_000_000_123_456_789
 
 
@@ -45,18 +45,16 @@ def depth(stamp_ns: int = T0, millimetres: int = 1500) -> SimpleNamespace:
     return image(np.full((HEIGHT, WIDTH), millimetres, np.uint16), "16UC1", stamp_ns)
 
 
-def compressed(data: bytes, format_: str, stamp_ns: int = T0) -> SimpleNamespace:
-    return SimpleNamespace(
-        header=header(stamp_ns), format=format_, data=np.frombuffer(data, np.uint8)
-    )
+def compressed(data: bytes, format_: str) -> SimpleNamespace:
+    return SimpleNamespace(header=header(T0), format=format_, data=np.frombuffer(data, np.uint8))
 
 
 def png(pixels: np.ndarray) -> bytes:
     return cv2.imencode(".png", pixels)[1].tobytes()
 
 
-def compressed_depth(counts: np.ndarray, encoding: str, a: float = 0, b: float = 0) -> bytes:
-    del encoding
+def compressed_depth(counts: np.ndarray, a: float = 0, b: float = 0) -> bytes:
+    """A compressedDepth payload: header with the parameters a and b, then a PNG."""
     return struct.pack("<iff", 0, a, b) + png(counts)
 
 

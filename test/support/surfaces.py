@@ -1,4 +1,4 @@
-"""Objects as points on their surfaces, and frames of them, for the surface rule."""
+"""Surface points of objects, and local graphs of them, for the surface rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CUP, TABLE, CHAIR = 0, 1, 2
 
 
 def slab(centre: tuple[float, float, float], size: tuple[float, float, float]) -> np.ndarray:
-    """Points on the surface of a thin box, with 3 mm of noise."""
+    """Points in a thin box with 3 mm of noise, about 2000 per square metre."""
     rng = np.random.default_rng(abs(hash((centre, size))) % 2**32)
     count = int(np.clip(2000 * max(size[0] * size[1], size[1] * size[2], 0.05), 100, 4000))
     points = rng.uniform(-0.5, 0.5, (count, 3)) * size + centre
@@ -21,7 +21,7 @@ def slab(centre: tuple[float, float, float], size: tuple[float, float, float]) -
 
 
 def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph:
-    """A local graph of objects given by surface points and class."""
+    """A local graph of objects, each with surface points and a class."""
     count = len(objects)
     gaussians = [moments(points, 1e-6) for points, _ in objects]
     classes = np.full((count, 4), 0.05)
@@ -50,12 +50,12 @@ def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph
 
 WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))
 CAMERA = Intrinsics(300.0, 300.0, 319.5, 239.5, 640, 480)
-WALL_M = 1.0  # distance of the table top, which faces the camera; cups are in front of it
+WALL_M = 1.0  # depth of the wall behind the objects
 HERE = slab((0.3, 0.1, 0.7), (0.08, 0.08, 0.06))
 
 
 def depth_grid(*surfaces: np.ndarray, background_m: float = WALL_M) -> DepthGrid:
-    """Depth of points before a wall, from a camera at the origin that looks along z."""
+    """Depth grid of points in front of a wall, from a camera at the origin that points along z."""
     depth_mm = np.full((60, 80), background_m * 1000, np.uint16)
     for points in surfaces:
         columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)

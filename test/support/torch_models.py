@@ -59,9 +59,9 @@ def rtdetr_config(version=1, labels=CLASSES, **changes):
     return family(backbone_config=backbone, **{**settings, **changes})
 
 
-def random_rtdetr(version=1, seed=0, **changes):
-    """An RT-DETR whose queries differ; those of a freshly initialised one do not."""
-    torch.manual_seed(seed)
+def random_rtdetr(version=1, **changes):
+    """An RT-DETR with different queries. The default initialisation makes them equal."""
+    torch.manual_seed(0)
     config = rtdetr_config(version, **changes)
     family = (
         transformers.RTDetrForObjectDetection
@@ -73,7 +73,7 @@ def random_rtdetr(version=1, seed=0, **changes):
         for name, value in model.named_parameters():
             if value.ndim > 1:
                 value.normal_(0, 1.4 / value[0].numel() ** 0.5)
-            elif name.endswith("weight"):  # of a normalisation
+            elif name.endswith("weight"):  # normalisation
                 value.uniform_(0.5, 1.5)
             elif "class_embed" in name:
                 value.normal_(-1, 0.5)
@@ -83,19 +83,21 @@ def random_rtdetr(version=1, seed=0, **changes):
     return model
 
 
-def save_rtdetr(folder, version=1, seed=0, card=None, side=64, normalise=False, **changes):
-    """A folder as `deworldsg models import-fross` writes it; without a card, as on the hub."""
-    random_rtdetr(version, seed, **changes).save_pretrained(folder)
-    preprocessing = {"size": {"height": side, "width": side}, "do_normalize": normalise, **IMAGENET}
+def save_rtdetr(folder, version=1, card=None, normalise=False, **changes):
+    """Save an RT-DETR like `deworldsg models import-fross`; without a card, like the model hub."""
+    random_rtdetr(version, **changes).save_pretrained(folder)
+    preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": normalise, **IMAGENET}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
     if card is not None:
         write_card(folder / CARD_FILE, card)
     return folder
 
 
-def random_head(seed=0, layers=LAYERS, classes=len(CLASSES), predicates=len(PREDICATES)):
-    torch.manual_seed(seed)
-    network = EgtrNetwork(WIDTH, layers, predicates, (classes + 1, classes + 1, predicates))
+def random_head():
+    """A relation head with random weights."""
+    torch.manual_seed(0)
+    classes, predicates = len(CLASSES), len(PREDICATES)
+    network = EgtrNetwork(WIDTH, LAYERS, predicates, (classes + 1, classes + 1, predicates))
     with torch.no_grad():
         for value in network.parameters():
             value.normal_(0, 0.3)
@@ -103,7 +105,7 @@ def random_head(seed=0, layers=LAYERS, classes=len(CLASSES), predicates=len(PRED
 
 
 def save_paper_checkpoint(folder, card_changes=None, **changes):
-    """Softmax detector and relation head in one folder."""
+    """Save a softmax detector and a relation head in one folder."""
     card = {"class_scores": "softmax", "score_threshold": 0.3, "predicates": PREDICATES}
     card = CheckpointCard(**{**card, "frequency_bias": True, **(card_changes or {})})
     save_rtdetr(folder, card=card, normalise=True, **changes)
@@ -111,8 +113,9 @@ def save_paper_checkpoint(folder, card_changes=None, **changes):
     return folder
 
 
-def save_sam2(folder, seed=0, video=False):
-    torch.manual_seed(seed)
+def save_sam2(folder, video=False):
+    """Save a small SAM 2, in the format of images or videos."""
+    torch.manual_seed(0)
     backbone = {
         "hidden_size": 12,
         "image_size": [128, 128],
@@ -151,13 +154,14 @@ def save_sam2(folder, seed=0, video=False):
                 vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
             )
         )
-    _stir(model)
+    _randomise_decoder(model)
     model.save_pretrained(folder)
     return folder
 
 
-def save_sam(folder, seed=0):
-    torch.manual_seed(seed)
+def save_sam(folder):
+    """Save a small SAM."""
+    torch.manual_seed(0)
     config = transformers.SamConfig(
         vision_config={
             "hidden_size": 24,
@@ -179,13 +183,13 @@ def save_sam(folder, seed=0):
         mask_decoder_config={"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32},
     )
     model = transformers.SamModel(config)
-    _stir(model)
+    _randomise_decoder(model)
     model.save_pretrained(folder)
     return folder
 
 
-def _stir(model):
-    """Weights of a size at which masks are neither empty nor full."""
+def _randomise_decoder(model):
+    """Set weights that give masks with some pixels, but not all."""
     with torch.no_grad():
         for name, value in model.mask_decoder.named_parameters():
             if "norm" not in name:
@@ -193,7 +197,7 @@ def _stir(model):
 
 
 def segmented(class_names, scores, features=None):
-    """Objects for a relation head that reads no image."""
+    """Objects for a relation head that ignores images."""
     instances, depth_m = np.zeros((4, 4), np.uint16), np.zeros((4, 4), np.float32)
     camera = Intrinsics(4.0, 4.0, 1.5, 1.5, 4, 4)
     up_camera = np.array([0.0, -1.0, 0.0])
