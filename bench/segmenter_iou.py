@@ -157,12 +157,13 @@ def main() -> None:
         by_class[label].append(iou)
     ranked = sorted(by_class.items(), key=lambda item: -len(item[1]))
     print("  " + ", ".join(f"{label} {np.mean(v):.2f} ({len(v)})" for label, v in ranked))
-    dozen = [t * 1e3 for t, n in zip(times["segmenter"], boxes) if 11 <= n <= 13]
     print(
         f"processor time, one thread: median {statistics.median(times['segmenter']) * 1e3:.1f} "
-        f"ms per frame of {statistics.mean(boxes):.1f} boxes; "
-        f"{statistics.median(dozen):.1f} ms at 11 to 13 boxes ({len(dozen)} frames)"
+        f"ms per frame of {statistics.mean(boxes):.1f} boxes"
     )
+    dozen = [t * 1e3 for t, n in zip(times["segmenter"], boxes) if 11 <= n <= 13]
+    if dozen:
+        print(f"  {statistics.median(dozen):.1f} ms at 11 to 13 boxes ({len(dozen)} frames)")
     if arguments.time:
         ratio = statistics.median(
             slow / fast for fast, slow in zip(times["segmenter"], times["grabCut"])
