@@ -52,7 +52,7 @@ class Pipeline:
 
     Args:
         config: the whole configuration.
-        perceiver: in place of the configured perception, e.g. recorded detections.
+        perceiver: replaces the configured perception, e.g. by recorded detections.
 
     Attributes:
         builder: keeps the global graph; None before the first frame, which gives the world frame.

@@ -16,9 +16,6 @@ from deworldsg_ros.checkpoints.probe_card import WEIGHTS_FILE, ProbeCard, read_c
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 
-# Dropout rate before the last layer of the layout `batch_norm`, as in the published probe.
-DROPOUT = 0.2
-
 
 def build_network(card: ProbeCard) -> torch.nn.Sequential:
     """The network (n, input_dim) → logits (n, R), with random weights.
@@ -34,7 +31,7 @@ def build_network(card: ProbeCard) -> torch.nn.Sequential:
             first,
             torch.nn.ReLU(),
             torch.nn.BatchNorm1d(card.hidden_dim),
-            torch.nn.Dropout(DROPOUT),
+            torch.nn.Dropout(0.2),  # as in the published probe
             last,
         ]
     return torch.nn.Sequential(OrderedDict(net=torch.nn.Sequential(*layers)))

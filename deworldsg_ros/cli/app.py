@@ -141,7 +141,7 @@ Timings = Annotated[bool, typer.Option("--timings", help="print the time of each
 
 @contextmanager
 def _reporting_errors() -> Iterator[None]:
-    """Print an error of the user as one sentence and exit; no traceback, not for Ctrl-C either."""
+    """Print an error of the user as one sentence and exit. Errors and Ctrl-C give no traceback."""
     try:
         yield
     except DeWorldSGError as error:

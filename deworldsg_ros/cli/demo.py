@@ -107,7 +107,7 @@ def run_demo(
 
 
 def dds_environment() -> dict[str, str]:
-    """Environment of the nodes: this machine only, an own domain, shared memory for images."""
+    """Environment of the nodes: this machine, its own domain, shared memory for images."""
     environment = dict(os.environ)
     environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     # Domains above 101 collide with ephemeral ports on Linux.
@@ -216,8 +216,8 @@ def _write_report(
         "frames": {
             "images": recording.frames,
             "published": finished.published,
-            "processed": finished.answered,
-            "unanswered": finished.unanswered,
+            "processed": finished.processed,
+            "without_result": finished.without_result,
         },
         "drops": {**_drops(finished), "objects": dict(objects)},
         "losses": finished.losses,
@@ -239,15 +239,15 @@ def _drops(finished: events.Finished) -> dict[str, dict[str, int]]:
 
 def _print_summary(out: Path, finished: events.Finished, console: Console) -> None:
     outputs.print_drops(console, finished.losses, _drops(finished), {})
-    if finished.unanswered or not finished.drained:
+    if finished.without_result or not finished.drained:
         console.print(
-            f"[yellow]warning:[/] no result for {finished.unanswered} frames; see the logs of the "
-            f"nodes in {out / 'logs'}",
+            f"[yellow]warning:[/] no result for {finished.without_result} frames; see the logs of "
+            f"the nodes in {out / 'logs'}",
             highlight=False,
             soft_wrap=True,
         )
     console.print(
-        f"{finished.published} frames published, {finished.answered} merged into the graph",
+        f"{finished.published} frames published, {finished.processed} merged into the graph",
         highlight=False,
     )
     outputs.print_files(console, out)

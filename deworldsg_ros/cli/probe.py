@@ -59,10 +59,10 @@ HeldOut = Annotated[
     Optional[list[str]],
     typer.Option("--held-out", metavar="GROUP", help="hold out this room; may be repeated"),
 ]
-HeldOutShare = Annotated[
+HeldOutFraction = Annotated[
     float,
     typer.Option(
-        "--held-out-share", min=0, max=0.9, help="fraction of the rooms to hold out instead"
+        "--held-out-fraction", min=0, max=0.9, help="fraction of the rooms to hold out instead"
     ),
 ]
 ClipsPerPair = Annotated[
@@ -123,7 +123,7 @@ def train_probe(
     layout: Layout = "two_layer",
     inputs: Inputs = "clip",
     held_out: HeldOut = None,
-    held_out_share: HeldOutShare = 0.2,
+    held_out_fraction: HeldOutFraction = 0.2,
     clips_per_pair: ClipsPerPair = 4,
     clip_length: ClipLength = 16,
     device: Device = "auto",
@@ -144,7 +144,7 @@ def train_probe(
     training = TrainingOptions(
         layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
         inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
-        held_out_share=held_out_share,
+        held_out_fraction=held_out_fraction,
         held_out_groups=tuple(held_out or ()),
         batch_size=batch_size,
         fit=FitOptions(epochs, patience, learning_rate=learning_rate, seed=seed),

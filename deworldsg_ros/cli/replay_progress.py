@@ -19,9 +19,6 @@ from deworldsg_ros.scene.errors import DeWorldSGError
 STARTING = "starting the nodes …"
 # A start with compiled kernels takes less: no explanation before this.
 EXPLAIN_AFTER_S = 8.0
-POLL_PERIOD_S = 0.2
-# From the end of the output to the end of the process.
-END_WAIT_S = 2.0
 
 
 class DemoFailed(DeWorldSGError):
@@ -80,11 +77,11 @@ class ReplayProgress:
         """The next event; None if there is none yet."""
         self._check_running()
         try:
-            line = self._lines.get(timeout=POLL_PERIOD_S)
+            line = self._lines.get(timeout=0.2)
         except queue.Empty:
             return None
         if line is None:
-            self._replay.wait(END_WAIT_S)
+            self._replay.wait(2.0)  # its output ends before its process
             self._check_running()
             raise DemoFailed(_early_end(self._replay))
         try:

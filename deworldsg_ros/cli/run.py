@@ -78,7 +78,7 @@ class _Processed:
     Attributes:
         poses: T_world_camera (4, 4) of each processed frame by its stamp in nanoseconds.
         refused: frames that the pipeline or the odometry refused, by reason.
-        updates: log of the graph's updates; None if it was not asked for.
+        updates: log of the graph's updates; None without `RunOptions.temporal`.
         wall_s: seconds for all frames.
     """
 

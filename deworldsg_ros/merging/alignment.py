@@ -32,8 +32,6 @@ PLANE_POINTS = 12
 FLATNESS = 0.25
 # Maximum distance of a point from its plane's point.
 REACH_M = 0.10
-MAX_ITERATIONS = 5
-MIN_STEP = 1e-4
 # Residuals beyond OUTLIER_M have small weights (Cauchy).
 OUTLIER_M = 0.02
 # Standard deviations of the points, and of the pose error of a frame (prior).
@@ -158,7 +156,7 @@ def register(points: Float64, planes: Float64, camera_world: Float64) -> tuple[F
 
     near, near_normals, distances = residuals()
     loss_before = _loss(distances, len(points))
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(5):
         if len(distances) < MIN_MATCHES:
             return no_motion
         jacobian, weights = point_to_plane(near, near_normals, distances, OUTLIER_M)
@@ -169,7 +167,7 @@ def register(points: Float64, planes: Float64, camera_world: Float64) -> tuple[F
         rotation = (step_rotation * Rotation.from_rotvec(rotation)).as_rotvec()
         translation = step_rotation.apply(translation) + step[3:]
         near, near_normals, distances = residuals()
-        if np.abs(step).max() < MIN_STEP:
+        if np.abs(step).max() < 1e-4:  # radians and metres
             break
     if _loss(distances, len(points)) > MAX_LOSS_RATIO * loss_before:
         return no_motion

@@ -183,7 +183,7 @@ class Existence:
         self.counts_by_visibility[:] = counts_by_visibility
 
     def assume_confirmed(self, owner: int, detections: int) -> None:
-        """Add a confirmed node of which only the number of detections is known."""
+        """Add a confirmed node by its number of detections; its viewpoints are unknown."""
         self._make_room(owner + 1)
         record = self._records[owner]
         record["detections"], record["best_score"] = detections, 1.0

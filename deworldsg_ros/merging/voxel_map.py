@@ -20,7 +20,6 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 CELL_M = 0.03
 # At 3 cm, a surface of about 7 m²; larger surfaces are not stored in full.
 CELLS_PER_OWNER = 8192
-FIRST_CAPACITY = 1 << 12
 
 
 class VoxelMap:
@@ -34,7 +33,7 @@ class VoxelMap:
     def __init__(self, cell_m: float = CELL_M, cells_per_owner: int = CELLS_PER_OWNER) -> None:
         self.cell_m = cell_m
         self._cells_per_owner = cells_per_owner
-        self._table = cell_kernels.new_table(FIRST_CAPACITY)
+        self._table = cell_kernels.new_table(1 << 12)
         # Slots of the table that are not empty.
         self._used = 0
         self._blocks_of: dict[int, list[Int64]] = {}

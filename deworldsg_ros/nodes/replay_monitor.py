@@ -122,7 +122,7 @@ class PipelineMonitor:
 
     def give_up_after(self, stall_s: float, now_s: float) -> None:
         """Stop waiting for the frames in flight after `stall_s` without a result."""
-        if not self.window.answered:
+        if not self.window.results:
             stall_s = max(stall_s, FIRST_RESULT_S)
         if self.silent_for(now_s) > stall_s:
             self._node.get_logger().warning(
@@ -186,7 +186,7 @@ class PipelineMonitor:
         self.poses.append(local.T_world_camera)
         self._local_graphs += 1
         self._progress_s = None
-        self.window.answer(wire.ns_from_stamp(local.stamp))
+        self.window.add_result(wire.ns_from_stamp(local.stamp))
 
     def _on_evidence(self, message: Any) -> None:
         self._evidence += 1

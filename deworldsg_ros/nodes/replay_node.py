@@ -50,8 +50,6 @@ LISTENER_WAIT_S = 4.0
 # Without a result for this time, a node has failed or hangs: the slowest step, a large model on a
 # CPU, takes seconds per frame.
 STALL_S = 30.0
-PROGRESS_PERIOD_S = 0.2
-WAITING_PERIOD_S = 1.0
 # Longest delay until a signal is noticed.
 SPIN_PERIOD_S = 0.1
 EXIT_NOT_READY = 3
@@ -160,7 +158,7 @@ class ReplayNode(Node):
             missing = self._monitor.missing(endpoints, time.monotonic())
             if not missing:
                 return True
-            if time.monotonic() - self._reported_s > WAITING_PERIOD_S:
+            if time.monotonic() - self._reported_s > 1.0:
                 self._reported_s = time.monotonic()
                 self._emit(events.Waiting(missing))
             self._spin(SPIN_PERIOD_S)
@@ -228,8 +226,8 @@ class ReplayNode(Node):
         self._emit(
             events.Finished(
                 published=self._published,
-                answered=window.answered,
-                unanswered=window.given_up,
+                processed=window.results,
+                without_result=window.given_up,
                 drained=drained,
                 diagnostics=self._monitor.diagnostics,
                 drops=dict(self._source.drops),
@@ -241,10 +239,10 @@ class ReplayNode(Node):
 
     def _emit_progress(self, *, at_once: bool = False) -> None:
         now_s = time.monotonic()
-        if at_once or now_s - self._reported_s > PROGRESS_PERIOD_S:
+        if at_once or now_s - self._reported_s > 0.2:
             self._reported_s = now_s
             monitor = self._monitor
-            self._emit(events.Progress(self._published, monitor.window.answered, monitor.nodes))
+            self._emit(events.Progress(self._published, monitor.window.results, monitor.nodes))
 
     def _emit(self, event: events.Event) -> None:
         if self._options.events:

@@ -18,10 +18,10 @@ class Started(msgspec.Struct, tag=True, frozen=True):
 
 
 class Progress(msgspec.Struct, tag=True, frozen=True):
-    """Frames published and answered so far, and nodes in the graph."""
+    """Frames published and processed so far, and nodes in the graph."""
 
     published: int
-    answered: int
+    processed: int
     nodes: int
 
 
@@ -39,8 +39,8 @@ class Finished(msgspec.Struct, tag=True, frozen=True):
     """
 
     published: int
-    answered: int
-    unanswered: int
+    processed: int
+    without_result: int
     drained: bool
     diagnostics: dict[str, dict[str, str]]
     drops: dict[str, int]

@@ -40,13 +40,13 @@ class Pace:
 
 
 class Window:
-    """Frames in flight: published and not yet answered; at most `size` of them.
+    """Frames in flight: published, without a result yet; at most `size` of them.
 
-    An answer to a frame also answers all frames before it, because the nodes process frames in
-    order. A refused frame never has an answer: `excuse` takes the number of refused frames, which
-    may be reported before or after the answer to a later frame.
+    The result of a frame also ends all frames before it, because the nodes process frames in
+    order. A refused frame never has a result: `excuse` takes the number of refused frames, which
+    may be reported before or after the result of a later frame.
 
-    A frame can be answered once each stream that it needs has passed its stamp: its pose may have
+    A frame can have a result once each stream that it needs has passed its stamp: its pose may have
     been recorded later. Until then it is undecided, and not in flight.
 
     Args:
@@ -54,8 +54,8 @@ class Window:
         needs: the streams that a frame needs.
 
     Attributes:
-        answered: number of answers.
-        given_up: number of frames whose answer is no longer expected.
+        results: number of results.
+        given_up: number of frames whose result is no longer expected.
     """
 
     def __init__(self, size: int, needs: Collection[Role] = ()) -> None:
@@ -63,15 +63,15 @@ class Window:
         self._newest_ns = dict.fromkeys(needs, -1)
         self._undecided: deque[int] = deque()
         self._in_flight: deque[int] = deque()
-        # Refused frames that no answer has covered yet. Negative: an answer has covered frames
-        # whose refusal is not reported yet.
+        # Refused frames before which no result has come yet. Negative: a later result has come, and
+        # the refusal of these frames is not reported yet.
         self._excused = 0
-        self.answered = 0
+        self.results = 0
         self.given_up = 0
 
     @property
     def in_flight(self) -> int:
-        """Number of frames that may still be answered."""
+        """Number of frames that may still have a result."""
         return max(0, len(self._in_flight) - max(0, self._excused))
 
     @property
@@ -95,9 +95,9 @@ class Window:
         self._in_flight += self._undecided
         self._undecided.clear()
 
-    def answer(self, stamp_ns: int) -> None:
-        """Note the answer to a frame, and so to the frames before it."""
-        self.answered += 1
+    def add_result(self, stamp_ns: int) -> None:
+        """Note the result of a frame, which ends the frames before it, too."""
+        self.results += 1
         behind = 0
         for frames in (self._in_flight, self._undecided):
             while frames and frames[0] <= stamp_ns:
@@ -107,7 +107,7 @@ class Window:
         self._settle()
 
     def excuse(self, number: int) -> None:
-        """Note a number of refused frames: they will not be answered."""
+        """Note a number of refused frames: they will have no result."""
         self._excused += number
         self._settle()
 

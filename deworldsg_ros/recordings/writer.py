@@ -54,7 +54,7 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
     The file appears when it is complete: a conversion that is interrupted leaves nothing.
 
     Raises:
-        RecordingError: as `check_output`, or where nothing came.
+        RecordingError: as `check_output`, or if there are no messages.
     """
     check_output(path)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".deworldsg-") as folder:

@@ -63,7 +63,7 @@ class ClipPolicy:
 
     Args:
         config: `max_clips_per_s` and `entropy_threshold_nats` are used. With `max_clips_per_s` 0
-            every clip is encoded, whatever the graph.
+            every clip is encoded, and the graph is not used.
     """
 
     def __init__(self, config: RelationsConfig) -> None:

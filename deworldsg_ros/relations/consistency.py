@@ -77,8 +77,8 @@ class Consistency:
 
     P(r_ab, r_ba) ∝ p_ab(r_ab) · p_ba(r_ba) · C(r_ab, r_ba), where C is 0 for predicates that
     contradict each other and 1 otherwise. Each edge gets its marginal. If both directions are
-    certain and contradict each other, the one with the less likely alternatives prevails. Equal
-    ones get half each.
+    certain and contradict each other, the one with the less likely alternatives prevails. Two
+    equal beliefs get half each.
 
     Args:
         predicates: names, in the order of the distributions.

@@ -10,8 +10,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from deworldsg_ros.scene.arrays import Int64
 
-_FIRST_CAPACITY = 64
-
 
 class Columns:
     """n rows of several arrays. Row r of every array belongs to the id `ids[r]`.
@@ -32,7 +30,7 @@ class Columns:
     def __init__(self, layout: Mapping[str, tuple[DTypeLike, tuple[int, ...]]]) -> None:
         self._rows: dict[int, int] = {}
         self._storage: dict[str, NDArray[Any]] = {
-            name: np.zeros((_FIRST_CAPACITY, *shape), dtype)
+            name: np.zeros((64, *shape), dtype)
             for name, (dtype, shape) in {"ids": (np.int64, ()), **layout}.items()
         }
         self._show(0)

@@ -91,7 +91,7 @@ def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> SceneGrap
     Args:
         arrays: by name; others are ignored.
         source: file name for errors.
-        settings: of `SceneGraph`, in place of the saved ones.
+        settings: of `SceneGraph`; they replace the saved ones.
 
     Raises:
         RefusedInput: ``invalid_graph_file`` if the arrays are not those of a graph.

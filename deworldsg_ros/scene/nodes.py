@@ -16,7 +16,7 @@ from deworldsg_ros.scene.columns import Columns
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
 from deworldsg_ros.scene.surface import add_points
 
-# All that is saved of a node beside its surface points; the rest follows from these.
+# Saved columns of a node, beside its surface points; the other columns follow from these.
 SAVED_COLUMNS = (
     "ids",
     "means",
@@ -33,7 +33,7 @@ SAVED_COLUMNS = (
 
 @dataclass(frozen=True)
 class Observations:
-    """What n nodes are fused with: one row for each of them.
+    """Observations to fuse into n nodes, one row for each node.
 
     Attributes:
         means_world: (n, 3) float64, metres.

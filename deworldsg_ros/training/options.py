@@ -32,7 +32,7 @@ class TrainingOptions:
 
     Attributes:
         layout, inputs: of the probe, see `ProbeCard`.
-        held_out_share: fraction of the groups that is kept for the final scores.
+        held_out_fraction: fraction of the groups that is kept for the final scores.
         held_out_groups: keep these groups instead.
         batch_size: clips encoded at once.
         fit: options of the fit.
@@ -40,7 +40,7 @@ class TrainingOptions:
 
     layout: Literal["two_layer", "batch_norm"] = "two_layer"
     inputs: Literal["clip", "clip_and_boxes"] = "clip"
-    held_out_share: float = 0.2
+    held_out_fraction: float = 0.2
     held_out_groups: tuple[str, ...] = ()
     batch_size: int = 1
     fit: FitOptions = field(default_factory=FitOptions)

@@ -36,7 +36,7 @@ def split_by_group(
     groups: Sequence[str],
     pairs: Sequence[str],
     *,
-    held_out_share: float,
+    held_out_fraction: float,
     held_out_groups: Sequence[str] = (),
     seed: int = 0,
 ) -> Split:
@@ -45,7 +45,7 @@ def split_by_group(
     Args:
         groups: group of each clip, e.g. its room.
         pairs: pair of objects of each clip.
-        held_out_share: fraction of the groups to hold out, at least one group.
+        held_out_fraction: fraction of the groups to hold out, at least one group.
         held_out_groups: hold out exactly these groups instead.
         seed: of the random choice.
 
@@ -65,7 +65,7 @@ def split_by_group(
             "expected at least one to train on and one to hold out"
         )
     generator = np.random.default_rng(seed)
-    chosen = set(held_out_groups) or _choose(generator, names, held_out_share)
+    chosen = set(held_out_groups) or _choose(generator, names, held_out_fraction)
     held_out = np.array([group in chosen for group in groups])
     rest = [name for name in names if name not in chosen]
     by_group = len(rest) > 1

@@ -108,7 +108,7 @@ def _split(clips: Sequence[LabelledClip], options: TrainingOptions) -> Split:
     return split_by_group(
         [clip.group for clip in clips],
         [clip.pair for clip in clips],
-        held_out_share=options.held_out_share,
+        held_out_fraction=options.held_out_fraction,
         held_out_groups=options.held_out_groups,
         seed=options.fit.seed,
     )

@@ -19,8 +19,8 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import shade
 from deworldsg_ros.view.geometry import SIGMAS
 from deworldsg_ros.view.picture_text import (
+    CONFIRMED_FROM,
     CURVATURE,
-    SURE_FROM,
     draw_frame,
     draw_labels,
     draw_predicates,
@@ -86,7 +86,7 @@ def _draw_ellipses(drawing: Drawing) -> None:
         variances, directions = np.linalg.eigh(view.covariances[row])
         width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances[::-1], 1e-8))
         angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
-        alpha = 1.0 if nodes[row].observations >= SURE_FROM else 0.45
+        alpha = 1.0 if nodes[row].observations >= CONFIRMED_FROM else 0.45
         fill = drawing.colours[nodes[row].label]
         rim = shade(fill, 0.8)
         zorder = 3 + order / (len(nodes) + 1)

@@ -19,11 +19,9 @@ from deworldsg_ros.view.top_view import BACKGROUND, FAINT, INK, Drawing
 # More labels leave no free space on a page.
 MOST_LABELS = 90
 # As `merging.confirm_observations`: nodes with fewer are pale and have a small label.
-SURE_FROM = 3
+CONFIRMED_FROM = 3
 # Of matplotlib's arc3 arrows: enough to separate an edge from its opposite.
 CURVATURE = 0.16
-# From a label to its object, pixels: above this a line connects the two.
-LEADER_FROM_PX = 14
 HALO = [patheffects.withStroke(linewidth=2.6, foreground=BACKGROUND)]
 PREDICATE_STYLE: dict[str, Any] = {"fontsize": 7.0, "fontstyle": "italic"}
 # Positions of a predicate along its arrow, best first.
@@ -53,7 +51,7 @@ def draw_labels(drawing: Drawing) -> Placement:
     ):
         colour = shade(drawing.colours[nodes[row].label], 0.62)
         near = nearest_on_box(anchor, box)
-        if np.linalg.norm(near - anchor) > LEADER_FROM_PX:
+        if np.linalg.norm(near - anchor) > 14:  # pixels; a label farther away gets a line
             line = to_data.transform([near, anchor])
             axes.plot(*line.T, color=colour, linewidth=0.6, alpha=0.55, zorder=6)
         _write(axes, to_data.transform(centre), text, color=colour, zorder=8, **style)
@@ -157,7 +155,7 @@ def _frame_px(axes: Axes) -> Float64:
 
 
 def _label_style(node: wire.NodeState, label_count: int) -> dict[str, Any]:
-    if node.observations < SURE_FROM:
+    if node.observations < CONFIRMED_FROM:
         return {"fontsize": 7.0, "alpha": 0.75}
     return {"fontsize": 9.0 if label_count <= 40 else 8.0, "fontweight": "bold"}
 

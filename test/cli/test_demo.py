@@ -68,7 +68,7 @@ def test_demo_and_run_end_with_the_same_graph(recording, unposed, tmp_path, pose
 
     report = json.loads((tmp_path / "shown" / "run.json").read_text(encoding="utf-8"))
     assert report["frames"]["published"] == report["frames"]["processed"] == FRAMES
-    assert report["frames"]["unanswered"] == 0
+    assert report["frames"]["without_result"] == 0
     assert set(NODES) <= set(report["diagnostics"])
     for name in ("scene_graph.png", "scene_graph.html", "config.yaml"):
         assert (tmp_path / "shown" / name).stat().st_size > 0

@@ -43,10 +43,10 @@ def test_an_answer_covers_the_frames_before_it():
     for stamp_ns in (10, 20, 30):
         window.publish(stamp_ns)
     assert window.is_full
-    window.answer(20)
+    window.add_result(20)
     assert window.in_flight == 1
     assert not window.is_full
-    assert window.answered == 1
+    assert window.results == 1
 
 
 def test_refused_frames_leave_the_window_and_lost_frames_are_counted():
@@ -76,7 +76,7 @@ def test_a_frame_is_in_flight_once_every_stream_passed_its_stamp():
     window.passed(Role.POSE, 4)
     assert window.in_flight == 4
     assert window.is_full
-    window.answer(4)
+    window.add_result(4)
     window.passed(Role.CAMERA_INFO, 9)
     assert window.in_flight == 0
     window.close()
@@ -88,7 +88,7 @@ def test_undecided_frames_are_bounded_and_an_answer_covers_them():
     for stamp_ns in range(1, MAX_UNDECIDED + 3):
         window.publish(stamp_ns)
     assert window.in_flight == 2
-    window.answer(MAX_UNDECIDED)
+    window.add_result(MAX_UNDECIDED)
     window.close()
     assert window.in_flight == 2
 
@@ -98,9 +98,9 @@ def test_a_refusal_before_the_answer_to_an_earlier_frame_counts():
     for stamp_ns in range(1, 7):
         window.publish(stamp_ns)
     window.excuse(3)  # 2, 3 and 4
-    window.answer(1)
+    window.add_result(1)
     assert window.in_flight == 2
-    window.answer(5)
+    window.add_result(5)
     assert window.in_flight == 1
 
 
@@ -108,30 +108,30 @@ def test_a_refusal_after_the_answer_to_a_later_frame_is_not_counted_twice():
     window = Window(4)
     for stamp_ns in range(1, 5):
         window.publish(stamp_ns)
-    window.answer(3)
+    window.add_result(3)
     window.excuse(2)
     assert window.in_flight == 1
 
 
 @given(
     size=st.integers(1, 5),
-    steps=st.lists(st.sampled_from(["publish", "answer", "excuse", "give up"]), max_size=60),
+    steps=st.lists(st.sampled_from(["publish", "result", "excuse", "give up"]), max_size=60),
 )
 def test_never_more_in_flight_than_the_window_allows(size, steps):
     window = Window(size)
-    stamp_ns, answered_ns = 0, 0
+    stamp_ns, result_ns = 0, 0
     for step in steps:
         if step == "publish" and not window.is_full:
             stamp_ns += 1
             window.publish(stamp_ns)
-        elif step == "answer" and answered_ns < stamp_ns:
-            answered_ns += 1
-            window.answer(answered_ns)
+        elif step == "result" and result_ns < stamp_ns:
+            result_ns += 1
+            window.add_result(result_ns)
         elif step == "excuse":
             window.excuse(1)
         elif step == "give up":
             window.give_up()
-        assert 0 <= window.in_flight <= stamp_ns - answered_ns
+        assert 0 <= window.in_flight <= stamp_ns - result_ns
     # However it went: answering the newest empties the window.
-    window.answer(stamp_ns)
+    window.add_result(stamp_ns)
     assert window.in_flight == 0

@@ -158,7 +158,7 @@ def test_a_damaged_file_of_features_is_extracted_again(backbone, clip_folder, tm
 def test_no_room_is_on_two_sides():
     groups = [f"room {n % 6}" for n in range(60)]
     pairs = [f"{group} {n}" for n, group in enumerate(groups)]
-    split = split_by_group(groups, pairs, held_out_share=0.3, seed=2)
+    split = split_by_group(groups, pairs, held_out_fraction=0.3, seed=2)
     parts = [
         {groups[row] for row in rows} for rows in (split.train, split.validation, split.held_out)
     ]
@@ -171,7 +171,7 @@ def test_no_room_is_on_two_sides():
 def test_with_one_room_to_train_on_the_clips_of_a_pair_stay_together():
     groups = ["a"] * 20 + ["b"] * 20
     pairs = [f"{group} {n // 4}" for n, group in enumerate(groups)]
-    split = split_by_group(groups, pairs, held_out_share=0.2, held_out_groups=["b"])
+    split = split_by_group(groups, pairs, held_out_fraction=0.2, held_out_groups=["b"])
     assert split.validation_by == "pair" and set(split.held_out.tolist()) == set(range(20, 40))
     assert not {pairs[row] for row in split.train} & {pairs[row] for row in split.validation}
 
@@ -186,7 +186,7 @@ def test_with_one_room_to_train_on_the_clips_of_a_pair_stay_together():
 )
 def test_clips_that_cannot_be_split_are_refused(groups, held_out, reported):
     with pytest.raises(ConfigurationError, match=reported):
-        split_by_group(groups, groups, held_out_share=0.2, held_out_groups=held_out)
+        split_by_group(groups, groups, held_out_fraction=0.2, held_out_groups=held_out)
 
 
 def test_rare_predicates_have_a_greater_weight():

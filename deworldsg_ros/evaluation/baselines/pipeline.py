@@ -1,4 +1,4 @@
-"""A baseline in place of the pipeline: same detections, depth and poses in, a graph out."""
+"""A baseline with the interface of the pipeline: same input, a graph as output."""
 
 from __future__ import annotations
 

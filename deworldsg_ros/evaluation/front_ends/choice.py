@@ -132,7 +132,7 @@ def build_front_end(
 
 
 def _backend(annotations: Annotations, config: Config) -> Perceiver:
-    """The configured backend with the predicates of the data set, whatever is configured."""
+    """The configured backend, with the predicates of the data set."""
     names = {predicates: name for name, predicates in PREDICATE_SETS.items()}
     predicate_set = names.get(annotations.vocabulary.predicates)
     perception = config.perception

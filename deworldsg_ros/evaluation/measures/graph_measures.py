@@ -32,7 +32,7 @@ CALIBRATION_BINS = 10
 
 
 class NodeView(NamedTuple):
-    """A node as the measures see it; the main node of an object has the largest `weight`."""
+    """A node in the form for the measures; the main node of an object has the largest `weight`."""
 
     id: int
     label: str
@@ -43,7 +43,7 @@ class NodeView(NamedTuple):
 
 
 class EdgeView(NamedTuple):
-    """An edge as the measures see it: node ids, best predicate and its probability."""
+    """An edge in the form for the measures: node ids, best predicate and its probability."""
 
     subject: int
     object: int

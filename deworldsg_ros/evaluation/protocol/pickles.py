@@ -239,7 +239,7 @@ def load_pickle(content: bytes, source: str) -> Any:
 
 
 def _resolve(value: Any, seen: dict[int, Any]) -> Any:
-    """`value` with arrays in place of the placeholders."""
+    """`value` with its placeholders replaced by arrays."""
     if isinstance(value, _Array):
         if id(value) not in seen:
             seen[id(value)] = value.array()

@@ -100,7 +100,7 @@ def run_row(
 
 
 def predicted_row(title: str, evaluation: Evaluation) -> RowResult:
-    """The row of a method of which only the predictions are known."""
+    """The row of a method that is known by its predictions only."""
     result = evaluation.result
     numbers = all_numbers(result, evaluation.pooled)
     return RowResult(title, title, evaluation.dataset, False, numbers, scans=len(result.scans))

@@ -20,8 +20,6 @@ OUTLIER_FRACTION = 0.04
 SUPPORT_MARGIN_M = 0.08
 # The camera sees only the front of furniture; its footprint extends this far behind it.
 HIDDEN_DEPTH_M = 0.15
-# Keeps fractions of a footprint finite.
-MIN_FOOTPRINT_M2 = 1e-6
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ def measure_layout(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
     )
     area, shared = _footprints(low[:, :2], high[:, :2])
-    area = np.maximum(area, MIN_FOOTPRINT_M2)
+    area = np.maximum(area, 1e-6)  # keeps fractions of a footprint finite
     deep, deep_shared = _footprints(low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M)
     return Layout(
         valid=valid,

@@ -91,8 +91,6 @@ WITH_GAP_M = Limit(0.35, 0.1)
 
 # Objects that are larger do not fit in one hand and count as furniture.
 FURNITURE_M = 0.45
-# Keeps the ratio of two widths finite.
-MIN_WIDTH_M = 1e-3
 
 CONTAINERS = frozenset(
     [
@@ -202,7 +200,8 @@ class _Pairs:
 def _resting(pairs: _Pairs) -> Float64:
     """On, if it is not in it nor attached to it."""
     layout = pairs.layout
-    width_m = np.maximum((layout.high - layout.low)[:, :2].max(axis=1), MIN_WIDTH_M)
+    # The lower limit keeps the ratio of two widths finite.
+    width_m = np.maximum((layout.high - layout.low)[:, :2].max(axis=1), 1e-3)
     return _all(
         CONTACT_M.at_most(layout.contact_m),
         ON_COVERED.at_least(layout.covered),

@@ -106,7 +106,7 @@ class BagSource:
         for raw in self.raw_messages():
             try:
                 message = decode(raw.data, raw.msgtype)
-            except Exception:  # whatever rosbags raises on a broken message
+            except Exception:  # rosbags raises errors of many types
                 self.drops["invalid_message"] += 1
                 continue
             yield RoleMessage(raw.role, raw.msgtype, raw.stamp_ns, message)
@@ -146,7 +146,7 @@ class BagSource:
         except RefusedInput as refusal:
             self.drops[refusal.reason] += 1
             return
-        except Exception:  # whatever rosbags raises on a broken message
+        except Exception:  # rosbags raises errors of many types
             self.drops["invalid_message"] += 1
             return
         T = T_world_child @ T_child_camera
@@ -156,7 +156,7 @@ class BagSource:
     def _first(self, topic: Topic) -> Any:
         """The first message that can be decoded; None if there is none."""
         for raw in self._bag.messages([topic.name]):
-            with contextlib.suppress(Exception):  # whatever rosbags raises on a broken message
+            with contextlib.suppress(Exception):  # rosbags raises errors of many types
                 return decode(raw.data, raw.msgtype)
         return None
 

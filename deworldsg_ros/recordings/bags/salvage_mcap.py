@@ -69,7 +69,7 @@ def salvage_mcap(path: Path, note: Callable[[str], None]) -> Iterator[Message]:
         for record in _records(file, path, note):
             try:
                 yield from _messages(record, tables)
-            except Exception as error:  # struct, unicode, or whatever a decompressor raises
+            except Exception as error:  # of struct, unicode or a decompressor
                 note(
                     f"{path.name}: the record at byte {record.start} is damaged and lost ({error})"
                 )

@@ -49,7 +49,7 @@ class _Element:
 def read_vertices(path: Path, names: Sequence[str]) -> Columns:
     """Scalar properties of the element ``vertex``, (n,) each, in the type that the file declares.
 
-    Memory stays in proportion to the size of the file, whatever its header declares.
+    Memory stays in proportion to the size of the file, even if its header declares more.
 
     Raises:
         RecordingError: for a file that cannot be read, is no PLY, ends early, or whose vertices

@@ -105,7 +105,7 @@ class SequenceDataset(FrameFiles):
             path = self.file(first, RENDERED_DEPTH)
             if not path.exists():
                 raise RecordingError(
-                    f"{path} is missing: rendered depth was asked for, but this scan has only "
+                    f"{path} is missing: --depth-source is rendered, but this scan has only "
                     "depth of the sensor. Use --depth-source sensor"
                 )
             return RENDERED_DEPTH

@@ -29,7 +29,6 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
 
 INTRINSICS_NAME = "camera-intrinsics.txt"
-SENSOR_RATE_HZ = 30.0
 # Value of an invalid pixel in a raw depth image.
 NO_DEPTH = 65535
 
@@ -66,7 +65,7 @@ class SevenScenes(FrameFiles):
         self._depth_camera = Intrinsics(*DEPTH_FX_FY_CX_CY, *size)
         # The file numbers count frames of the sensor, and some copies keep every N-th frame only.
         numbers = range(len(colors)) if options.rate_hz else colors
-        rate_hz = options.rate_hz or SENSOR_RATE_HZ
+        rate_hz = options.rate_hz or 30.0  # of the Kinect
         stamps_ns = [FIRST_STAMP_NS + round(number * 1e9 / rate_hz) for number in numbers]
         calibration = INTRINSICS_NAME if self.registered else "(built-in calibration)"
         self._set_frames(colors, stamps_ns, calibration)

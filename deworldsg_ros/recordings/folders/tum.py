@@ -33,7 +33,6 @@ from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import UsedTopic
 from deworldsg_ros.scene.camera import Intrinsics
 
-DEPTH_UNITS_PER_M = 5000.0
 # Factory-calibrated colour cameras, from the data set's documentation.
 INTRINSICS = {
     1: (517.3, 516.5, 318.6, 255.3),
@@ -117,8 +116,8 @@ class TumRgbd(Dataset):
         units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
         if units.dtype != np.uint16 or units.ndim != 2:
             raise RecordingError(f"{path} is {units.dtype}: expected 16-bit grey")
-        # Rounding to millimetres is far below the noise of the sensor.
-        depth_mm = np.rint(units * (1000.0 / DEPTH_UNITS_PER_M)).astype(np.uint16)
+        # 5000 units are one metre. Rounding to millimetres is far below the noise of the sensor.
+        depth_mm = np.rint(units * (1000.0 / 5000.0)).astype(np.uint16)
         return [ros.compressed_depth(entry.stamp_ns, CAMERA_FRAME, encode_png(depth_mm))]
 
     def _known_intrinsics(self) -> tuple[float, float, float, float]:
