@@ -172,7 +172,7 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
     assert refused.value.reason == "vocabulary_mismatch"
 
 
-def test_only_confirmed_nodes_are_published_unless_asked_for() -> None:
+def test_tentative_nodes_are_published_only_on_request() -> None:
     merging = MergingConfig(confirm_observations=2)
     pipeline = Pipeline(Config(merging=merging), Scripted())
     asked = Pipeline(

@@ -63,8 +63,8 @@ class Window:
         self._newest_ns = dict.fromkeys(needs, -1)
         self._undecided: deque[int] = deque()
         self._in_flight: deque[int] = deque()
-        # Refused frames before which no result has come yet. Negative: a later result has come, and
-        # the refusal of these frames is not reported yet.
+        # Refused frames that no later result has ended yet. Negative: a result has ended frames
+        # whose refusal is not reported yet.
         self._excused = 0
         self.results = 0
         self.given_up = 0

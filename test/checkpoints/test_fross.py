@@ -241,7 +241,7 @@ def test_parameters_are_where_they_belong(imported):
     assert torch.equal(torch.cat(there).sort().values, torch.cat(wanted).sort().values)
 
 
-def test_what_was_imported_finds_objects_and_relations(imported):
+def test_an_imported_checkpoint_finds_objects_and_relations(imported):
     _, out, _ = imported
     config = settings(detector_path=str(out), predicate_set="3dssg")
     detector = RtDetrDetector(config)

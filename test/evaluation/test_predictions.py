@@ -160,7 +160,7 @@ def test_open_format(tmp_path: Path) -> None:
         ({"class_index": 0, "points": []}, {"subject": -1, "object": 0}, "expected 0 or more"),
     ],
 )
-def test_open_format_errors_state_what_was_expected(
+def test_open_format_errors_state_the_expected_value(
     tmp_path: Path, node: Any, edge: Any, expected: str
 ) -> None:
     edges = [{**edge, "predicate_probabilities": [1.0, 0.0]}] if edge else []

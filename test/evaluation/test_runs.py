@@ -191,7 +191,7 @@ def test_command_on_predictions(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "confusion.png").exists()
 
 
-def test_command_states_what_was_expected(tmp_path: Path) -> None:
+def test_command_errors_state_the_expected_value(tmp_path: Path) -> None:
     root = write_room(tmp_path / "data_set")
     run = ("run", root, "--out", tmp_path / "out")
     score = ("score", root, "--layout", "replica")

@@ -122,7 +122,7 @@ def test_median_hidden_in_one_crowded_bucket():
     assert dominant_layer(depths, 0.03, 10.0, 0.02) == kept_layer(depths)
 
 
-def test_of_two_clusters_with_tied_means_the_nearer_is_kept():
+def test_the_nearer_of_two_clusters_with_tied_means_is_kept():
     depths = np.array([1.0] * 8 + [2.0] * 8, np.float32)
     assert dominant_layer(depths, 0.03, 10.0, 0.02) == (1.0, 1.0)
     assert kept_layer(depths) == (1.0, 1.0)

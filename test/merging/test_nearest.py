@@ -38,7 +38,7 @@ def search(mean, covariance, classes, nodes, delta_g=0.7, delta_c=0.8, skipped_r
 
 
 @given(seeds, st.sampled_from([0.05, 0.3, 0.7, 0.95]), st.sampled_from([0.2, 0.8, 1.0]))
-def test_the_kernel_finds_what_linalg_finds(seed: int, delta_g: float, delta_c: float) -> None:
+def test_the_kernel_equals_linalg(seed: int, delta_g: float, delta_c: float) -> None:
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 60))
     spread_m = 10 ** rng.uniform(-3, 1)

@@ -72,7 +72,7 @@ def test_newest_suitable_python_is_taken_when_python3_is_not(checkout: Path, pyt
     assert bash(checkout, "find_python", PATH=str(pythons)).stdout == f"{pythons}/python3.11\n"
 
 
-def test_refusal_names_what_was_found_and_what_is_wanted(checkout: Path, pythons: Path) -> None:
+def test_refusal_states_the_found_and_the_expected_value(checkout: Path, pythons: Path) -> None:
     fake_python(pythons, "python3", "3.8")
     fake_python(pythons, "python3.12", "3.12", has_venv=False)
     done = bash(checkout, "find_python", PATH=str(pythons))

@@ -133,7 +133,7 @@ def test_ament_index_finds_the_package(sourced: Install) -> None:
     assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
 
 
-def test_share_has_what_the_checkout_has(sourced: Install, root_dir: Path) -> None:
+def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_dir: Path) -> None:
     share = Path(get_package_share_directory(PACKAGE))
     assert (share / "package.xml").is_file()
     for folder in SHARED:

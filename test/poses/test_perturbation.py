@@ -58,7 +58,7 @@ def test_perturbed_poses_are_rigid_and_reproducible(
         np.testing.assert_array_equal(T, same)
 
 
-def test_jitter_is_of_the_size_asked_for_and_does_not_add_up() -> None:
+def test_jitter_has_the_configured_size_and_does_not_accumulate() -> None:
     poses = line()
     worse = apply(PoseNoise(jitter_m=0.02, jitter_deg=1.0), poses)
     errors = [invert_pose(T) @ W for T, W in zip(poses, worse)]

@@ -38,7 +38,7 @@ def test_an_empty_window_is_not_full_and_zero_is_no_limit():
     assert unlimited.in_flight == 1000
 
 
-def test_an_answer_covers_the_frames_before_it():
+def test_a_result_ends_the_frames_before_it():
     window = Window(3)
     for stamp_ns in (10, 20, 30):
         window.publish(stamp_ns)
@@ -83,7 +83,7 @@ def test_a_frame_is_in_flight_once_every_stream_passed_its_stamp():
     assert window.in_flight == 2
 
 
-def test_undecided_frames_are_bounded_and_an_answer_covers_them():
+def test_undecided_frames_are_bounded_and_a_result_ends_them():
     window = Window(4, NEEDS)
     for stamp_ns in range(1, MAX_UNDECIDED + 3):
         window.publish(stamp_ns)
@@ -93,7 +93,7 @@ def test_undecided_frames_are_bounded_and_an_answer_covers_them():
     assert window.in_flight == 2
 
 
-def test_a_refusal_before_the_answer_to_an_earlier_frame_counts():
+def test_a_refusal_before_the_result_of_an_earlier_frame_counts():
     window = Window(4)
     for stamp_ns in range(1, 7):
         window.publish(stamp_ns)
@@ -104,7 +104,7 @@ def test_a_refusal_before_the_answer_to_an_earlier_frame_counts():
     assert window.in_flight == 1
 
 
-def test_a_refusal_after_the_answer_to_a_later_frame_is_not_counted_twice():
+def test_a_refusal_after_the_result_of_a_later_frame_is_not_counted_twice():
     window = Window(4)
     for stamp_ns in range(1, 5):
         window.publish(stamp_ns)

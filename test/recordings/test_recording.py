@@ -51,7 +51,7 @@ def assert_whole(frames, count=COUNT):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("compressed", [True, False])
-def test_frames_are_what_was_recorded(tmp_path, storage, compressed):
+def test_frames_equal_the_recorded_messages(tmp_path, storage, compressed):
     bag = write_bag(tmp_path / "bag", camera_items(COUNT, compressed=compressed), storage)
     frames, recording = frames_of(bag)
     assert_whole(frames)

@@ -200,7 +200,7 @@ def test_order_class_pairs_without_a_prior_then_uncertainty_then_observations():
     assert order == [(5, 6), (4, 5), (1, 3), (2, 3), (1, 2)]
 
 
-def test_of_two_equally_uncertain_pairs_the_more_observed_one_is_first():
+def test_the_more_observed_of_two_equally_uncertain_pairs_is_first():
     graph = Graph(4)
     graph.entropies = {(1, 2): 0.0, (2, 3): 0.0, (2, 4): 0.0, (3, 4): 0.0, (1, 4): 1.2, (1, 3): 1.2}
     graph.observations.update({1: 9, 3: 8})

@@ -237,7 +237,7 @@ def test_no_edges():
     assert after.shape == (0, WIDTH)
 
 
-def test_the_gate_looks_at_each_direction_for_itself() -> None:
+def test_the_entropy_gate_treats_each_direction_separately() -> None:
     """Two certain directions that contradict are no call for the prior (Eq. 10)."""
     logits = np.array([logits_of(on=40), logits_of(on=40)])
     prior = np.full((2, WIDTH), 1 / WIDTH)

@@ -46,7 +46,7 @@ def running(logits=UNSURE):
 
 
 @pytest.mark.parametrize("logits", [SURE, UNSURE])
-def test_the_published_graph_answers_like_the_live_one(logits):
+def test_the_published_graph_gives_the_results_of_the_live_one(logits):
     published, stamps_ns = PublishedGraph(), []
     for builder, update, _, stamp_ns in running(logits):
         stamps_ns.append(stamp_ns)

@@ -117,7 +117,7 @@ def test_resampling_to_the_same_camera_is_the_identity_and_outside_is_zero() -> 
 def test_depth_source_of_3rscan(tmp_path: Path) -> None:
     folder = write_sequence(tmp_path / "data" / "a", 1)
     assert open_source(folder).topics["depth"].name == "frame-*.depth.pgm"  # type: ignore[index]
-    with pytest.raises(RecordingError, match="rendered depth was asked for"):
+    with pytest.raises(RecordingError, match="--depth-source is rendered"):
         open_source(folder, options=DatasetOptions(depth_source="rendered"))
     rendered = np.full((HEIGHT, WIDTH), 1500, np.uint16)
     cv2.imwrite(str(folder / "sequence" / "frame-000000.rendered.depth.png"), rendered)

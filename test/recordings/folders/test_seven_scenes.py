@@ -182,7 +182,7 @@ def test_the_real_kitchen_is_read_whole(shared_dir):
     assert 0.4 < np.median(frames[0].depth_m[frames[0].depth_m > 0]) < 4
 
 
-def test_support_images_are_what_the_tests_assume():
+def test_support_images_have_the_properties_that_the_tests_assume():
     assert rgb_pixels(0).shape == (HEIGHT, WIDTH, 3)
     decoded = cv2.imdecode(np.frombuffer(encoded(depth_mm(3)), np.uint8), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(decoded, depth_mm(3))

@@ -63,7 +63,7 @@ def test_resizing_equals_the_plain_filter(interpolation, size):
     np.testing.assert_allclose(resized.numpy(), reference(clip, geometry), atol=2.5)
 
 
-def test_of_a_very_long_crop_the_middle_is_taken():
+def test_the_middle_of_a_very_long_crop_is_used():
     clip = np.zeros((1, 4, 400, 3), np.uint8)
     clip[:, :, 198:202] = 200
     resized = resize_and_crop(clip, ClipGeometry(36, 32, "bilinear"))
