@@ -22,12 +22,12 @@ class DepthNoise:
     sigma_base_m: float = 0.0008
     sigma_quadratic: float = 0.0013
     correlation_px: float = 3.2
-    white_fraction: float = 0.0
+    white_share: float = 0.0
     baseline_m: float = 0.075
     disparity_step_px: float = 0.125
     edge_jitter_px: float = 0.4
-    flying_fraction: float = 0.22
-    edge_hole_fraction: float = 0.22
+    flying_share: float = 0.22
+    edge_hole_share: float = 0.22
     min_cos_incidence: float = 0.20
     min_depth_m: float = 0.40
     max_depth_m: float = 4.6
@@ -59,15 +59,15 @@ def sense_depth(
     edge = (far - near) > np.maximum(0.03, 0.03 * near)
     draw = _patches(rng, depth.shape, 1.4)
     fraction = rng.random(depth.shape) ** 1.5
-    flying = edge & (draw < noise.flying_fraction)
+    flying = edge & (draw < noise.flying_share)
     z = np.where(flying, near + fraction * (far - near), sampled)
-    holes = edge & (draw > 1 - noise.edge_hole_fraction)
+    holes = edge & (draw > 1 - noise.edge_hole_share)
 
     grain = cv2.GaussianBlur(
         rng.normal(size=depth.shape).astype(np.float32), (0, 0), noise.correlation_px
     )
-    grain = grain / grain.std() * np.sqrt(1 - noise.white_fraction**2)
-    grain += noise.white_fraction * rng.normal(size=depth.shape)
+    grain = grain / grain.std() * np.sqrt(1 - noise.white_share**2)
+    grain += noise.white_share * rng.normal(size=depth.shape)
     sigma = noise.sigma_base_m + noise.sigma_quadratic * np.maximum(z - 0.4, 0) ** 2
     z = z + sigma * grain
     with np.errstate(divide="ignore"):
