@@ -67,7 +67,7 @@ class Broken(FakeWorldModel):
 
 @pytest.mark.timeout(400)
 def test_a_failing_world_model_is_in_the_report_and_the_run_continues(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "build_world_model", lambda config: Broken(16))
+    monkeypatch.setattr(pipeline, "build_world_model", lambda config, device: Broken(16))
     options = ["--max-frames", "6", "--set", "relations.max_clips_per_s=0"]
     result = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
     assert result.exit_code == 0, result.output

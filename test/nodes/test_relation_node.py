@@ -166,7 +166,7 @@ def test_predicates_of_an_imported_checkpoint_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The relation node runs no perception, and may run where its checkpoint is not."""
-    monkeypatch.setattr(relation_node, "build_world_model", lambda config: Bound(4))
+    monkeypatch.setattr(relation_node, "build_world_model", lambda config, device: Bound(4))
     chosen = {"perception__predicate_set": "checkpoint"}
     for predicates in (("on", "under"), ("on", "near"), ()):
         write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
