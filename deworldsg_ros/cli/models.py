@@ -68,8 +68,8 @@ def _import(
         from deworldsg_ros.checkpoints.fross import Names, import_checkpoint
     except ImportError as error:
         raise ConfigurationError(
-            f"importing a checkpoint needs torch, transformers and safetensors ({error}): pip "
-            "install 'deworldsg_ros[models]'"
+            f"importing a checkpoint needs torch, transformers and safetensors ({error}): "
+            "pip install torch transformers safetensors"
         ) from error
     names = None
     if names_file is not None:

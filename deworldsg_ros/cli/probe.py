@@ -273,6 +273,6 @@ def _needing_torch() -> Iterator[None]:
         yield
     except ImportError as error:
         raise ConfigurationError(
-            f"probes need torch, transformers and safetensors ({error}): pip install "
-            "'deworldsg_ros[models]'"
+            f"probes need torch, transformers and safetensors ({error}): "
+            "pip install torch transformers safetensors"
         ) from error

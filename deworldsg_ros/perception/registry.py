@@ -113,7 +113,7 @@ def _torch(parameter: str, name: str, config: PerceptionConfig) -> Iterator[None
     except ImportError as error:
         raise ConfigurationError(
             f"{parameter} is '{name}', which needs torch, transformers and safetensors ({error}): "
-            "pip install 'deworldsg_ros[models]'"
+            "pip install torch transformers safetensors"
         ) from error
     if config.threads:
         import torch

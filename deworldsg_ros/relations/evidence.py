@@ -22,9 +22,9 @@ OUTLIER_RATE = 0.1
 
 # If the prior completed both directions of a pair, one is published: the second one only if its
 # best predicate is more probable by this margin. Predictions for the clips of one class pair have a
-# standard deviation of about 0.2, of which a third remains in the fused distribution at the paper's
-# weight. With a smaller margin than a few clips can resolve, an edge would change its direction
-# again and again while predictions arrive.
+# standard deviation of about 0.2. At the paper's weight, a third of it remains in the fused
+# distribution. With a smaller margin than a few clips can resolve, an edge would change its
+# direction again and again while predictions arrive.
 DIRECTION_MARGIN = 0.05
 
 

@@ -118,7 +118,7 @@ def build_world_model(config: RelationsConfig, device: str = "auto") -> WorldMod
             raise
         raise ConfigurationError(
             f"world model '{config.world_model}' needs {' and '.join(MODEL_LIBRARIES)}: "
-            f"pip install 'deworldsg_ros[models]' ({error})"
+            f"pip install torch transformers safetensors ({error})"
         ) from error
     model: WorldModel | None = module.build(config, device)
     return model

@@ -153,7 +153,7 @@ def test_a_scheduler_without_dask_is_refused_with_the_package_to_install(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(EvaluationError, match=r"pip install 'deworldsg_ros\[cluster\]'"):
+    with pytest.raises(EvaluationError, match="pip install distributed"):
         list(run_jobs([job(root, tmp_path)], scheduler="tcp://nowhere:1"))
 
 

@@ -79,7 +79,9 @@ def test_without_torch_the_error_names_the_package_to_install(field, name, monke
         return really(module, *arguments, **options)
 
     monkeypatch.setattr(builtins, "__import__", without_torch)
-    with pytest.raises(ConfigurationError, match=f"'{name}', which needs torch.*\\[models\\]"):
+    with pytest.raises(
+        ConfigurationError, match=f"'{name}', which needs torch.*: pip install torch"
+    ):
         build_perception(PerceptionConfig(**{field: name}))
 
 

@@ -91,7 +91,7 @@ def _over_cluster(jobs: Sequence[Job], address: str) -> Iterator[JobResult]:
         from distributed import as_completed as completed
     except ImportError as error:
         raise EvaluationError(
-            f"--scheduler needs dask.distributed: pip install 'deworldsg_ros[cluster]' ({error})"
+            f"--scheduler needs dask.distributed: pip install distributed ({error})"
         ) from error
     try:
         client = Client(address, timeout="10s")
