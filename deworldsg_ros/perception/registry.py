@@ -86,12 +86,15 @@ RELATION_HEADS: dict[str, Callable[[PerceptionConfig, Detector], RelationHead]] 
 }
 
 
-def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Perception:
+def build_perception(
+    config: PerceptionConfig, *, world_up: str = "auto", detector: Detector | None = None
+) -> Perception:
     """Perception with the backends that `config` names.
 
     Args:
         config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y.
+        detector: replaces the configured detector.
 
     Raises:
         ConfigurationError: an unknown backend or axis, or a checkpoint that cannot be used.
@@ -100,7 +103,7 @@ def build_perception(config: PerceptionConfig, *, world_up: str = "auto") -> Per
     make_detector = _choose("perception.detector", config.detector, DETECTORS)
     make_segmenter = _choose("perception.segmenter", config.segmenter, SEGMENTERS)
     make_head = _choose("perception.relation_head", config.relation_head, RELATION_HEADS)
-    detector = make_detector(config)
+    detector = make_detector(config) if detector is None else detector
     head = make_head(config, detector)
     return Perception(detector, make_segmenter(config), head, config, world_up=world_up)
 

@@ -7,11 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.sequences import BLOCKS, ROWS, instance_image, write_room
+from support.sequences import (
+    BLOCKS,
+    HEIGHT,
+    ROWS,
+    WIDTH,
+    instance_image,
+    write_pgm,
+    write_room,
+)
 
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, PerceptionConfig
 from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.front_ends.assembly import logits, spread, visible_box
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.folders.annotations import Annotations
@@ -19,11 +27,11 @@ from deworldsg_ros.recordings.folders.sequence import SequenceDataset
 from deworldsg_ros.recordings.recording import open_recording
 
 
-def perceived(root: Path, choice: FrontEndChoice) -> list[Perceived]:
+def perceived(root: Path, choice: FrontEndChoice, config: Config = Config()) -> list[Perceived]:
     recording = open_recording(root / "data" / "room_0")
     assert isinstance(recording.source, SequenceDataset)
     annotations = Annotations(root, "replica")
-    front_end = build_front_end(choice, annotations, "room_0", recording.source, Config())
+    front_end = build_front_end(choice, annotations, "room_0", recording.source, config)
     return [front_end.perceive(frame) for frame in recording.frames()]
 
 
@@ -132,3 +140,66 @@ def test_small_objects_are_not_detected() -> None:
 def test_bad_choices_are_refused(faults: dict[str, object]) -> None:
     with pytest.raises(EvaluationError, match="expected"):
         FrontEndChoice(**faults)  # type: ignore[arg-type]
+
+
+def test_boxes_are_true_and_masks_are_those_of_the_segmenter(tmp_path: Path) -> None:
+    root = write_room(tmp_path)
+    first = perceived(root, FrontEndChoice("boxes", jitter_px=0))[0]
+    graph = first.frame_graph
+    assert graph.vocabulary.classes == ("book", "chair", "table")
+    assert graph.class_probabilities.argmax(axis=1).tolist() == [1, 2, 0]
+    np.testing.assert_allclose(graph.class_probabilities.max(axis=1), 0.9)
+    np.testing.assert_allclose(graph.scores, 0.9)
+    for row, (object_id, _, left, right) in enumerate(BLOCKS):
+        assert graph.boxes_xyxy[row].tolist() == [left, ROWS[0], right - 1, ROWS[1] - 1]
+        mask, true = first.instances == row + 1, instance_image() == object_id
+        # The depth separates block and background, but a segmenter is not exact.
+        assert (mask & true).sum() / (mask | true).sum() > 0.6
+    # The images, not the annotation, decide about masks.
+    for path in (root / "data/room_0/sequence").glob("*.depth.pgm"):
+        write_pgm(path, np.zeros((HEIGHT, WIDTH), np.uint16))
+    blind = perceived(root, FrontEndChoice("boxes", jitter_px=0))[0]
+    assert len(blind.frame_graph) == 3
+    assert not (blind.instances == first.instances).all()
+
+
+def test_relations_of_boxes_are_those_of_the_relation_head(tmp_path: Path) -> None:
+    root = write_room(tmp_path)
+    graph = perceived(root, FrontEndChoice("boxes"))[0].frame_graph
+    # The annotated "book on table" does not hold in the images: the blocks float side by side.
+    best = graph.relations.logits.argmax(axis=1)
+    names = {graph.vocabulary.predicates[index] for index in best}
+    assert names
+    assert "on" not in names
+    with pytest.raises(EvaluationError, match="set perception.relation_head to geometric"):
+        perceived(
+            root, FrontEndChoice("boxes"), Config(perception=PerceptionConfig(relation_head="egtr"))
+        )
+
+
+def test_boxes_are_jittered_by_two_pixels_by_default(tmp_path: Path) -> None:
+    root = write_room(tmp_path, frames=30)
+    choice = FrontEndChoice("boxes")
+    assert choice.describe() == "boxes jitter 2"
+    boxes = [item.frame_graph.boxes_xyxy for item in perceived(root, choice)]
+    again = [item.frame_graph.boxes_xyxy for item in perceived(root, choice)]
+    assert all((one == two).all() for one, two in zip(boxes, again))
+    true = np.array([[left, ROWS[0], right - 1, ROWS[1] - 1] for _, _, left, right in BLOCKS])
+    errors = np.concatenate([item - true for item in boxes if len(item) == 3])
+    assert abs(errors.mean()) < 0.4
+    assert 1.7 < errors.std() < 2.3
+    other = perceived(root, FrontEndChoice("boxes", seed=1))[0].frame_graph.boxes_xyxy
+    assert not np.array_equal(other, boxes[0])
+
+
+def test_faults_of_boxes(tmp_path: Path) -> None:
+    root = write_room(tmp_path)
+    missed = perceived(root, FrontEndChoice("boxes", miss=1.0))
+    assert all(len(item.frame_graph) == 0 for item in missed)
+    for item in perceived(root, FrontEndChoice("boxes", flip=1.0)):
+        assert (item.frame_graph.class_probabilities.argmax(axis=1) != [1, 2, 0]).all()
+    false = perceived(root, FrontEndChoice("boxes", faults=Faults(false=8)))
+    assert max(len(item.frame_graph) for item in false) > 3
+    for name in ("bleed", "merge", "cut"):
+        with pytest.raises(EvaluationError, match=f"boxes with {name} 0.1: the masks are those"):
+            FrontEndChoice("boxes", faults=Faults(**{name: 0.1}))

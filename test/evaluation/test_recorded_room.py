@@ -71,6 +71,18 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
     assert ns_from_stamp(graph.stamp) == 1_750_000_000_000_000_000 + 9 * 800_000_000
 
 
+def test_true_boxes_of_a_recording_get_the_masks_of_the_segmenter(tmp_path: Path) -> None:
+    result = evaluate(
+        *("--front-end", "boxes", "--every", 25, "--max-frames", 3),
+        *("--out", tmp_path, "--json", tmp_path / "n.json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads((tmp_path / "n.json").read_text())
+    assert values["front_end"] == "boxes jitter 2"
+    assert values["measures"]["found"] >= 4
+    assert values["measures"]["wrong_class"] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -78,6 +90,7 @@ def test_command_on_a_recording(tmp_path: Path) -> None:
         (("--front-end", "ground-truth", "--poses", "slam"), "no frame-NNNNNN.slam.pose.txt"),
         (("--front-end", "ground-truth", "--faults", "cut=2"), "fault cut=2: expected 0 to 1"),
         (("--front-end", "backend", "--faults", "cut=0.1"), "backend with cut 0.1: faults need"),
+        (("--front-end", "boxes", "--faults", "cut=0.1"), "boxes with cut 0.1: the masks are"),
         (
             ("--front-end", "ground-truth", "--poses", "odometry", "--pose-noise", "jitter_m=1"),
             "only --poses perturbed has noise",

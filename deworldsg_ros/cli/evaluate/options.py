@@ -57,7 +57,11 @@ class DetectionOptions:
 
     front_end: Annotated[
         str,
-        typer.Option("--front-end", help="source of detections: backend, recorded or ground-truth"),
+        typer.Option(
+            "--front-end",
+            help="source of detections: backend, boxes (true boxes, own masks and relations), "
+            "recorded or ground-truth",
+        ),
     ] = "backend"
     flip: Annotated[
         float,
@@ -65,21 +69,22 @@ class DetectionOptions:
     ] = 0.0
     miss: Annotated[
         float,
-        typer.Option("--miss", help="recorded, ground-truth: fraction of detections to drop"),
+        typer.Option("--miss", help="not backend: fraction of detections to drop"),
     ] = 0.0
     jitter_px: Annotated[
-        float,
+        Optional[float],
         typer.Option(
             "--jitter",
-            help="recorded, ground-truth: standard deviation of each box edge, pixels",
+            help="not backend: standard deviation of each box edge, pixels; default: 2 of boxes, "
+            "else 0",
         ),
-    ] = 0.0
+    ] = None
     faults: Annotated[
         str,
         typer.Option(
             "--faults",
             metavar="NAME=NUMBER,…",
-            help="recorded, ground-truth: faults that persist over frames, e.g. label=0.1,false=1",
+            help="not backend: faults that persist over frames, e.g. label=0.1,false=1",
         ),
     ] = ""
     seed: Annotated[int, typer.Option("--seed", min=0, help="random seed of all faults")] = 0

@@ -1,4 +1,4 @@
-"""Front ends: detections and relations from a backend, a recording, or the ground truth.
+"""Front ends: detections and relations of a backend, true boxes, a recording or ground truth.
 
 Each is a `pipeline.Perceiver`. Methods of lifting and merging are compared on identical detections.
 """
