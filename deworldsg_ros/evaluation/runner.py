@@ -18,6 +18,7 @@ from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.measures.edge_list import EDGES_FILE, write_edge_list
 from deworldsg_ros.evaluation.measures.graph_measures import (
     Measures,
     ReferenceScene,
@@ -120,7 +121,10 @@ class ScanOutcome:
 
 
 def evaluate_scan(task: ScanTask) -> ScanOutcome:
-    """Run one scan and evaluate its graph, which is written to ``out/SCAN/scene_graph.json``.
+    """Run one scan and evaluate its graph.
+
+    The graph is written to ``out/SCAN/scene_graph.json``, and its edges beside the annotation to
+    ``edges.csv`` there.
 
     Raises:
         DeWorldSGError: the scan cannot be read or evaluated.
@@ -170,11 +174,12 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     if not frames:
         raise EvaluationError(f"scan {task.scan}: all frames were refused: {dict(refused)}")
     graph = pipeline.graph()
-    _write(task, graph)
+    measures = measure(translate(graph, annotations), reference)
+    _write(task, graph, measures)
     return ScanOutcome(
         scan=task.scan,
         result=score(graph),
-        measures=measure(translate(graph, annotations), reference),
+        measures=measures,
         frames=frames,
         nodes=len(graph.nodes),
         edges=len(graph.edges),
@@ -223,11 +228,12 @@ def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:
     )
 
 
-def _write(task: ScanTask, graph: wire.SceneGraphMessage) -> None:
+def _write(task: ScanTask, graph: wire.SceneGraphMessage, measures: Measures) -> None:
     folder = task.out / task.scan
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CONFIG_FILE).write_text(to_yaml(task.config), encoding="utf-8")
         write_graph(folder, graph)
+        write_edge_list(folder / EDGES_FILE, measures.edges, measures.relations)
     except OSError as error:
         raise EvaluationError(f"--out {task.out}: cannot be written ({error.strerror})") from error

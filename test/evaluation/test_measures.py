@@ -11,11 +11,8 @@ from support.evaluation import write_dataset
 from support.sequences import write_ground_truth
 
 from deworldsg_ros.evaluation.measures.graph_measures import (
-    Calibrated,
-    EdgeView,
     Measures,
     NodeView,
-    calibration_error,
     measure_prediction,
     measure_views,
     pool,
@@ -75,32 +72,6 @@ def test_nodes() -> None:
     assert ("table", "book") in measured.confusion
 
 
-def test_edges() -> None:
-    nodes = [node(1, "chair", 0.5), node(2, "table", 2.5), node(3, "chair", 0.6), node(4, "cup", 9)]
-    edges = [
-        EdgeView(1, 2, "near", 0.9),
-        EdgeView(3, 2, "near", 0.7),  # of a duplicate: right, and states nothing new
-        EdgeView(2, 1, "near", 0.6),  # the other direction is "under"
-        EdgeView(1, 3, "near", 0.5),  # between two nodes of one object
-        EdgeView(1, 4, "near", 0.5),  # to a stray node
-    ]
-    measured = measure_views(nodes, edges, SCENE)
-    assert (measured.edges, measured.edges_between, measured.edges_right) == (5, 3, 2)
-    assert (measured.relations, measured.relations_found) == (2, 1)
-    numbers = measured.numbers()
-    assert numbers["edge_precision"] == 0.4
-    assert numbers["edge_calibration_error"] == pytest.approx((0.1 + 0.3 + 0.6) / 3)
-
-
-def test_calibration_error() -> None:
-    assert math.isnan(calibration_error([]))
-    assert calibration_error([Calibrated(1.0, True), Calibrated(0.0, False)]) == 0
-    # Within a bin, over and under add up to the bin's gap.
-    bin_ = [Calibrated(0.75, True)] * 3 + [Calibrated(0.75, False)]
-    assert calibration_error(bin_) == pytest.approx(0)
-    assert calibration_error([Calibrated(0.9, False)]) == pytest.approx(0.9)
-
-
 def test_pooling_adds() -> None:
     one = measure_views([node(1, "chair", 0.5)], [], SCENE)
     both = pool([one, one])
@@ -120,6 +91,9 @@ def test_a_prediction_is_measured_by_its_points() -> None:
 
     measured = measure_prediction(prediction, Vocabulary(class_names, ("near", "on")), SCENE)
     assert (measured.found, measured.matched, measured.stray) == (1, 1, 2)
+    # On a tie the last predicate counts.
+    assert [(edge.predicate, edge.probability) for edge in measured.edges] == [("on", 0.5)]
+    assert not measured.edges[0].matched
 
 
 def test_reference_from_surface_points(tmp_path: Path) -> None:

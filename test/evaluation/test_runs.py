@@ -147,8 +147,17 @@ def test_command_on_a_data_set(tmp_path: Path) -> None:
     assert values["measures"]["node_precision"] == 1.0
     assert values["scans"][0]["frames"] == 3
     assert len(values["scans"][0]["over_time"]) == 3
-    for name in ("results.csv", "classes.csv", "results.tex", "confusion.png", "predicates.png"):
+    tables = ("results.csv", "classes.csv", "edge_scores.csv", "results.tex")
+    for name in (*tables, "confusion.png", "predicates.png", "reliability.png"):
         assert (out / name).stat().st_size > 0
+    # Both annotated relations are recorded in every frame.
+    near, on = (values["measures"]["edges_by_predicate"][name] for name in ("near", "on"))
+    assert (near["relations"], near["relations_found"], near["edge_precision"]) == (1, 1, 1.0)
+    assert (on["relations"], on["relations_found"], on["edge_precision"]) == (1, 1, 1.0)
+    assert values["measures"]["complete_edge_recall"] == 1.0
+    assert "edges by predicate" in text
+    rows = (out / "room_0" / "edges.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows] == ["verdict", "right", "right"]
     assert (out / "recall_over_time.png").read_bytes().startswith(b"\x89PNG")
     assert (out / "results.tex").read_text().endswith("& 100.0 & 100.0 \\\\\n")
     header, first, _ = (out / "results.csv").read_text().splitlines()
@@ -201,7 +210,7 @@ def test_command_errors_state_the_expected_value(tmp_path: Path) -> None:
         ((*score, "--predictions", root / "none.json"), "cannot be read"),
         ((*run, "--layout", "scannet", "--front-end", "recorded"), "replica, 3rscan"),
         ((*run, "--layout", "3rscan", "--front-end", "recorded"), "is missing"),
-        ((*run, "--layout", "replica", "--front-end", "video"), "backend, recorded"),
+        ((*run, "--layout", "replica", "--front-end", "video"), "backend, boxes, recorded"),
         ((*run, "--layout", "replica", "--split", "train"), "has no scan"),
         (
             (*run, "--layout", "replica", "--poses", "slam", "--poses", "odometry"),

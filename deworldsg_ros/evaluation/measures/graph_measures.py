@@ -9,11 +9,23 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from deworldsg_ros.evaluation.measures.calibration import Calibrated, calibration_error
+from deworldsg_ros.evaluation.measures.edge_measures import (
+    ALL,
+    COMPLETE,
+    EdgeEnd,
+    EdgeScores,
+    EdgeView,
+    JudgedEdge,
+    judge_edges,
+    judge_relations,
+    scores_by_predicate,
+)
 from deworldsg_ros.evaluation.measures.reference import ReferenceScene, read_reference
 from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
@@ -28,7 +40,6 @@ BOX_MARGIN_M = 0.05
 # The extent of a node lies between these quantiles of its surface points: single outliers in depth
 # do not count.
 EXTENT_QUANTILES = (0.02, 0.98)
-CALIBRATION_BINS = 10
 
 
 class NodeView(NamedTuple):
@@ -40,22 +51,7 @@ class NodeView(NamedTuple):
     mean_m: Float64
     points_m: Float64
     weight: float
-
-
-class EdgeView(NamedTuple):
-    """An edge in the form for the measures: node ids, best predicate and its probability."""
-
-    subject: int
-    object: int
-    predicate: str
-    probability: float
-
-
-class Calibrated(NamedTuple):
-    """A predicted probability and whether the prediction is right."""
-
-    probability: float
-    right: bool
+    observations: int = 0
 
 
 @dataclass(frozen=True)
@@ -69,17 +65,14 @@ class Measures:
         matched: nodes whose mean is in the box of an object of their class.
         wrong_class: nodes whose mean is only in boxes of objects of other classes.
         stray: nodes whose mean is in no box.
-        edges: of the graph.
-        edges_between: edges whose ends are matched to two objects.
-        edges_right: of those, the ones whose best predicate is annotated.
-        relations: annotated relations between objects that can be detected.
-        relations_found: of those, the ones that a right edge states.
+        edges: of the graph, beside the annotation.
+        relations: annotated relations between objects that can be detected, each with the edge that
+            states it best.
         best_errors_m, main_errors_m: distance of node mean and visible centroid, metres, of the
             nearest and of the main node of each object found.
         extent_errors_m: absolute difference of extents, mean over the axes, of main nodes.
         box_ious: intersection over union of boxes, of main nodes.
-        edge_beliefs, node_beliefs: probability of the best predicate of edges between objects, and
-            of the best class of nodes in a box; with whether it is right.
+        node_beliefs: probability of the best class of nodes in a box, and whether it is right.
         confusion: (annotated class, predicted class) of nodes in a box.
     """
 
@@ -89,16 +82,12 @@ class Measures:
     matched: int = 0
     wrong_class: int = 0
     stray: int = 0
-    edges: int = 0
-    edges_between: int = 0
-    edges_right: int = 0
-    relations: int = 0
-    relations_found: int = 0
+    edges: list[JudgedEdge] = field(default_factory=list)
+    relations: list[JudgedEdge] = field(default_factory=list)
     best_errors_m: list[float] = field(default_factory=list)
     main_errors_m: list[float] = field(default_factory=list)
     extent_errors_m: list[float] = field(default_factory=list)
     box_ious: list[float] = field(default_factory=list)
-    edge_beliefs: list[Calibrated] = field(default_factory=list)
     node_beliefs: list[Calibrated] = field(default_factory=list)
     confusion: list[tuple[str, str]] = field(default_factory=list)
 
@@ -107,9 +96,14 @@ class Measures:
         """Matched nodes beyond the first of each object."""
         return self.matched - self.found
 
+    def edge_scores(self) -> dict[str, EdgeScores]:
+        """Scores of the edges by predicate, then ``complete`` and ``all``."""
+        return scores_by_predicate(self.edges, self.relations)
+
     def numbers(self) -> dict[str, float]:
         """Every measure by name; fractions, metres; NaN where undefined."""
         node_precision = _ratio(self.matched, self.nodes)
+        edge_scores = self.edge_scores()
         return {
             "objects": self.objects,
             "nodes": self.nodes,
@@ -129,13 +123,9 @@ class Measures:
             "extent_error_median_m": _quantile(self.extent_errors_m, 0.5),
             "extent_error_mean_m": _mean(self.extent_errors_m),
             "box_iou_mean": _mean(self.box_ious),
-            "edges": self.edges,
-            "edges_between_objects": self.edges_between,
-            "edges_right": self.edges_right,
-            "edge_precision": _ratio(self.edges_right, self.edges),
-            "edge_precision_between_objects": _ratio(self.edges_right, self.edges_between),
-            "edge_recall": _ratio(self.relations_found, self.relations),
-            "edge_calibration_error": calibration_error(self.edge_beliefs),
+            "edges": len(self.edges),
+            **edge_scores[ALL].numbers(),
+            **{f"complete_{k}": v for k, v in edge_scores[COMPLETE].numbers().items()},
             "node_calibration_error": calibration_error(self.node_beliefs),
         }
 
@@ -151,11 +141,12 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
             np.array(node.surface_points_m, np.float64).reshape(-1, 3),
             # Between nodes with equal numbers of observations, the points decide.
             node.observations + 1e-6 * len(node.surface_points_m),
+            node.observations,
         )
         for node in graph.nodes
     ]
     edges = [
-        EdgeView(edge.subject, edge.object, edge.predicate, edge.probability)
+        EdgeView(edge.subject, edge.object, edge.predicate, edge.probability, edge.observations)
         for edge in graph.edges
     ]
     return measure_views(nodes, edges, reference)
@@ -187,6 +178,7 @@ def measure_views(
 ) -> Measures:
     """Measures of nodes and edges against the objects of a scan."""
     assignment = _assign(nodes, reference)
+    judged, relations = _judge(nodes, edges, assignment, reference)
     return Measures(
         objects=len(reference),
         nodes=len(nodes),
@@ -194,7 +186,8 @@ def measure_views(
         matched=assignment.counts["matched"],
         wrong_class=assignment.counts["wrong_class"],
         stray=assignment.counts["stray"],
-        **_edge_measures(edges, assignment.object_of, reference),
+        edges=judged,
+        relations=relations,
         **_geometric_errors(assignment.nodes_of, reference),
         node_beliefs=assignment.beliefs,
         confusion=assignment.confusion,
@@ -245,11 +238,11 @@ def _geometric_errors(
     best_errors, main_errors, extent_errors, ious = [], [], [], []
     for row, matched in sorted(nodes_of.items()):
         errors = [float(np.linalg.norm(n.mean_m - reference.centroids[row])) for n in matched]
-        main = max(range(len(matched)), key=lambda index: matched[index].weight)
+        main = _main(matched)
         best_errors.append(min(errors))
-        main_errors.append(errors[main])
-        if len(matched[main].points_m):
-            low, high = np.quantile(matched[main].points_m, EXTENT_QUANTILES, axis=0)
+        main_errors.append(float(np.linalg.norm(main.mean_m - reference.centroids[row])))
+        if len(main.points_m):
+            low, high = np.quantile(main.points_m, EXTENT_QUANTILES, axis=0)
             box = reference.boxes_min[row], reference.boxes_max[row]
             extent_errors.append(float(np.abs((high - low) - (box[1] - box[0])).mean()))
             ious.append(_box_iou((low, high), box))
@@ -261,30 +254,20 @@ def _geometric_errors(
     }
 
 
-def _edge_measures(
-    edges: Sequence[EdgeView], object_of: Mapping[int, int], reference: ReferenceScene
-) -> dict[str, Any]:
-    """Counts and beliefs of edges by name of the measure."""
-    judged = [
-        ((object_of[edge.subject], object_of[edge.object], edge.predicate), edge.probability)
-        for edge in edges
-        if edge.subject in object_of
-        and edge.object in object_of
-        and object_of[edge.subject] != object_of[edge.object]
-    ]
-    known = set(reference.ids)
-    expected = {item for item in reference.relations if {item[0], item[1]} <= known}
-    right = [triple for triple, _ in judged if triple in reference.relations]
-    return {
-        "edges": len(edges),
-        "edges_between": len(judged),
-        "edges_right": len(right),
-        "relations": len(expected),
-        "relations_found": len(expected & set(right)),
-        "edge_beliefs": [
-            Calibrated(probability, triple in reference.relations) for triple, probability in judged
-        ],
+def _judge(
+    nodes: Sequence[NodeView],
+    edges: Sequence[EdgeView],
+    assignment: _Assignment,
+    reference: ReferenceScene,
+) -> tuple[list[JudgedEdge], list[JudgedEdge]]:
+    """The edges and the annotated relations, each beside the other."""
+    object_of = assignment.object_of
+    ends = {n.id: EdgeEnd(n.id, n.label, n.observations, object_of.get(n.id)) for n in nodes}
+    main_ends = {
+        reference.ids[row]: ends[_main(matched).id] for row, matched in assignment.nodes_of.items()
     }
+    judged = judge_edges(edges, ends, reference)
+    return judged, judge_relations(judged, main_ends, reference)
 
 
 def pool(measures: Iterable[Measures]) -> Measures:
@@ -292,23 +275,12 @@ def pool(measures: Iterable[Measures]) -> Measures:
     totals = Measures()
     for item in measures:
         totals = Measures(
-            **{name: getattr(totals, name) + getattr(item, name) for name in vars(totals)}
+            **{
+                part.name: getattr(totals, part.name) + getattr(item, part.name)
+                for part in fields(Measures)
+            }
         )
     return totals
-
-
-def calibration_error(beliefs: Sequence[Calibrated]) -> float:
-    """Expected calibration error, Σ |right - probability| by bin / n; NaN without beliefs."""
-    if not beliefs:
-        return math.nan
-    probabilities = np.array([item.probability for item in beliefs])
-    right = np.array([item.right for item in beliefs], np.float64)
-    bins = np.clip((probabilities * CALIBRATION_BINS).astype(int), 0, CALIBRATION_BINS - 1)
-    gaps = [
-        abs(float((right[bins == index] - probabilities[bins == index]).sum()))
-        for index in range(CALIBRATION_BINS)
-    ]
-    return sum(gaps) / len(beliefs)
 
 
 def _objects_around(mean_m: Float64, reference: ReferenceScene) -> list[int]:
@@ -322,6 +294,10 @@ def _objects_around(mean_m: Float64, reference: ReferenceScene) -> list[int]:
 
 def _nearest(mean_m: Float64, rows: Sequence[int], reference: ReferenceScene) -> int:
     return min(rows, key=lambda row: float(np.linalg.norm(mean_m - reference.centroids[row])))
+
+
+def _main(nodes: Sequence[NodeView]) -> NodeView:
+    return max(nodes, key=lambda node: node.weight)
 
 
 def _box_iou(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:

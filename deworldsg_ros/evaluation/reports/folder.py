@@ -5,11 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.measures.calibration import Calibrated
+from deworldsg_ros.evaluation.measures.edge_measures import COMPLETE_PREDICATES, beliefs_of
+from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import pool
 from deworldsg_ros.evaluation.reports import csv_latex, plots
 from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 
 CSV_FILE, CLASSES_FILE, LATEX_FILE = "results.csv", "classes.csv", "results.tex"
+EDGE_SCORES_FILE, RELIABILITY_PLOT = "edge_scores.csv", "reliability.png"
 OBJECTS_PLOT, PREDICATES_PLOT = "objects_by_class.png", "predicates.png"
 CONFUSION_PLOT, TIME_PLOT = "confusion.png", "recall_over_time.png"
 
@@ -28,20 +32,36 @@ def write_folder(out: Path, evaluation: Evaluation) -> list[Path]:
     }
     rows["all"] = result.numbers() | evaluation.pooled.numbers()
     over_time = {scan: points for scan, points in evaluation.over_time.items() if points}
-    names = [CSV_FILE, CLASSES_FILE, LATEX_FILE, OBJECTS_PLOT, PREDICATES_PLOT, CONFUSION_PLOT]
+    names = [CSV_FILE, CLASSES_FILE, EDGE_SCORES_FILE, LATEX_FILE]
+    names += [OBJECTS_PLOT, PREDICATES_PLOT, CONFUSION_PLOT, RELIABILITY_PLOT]
     try:
         out.mkdir(parents=True, exist_ok=True)
         csv_latex.write_rows(out / CSV_FILE, rows, "scan")
         csv_latex.write_classes(out / CLASSES_FILE, result)
+        edge_scores = evaluation.pooled.edge_scores()
+        edge_rows = {name: scores.numbers() for name, scores in edge_scores.items()}
+        csv_latex.write_rows(out / EDGE_SCORES_FILE, edge_rows, "predicate")
         latex = csv_latex.latex_rows({method: result.numbers()})
         (out / LATEX_FILE).write_text(latex, encoding="utf-8")
         plots.plot_classes(out / OBJECTS_PLOT, result.object_classes, f"objects: {method}")
         plots.plot_classes(out / PREDICATES_PLOT, result.predicate_classes, f"predicates: {method}")
         confusion = evaluation.pooled.confusion
         plots.plot_confusion(out / CONFUSION_PLOT, confusion, f"classes of nodes: {method}")
+        plots.plot_reliability(
+            out / RELIABILITY_PLOT, _edge_beliefs(evaluation.pooled), f"edges: {method}"
+        )
         if over_time:
             plots.plot_over_time(out / TIME_PLOT, over_time, f"recall over time: {method}")
             names.append(TIME_PLOT)
     except OSError as error:
         raise EvaluationError(f"--out {out}: cannot be written ({error.strerror})") from error
     return [out / name for name in names]
+
+
+def _edge_beliefs(measures: Measures) -> dict[str, list[Calibrated]]:
+    """Beliefs of the edges with a complete predicate, and of all."""
+    complete = [edge for edge in measures.edges if edge.predicate in COMPLETE_PREDICATES]
+    return {
+        "complete predicates": beliefs_of(complete),
+        "all predicates": beliefs_of(measures.edges),
+    }

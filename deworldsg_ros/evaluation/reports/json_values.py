@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult, ScanResult
 from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 from deworldsg_ros.evaluation.runner import ScanOutcome
@@ -56,14 +57,21 @@ def outcome_values(outcome: ScanOutcome) -> dict[str, Any]:
         "edges": outcome.edges,
         "times_ms": outcome.times_ms,
         "drops": outcome.drops,
-        "measures": outcome.measures.numbers(),
+        "measures": measure_values(outcome.measures),
         "over_time": [asdict(item) for item in outcome.over_time],
     }
 
 
 def evaluation_values(evaluation: Evaluation) -> dict[str, Any]:
     """Plain values of a whole evaluation."""
-    return {**protocol_values(evaluation.result), "measures": evaluation.pooled.numbers()}
+    return {**protocol_values(evaluation.result), "measures": measure_values(evaluation.pooled)}
+
+
+def measure_values(measures: Measures) -> dict[str, Any]:
+    """Plain values of the measures beside the protocol."""
+    scores = measures.edge_scores()
+    by_predicate = {name: item.numbers() for name, item in scores.items()}
+    return {**measures.numbers(), "edges_by_predicate": by_predicate}
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:

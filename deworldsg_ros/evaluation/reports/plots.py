@@ -1,4 +1,4 @@
-"""PNG plots: recall by class, confusion, recall over time."""
+"""PNG plots: recall by class, confusion, reliability of edges, recall over time."""
 
 from __future__ import annotations
 
@@ -11,6 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from deworldsg_ros.evaluation.measures.calibration import (
+    Calibrated,
+    calibration_error,
+    reliability,
+)
 from deworldsg_ros.evaluation.protocol.scoring import Count
 from deworldsg_ros.evaluation.reports.csv_latex import class_items
 from deworldsg_ros.evaluation.runner import Checkpoint
@@ -59,6 +64,44 @@ def plot_confusion(path: Path, pairs: Sequence[tuple[str, str]], title: str) -> 
     axes.set_xlabel("predicted class of the node")
     axes.set_ylabel("annotated class of the object")
     axes.set_title(title)
+    _save(figure, path)
+
+
+def plot_reliability(path: Path, beliefs: Mapping[str, Sequence[Calibrated]], title: str) -> None:
+    """Right part of the edges over their probability, a line per name; on the diagonal if honest.
+
+    The number beside a point is that of the edges in its interval.
+    """
+    figure, axes = _figure(6.4, 6.0)
+    axes.plot([0, 1], [0, 1], color=ALL, linewidth=1)
+    # Numbers of the first line are above its points, those of the second below.
+    for (name, items), colour, offset in zip(beliefs.items(), COLOURS, ((-4, 6), (4, -10))):
+        bins = reliability(items)
+        error = f"ECE {100 * calibration_error(items):.1f} %" if items else "no edge"
+        axes.plot(
+            [item.probability for item in bins],
+            [item.right for item in bins],
+            color=colour,
+            marker="o",
+            markersize=4,
+            label=f"{name}: {len(items)} edges, {error}",
+        )
+        for item in bins:
+            axes.annotate(
+                str(item.size),
+                (item.probability, item.right),
+                xytext=offset,
+                textcoords="offset points",
+                fontsize=7,
+                color=colour,
+            )
+    axes.set_xlim(0, 1.04)
+    axes.set_ylim(-0.04, 1.04)
+    axes.set_xlabel("probability of the edge")
+    axes.set_ylabel("part of the edges that is right")
+    axes.set_title(title)
+    if beliefs:
+        axes.legend(loc="upper left", frameon=False)
     _save(figure, path)
 
 

@@ -22,6 +22,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print the official scores and the further measures."""
     print_protocol(console, evaluation.result, f"{evaluation.method} on {evaluation.dataset}")
     print_measures(console, {**evaluation.measures, "all": evaluation.pooled})
+    print_edges(console, evaluation.pooled)
 
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
@@ -56,8 +57,19 @@ MEASURE_ROWS = (
     ("centroid error, cm (median)", "centroid_error_main_median_m", 100),
     ("extent error, cm (median)", "extent_error_median_m", 100),
     ("edges", "edges", 0),
-    ("edge precision, %", "edge_precision", 100),
-    ("edge calibration error, %", "edge_calibration_error", 100),
+    ("edges without two objects", "edges_unmatched", 0),
+    ("edge precision, complete predicates, %", "complete_edge_precision", 100),
+    ("edge recall, complete predicates, %", "complete_edge_recall", 100),
+    ("edge calibration error, the same, %", "complete_edge_calibration_error", 100),
+)
+# Printed scores of edges: heading, name, factor (0 = a count).
+EDGE_COLUMNS = (
+    ("relations", "relations", 0),
+    ("said", "edges_said", 0),
+    ("right", "edges_right", 0),
+    ("prec.", "edge_precision", 100),
+    ("recall", "edge_recall", 100),
+    ("ECE", "edge_calibration_error", 100),
 )
 # A terminal has space for this many scans; the files contain all.
 MAX_COLUMNS = 4
@@ -73,6 +85,23 @@ def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
     numbers = [item.numbers() for item in shown.values()]
     for heading, key, factor in MEASURE_ROWS:
         table.add_row(heading, *(_cell(item[key], factor) for item in numbers))
+    console.print(table)
+
+
+def print_edges(console: Console, measures: Measures) -> None:
+    """Print the scores of the edges by predicate, of the complete predicates, and of all."""
+    table = Table(title="edges by predicate (precision, recall, calibration error in %)")
+    table.add_column("predicate", no_wrap=True)
+    for heading, _, _ in EDGE_COLUMNS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("wrong ≥99%", justify="right", no_wrap=True)
+    scores = measures.edge_scores()
+    for name, item in scores.items():
+        numbers = item.numbers()
+        cells = [_cell(numbers[key], factor) for _, key, factor in EDGE_COLUMNS]
+        # A line separates the predicates from the sums.
+        last = list(scores).index(name) == len(scores) - 3
+        table.add_row(name, *cells, f"{item.sure_wrong}/{item.sure}", end_section=last)
     console.print(table)
 
 
