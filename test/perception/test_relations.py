@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from support.perception import (
@@ -23,8 +24,11 @@ SHELF = Slab((-0.5, 2.6, 0.75), (0.5, 2.95, 1.05), (90, 90, 100))
 CHEST = Slab((-0.5, 2.5, 0.0), (0.5, 2.98, 0.4), (100, 60, 60))
 
 
-def see(named, predicates=REPLICA_SSG_PREDICATES, top=100):
-    """Relations of named objects, each a list of slabs, as {(subject, object): predicate}."""
+def see(named, predicates=REPLICA_SSG_PREDICATES, top=100, flying_px=0):
+    """Relations of named objects, each a list of slabs, as {(subject, object): predicate}.
+
+    Pixels within `flying_px` of the border of a mask get a depth between those of both sides.
+    """
     slabs = [slab for _, parts in named for slab in parts]
     _, depth_m, owner = render(slabs, 0.001)
     instances = np.zeros(SHAPE, np.uint16)
@@ -33,6 +37,12 @@ def see(named, predicates=REPLICA_SSG_PREDICATES, top=100):
         mask = (owner >= first) & (owner < first + len(parts))
         instances[mask] = row + 1
         first += len(parts)
+    if flying_px:
+        window = np.ones((2 * flying_px + 1,) * 2, np.uint8)
+        border = cv2.dilate(instances, window) != cv2.erode(instances, window)
+        near, far = cv2.erode(depth_m, window), cv2.dilate(depth_m, window)
+        part = np.random.default_rng(0).uniform(0, 1, SHAPE).astype(np.float32)
+        depth_m = np.where(border, part * near + (1 - part) * far, depth_m)
     head = GeometricRelationHead(predicates)
     names = [name for name, _ in named]
     found = head.relate(segmented(names, instances, depth_m), top)
@@ -119,6 +129,18 @@ def test_objects_without_pixels_or_depth_are_not_related():
     for instances, depth in ((np.zeros(SHAPE), depth_m), (owner, np.zeros_like(depth_m))):
         found = head.relate(segmented(["table", "cup"], instances, depth), 10)
         assert len(found.pairs) == 0
+
+
+def test_flying_pixels_at_the_border_of_a_mask_do_not_change_the_relations():
+    named = [TABLE, ("bowl", [Slab((0.2, 1.6, 0.70), (0.33, 1.73, 0.80), (40, 120, 60))]), CUP]
+    expected = see(named)
+    assert ("cup", "bowl") not in expected and expected["cup", "table"] == "on"
+    assert see(named, flying_px=2) == expected
+
+
+def test_a_thin_object_is_read_from_all_of_its_pixels():
+    rod = ("toothbrush", [Slab((-0.25, 1.6, 0.70), (-0.24, 1.61, 0.90), (200, 40, 40))])
+    assert see([TABLE, rod])["toothbrush", "table"] == "on"
 
 
 def test_one_object_has_no_relation():

@@ -12,6 +12,18 @@ from deworldsg_ros.scene.camera import Intrinsics
 
 # The bounds are quantiles, which more points hardly change; the time grows with the points.
 POINTS_PER_OBJECT = 256
+# Depth within this distance of the border of a mask is often that of the surface behind, or a mean
+# of both ("flying pixels").
+BORDER_PX = 2
+# A pixel is on one surface with its neighbours if it is off their mean by less than a + b z². The
+# noise of depth cameras grows with the square of the depth.
+SURFACE_STEP_M = 0.02
+SURFACE_STEP_PER_M = 0.008
+# An object is sampled from its inner pixels, unless fewer than this fraction of its pixels are
+# inner ones: it is thin.
+MIN_INNER_FRACTION = 0.1
+# Number of pixels that are examined for one point.
+CANDIDATES_PER_POINT = 3
 # The bounds of an object with fewer points are not reliable.
 MIN_POINTS = 10
 # Bounds leave out this fraction of the points at either end, because of flying pixels.
@@ -68,6 +80,9 @@ def measure_layout(
     z = depth_m[v, u].astype(np.float64)
     points = intrinsics.back_project(u, v, z) @ upright_axes(up_camera).T
     low, high, valid = _bounds(points, owners, count)
+    # The border that the sampling leaves out, at the mean depth of the object.
+    border_m = BORDER_PX / intrinsics.fx * _means(z, owners, count)[:, None]
+    low, high = low - border_m, high + border_m
     separation = np.clip(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
     )
@@ -101,10 +116,39 @@ def upright_axes(up_camera: Float64) -> Float64:
 
 
 @kernel
+def _is_inner(
+    depth_m: Float32, instances: UInt16, y: int, x: int, margin: int, step_m: float
+) -> bool:
+    """Whether a pixel lies inside its mask and on one surface with the pixels around it.
+
+    All pixels within `margin` have its label. Along the row and along the column, its depth is
+    within `step_m` of the mean of the two pixels at that distance: on a plane, however slanted, it
+    equals their mean. A neighbour without depth, or outside the image, does not count.
+    """
+    height, width = instances.shape
+    label = instances[y, x]
+    for row in range(max(y - margin, 0), min(y + margin + 1, height)):
+        for column in range(max(x - margin, 0), min(x + margin + 1, width)):
+            if instances[row, column] != label:
+                return False
+    depth = depth_m[y, x]
+    if margin <= y < height - margin:
+        a, b = depth_m[y - margin, x], depth_m[y + margin, x]
+        if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
+            return False
+    if margin <= x < width - margin:
+        a, b = depth_m[y, x - margin], depth_m[y, x + margin]
+        if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
+            return False
+    return True
+
+
+@kernel
 def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple[Int64, Int64]:
     """Pixels (k, 2) as row and column, and their object (k,) from 0, in the order of the objects.
 
-    At most `most` pixels of an object, evenly spread in scan order.
+    At most `most` pixels of an object, evenly spread in scan order. They are inner pixels
+    (`_is_inner`), except for thin objects, which have hardly any.
     """
     height, width = instances.shape
     sizes = np.zeros(count, np.int64)
@@ -113,9 +157,11 @@ def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple
             label = instances[y, x]
             if 0 < label <= count and 0 < depth_m[y, x] < np.inf:
                 sizes[label - 1] += 1
-    ends = np.cumsum(np.minimum(sizes, most))
-    pixels = np.empty((ends[-1], 2), np.int64)
-    owners = np.empty(ends[-1], np.int64)
+    # Only some pixels are examined, because examining all takes too long.
+    quotas = np.minimum(sizes, CANDIDATES_PER_POINT * most)
+    ends = np.cumsum(quotas)
+    candidates = np.empty((ends[-1], 2), np.int64)
+    inner = np.empty(ends[-1], np.bool_)
     seen = np.zeros(count, np.int64)
     taken = np.zeros(count, np.int64)
     for y in range(height):
@@ -124,15 +170,33 @@ def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple
             if not (0 < label <= count and 0 < depth_m[y, x] < np.inf):
                 continue
             row = label - 1
-            quota = min(sizes[row], most)
             # The n-th of `quota` samples is the first pixel past the fraction n / quota.
-            if seen[row] * quota >= taken[row] * sizes[row]:
-                slot = ends[row] - quota + taken[row]
-                pixels[slot, 0], pixels[slot, 1] = y, x
-                owners[slot] = row
+            if seen[row] * quotas[row] >= taken[row] * sizes[row]:
+                slot = ends[row] - quotas[row] + taken[row]
+                candidates[slot, 0], candidates[slot, 1] = y, x
+                step_m = SURFACE_STEP_M + SURFACE_STEP_PER_M * depth_m[y, x] ** 2
+                inner[slot] = _is_inner(depth_m, instances, y, x, BORDER_PX, step_m)
                 taken[row] += 1
             seen[row] += 1
-    return pixels, owners
+    pixels = np.empty((count * most, 2), np.int64)
+    owners = np.empty(count * most, np.int64)
+    end = 0
+    for row in range(count):
+        first = ends[row] - quotas[row]
+        usable = inner[first : ends[row]]
+        if usable.sum() < MIN_INNER_FRACTION * quotas[row]:
+            usable[:] = True
+        left = usable.sum()
+        quota = min(left, most)
+        passed = kept = 0
+        for slot in range(first, ends[row]):
+            if inner[slot]:
+                if passed * quota >= kept * left:
+                    pixels[end], owners[end] = candidates[slot], row
+                    end += 1
+                    kept += 1
+                passed += 1
+    return pixels[:end], owners[:end]
 
 
 def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float64, Bool]:
@@ -159,21 +223,31 @@ def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float6
     return low, high, valid
 
 
+def _means(values: Float64, owners: Int64, count: int) -> Float64:
+    """Mean (count,) of the values of each object; 0 without any."""
+    sums = np.bincount(owners, values, minlength=count)
+    return np.asarray(sums / np.maximum(np.bincount(owners, minlength=count), 1))
+
+
 def _footprints(low: Float64, high: Float64) -> tuple[Float64, Float64]:
     """Areas (n,) of rectangles with corners (n, 2), and areas (n, n) that two have in common."""
     sides = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
     return (high - low).prod(axis=1), np.clip(sides, 0.0, None).prod(axis=2)
 
 
+@kernel
 def _contacts(points: Float64, owners: Int64, low: Float64, high: Float64, valid: Bool) -> Float64:
     """`Layout.contact_m`."""
-    contact = np.full((len(low), len(low)), np.inf)
-    for row in np.flatnonzero(valid):
-        around = (
-            (points[:, :2] > low[row, :2] - SUPPORT_MARGIN_M)
-            & (points[:, :2] < high[row, :2] + SUPPORT_MARGIN_M)
-        ).all(axis=1)
-        distance = np.abs(points[around, 2] - low[row, 2])
-        np.minimum.at(contact[row], owners[around], distance)
-        contact[row, row] = np.inf
+    count = len(low)
+    contact = np.full((count, count), np.inf)
+    for row in range(count):
+        if not valid[row]:
+            continue
+        left, right = low[row, 0] - SUPPORT_MARGIN_M, high[row, 0] + SUPPORT_MARGIN_M
+        front, back = low[row, 1] - SUPPORT_MARGIN_M, high[row, 1] + SUPPORT_MARGIN_M
+        for index in range(len(points)):
+            x, y, z = points[index]
+            if owners[index] != row and left < x < right and front < y < back:
+                distance = abs(z - low[row, 2])
+                contact[row, owners[index]] = min(contact[row, owners[index]], distance)
     return contact
