@@ -49,8 +49,9 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ),
     ] = -1.0
     max_relations: Annotated[
-        int, option("maximum number of relations per frame, best first", ge=0, le=1000)
-    ] = 10
+        int,
+        option("maximum number of relations per frame, best first (the paper: 10)", ge=0, le=1000),
+    ] = 100
     refine_detections: Annotated[
         bool,
         option(

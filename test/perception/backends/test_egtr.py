@@ -146,6 +146,7 @@ def test_rtdetr_sam2_and_egtr_as_one_stage(folder, tmp_path):
         segmenter_path=str(save_sam2(tmp_path)),
         predicate_set="checkpoint",
         score_threshold=0.0,
+        max_relations=10,
         # Random weights put their boxes anywhere.
         refine_detections=False,
     )
