@@ -201,6 +201,7 @@ def test_the_paper_differs_from_the_default_in_these_options() -> None:
         for field, value in default[section].items()
         if paper[section][field] != value
     } == {
+        ("perception", "max_relations"),
         ("perception", "refine_detections"),
         ("merging", "association"),
         ("relations", "max_clips_per_s"),
