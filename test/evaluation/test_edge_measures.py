@@ -13,8 +13,8 @@ from deworldsg_ros.evaluation.measures.calibration import (
     Calibrated,
     ReliabilityBin,
     calibration_error,
-    log_loss,
     reliability,
+    total_log_loss,
 )
 from deworldsg_ros.evaluation.measures.edge_list import write_edge_list
 from deworldsg_ros.evaluation.measures.edge_measures import EdgeView
@@ -91,11 +91,13 @@ def test_scores_by_predicate_are_those_counted_by_hand() -> None:
     gaps = [2 * abs(0.5 - (0.95 + 0.995) / 2), 1 - 0.65, 1 - 0.45]
     assert on.calibration_error == pytest.approx(sum(gaps) / 4)
     of_truth = (0.95, 0.65, 0.45, 0.005)
-    assert on.log_loss == pytest.approx(-sum(map(math.log, of_truth)) / 4)
+    assert on.log_loss == pytest.approx(-sum(map(math.log, of_truth)) / 2)
     under = scores["under"]
     assert (under.relations, under.found, under.said, under.recall) == (1, 0, 0, 0.0)
     assert math.isnan(under.precision)
     assert math.isnan(under.calibration_error)
+    # No edge states the one relation: a probability of 0, limited to 0.001.
+    assert under.log_loss == pytest.approx(-math.log(1e-3))
     near = scores["near"]
     assert (near.relations, near.found, near.said, near.right, near.unmatched) == (2, 0, 1, 0, 0)
 
@@ -121,8 +123,8 @@ def test_no_edges_and_no_relations() -> None:
         assert (scores.said, scores.found, scores.unmatched) == (0, 0, 0)
         assert math.isnan(scores.precision)
         assert math.isnan(scores.calibration_error)
-        assert math.isnan(scores.log_loss)
-    assert math.isnan(Measures().edge_scores()["all"].recall)
+    assert math.isnan(scores.recall)
+    assert math.isnan(scores.log_loss)
 
 
 @pytest.mark.parametrize(("probability", "said"), [(0.5, 1), (0.4999, 0)])
@@ -190,11 +192,21 @@ def test_calibration_error() -> None:
     assert calibration_error([Calibrated(0.9, False)]) == pytest.approx(0.9)
 
 
-def test_log_loss() -> None:
-    assert math.isnan(log_loss([]))
+def test_total_log_loss() -> None:
+    assert total_log_loss([]) == 0
     beliefs = [Calibrated(0.8, True), Calibrated(0.8, False)]
-    assert log_loss(beliefs) == pytest.approx(-(math.log(0.8) + math.log(0.2)) / 2)
-    assert log_loss([Calibrated(1.0, False)]) == pytest.approx(-math.log(1e-3))
+    assert total_log_loss(beliefs) == pytest.approx(-math.log(0.8) - math.log(0.2))
+    assert total_log_loss([Calibrated(1.0, False)]) == pytest.approx(-math.log(1e-3))
+
+
+def test_leaving_out_an_edge_that_holds_does_not_lower_the_log_loss() -> None:
+    stated = [EdgeView(1, 2, "on", 0.6), EdgeView(4, 2, "on", 0.3)]
+    full = measure_views(NODES, stated, SCENE).edge_scores()["on"].log_loss
+    assert measure_views(NODES, stated[:1], SCENE).edge_scores()["on"].log_loss > full
+    assert measure_views(NODES, [], SCENE).edge_scores()["on"].log_loss > full
+    # Leaving out an edge that does not hold lowers it.
+    wrong = [*stated, EdgeView(4, 1, "on", 0.3)]
+    assert measure_views(NODES, wrong, SCENE).edge_scores()["on"].log_loss > full
 
 
 def test_the_reliability_plot_is_drawn_with_and_without_edges(tmp_path: Path) -> None:

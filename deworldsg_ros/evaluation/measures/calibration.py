@@ -52,13 +52,11 @@ def calibration_error(beliefs: Sequence[Calibrated]) -> float:
     return sum(gaps) / len(beliefs)
 
 
-def log_loss(beliefs: Sequence[Calibrated]) -> float:
-    """Mean of -ln(probability of what is true), nats; NaN without beliefs.
+def total_log_loss(beliefs: Sequence[Calibrated]) -> float:
+    """Sum of -ln(probability of what is true), nats.
 
     Probabilities are clipped to [`LOG_LOSS_MARGIN`, 1 - `LOG_LOSS_MARGIN`].
     """
-    if not beliefs:
-        return math.nan
     stated = np.array([item.probability for item in beliefs], np.float64)
     of_truth = np.where([item.right for item in beliefs], stated, 1.0 - stated)
-    return float(-np.log(np.clip(of_truth, LOG_LOSS_MARGIN, 1.0 - LOG_LOSS_MARGIN)).mean())
+    return float(-np.log(np.clip(of_truth, LOG_LOSS_MARGIN, 1.0 - LOG_LOSS_MARGIN)).sum())

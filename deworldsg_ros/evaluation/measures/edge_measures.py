@@ -10,7 +10,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from deworldsg_ros.evaluation.measures.calibration import Calibrated, calibration_error, log_loss
+from deworldsg_ros.evaluation.measures.calibration import (
+    Calibrated,
+    calibration_error,
+    total_log_loss,
+)
 from deworldsg_ros.evaluation.measures.reference import ReferenceScene
 
 # Ground truth lists every instance of these predicates: an edge without annotation is wrong.
@@ -97,7 +101,10 @@ class EdgeScores:
             objects.
         sure: said edges with a probability of at least `SURE`.
         sure_wrong: of those, the ones that are not annotated.
-        calibration_error, log_loss: over all edges between nodes of two objects; NaN without any.
+        calibration_error: over all edges between nodes of two objects; NaN without any.
+        log_loss: nats per relation, over these edges and the relations that no edge states, which
+            have a probability of 0; NaN without relations. A graph cannot lower it by leaving out
+            an edge that holds.
     """
 
     relations: int
@@ -209,6 +216,8 @@ def score_edges(
     said = [edge for edge in edges if edge.matched and edge.said]
     sure = [edge for edge in said if edge.probability >= SURE]
     beliefs = beliefs_of(edges)
+    unstated = [Calibrated(0.0, right=True) for item in wanted if item.probability == 0.0]
+    loss = total_log_loss(beliefs + unstated)
     return EdgeScores(
         relations=len(wanted),
         found=sum(item.said for item in wanted),
@@ -218,7 +227,7 @@ def score_edges(
         sure=len(sure),
         sure_wrong=sum(not edge.right for edge in sure),
         calibration_error=calibration_error(beliefs),
-        log_loss=log_loss(beliefs),
+        log_loss=loss / len(wanted) if wanted else math.nan,
     )
 
 
