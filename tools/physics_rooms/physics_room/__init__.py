@@ -1,0 +1,1 @@
+"""Simulated rooms: shapes, furniture, layout, physics, truth, pictures and files."""
