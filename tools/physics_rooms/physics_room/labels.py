@@ -1,7 +1,7 @@
 """Names of classes: Replica's label, its Visual Genome class and its COCO name.
 
-Labels that /tmp-like rooms leave unmapped get the nearest class of the Visual Genome list, so that
-each object can be a node. The COCO name is kept beside it.
+Labels without a class of their own get the nearest class of the Visual Genome list, so that each
+object can be a node. The COCO name is kept beside it.
 """
 
 from __future__ import annotations

@@ -9,29 +9,22 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .bodies import Bodies
+from .holding import MIN_UPWARD, Holding
 from .labels import CHAIRS, SEATS, TABLES, visual_genome
-from .plane import area, clip, gap, hull
 from .shapes import Item
-from .simulate import FLOOR, WALL, Outcome
+from .simulate import FLOOR, Outcome
 
-# Smallest share of a thing's weight that counts as a support.
-MIN_SHARE = 0.12
 # A second support is a relation of its own from this share on; below, and above UNCLEAR_SHARE, the
 # pair is unclear.
 SECOND_SHARE = 0.4
 UNCLEAR_SHARE = 0.15
-# The normal of a support points upwards by at least this much.
-MIN_UPWARD = 0.5
-# The bottom of a thing in a container is this far below the rim.
-MIN_DEPTH_M = 0.01
 AGAINST_GAP_M, AGAINST_UNCLEAR_M = 0.05, 0.07
 AGAINST_SHARE, AGAINST_HEIGHT_M = 0.5, 0.3
 SKEW_RAD = np.deg2rad(15)
 OVER_SHARE, OVER_LOW_M, OVER_HIGH_M = 0.5, -0.02, 1.2
 OVER_UNCLEAR = (0.38, 0.62)
-WALL_REACH_M = 0.15
 WITH_GAP_M = 0.35
 FLOOR_GAP_M, SUPPORT_GAP_M, LEVEL_M = 0.5, 0.10, 0.04
 NEAREST = 2
@@ -46,15 +39,6 @@ PREDICATES = {
     "under": 42,
     "with": 49,
 }
-
-
-@dataclass
-class Support:
-    """One support of an item: share of the weight, mean normal, kind of contact."""
-
-    number: int
-    share: float
-    normal: NDArray[np.float64]
 
 
 @dataclass
@@ -96,13 +80,9 @@ class Judge:
         self.outcome = outcome
         self.visible = visible
         self.truth = Truth()
-        points = {item.number: item.vertices() for item in items}
-        self.low = {n: p.min(0) for n, p in points.items()}
-        self.high = {n: p.max(0) for n, p in points.items()}
-        self.points = points
-        self.shapes = {item.number: _shapes(item) for item in items}
-        self.supports = {item.number: self._supports(item) for item in items}
-        self.container = {item.number: self._container(item) for item in items}
+        self.bodies = Bodies(items)
+        self.holding = Holding(items, outcome, self.bodies)
+        self.supports, self.container = self.holding.supports, self.holding.container
 
     def judge(self) -> Truth:
         """All relations; see README.md."""
@@ -123,54 +103,6 @@ class Judge:
         for item in self.items:
             self._record(item)
         return self.truth
-
-    def _supports(self, item: Item) -> list[Support]:
-        if item.anchor != "free":
-            return []
-        found = []
-        for (upper, lower), touch in self.outcome.touches.items():
-            if upper == item.number and touch.lift > 0:
-                normal = np.mean(touch.normals, axis=0)
-                steep = max(n[2] for n in touch.normals)
-                found.append((lower, touch.lift, normal, steep))
-        total = sum(f[1] for f in found)
-        shares = [
-            Support(lower, lift / total, normal)
-            for lower, lift, normal, steep in found
-            if lift / total >= MIN_SHARE and steep >= MIN_UPWARD and lower != WALL
-        ]
-        return sorted(shares, key=lambda s: -s.share)
-
-    def _container(self, item: Item) -> Item | None:
-        """The container whose hollow holds the bottom of an item, if it also holds the item."""
-        points = self.points[item.number]
-        bottom = points[points[:, 2] < points[:, 2].min() + 0.01].mean(0)
-        inside = [
-            other for other in self.items
-            if other is not item and self._holds(other, item) and _in_cavity(other, bottom)
-        ]  # fmt: skip
-        return min(
-            inside,
-            key=lambda o: float(np.prod(self.high[o.number] - self.low[o.number])),
-            default=None,
-        )
-
-    def _holds(self, container: Item, item: Item) -> bool:
-        """Whether contacts lead from an item down to a container, or it is welded into it."""
-        if item.holder is container:
-            return bool(container.cavities)
-        seen, edge = set(), [item.number]
-        while edge:
-            number = edge.pop()
-            for (upper, lower), touch in self.outcome.touches.items():
-                if upper != number or lower in seen or touch.lift <= 0.005:
-                    continue
-                if lower == container.number:
-                    return bool(container.cavities)
-                if lower > 0 and self.by_number[lower].anchor == "free":
-                    seen.add(lower)
-                    edge.append(lower)
-        return False
 
     def _say_support(self, item: Item) -> None:
         holder = self.container[item.number]
@@ -203,13 +135,17 @@ class Judge:
     def _against(self, a: Item, b: Item) -> None:
         if a.label in SEATS or b.label in SEATS:
             return
-        if self.high[a.number][2] > self.high[b.number][2] or self.truth.linked(a, b):
+        if self.bodies.top(a) > self.bodies.top(b) or self.truth.linked(a, b):
             return
-        tall = min(self.high[a.number][2], self.high[b.number][2])
-        distance = self._gap(a, b)
-        if distance > AGAINST_UNCLEAR_M or tall < AGAINST_HEIGHT_M or self._overlap(a, b) > 0.1:
+        tall = min(self.bodies.top(a), self.bodies.top(b))
+        distance = self.bodies.gap(a, b)
+        if (
+            distance > AGAINST_UNCLEAR_M
+            or tall < AGAINST_HEIGHT_M
+            or self.bodies.overlap(a, b) > 0.1
+        ):
             return
-        share, skew = self._side_by_side(a, b)
+        share, skew = self.bodies.side_by_side(a, b)
         if skew > SKEW_RAD or share < 0.4:
             if share > 0.25:
                 self._doubt(a, b)
@@ -220,25 +156,6 @@ class Judge:
             self._doubt(a, b)
         else:
             self.truth.say(a, "against", b)
-
-    def _side_by_side(self, a: Item, b: Item) -> tuple[float, float]:
-        """Shared part of the shorter side, and the angle between the two, of boxes side by side."""
-        best = (-np.inf, 0.0)
-        for item in (a, b):
-            axes = item.rotation[:2, :2].T
-            for axis, other in ((axes[0], axes[1]), (axes[1], axes[0])):
-                apart = self._shared(a, b, axis)
-                if -apart[0] > best[0]:
-                    along = self._shared(a, b, other)
-                    best = (-apart[0], along[0] / max(along[1], 1e-6))
-        angle = np.arctan2(*(a.rotation.T @ b.rotation)[[1, 0], [0, 0]])
-        skew = abs((angle + np.pi / 4) % (np.pi / 2) - np.pi / 4)
-        return best[1], float(skew)
-
-    def _shared(self, a: Item, b: Item, axis: NDArray[np.float64]) -> tuple[float, float]:
-        p, q = (self.points[i.number][:, :2] @ axis for i in (a, b))
-        shared = min(p.max(), q.max()) - max(p.min(), q.min())
-        return float(shared), float(min(np.ptp(p), np.ptp(q)))
 
     def _over(self, floor: list[Item]) -> None:
         on_floor = {i.number for i in floor}
@@ -251,20 +168,19 @@ class Judge:
                     self._over_pair(a, b, a.number in on_floor)
 
     def _over_pair(self, a: Item, b: Item, a_on_floor: bool) -> None:
-        space = self.low[a.number][2] - self.high[b.number][2]
-        tucked = a_on_floor and b.label in (*TABLES, "bench") and self._lower(a, b)
+        space = self.bodies.bottom(a) - self.bodies.top(b)
+        tucked = (
+            a_on_floor and b.label in (*TABLES, "bench") and self.bodies.top(a) < self.bodies.top(b)
+        )
         if not (OVER_LOW_M <= space <= OVER_HIGH_M or tucked):
             return
-        share = self._overlap(a, b)
+        share = self.bodies.overlap(a, b)
         if OVER_UNCLEAR[0] < share < OVER_UNCLEAR[1]:
             self._doubt(a, b)
         elif share >= OVER_SHARE:
             over, below = (b, a) if tucked else (a, b)
             self.truth.say(over, "above", below)
             self.truth.say(below, "under", over)
-
-    def _lower(self, a: Item, b: Item) -> bool:
-        return bool(self.high[a.number][2] < self.high[b.number][2])
 
     def _stacked(self, a: Item, b: Item) -> bool:
         """Whether supports or welds lead from one to the other."""
@@ -276,21 +192,10 @@ class Judge:
                     return True
         return False
 
-    def _overlap(self, a: Item, b: Item) -> float:
-        """Overlap of the two footprints as a share of the smaller; walls reach 15 cm further."""
-        p, q = self._footprint(a), self._footprint(b)
-        return area(clip(p, q)) / max(min(area(p), area(q)), 1e-9)
-
-    def _footprint(self, item: Item) -> NDArray[np.float64]:
-        local = item.vertices(placed=False)
-        if item.kind == "wallm" and item.label != "lamp":
-            local = np.concatenate([local, local - [0, WALL_REACH_M, 0]])
-        return hull((local @ item.rotation.T + item.position)[:, :2])
-
     def _with(self, floor: list[Item]) -> None:
         for table in (i for i in floor if i.label in TABLES):
             for seat in (i for i in floor if i.label in CHAIRS):
-                distance = self._gap(table, seat)
+                distance = self.bodies.gap(table, seat)
                 if distance <= WITH_GAP_M:
                     self.truth.say(table, "with", seat)
                     self.truth.say(seat, "near", table)
@@ -312,17 +217,17 @@ class Judge:
         distances: dict[tuple[int, int], float] = {}
         for a in group:
             for b in group:
-                if a is b or self._apart(a, b) > reach * 1.2:
+                if a is b or self.bodies.apart(a, b) > reach * 1.2:
                     continue
-                level = abs(self.low[a.number][2] - self.low[b.number][2]) <= LEVEL_M
+                level = abs(self.bodies.bottom(a) - self.bodies.bottom(b)) <= LEVEL_M
                 if level:
-                    distances[a.number, b.number] = self._gap(a, b)
+                    distances[a.number, b.number] = self.bodies.gap(a, b)
         for (a, b), distance in distances.items():
             first, second = self.by_number[a], self.by_number[b]
             if a > b or distance > reach or self.truth.linked(first, second):
                 continue
             ranks = [self._rank(distances, x, y) for x, y in ((a, b), (b, a))]
-            if max(ranks) < NEAREST and not self._between(first, second, group):
+            if max(ranks) < NEAREST and not self.bodies.between(first, second, group):
                 self.truth.say(first, "near", second)
                 self.truth.say(second, "near", first)
                 self.physics(a)["near_gaps_m"][str(b)] = round(distance, 4)
@@ -335,38 +240,6 @@ class Judge:
             for (x, y), d in distances.items()
             if x == a and y != b
         )
-
-    def _between(self, a: Item, b: Item, group: list[Item]) -> bool:
-        """Whether a third item of the group, or one beside them, crosses the line between two."""
-        distance, p, q = self._nearest(a, b)
-        if distance < 0.015:
-            return False
-        line = np.array([p, q]) + (q - p)[None] / distance * [[0.004], [-0.004]]
-        normal = np.array([-(q - p)[1], (q - p)[0]]) / distance * 0.002
-        strip = np.array([line[0] - normal, line[1] - normal, line[1] + normal, line[0] + normal])
-        top = min(self.high[a.number][2], self.high[b.number][2])
-        low = max(self.low[a.number][2], self.low[b.number][2])
-        for other in group:
-            if other is a or other is b or self.high[other.number][2] < low + 0.25 * (top - low):
-                continue
-            if any(len(clip(strip, part[0])) >= 3 for part in self.shapes[other.number]):
-                return True
-        return False
-
-    def _apart(self, a: Item, b: Item) -> float:
-        """Horizontal distance of the axis-aligned boxes, a lower bound of the gap."""
-        apart = np.maximum(
-            self.low[a.number] - self.high[b.number], self.low[b.number] - self.high[a.number]
-        )
-        return float(np.linalg.norm(np.maximum(apart[:2], 0)))
-
-    def _gap(self, a: Item, b: Item) -> float:
-        return self._nearest(a, b)[0] if self._apart(a, b) < 0.8 else self._apart(a, b)
-
-    def _nearest(self, a: Item, b: Item) -> tuple[float, NDArray, NDArray]:
-        """Horizontal gap between the parts of two items, and its two ends."""
-        pairs = [gap(p[0], q[0]) for p in self.shapes[a.number] for q in self.shapes[b.number]]
-        return min(pairs, key=lambda pair: pair[0])
 
     def physics(self, number: int) -> dict[str, Any]:
         """The record of an item, made when first asked for."""
@@ -399,30 +272,6 @@ class Judge:
                 and item.anchor == "free"
             ):
                 record.setdefault("touches_beside", []).append(other)
-
-
-def _in_cavity(container: Item, point: NDArray[np.float64]) -> bool:
-    local = container.rotation.T @ (point - container.position)
-    for cavity in container.cavities:
-        offset = local[:2] - cavity.centre
-        if cavity.round:
-            inside = np.linalg.norm(offset / cavity.half) <= 1.0
-        else:
-            inside = bool((np.abs(offset) <= cavity.half).all())
-        if inside and cavity.low - 0.01 <= local[2] <= cavity.rim - MIN_DEPTH_M:
-            return True
-    return False
-
-
-def _shapes(item: Item) -> list[tuple[NDArray[np.float64], float, float]]:
-    """Convex outline in the plane, lowest and highest point of each visible part."""
-    found = []
-    for part in item.parts:
-        if not part.visible or (item.label == "indoor-plant" and part.shape == "ellipsoid"):
-            continue
-        points = part.mesh.vertices @ item.rotation.T + item.position
-        found.append((hull(points[:, :2]), float(points[:, 2].min()), float(points[:, 2].max())))
-    return found
 
 
 def relation_rows(truth: Truth, keep: set[int]) -> list[list[Any]]:
