@@ -8,6 +8,8 @@ from deworldsg_ros.perception.geometry.layout import Layout, measure_layout
 from deworldsg_ros.perception.geometry.predicates import (
     CEILING_LOGIT,
     FLOOR_LOGIT,
+    GENERAL,
+    MIN_LOGIT,
     predicate_logits,
 )
 from deworldsg_ros.perception.protocols import SegmentedObjects
@@ -15,8 +17,6 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import Relations
 
-# A pair is related if its best predicate exceeds this logit, a probability of 0.27.
-MIN_LOGIT = -1.0
 # In a predicate set with "on", these synonyms would take a part of its probability.
 SYNONYMS_OF_ON = frozenset({"standing on", "supported by", "hanging on"})
 
@@ -33,6 +33,7 @@ class GeometricRelationHead:
 
     def __init__(self, predicates: tuple[str, ...]) -> None:
         self.predicates = predicates
+        self._is_general = np.array([name in GENERAL for name in predicates], dtype=bool)
         self._column = {name: column for column, name in enumerate(predicates)}
         # Compile the kernel now, so that the first image does not wait.
         measure_layout(
@@ -44,7 +45,7 @@ class GeometricRelationHead:
         )
 
     def relate(self, objects: SegmentedObjects, max_relations: int) -> Relations:
-        """The best ordered pairs, best first; see `RelationHead`."""
+        """The best ordered pairs, specific predicates first; see `RelationHead`."""
         count = len(objects)
         if count < 2 or max_relations <= 0:
             return Relations.none(len(self.predicates))
@@ -57,7 +58,8 @@ class GeometricRelationHead:
         best = logits.max(axis=2)
         pair_scores = scores[:, None] * scores[None, :] / (1.0 + np.exp(-best))
         candidates = np.flatnonzero((best > MIN_LOGIT).ravel())
-        order = np.argsort(-pair_scores.ravel()[candidates], kind="stable")[:max_relations]
+        general = self._is_general[logits.argmax(axis=2).ravel()[candidates]]
+        order = np.lexsort((-pair_scores.ravel()[candidates], general))[:max_relations]
         kept = candidates[order]
         pairs = np.stack([kept // count, kept % count], axis=1).astype(np.int64)
         return Relations(

@@ -7,23 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.kernels import kernel, read_only
+from deworldsg_ros.perception.geometry.bottom_edge import surfaces_beneath
+from deworldsg_ros.perception.geometry.sampling import BORDER_PX, sample_pixels
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 
 # The bounds are quantiles, which more points hardly change; the time grows with the points.
 POINTS_PER_OBJECT = 256
-# Depth within this distance of the border of a mask is often that of the surface behind, or a mean
-# of both ("flying pixels").
-BORDER_PX = 2
-# A pixel is on one surface with its neighbours if it is off their mean by less than a + b z². The
-# noise of depth cameras grows with the square of the depth.
-SURFACE_STEP_M = 0.02
-SURFACE_STEP_PER_M = 0.008
-# An object is sampled from its inner pixels, unless fewer than this fraction of its pixels are
-# inner ones: it is thin.
-MIN_INNER_FRACTION = 0.1
-# Number of pixels that are examined for one point.
-CANDIDATES_PER_POINT = 3
 # The bounds of an object with fewer points are not reliable.
 MIN_POINTS = 10
 # Bounds leave out this fraction of the points at either end, because of flying pixels.
@@ -45,9 +35,12 @@ class Layout:
         low, high: (n, 3) metres, robust bounds.
         contact_m: (n, n) vertical distance from the bottom of i to the nearest surface of j below
             or around i; inf if j has none there.
+        beneath: (n, n) fraction of the bottom edge of i with a surface of j beneath it, in the
+            image; NaN if the edge is not visible (`surfaces_beneath`).
         shared: (n, n) overlap of the footprints, as a fraction of the smaller one.
         shared_deep: (n, n) the same for footprints that are extended by the hidden depth.
         covered: (n, n) fraction of the footprint of i inside that of j.
+        covered_deep: (n, n) the same for a footprint of j that is extended by the hidden depth.
         gap_m: (n, n) horizontal distance between the bounds; 0 if they overlap.
         clearance_m: (n, n) height of the bottom of i over the top of j; negative if it is lower.
     """
@@ -56,9 +49,11 @@ class Layout:
     low: Float64
     high: Float64
     contact_m: Float64
+    beneath: Float64
     shared: Float64
     shared_deep: Float64
     covered: Float64
+    covered_deep: Float64
     gap_m: Float64
     clearance_m: Float64
 
@@ -75,10 +70,13 @@ def measure_layout(
         count: number of objects.
         up_camera: (3,) unit vector against gravity, camera frame.
     """
-    pixels, owners = _sample(read_only(depth_m), read_only(instances), count, POINTS_PER_OBJECT)
+    axes = upright_axes(up_camera)
+    pixels, owners = sample_pixels(
+        read_only(depth_m), read_only(instances), count, POINTS_PER_OBJECT
+    )
     v, u = pixels[:, 0], pixels[:, 1]
     z = depth_m[v, u].astype(np.float64)
-    points = intrinsics.back_project(u, v, z) @ upright_axes(up_camera).T
+    points = intrinsics.back_project(u, v, z) @ axes.T
     low, high, valid = _bounds(points, owners, count)
     # The border that the sampling leaves out, at the mean depth of the object.
     border_m = BORDER_PX / intrinsics.fx * _means(z, owners, count)[:, None]
@@ -86,17 +84,20 @@ def measure_layout(
     separation = np.clip(
         np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
     )
-    area, shared = _footprints(low[:, :2], high[:, :2])
-    area = np.maximum(area, 1e-6)  # keeps fractions of a footprint finite
-    deep, deep_shared = _footprints(low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M)
+    seen = low[:, :2], high[:, :2]
+    deep = low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M
+    area = _areas(*seen)
+    shared, shared_deep = _overlaps(seen, seen), _overlaps(deep, deep)
     return Layout(
         valid=valid,
         low=low,
         high=high,
         contact_m=_contacts(points, owners, low, high, valid),
+        beneath=surfaces_beneath(depth_m, intrinsics, instances, axes[2], low[:, 2]),
         shared=shared / np.minimum(area[:, None], area[None]),
-        shared_deep=deep_shared / np.minimum(deep[:, None], deep[None]),
+        shared_deep=shared_deep / np.minimum(_areas(*deep)[:, None], _areas(*deep)[None]),
         covered=shared / area[:, None],
+        covered_deep=_overlaps(seen, deep) / area[:, None],
         gap_m=np.hypot(separation[..., 0], separation[..., 1]),
         clearance_m=low[:, None, 2] - high[None, :, 2],
     )
@@ -113,90 +114,6 @@ def upright_axes(up_camera: Float64) -> Float64:
     forward = forward - (forward @ up) * up
     forward /= np.linalg.norm(forward)
     return np.stack([np.cross(forward, up), forward, up])
-
-
-@kernel
-def _is_inner(
-    depth_m: Float32, instances: UInt16, y: int, x: int, margin: int, step_m: float
-) -> bool:
-    """Whether a pixel lies inside its mask and on one surface with the pixels around it.
-
-    All pixels within `margin` have its label. Along the row and along the column, its depth is
-    within `step_m` of the mean of the two pixels at that distance: on a plane, however slanted, it
-    equals their mean. A neighbour without depth, or outside the image, does not count.
-    """
-    height, width = instances.shape
-    label = instances[y, x]
-    for row in range(max(y - margin, 0), min(y + margin + 1, height)):
-        for column in range(max(x - margin, 0), min(x + margin + 1, width)):
-            if instances[row, column] != label:
-                return False
-    depth = depth_m[y, x]
-    if margin <= y < height - margin:
-        a, b = depth_m[y - margin, x], depth_m[y + margin, x]
-        if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
-            return False
-    if margin <= x < width - margin:
-        a, b = depth_m[y, x - margin], depth_m[y, x + margin]
-        if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
-            return False
-    return True
-
-
-@kernel
-def _sample(depth_m: Float32, instances: UInt16, count: int, most: int) -> tuple[Int64, Int64]:
-    """Pixels (k, 2) as row and column, and their object (k,) from 0, in the order of the objects.
-
-    At most `most` pixels of an object, evenly spread in scan order. They are inner pixels
-    (`_is_inner`), except for thin objects, which have hardly any.
-    """
-    height, width = instances.shape
-    sizes = np.zeros(count, np.int64)
-    for y in range(height):
-        for x in range(width):
-            label = instances[y, x]
-            if 0 < label <= count and 0 < depth_m[y, x] < np.inf:
-                sizes[label - 1] += 1
-    # Only some pixels are examined, because examining all takes too long.
-    quotas = np.minimum(sizes, CANDIDATES_PER_POINT * most)
-    ends = np.cumsum(quotas)
-    candidates = np.empty((ends[-1], 2), np.int64)
-    inner = np.empty(ends[-1], np.bool_)
-    seen = np.zeros(count, np.int64)
-    taken = np.zeros(count, np.int64)
-    for y in range(height):
-        for x in range(width):
-            label = instances[y, x]
-            if not (0 < label <= count and 0 < depth_m[y, x] < np.inf):
-                continue
-            row = label - 1
-            # The n-th of `quota` samples is the first pixel past the fraction n / quota.
-            if seen[row] * quotas[row] >= taken[row] * sizes[row]:
-                slot = ends[row] - quotas[row] + taken[row]
-                candidates[slot, 0], candidates[slot, 1] = y, x
-                step_m = SURFACE_STEP_M + SURFACE_STEP_PER_M * depth_m[y, x] ** 2
-                inner[slot] = _is_inner(depth_m, instances, y, x, BORDER_PX, step_m)
-                taken[row] += 1
-            seen[row] += 1
-    pixels = np.empty((count * most, 2), np.int64)
-    owners = np.empty(count * most, np.int64)
-    end = 0
-    for row in range(count):
-        first = ends[row] - quotas[row]
-        usable = inner[first : ends[row]]
-        if usable.sum() < MIN_INNER_FRACTION * quotas[row]:
-            usable[:] = True
-        left = usable.sum()
-        quota = min(left, most)
-        passed = kept = 0
-        for slot in range(first, ends[row]):
-            if inner[slot]:
-                if passed * quota >= kept * left:
-                    pixels[end], owners[end] = candidates[slot], row
-                    end += 1
-                    kept += 1
-                passed += 1
-    return pixels[:end], owners[:end]
 
 
 def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float64, Bool]:
@@ -229,10 +146,15 @@ def _means(values: Float64, owners: Int64, count: int) -> Float64:
     return np.asarray(sums / np.maximum(np.bincount(owners, minlength=count), 1))
 
 
-def _footprints(low: Float64, high: Float64) -> tuple[Float64, Float64]:
-    """Areas (n,) of rectangles with corners (n, 2), and areas (n, n) that two have in common."""
-    sides = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
-    return (high - low).prod(axis=1), np.clip(sides, 0.0, None).prod(axis=2)
+def _areas(low: Float64, high: Float64) -> Float64:
+    """Areas (n,) of rectangles with corners (n, 2); not 0, which keeps fractions of them finite."""
+    return np.asarray(np.maximum((high - low).prod(axis=1), 1e-6))
+
+
+def _overlaps(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> Float64:
+    """Areas (n, n) that the rectangles a and b, each with low and high corners (n, 2), share."""
+    sides = np.minimum(a[1][:, None], b[1][None]) - np.maximum(a[0][:, None], b[0][None])
+    return np.asarray(np.clip(sides, 0.0, None).prod(axis=2))
 
 
 @kernel
