@@ -28,7 +28,7 @@ from deworldsg_ros.perception.protocols import MaskPatch, SegmentedObjects
 from deworldsg_ros.scene.frame_graph import Relations
 from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
 
-MAX_RELATIONS = 10
+MAX_RELATIONS = 100
 ALL_RELATIONS = 10_000
 
 
