@@ -138,6 +138,21 @@ class TestTruth:
         assert truth.relations[2, 3] == truth.relations[3, 4] == "near"
         assert (2, 4) not in truth.relations
 
+    def test_a_cup_in_a_sink_is_in_it_and_falls_with_all_that_carries_the_sink(self) -> None:
+        from physics_room.furniture import base_cabinet, counter
+        from physics_room.layout import attach
+        from physics_room.things import cup
+
+        rng = np.random.default_rng(1)
+        base, (board, sink), (mug,) = base_cabinet(rng, 1.4), counter(rng, 1.4, True), cup(rng)
+        base.anchor = "world"
+        board.position = np.array([0, -0.02, base.height + 0.001])
+        attach(sink)
+        mug.position = sink.position + [0, 0, 0.02]
+        truth = judge([base, board, sink, mug])
+        assert truth.relations == {(2, 1): "on", (3, 2): "attached to", (4, 3): "in"}
+        assert truth.physics[4]["falls_without"] == [1, 2, 3]
+
     def test_the_same_seed_gives_the_same_room(self) -> None:
         from physics_room.layout import build_room
 

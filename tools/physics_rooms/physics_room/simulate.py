@@ -16,6 +16,8 @@ LONGEST_S = 4.0
 # A body is at rest below this speed (m/s, or rad/s at a reach of 0.3 m).
 REST = 0.02
 REMOVAL_S = 0.6
+# A contact that lifts less than this carries nothing (a plate weighs 4 N).
+MIN_LIFT_N = 0.02
 # Who moves further than this, or drops by more than this (a plate is 8 mm thick), has fallen.
 MOVED_M, DROPPED_M = 0.03, 0.004
 
@@ -131,7 +133,7 @@ class World:
         free = {i.number for i in self.items if i.anchor == "free"}
         wanted: dict[int, set[int]] = {}
         for (upper, lower), touch in touches.items():
-            if upper in free and lower > 0 and touch.lift > 0.02:
+            if upper in free and lower > 0 and touch.lift > MIN_LIFT_N:
                 root = self._root(lower)
                 wanted.setdefault(root, set()).add(parts[upper])
                 if root in parts:
@@ -153,7 +155,7 @@ class World:
                     if other != number and parts.get(other) in wanted[number]:
                         falls.setdefault(other, set()).add(number)
             pending = later
-        self._follow_holders(falls)
+        self._follow_welds(falls, touches)
         return falls
 
     def _root(self, number: int) -> int:
@@ -165,7 +167,17 @@ class World:
             item = item.holder
         return item.number
 
-    def _follow_holders(self, falls: dict[int, set[int]]) -> None:
+    def _follow_welds(
+        self, falls: dict[int, set[int]], touches: dict[tuple[int, int], Touch]
+    ) -> None:
+        """A welded item goes with its holder: both for what it needs and for what needs it."""
+        for (upper, lower), touch in touches.items():
+            if (
+                lower > 0
+                and touch.lift > MIN_LIFT_N
+                and self._root(lower) in falls.get(upper, set())
+            ):
+                falls[upper].add(lower)
         for item in self.items:
             if item.anchor == "item" and item.holder is not None:
                 above = falls.get(item.holder.number, set())
