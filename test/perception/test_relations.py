@@ -110,6 +110,45 @@ def test_a_wall_shelf_above_a_chest():
     assert related["cabinet", "shelf"] == "under"
 
 
+def test_a_basket_on_the_floor_under_a_table():
+    basket = ("basket", [Slab((-0.5, 1.55, 0.0), (-0.2, 1.85, 0.25), (160, 120, 40))])
+    high_top = Slab((-0.6, 1.5, 0.95), (0.6, 2.2, 1.0), (120, 70, 40))
+    leg = Slab((0.4, 1.7, 0.0), (0.5, 1.8, 0.95), (120, 70, 40))
+    related = see([("table", [high_top, leg]), basket])
+    assert related["basket", "table"] == "under" and related["table", "basket"] == "above"
+
+
+def test_a_basket_beside_a_chair_on_the_floor():
+    chair = ("chair", [Slab((0.3, 1.9, 0.0), (0.75, 2.35, 0.8), (30, 60, 120))])
+    basket = ("basket", [Slab((-0.1, 1.95, 0.0), (0.15, 2.2, 0.25), (160, 120, 40))])
+    related = see([chair, basket])
+    assert related["basket", "chair"] == related["chair", "basket"] == "near"
+
+
+def test_a_clock_on_the_wall_above_a_chest():
+    chest = ("cabinet", [Slab((-0.5, 3.6, 0.0), (0.5, 4.0, 0.5), (100, 60, 60))])
+    clock = ("clock", [Slab((-0.15, 3.95, 0.7), (0.15, 4.0, 0.9), (200, 200, 40))])
+    chair = ("chair", [Slab((-0.5, 3.6, 0.0), (0.5, 4.0, 0.5), (100, 60, 60))])
+    assert see([chest, clock])["clock", "cabinet"] == "above"
+    assert ("clock", "chair") not in see([chair, clock])
+
+
+def test_the_gap_of_turned_objects():
+    # Two strips on the floor, at 45 degrees, seen from 2 m above: their boxes overlap.
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    across = (u - v - 40) / np.sqrt(2)
+    instances = (np.abs(across + 40) < 15) + 2 * (np.abs(across - 40) < 15)
+    layout = measure_layout(
+        np.full(SHAPE, 2.0, np.float32),
+        INTRINSICS,
+        instances.astype(np.uint16),
+        2,
+        np.array([0.0, 0.0, -1.0]),
+    )
+    assert layout.gap_m[0, 1] == pytest.approx((80 - 30) * 2.0 / INTRINSICS.fx, abs=0.03)
+    assert layout.covered[0, 1] == layout.shared[0, 1] == 0
+
+
 def test_a_table_with_its_chair():
     chair = ("chair", [Slab((0.75, 1.5, 0.0), (1.2, 1.95, 0.9), (30, 60, 120))])
     related = see([TABLE, chair])

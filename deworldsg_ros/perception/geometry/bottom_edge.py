@@ -64,6 +64,27 @@ def _down_in_image(up_camera: Float64) -> tuple[int, int]:
 
 
 @kernel
+def _rise(height: Float64, depth: float, v: int, u: int) -> float:
+    """Height of pixel (u, v) at a depth over the camera, metres."""
+    return depth * (height[0] * u + height[1] * v + height[2])
+
+
+@kernel
+def _pixel_beneath(
+    depth_m: Float32, instances: UInt16, v: int, u: int, down: tuple[int, int]
+) -> tuple[int, int]:
+    """The first pixel below the edge at (u, v) with depth that is not of the same object.
+
+    It is (v, u) itself if none is within reach.
+    """
+    for step in range(1 + BORDER_PX, 1 + REACH_PX):
+        y, x = v + step * down[0], u + step * down[1]
+        if instances[y, x] != instances[v, u] and depth_m[y, x] > 0:
+            return y, x
+    return v, u
+
+
+@kernel
 def _surfaces_beneath(
     depth_m: Float32,
     instances: UInt16,
@@ -73,34 +94,29 @@ def _surfaces_beneath(
 ) -> Float64:
     """`surfaces_beneath`, for the height coefficients and the downward step of the image."""
     rows, columns = instances.shape
-    down_v, down_u = down
     count = len(low_m)
     edge = np.zeros(count)
     beneath = np.zeros((count, count))
     # Both ends of a step from inside the mask to the surface beneath are inside the image.
-    margin_v, margin_u = REACH_PX * abs(down_v), REACH_PX * abs(down_u)
+    margin_v, margin_u = REACH_PX * abs(down[0]), REACH_PX * abs(down[1])
     for v in range(margin_v, rows - margin_v):
         for u in range(margin_u, columns - margin_u):
             label = instances[v, u]
-            if not 0 < label <= count or instances[v + down_v, u + down_u] == label:
+            if not 0 < label <= count or instances[v + down[0], u + down[1]] == label:
                 continue
-            y, x = v - BORDER_PX * down_v, u - BORDER_PX * down_u
+            y, x = v - BORDER_PX * down[0], u - BORDER_PX * down[1]
             z, low = depth_m[y, x], low_m[label - 1]
-            bottom = z * (height[0] * x + height[1] * y + height[2]) < low + HEIGHT_M
-            if instances[y, x] != label or not z > 0 or not bottom:
+            inside = instances[y, x] == label and z > 0
+            if not inside or _rise(height, z, y, x) > low + HEIGHT_M:
                 continue
-            for step in range(1 + BORDER_PX, 1 + REACH_PX):
-                y, x = v + step * down_v, u + step * down_u
-                other, other_z = instances[y, x], depth_m[y, x]
-                if other == label or not other_z > 0:
-                    continue
-                if other_z > z - DEPTH_STEP_M:  # otherwise something in front hides the bottom
-                    edge[label - 1] += 1.0
-                    rise = other_z * (height[0] * x + height[1] * y + height[2]) - low
-                    level = abs(rise) < HEIGHT_M and other_z < z + DEPTH_STEP_M
-                    if level and 0 < other <= count:
-                        beneath[label - 1, other - 1] += 1.0
-                break
+            y, x = _pixel_beneath(depth_m, instances, v, u, down)
+            other, other_z = instances[y, x], depth_m[y, x]
+            if other == label or other_z < z - DEPTH_STEP_M:
+                continue  # something in front hides the bottom
+            edge[label - 1] += 1.0
+            level = abs(_rise(height, other_z, y, x) - low) < HEIGHT_M
+            if level and other_z < z + DEPTH_STEP_M and 0 < other <= count:
+                beneath[label - 1, other - 1] += 1.0
     for row in range(count):
         beneath[row] /= edge[row] if edge[row] >= MIN_EDGE_PX else np.nan
     return beneath

@@ -37,3 +37,5 @@ FIXED_TO = {
 BUILT_IN = frozenset({"sink", "window"})
 FLOORS = frozenset({"floor"})
 WALLS = frozenset({"wall"})
+# Classes of objects that hang on walls.
+HUNG = frozenset({"board", "clock", "picture", "sign"})

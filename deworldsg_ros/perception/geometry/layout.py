@@ -24,6 +24,13 @@ SUPPORT_MARGIN_M = 0.08
 HIDDEN_DEPTH_M = 0.15
 
 
+# Extents are measured in horizontal directions every 22.5 degrees, and in height. The first and
+# the fifth direction are axes 0 and 1.
+_ANGLES = np.arange(8) * np.pi / 8.0
+_DIRECTIONS = np.array([[*np.cos(_ANGLES), 0.0], [*np.sin(_ANGLES), 0.0], [*np.zeros(8), 1.0]])
+_AXES = [0, 4, 8]
+
+
 @dataclass(frozen=True)
 class Layout:
     """Metric layout of n objects; axes 0 and 1 are horizontal, 2 is up.
@@ -37,11 +44,13 @@ class Layout:
             or around i; inf if j has none there.
         beneath: (n, n) fraction of the bottom edge of i with a surface of j beneath it, in the
             image; NaN if the edge is not visible (`surfaces_beneath`).
-        shared: (n, n) overlap of the footprints, as a fraction of the smaller one.
+        shared: (n, n) overlap of the footprints, as a fraction of the smaller one: of all
+            horizontal directions, the least overlap of the two extents.
         shared_deep: (n, n) the same for footprints that are extended by the hidden depth.
-        covered: (n, n) fraction of the footprint of i inside that of j.
+        covered: (n, n) fraction of the footprint of i inside that of j, by the same measure.
         covered_deep: (n, n) the same for a footprint of j that is extended by the hidden depth.
-        gap_m: (n, n) horizontal distance between the bounds; 0 if they overlap.
+        gap_m: (n, n) horizontal distance: of all directions, the greatest gap between the two
+            extents; 0 if they overlap.
         clearance_m: (n, n) height of the bottom of i over the top of j; negative if it is lower.
     """
 
@@ -77,28 +86,28 @@ def measure_layout(
     v, u = pixels[:, 0], pixels[:, 1]
     z = depth_m[v, u].astype(np.float64)
     points = intrinsics.back_project(u, v, z) @ axes.T
-    low, high, valid = _bounds(points, owners, count)
+    low, high, valid = _bounds(points @ _DIRECTIONS, owners, count)
     # The border that the sampling leaves out, at the mean depth of the object.
     border_m = BORDER_PX / intrinsics.fx * _means(z, owners, count)[:, None]
     low, high = low - border_m, high + border_m
-    separation = np.clip(
-        np.maximum(low[:, None], low[None]) - np.minimum(high[:, None], high[None]), 0.0, None
-    )
-    seen = low[:, :2], high[:, :2]
-    deep = low[:, :2] - HIDDEN_DEPTH_M, high[:, :2] + HIDDEN_DEPTH_M
-    area = _areas(*seen)
-    shared, shared_deep = _overlaps(seen, seen), _overlaps(deep, deep)
+    seen = low[:, :-1], high[:, :-1]
+    deep = seen[0] - HIDDEN_DEPTH_M, seen[1] + HIDDEN_DEPTH_M
+    overlap_m, deep_overlap_m = _overlaps(seen, seen), _overlaps(deep, deep)
+    length_m, deep_length_m = _lengths(seen), _lengths(deep)
+    low, high = low[:, _AXES], high[:, _AXES]
     return Layout(
         valid=valid,
         low=low,
         high=high,
         contact_m=_contacts(points, owners, low, high, valid),
         beneath=surfaces_beneath(depth_m, intrinsics, instances, axes[2], low[:, 2]),
-        shared=shared / np.minimum(area[:, None], area[None]),
-        shared_deep=shared_deep / np.minimum(_areas(*deep)[:, None], _areas(*deep)[None]),
-        covered=shared / area[:, None],
-        covered_deep=_overlaps(seen, deep) / area[:, None],
-        gap_m=np.hypot(separation[..., 0], separation[..., 1]),
+        shared=_fraction(overlap_m, np.minimum(length_m[:, None], length_m[None])),
+        shared_deep=_fraction(
+            deep_overlap_m, np.minimum(deep_length_m[:, None], deep_length_m[None])
+        ),
+        covered=_fraction(overlap_m, length_m[:, None]),
+        covered_deep=_fraction(_overlaps(seen, deep), length_m[:, None]),
+        gap_m=np.clip(-overlap_m.min(axis=2), 0.0, None),
         clearance_m=low[:, None, 2] - high[None, :, 2],
     )
 
@@ -117,14 +126,14 @@ def upright_axes(up_camera: Float64) -> Float64:
 
 
 def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float64, Bool]:
-    """Robust bounds (count, 3) of each object's points, 0 if it has too few; (count,) has enough.
+    """Robust bounds (count, d) of each object's points, 0 if it has too few; (count,) has enough.
 
     Args:
-        points: (k, 3) upright frame, metres.
+        points: (k, d) positions in d directions, the vertical one last, metres.
         owners: (k,) ascending object of each point.
         count: number of objects.
     """
-    low, high = np.zeros((count, 3)), np.zeros((count, 3))
+    low, high = np.zeros((2, count, points.shape[1]))
     starts = np.searchsorted(owners, np.arange(count + 1))
     valid = np.diff(starts) >= MIN_POINTS
     for row in np.flatnonzero(valid):
@@ -133,10 +142,10 @@ def _bounds(points: Float64, owners: Int64, count: int) -> tuple[Float64, Float6
         high[row] = own[round((1.0 - OUTLIER_FRACTION) * (len(own) - 1))]
         # Give back the part of an evenly covered surface that the quantiles cut off. Not in
         # height: most visible points of a plate or a table are at one height.
-        width = high[row, :2] - low[row, :2]
+        width = high[row, :-1] - low[row, :-1]
         trimmed = width * OUTLIER_FRACTION / (1.0 - 2.0 * OUTLIER_FRACTION)
-        low[row, :2] -= trimmed
-        high[row, :2] += trimmed
+        low[row, :-1] -= trimmed
+        high[row, :-1] += trimmed
     return low, high, valid
 
 
@@ -146,15 +155,22 @@ def _means(values: Float64, owners: Int64, count: int) -> Float64:
     return np.asarray(sums / np.maximum(np.bincount(owners, minlength=count), 1))
 
 
-def _areas(low: Float64, high: Float64) -> Float64:
-    """Areas (n,) of rectangles with corners (n, 2); not 0, which keeps fractions of them finite."""
-    return np.asarray(np.maximum((high - low).prod(axis=1), 1e-6))
+_Extents = tuple[Float64, Float64]
 
 
-def _overlaps(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> Float64:
-    """Areas (n, n) that the rectangles a and b, each with low and high corners (n, 2), share."""
-    sides = np.minimum(a[1][:, None], b[1][None]) - np.maximum(a[0][:, None], b[0][None])
-    return np.asarray(np.clip(sides, 0.0, None).prod(axis=2))
+def _lengths(extents: _Extents) -> Float64:
+    """Lengths (n, d) of extents, low and high (n, d); not 0, which keeps fractions finite."""
+    return np.asarray(np.maximum(extents[1] - extents[0], 1e-3))
+
+
+def _overlaps(a: _Extents, b: _Extents) -> Float64:
+    """Overlap (n, n, d) of the extents of each pair; negative = the gap between them."""
+    return np.asarray(np.minimum(a[1][:, None], b[1][None]) - np.maximum(a[0][:, None], b[0][None]))
+
+
+def _fraction(overlap_m: Float64, length_m: Float64) -> Float64:
+    """The least (n, n) of the fractions (n, n, d), at least 0."""
+    return np.asarray(np.clip((overlap_m / length_m).min(axis=2), 0.0, None))
 
 
 @kernel

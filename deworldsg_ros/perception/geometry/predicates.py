@@ -19,6 +19,7 @@ from deworldsg_ros.perception.geometry.classes import (
     FLOOR_STANDING,
     FLOORS,
     FURNITURE,
+    HUNG,
     PLANTS,
     SEATS,
     TABLES,
@@ -105,6 +106,9 @@ ABOVE_OVERLAP = Limit(0.5, 0.15)
 # Above: from the top of the object to the bottom of the subject; at most an arm's reach.
 ABOVE_MIN_CLEARANCE_M = Limit(-0.02, 0.02)
 ABOVE_MAX_CLEARANCE_M = Limit(1.2, 0.2)
+# Under a table: fraction of the footprint; from the top of the table to that of the subject.
+UNDER_COVERED = Limit(0.6, 0.15)
+UNDER_RISE_M = Limit(-0.1, 0.05)
 # Above: from the bottom of the subject to the nearest surface of the object. Contact is "on".
 ABOVE_CONTACT_M = Limit(0.06, 0.02)
 
@@ -119,6 +123,8 @@ AGAINST_RISE_M = Limit(0.0, 0.05)
 NEAR_FURNITURE_M = Limit(0.5, 0.1)
 NEAR_SMALL_M = Limit(0.10, 0.03)
 NEAR_LEVEL_M = Limit(0.06, 0.03)
+# Near: objects with their bottoms at most this far above the lowest furniture stand on the floor.
+FLOOR_M = 0.1
 # Near: each is among this many nearest neighbours of the other.
 NEAREST = 2
 # With: a table and its chair, which is within reach of a person who sits on it.
@@ -146,7 +152,8 @@ def predicate_logits(layout: Layout, class_names: list[str]) -> dict[str, Float6
     inside, fixed = _unless(inside, rivals), _unless(fixed, rivals)
     on = _unless(resting, rivals, inside, inside.T, fixed)
     held = _any(on, inside, fixed)
-    above = _unless(_above(pairs), held, held.T)
+    over_table = _under_table(pairs, held).T
+    above = _unless(_any(_above(pairs), over_table), held, held.T)
     against = _unless(_against(pairs), held, held.T)
     specific = _any(held, above, against)
     reach = _unless(_within_reach(pairs, held), specific, specific.T)
@@ -293,14 +300,30 @@ def _fixed(pairs: _Pairs) -> Float64:
 
 
 def _above(pairs: _Pairs) -> Float64:
-    """Furniture over furniture."""
+    """Furniture, or an object on a wall, over furniture; people move seats, which do not count."""
     layout = pairs.layout
     return _all(
         ABOVE_OVERLAP.at_least(layout.shared_deep),
         ABOVE_MIN_CLEARANCE_M.at_least(layout.clearance_m),
         ABOVE_MAX_CLEARANCE_M.at_most(layout.clearance_m),
         ABOVE_CONTACT_M.at_least(layout.contact_m),
-        _flag(pairs.both(FURNITURE - BUILT_IN, FURNITURE)),
+        _flag(pairs.both((FURNITURE | HUNG) - SEATS - {"sink"}, FURNITURE - SEATS)),
+    )
+
+
+def _under_table(pairs: _Pairs, held: Float64) -> Float64:
+    """Under: an object on the floor, inside the outline of a table and lower than its top.
+
+    Args:
+        pairs: of the objects.
+        held: (n, n) logits that the row is on, in or attached to the column.
+    """
+    layout = pairs.layout
+    return _all(
+        UNDER_COVERED.at_least(layout.covered),
+        UNDER_RISE_M.at_most(_height(layout.high, layout.high)),
+        -held.max(axis=1, keepdims=True),
+        _flag(pairs.different & ~pairs.are(SEATS)[:, None] & pairs.are(TABLES)[None, :]),
     )
 
 
@@ -328,7 +351,12 @@ def _within_reach(pairs: _Pairs, held: Float64) -> Float64:
         held: (n, n) logits that the row is on, in or attached to the column.
     """
     layout = pairs.layout
-    standing = pairs.furniture & ~pairs.are(FIXED_TO)
+    # The image need not show the floor: furniture stands on it, and what is as low.
+    bottom_m = layout.low[:, 2]
+    floor_m = bottom_m[layout.valid & pairs.furniture].min(initial=np.inf)
+    standing = (pairs.furniture | (bottom_m < floor_m + FLOOR_M)) & ~pairs.are(
+        HUNG | FIXED_TO.keys()
+    )
     small = ~pairs.furniture
     one_support = np.minimum(held[:, None], held[None]).max(axis=2)
     no_support = -_any(held.max(axis=1)[:, None], held.max(axis=1)[None, :])
