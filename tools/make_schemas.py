@@ -83,8 +83,10 @@ def _frame_examples() -> dict[str, wire.Message]:
             ],
             relations=relations,
             drops={"few_mask_pixels": 1},
-            # The coarsest grid: one depth of 1.85 m in the middle of the image.
-            depth_grid=wire.DepthGridState(640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07"),
+            # The coarsest grid: one pixel in the middle, of the second object at 1.85 m.
+            depth_grid=wire.DepthGridState(
+                640, 525.0, 525.0, 319.5, 239.5, b"\x3a\x07", b"\x02\x00"
+            ),
         ),
         "relation_evidence": wire.RelationEvidenceMessage(
             **_head("relation_evidence"),

@@ -101,7 +101,7 @@ class Lifting:
             surface_points_world=_surface_points(objects, point_counts, intrinsics, T_world_camera),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
-            depth_grid=_depth_grid(depth_m, intrinsics),
+            depth_grid=_depth_grid(depth_m, instances, intrinsics),
         )
 
     def warm_up(self) -> None:
@@ -219,12 +219,13 @@ def _surface_points(
     return tuple(np.split(points, np.cumsum(counts)[:-1]))
 
 
-def _depth_grid(depth_m: Float32, intrinsics: Intrinsics) -> DepthGrid:
-    """Valid depth on every N-th pixel, in whole millimetres."""
-    stride = DEPTH_GRID_STRIDE_PX
-    samples_mm = np.rint(depth_m[stride // 2 :: stride, stride // 2 :: stride] * 1000.0)
+def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> DepthGrid:
+    """Valid depth in whole millimetres, and instances, on every N-th pixel."""
+    every = slice(DEPTH_GRID_STRIDE_PX // 2, None, DEPTH_GRID_STRIDE_PX)
+    samples_mm = np.rint(depth_m[every, every] * 1000.0)
     samples_mm = np.minimum(samples_mm, np.iinfo(np.uint16).max).astype(np.uint16)
-    return DepthGrid(samples_mm, stride, intrinsics)
+    samples = np.ascontiguousarray(instances[every, every], np.uint16)
+    return DepthGrid(samples_mm, DEPTH_GRID_STRIDE_PX, intrinsics, samples)
 
 
 def _kept_relations(relations: Relations, rows: Int64, count: int) -> Relations:

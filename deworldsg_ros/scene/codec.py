@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
@@ -167,6 +167,7 @@ def _depth_grid_to_wire(grid: DepthGrid | None) -> wire.DepthGridState | None:
         cx=camera.cx,
         cy=camera.cy,
         depth_mm=grid.depth_mm.astype("<u2").tobytes(),
+        instances=b"" if grid.instances is None else grid.instances.astype("<u2").tobytes(),
     )
 
 
@@ -175,10 +176,15 @@ def _depth_grid_from_wire(message: wire.LocalGraphMessage) -> DepthGrid | None:
     if state is None:
         return None
     columns = len(range(state.stride_px // 2, message.width, state.stride_px))
+
+    def pixels(content: bytes) -> UInt16:
+        return np.frombuffer(content, "<u2").reshape(-1, columns).astype(np.uint16)
+
     return DepthGrid(
-        np.frombuffer(state.depth_mm, "<u2").reshape(-1, columns).astype(np.uint16),
+        pixels(state.depth_mm),
         state.stride_px,
         Intrinsics(state.fx, state.fy, state.cx, state.cy, message.width, message.height),
+        pixels(state.instances) if state.instances else None,
     )
 
 

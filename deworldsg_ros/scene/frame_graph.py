@@ -87,18 +87,23 @@ class FrameGraph:
 
 @dataclass(frozen=True)
 class DepthGrid:
-    """Every n-th pixel of the depth image: it shows which space the camera saw as free.
+    """Every n-th pixel of the depth image and of the instance image.
+
+    It shows which space the camera saw as free, and which object each surface belongs to.
 
     Attributes:
         depth_mm: (h, w) uint16, millimetres along the optical axis; 0 = invalid. Row r, column c
             is the pixel (stride_px // 2 + c * stride_px, stride_px // 2 + r * stride_px).
         stride_px: pixels between samples.
         intrinsics: of the whole image.
+        instances: (h, w) uint16, value of the instance image on the same pixels; 0 = no object.
+            None = not available.
     """
 
     depth_mm: UInt16
     stride_px: int
     intrinsics: Intrinsics
+    instances: UInt16 | None = None
 
     def __post_init__(self) -> None:
         if self.stride_px < 1:
@@ -109,6 +114,8 @@ class DepthGrid:
             for size in (self.intrinsics.height, self.intrinsics.width)
         )
         _check("depth grid", self.depth_mm, shape)
+        if self.instances is not None:
+            _check("instances of the depth grid", self.instances, shape)
 
 
 @dataclass(frozen=True)
@@ -132,7 +139,7 @@ class LocalGraph:
         surface_points_world: n arrays (k, 3) float32, a deterministic sample of the inliers.
         relations: visual relations between rows.
         drops: number of objects not lifted, by reason.
-        depth_grid: depth of the whole image, objects or not; None = not available.
+        depth_grid: depth and instances of the whole image; None = not available.
     """
 
     stamp_ns: int

@@ -104,7 +104,7 @@ class LiftedObject(msgspec.Struct):
 
 
 class DepthGridState(msgspec.Struct, frozen=True):
-    """The depth image on every n-th pixel, from pixel n // 2 on."""
+    """The depth image and the instance image on every n-th pixel, from pixel n // 2 on."""
 
     stride_px: Annotated[int, msgspec.Meta(ge=1)]
     fx: float
@@ -114,6 +114,9 @@ class DepthGridState(msgspec.Struct, frozen=True):
     depth_mm: Annotated[
         bytes, msgspec.Meta(description="row by row, uint16 little-endian, base64; 0 = invalid")
     ]
+    instances: Annotated[
+        bytes, msgspec.Meta(description="as depth_mm; 0 = no object; empty = not available")
+    ] = b""
 
 
 class LocalGraphMessage(Message, kw_only=True):

@@ -231,6 +231,15 @@ def test_the_memory_layout_does_not_change_the_graph():
         np.testing.assert_array_equal(local.covariances_world, plain.covariances_world)
 
 
+def test_the_depth_grid_samples_depth_and_instances():
+    instances, depth_m, intrinsics, T = make_scene(1)
+    grid = lift((instances, depth_m, intrinsics, T)).depth_grid
+    valid = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0)
+    np.testing.assert_array_equal(grid.depth_mm, np.rint(1000 * valid[4::8, 4::8]))
+    np.testing.assert_array_equal(grid.instances, instances[4::8, 4::8])
+    assert grid.instances.any()
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

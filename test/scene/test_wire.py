@@ -70,7 +70,9 @@ def random_depth_grid(rng: np.random.Generator) -> DepthGrid | None:
         return None
     shape = [len(range(stride_px // 2, size, stride_px)) for size in (480, 640)]
     depth_mm = rng.integers(0, 2**16, shape).astype(np.uint16)
-    return DepthGrid(depth_mm, stride_px, Intrinsics(*rng.uniform(1, 900, 4).tolist(), 640, 480))
+    instances = rng.integers(0, 5, shape).astype(np.uint16) if rng.random() < 0.5 else None
+    intrinsics = Intrinsics(*rng.uniform(1, 900, 4).tolist(), 640, 480)
+    return DepthGrid(depth_mm, stride_px, intrinsics, instances)
 
 
 def random_local_graph(rng: np.random.Generator) -> LocalGraph:
