@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int32, Int64, UInt64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt64
 
 EMPTY = np.int64(-1)
 # Cell indices lie in ±2^20: with cells of 3 cm, 31 km around the origin.
@@ -19,6 +19,8 @@ INDEX_BIAS = 1 << 20
 INDEX_MASK = (1 << 21) - 1
 # An owner with fewer cells says too little by lying within a set.
 MIN_OWNER_CELLS = 4
+# Score of a cell that another object has taken: as after one miss (`cell_beliefs`).
+CONTESTED_SCORE = -3
 # The six faces of a block. For each face: its cells, the rotation to the right that turns their
 # bits into the bits of the cells that they touch in the adjacent block, and the step to that block.
 _FACES = np.array(
@@ -61,16 +63,23 @@ class CellTable(NamedTuple):
         masks: (capacity,) uint64, cells of each slot.
         owners: (capacity,) int32, owner of each slot; -1 = removed.
         marks: (capacity,) uint64, cells that a query has met; zero between queries.
+        rejected: (capacity,) uint64, cells with a negative score.
+        scores: (capacity, 64) int8, evidence that each cell is the owner's surface
+            (`cell_beliefs`). It stays when the owner loses the cell.
+        nexts: (capacity,) int32, next slot of the same owner; -1 = none.
     """
 
     keys: Int64
     masks: UInt64
     owners: Int32
     marks: UInt64
+    rejected: UInt64
+    scores: Int8
+    nexts: Int32
 
 
 # The kernels take the same arrays as plain tuples: numba is slower to call with named ones.
-TableArrays = tuple[Int64, UInt64, Int32, UInt64]
+TableArrays = tuple[Int64, UInt64, Int32, UInt64, UInt64, Int8, Int32]
 SetArrays = tuple[Int64, UInt64, Int64]
 
 
@@ -81,6 +90,9 @@ def new_table(capacity: int) -> CellTable:
         np.zeros(capacity, np.uint64),
         np.full(capacity, -1, np.int32),
         np.zeros(capacity, np.uint64),
+        np.zeros(capacity, np.uint64),
+        np.zeros((capacity, 64), np.int8),
+        np.full(capacity, -1, np.int32),
     )
 
 
@@ -89,6 +101,13 @@ def _home_slot(keys: Int64, block: np.int64) -> int:
     """First slot in which a block may lie."""
     mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
     return int(np.int64(mixed >> np.uint64(32)) & (len(keys) - 1))
+
+
+@kernel
+def _hash_bit(block: np.int64) -> np.uint64:
+    """One of 64 bits."""
+    mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
+    return np.uint64(1) << (mixed >> np.uint64(58))
 
 
 @kernel
@@ -133,7 +152,7 @@ def _cell_of(point: Float32, cells_per_m: float) -> tuple[np.int64, np.uint64]:
 @kernel
 def contains(table: TableArrays, owner: int, points: Float32, cell_m: float) -> Bool:
     """Whether each point (k, 3) lies in a cell of an owner."""
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, marks, _, _, _ = table
     contained = np.zeros(len(points), np.bool_)
     for index in range(len(points)):
         block, bit = _cell_of(points[index], 1.0 / cell_m)
@@ -180,7 +199,7 @@ def _find_slots(table: TableArrays, block: np.int64, owner: int) -> tuple[int, i
     """The owner's slot of a block, a removed slot (-1 = none), the next empty slot, and the cells
     of the block that have four owners.
     """
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, marks, _, _, _ = table
     own = removed = -1
     # The three bits of the number of owners of each cell.
     ones = twos = fours = np.uint64(0)
@@ -201,26 +220,30 @@ def _find_slots(table: TableArrays, block: np.int64, owner: int) -> tuple[int, i
 
 @kernel
 def add(
-    table: TableArrays, counts: Int64, max_cells: int, used: int, owners: Int64, sets: SetArrays
-) -> tuple[Int64, Int64, int]:
+    table: TableArrays,
+    counts: Int64,
+    firsts: Int64,
+    max_cells: int,
+    used: int,
+    owners: Int64,
+    sets: SetArrays,
+) -> int:
     """Add the cells of each set to its owner.
 
     Args:
         table: with room for all blocks of the sets.
         counts: number of cells of each owner; updated.
+        firsts: first slot of each owner, -1 = none; updated.
         max_cells: of an owner.
         used: number of slots that are not empty.
         owners: (n,) owner of each set.
         sets: n sets.
 
     Returns:
-        The blocks that are new to their owner, their starts by set, and the new `used`.
+        The new `used`.
     """
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, _, _, _, nexts = table
     blocks, set_masks, starts = sets
-    new = np.empty(len(blocks), np.int64)
-    new_starts = np.zeros(len(starts), np.int64)
-    new_count = 0
     for index in range(len(owners)):
         owner = owners[index]
         for at in range(starts[index], starts[index + 1]):
@@ -238,12 +261,57 @@ def add(
                 used += int(removed < 0)
                 keys[slot] = blocks[at]
                 slot_owners[slot] = owner
-                new[new_count] = blocks[at]
-                new_count += 1
+                nexts[slot] = firsts[owner]
+                firsts[owner] = slot
             masks[slot] |= cells
             counts[owner] += _bit_count(cells)
-        new_starts[index + 1] = new_count
-    return new[:new_count].copy(), new_starts, used
+    return used
+
+
+@kernel
+def mark(table: TableArrays, owners: Int64, sets: SetArrays) -> None:
+    """Mark the cells of each set in the slots of its owner."""
+    keys, _, slot_owners, marks, _, _, _ = table
+    blocks, set_masks, starts = sets
+    for index in range(len(owners)):
+        for at in range(starts[index], starts[index + 1]):
+            slot = _home_slot(keys, blocks[at])
+            while keys[slot] != -1:
+                if keys[slot] == blocks[at] and slot_owners[slot] == owners[index]:
+                    marks[slot] = set_masks[at]
+                slot = (slot + 1) & (len(keys) - 1)
+
+
+@kernel
+def points_in(points: Float32, counts: Int64, rows: Int64, sets: SetArrays, cell_m: float) -> Bool:
+    """Which of the first points of n rows lie in a cell of the row's set.
+
+    Args:
+        points: (S, K, 3) metres.
+        counts: (S,) number of points of each row.
+        rows: (n,) rows.
+        sets: n sets.
+        cell_m: edge of a cell, metres.
+
+    Returns:
+        (n, K) bool.
+    """
+    blocks, set_masks, starts = sets
+    inside = np.zeros((len(rows), points.shape[1]), np.bool_)
+    cells_per_m = 1.0 / cell_m
+    for index in range(len(rows)):
+        # Most points are in no block of the set, and most of them need no comparison.
+        hashes = np.uint64(0)
+        for at in range(starts[index], starts[index + 1]):
+            hashes |= _hash_bit(blocks[at])
+        row = rows[index]
+        for place in range(counts[row] if hashes != 0 else 0):
+            block, bit = _cell_of(points[row, place], cells_per_m)
+            if hashes & _hash_bit(block) == 0:
+                continue
+            for at in range(starts[index], starts[index + 1]):
+                inside[index, place] |= blocks[at] == block and set_masks[at] & bit != 0
+    return inside
 
 
 @kernel
@@ -261,7 +329,7 @@ def overlaps(
     table: TableArrays, counts: Int64, used: int, sets: SetArrays
 ) -> tuple[Int64, Float64]:
     """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, marks, _, _, _ = table
     blocks, set_masks, starts = sets
     set_count = len(starts) - 1
     # Cells of the set that lie on the owner, and cells of the owner that the set meets.
@@ -306,7 +374,7 @@ def _meet(
     Returns:
         The number of owners, and the new number of marked slots.
     """
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, marks, _, _, _ = table
     owner_count = 0
     # The block itself (-1), then the adjacent blocks that the cells touch through a face.
     for face in range(-1, 6):
@@ -381,7 +449,7 @@ def contest(
     min_fraction: float,
 ) -> Int64:
     """Number of cells that each owner lost; see `VoxelMap.contest`."""
-    keys, masks, slot_owners, marks = table
+    keys, masks, slot_owners, marks, rejected, scores, _ = table
     blocks, set_masks, starts = sets
     set_of = np.full(len(counts), -1, np.int64)
     for index in range(len(owners)):
@@ -410,6 +478,8 @@ def contest(
         slot = marked[position]
         if lost[slot_owners[slot]] > 0:
             masks[slot] &= ~marks[slot]
+            _reject(scores[slot], marks[slot])
+            rejected[slot] |= marks[slot]
         marks[slot] = 0
     for owner in range(len(counts)):
         counts[owner] -= lost[owner]
@@ -417,32 +487,52 @@ def contest(
 
 
 @kernel
-def slots_of(table: TableArrays, owner: int, blocks: Int64) -> Int64:
-    """Slots of an owner in blocks in which it has one."""
-    keys, masks, slot_owners, marks = table
-    slots = np.empty(len(blocks), np.int64)
-    for index in range(len(blocks)):
-        slot = _home_slot(keys, blocks[index])
-        while keys[slot] != blocks[index] or slot_owners[slot] != owner:
-            slot = (slot + 1) & (len(keys) - 1)
-        slots[index] = slot
-    return slots
+def _reject(scores: Int8, cells: np.uint64) -> None:
+    """Give some of the cells of a slot (64,) the score of a cell whose only frame is a miss."""
+    for cell in range(64):
+        if (cells >> np.uint64(cell)) & np.uint64(1):
+            scores[cell] = CONTESTED_SCORE
 
 
 @kernel
-def rehash(table: TableArrays, larger: TableArrays) -> int:
-    """Copy all slots with an owner to an empty table; returns their number."""
-    keys, masks, slot_owners, _ = table
-    new_keys, new_masks, new_owners, _ = larger
+def slots_of(table: TableArrays, first: int) -> Int64:
+    """Slots of an owner from its first one on."""
+    nexts = table[6]
+    slots = np.empty(16, np.int64)
+    count = 0
+    slot = first
+    while slot >= 0:
+        if count == len(slots):
+            slots = np.concatenate((slots, slots))
+        slots[count] = slot
+        count += 1
+        slot = nexts[slot]
+    return slots[:count].copy()
+
+
+@kernel
+def rehash(table: TableArrays, larger: TableArrays, firsts: Int64) -> int:
+    """Copy all slots with an owner to an empty table; returns their number.
+
+    `firsts`, the first slot of each owner, is updated.
+    """
+    keys, masks, slot_owners, _, rejected, scores, _ = table
+    new_keys, new_masks, new_owners, _, new_rejected, new_scores, new_nexts = larger
     used = 0
+    firsts[:] = -1
     for slot in range(len(keys)):
-        if slot_owners[slot] < 0:
+        owner = slot_owners[slot]
+        if owner < 0:
             continue
         target = _home_slot(new_keys, keys[slot])
         while new_keys[target] != -1:
             target = (target + 1) & (len(new_keys) - 1)
         new_keys[target] = keys[slot]
         new_masks[target] = masks[slot]
-        new_owners[target] = slot_owners[slot]
+        new_owners[target] = owner
+        new_rejected[target] = rejected[slot]
+        new_scores[target] = scores[slot]
+        new_nexts[target] = firsts[owner]
+        firsts[owner] = target
         used += 1
     return used

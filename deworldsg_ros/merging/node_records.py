@@ -53,10 +53,13 @@ class NodeRecords:
         spare_map.add([0], cells)
         spare_map.overlaps(cells)
         spare_map.contest([0], cells, 0.0)
-        spare_map.remove(0)
-        grid = DepthGrid(np.ones((1, 1), np.uint16), 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8))
+        one = np.ones((1, 1), np.uint16)
+        grid = DepthGrid(one, 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8), one)
+        spare_map.judge([0], cells, np.ones(1, np.int64), np.eye(4), grid)
         nodes = NodeTable(1, 1)
         nodes.append(1)
+        nodes.drop_points([0], spare_map.points_in(cells, nodes, [0]))
+        spare_map.remove(0)
         spare_absence = AbsenceEvidence(1)
         spare_absence.update_points([0], nodes, [0])
         spare_absence.observe(np.eye(4), grid, [])
@@ -86,8 +89,10 @@ class NodeRecords:
         kept, removed = self.owners.of(kept_id), self.owners.of(removed_id)
         self.existence.merge(kept, removed)
         self.joint.merge(kept, removed)
+        scores = self.map.scores(removed)
         cells = self.remove(removed_id)
         self.map.add([kept], cells)
+        self.map.add_scores(kept, cells.blocks, scores)
         self.changed.add(kept)
 
     def memory(self) -> Memory:
@@ -103,6 +108,7 @@ class NodeRecords:
             "blocks": np.concatenate([np.zeros(0, np.int64), *(cells.blocks for cells in sets)]),
             "masks": np.concatenate([np.zeros(0, np.uint64), *(cells.masks for cells in sets)]),
             "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
+            "scores": np.concatenate([np.zeros((0, 64), np.int8), *map(self.map.scores, owners)]),
             "existence": self.existence.records(owners),
             "looks_by_view": self.existence.counts_by_visibility,
             "joint": np.array(pairs, np.int64).reshape(-1, 3),
@@ -125,6 +131,8 @@ class NodeRecords:
             own = slice(stops[row] - counts[row], stops[row])
             cells = memory["blocks"][own], memory["masks"][own], np.array([0, counts[row]])
             self.map.add([owner], CellSets(*cells))
+            if "scores" in memory:  # not in maps of version 0.2.0
+                self.map.add_scores(owner, cells[0], memory["scores"][own])
         self.joint.restore(
             {
                 (owner_of[a], owner_of[b]): balance
@@ -144,7 +152,10 @@ class NodeRecords:
     def apply_correction(
         self, graph: SceneGraph, node_ids: list[int], T_correction: Float64
     ) -> None:
-        """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph."""
+        """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph.
+
+        Their scores start again at 0: rotated cells do not lie on cells.
+        """
         # After a pose-graph correction, reset the alignment offset.
         self.alignment = PoseAlignment()
         for node_id in node_ids:

@@ -18,6 +18,7 @@ from deworldsg_ros.merging.matching import match_scores, one_to_one
 from deworldsg_ros.merging.matching import warm_up as warm_up_matching
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -107,6 +108,25 @@ class SurfaceMerging:
             kept = points[self._records.map.contains(owner, points)]
             graph.correct(node_id, 1.0 - fraction, kept)
 
+    def _judge(
+        self,
+        graph: SceneGraph,
+        local: LocalGraph,
+        cells: CellSets,
+        owners: list[int],
+        node_ids: list[int],
+    ) -> None:
+        """Drop surface points in cells that the frames so far show as something else."""
+        if local.depth_grid is None:
+            return
+        T_camera_world = invert_pose(local.T_world_camera)
+        rejected = self._records.map.judge(
+            owners, cells, local.instance_ids, T_camera_world, local.depth_grid
+        )
+        if len(rejected.blocks):
+            rows = [graph.nodes.row(node_id) for node_id in node_ids]
+            graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, rows))
+
     def _fuse(
         self, graph: SceneGraph, local: LocalGraph, cells: CellSets, owners: list[int]
     ) -> list[int]:
@@ -139,6 +159,7 @@ class SurfaceMerging:
                 )
                 owners[row] = records.owners.add(node_ids[row])
         records.map.add(owners, cells)
+        self._judge(graph, local, cells, owners, node_ids)
         records.existence.add_detections(
             owners,
             local.means_world,

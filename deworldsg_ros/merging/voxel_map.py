@@ -1,7 +1,8 @@
 """Surface map: the cells of space that the surface of each node passes through.
 
 The map is a sparse hash of small cubes. A cell keeps up to four nodes ("owners"). The cost of each
-operation is linear in the number of its points, and independent of the size of the map.
+operation is linear in the number of its points, and independent of the size of the map. Each cell
+of an owner has a score, the evidence that it is the owner's surface (`cell_beliefs`).
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ from itertools import accumulate
 
 import numpy as np
 
-from deworldsg_ros.merging import cell_kernels
+from deworldsg_ros.merging import cell_beliefs, cell_kernels
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64
+from deworldsg_ros.scene.frame_graph import DepthGrid
+from deworldsg_ros.scene.nodes import NodeTable
 
 # Edge of a cell. In the rendered rooms, cells of 2 cm lose objects and cells of 5 cm lose relations
 # (docs/dev/notebook.md).
@@ -36,8 +39,9 @@ class VoxelMap:
         self._table = cell_kernels.new_table(1 << 12)
         # Slots of the table that are not empty.
         self._used = 0
-        self._blocks_of: dict[int, list[Int64]] = {}
+        # Number of cells of each owner, and its first slot.
         self._counts = np.zeros(64, np.int64)
+        self._firsts = np.full(64, -1, np.int64)
 
     @property
     def capacity(self) -> int:
@@ -52,8 +56,13 @@ class VoxelMap:
 
     def cells(self, owner: int) -> CellSets:
         """An owner's cells, as one set."""
-        blocks, slots = self._slots_of(owner)
-        return CellSets(blocks, self._table.masks[slots], np.array([0, len(blocks)]))
+        slots = self._slots_of(owner)
+        blocks, masks = self._table.keys[slots], self._table.masks[slots]
+        return CellSets(blocks, masks, np.array([0, len(slots)]))
+
+    def scores(self, owner: int) -> Int8:
+        """Score of each cell in each block of `cells` (m, 64)."""
+        return self._table.scores[self._slots_of(owner)]
 
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
@@ -72,17 +81,70 @@ class VoxelMap:
         self._make_room(max(owners) + 1)
         if 2 * (self._used + len(sets.blocks)) > self.capacity:
             self._grow(len(sets.blocks))
-        new, starts, self._used = cell_kernels.add(
+        self._used = cell_kernels.add(
             self._table[:],
             self._counts,
+            self._firsts,
             self._cells_per_owner,
             self._used,
             np.array(owners, np.int64),
             sets[:],
         )
-        for owner, start, stop in zip(owners, starts[:-1].tolist(), starts[1:].tolist()):
-            if stop > start:
-                self._blocks_of.setdefault(owner, []).append(new[start:stop].copy())
+
+    def add_scores(self, owner: int, blocks: Int64, scores: Int8) -> None:
+        """Add to the scores of an owner's cells in some blocks (m, 64)."""
+        table, limit = self._table, cell_beliefs.MAX_SCORE
+        slot_of = {int(table.keys[slot]): slot for slot in self._slots_of(owner).tolist()}
+        for block, more in zip(blocks.tolist(), scores.astype(np.int64)):
+            slot = slot_of.get(block)
+            if slot is not None:
+                table.scores[slot] = np.clip(table.scores[slot] + more, -limit, limit)
+                negative = np.packbits(table.scores[slot] < 0, bitorder="little")
+                table.rejected[slot] = negative.view("<u8")[0]
+
+    def judge(
+        self,
+        owners: Sequence[int],
+        sets: CellSets,
+        values: Int64,
+        T_camera_world: Float64,
+        grid: DepthGrid,
+    ) -> CellSets:
+        """Update the scores of the cells of owners that a frame shows.
+
+        Args:
+            owners: n owners.
+            sets: cells in which the frame shows each owner, and which it has (`add`).
+            values: (n,) value of each owner in the instances of the grid.
+            T_camera_world: (4, 4) float64.
+            grid: of the frame; without instances, no score changes.
+
+        Returns:
+            For each owner, the cells that became rejected, and the rejected ones of its set.
+        """
+        if grid.instances is None or not len(owners):
+            no_cells = np.zeros(0, np.int64), np.zeros(0, np.uint64)
+            return CellSets(*no_cells, np.zeros(len(owners) + 1, np.int64))
+        owner_array = np.array(owners, np.int64)
+        cell_kernels.mark(self._table[:], owner_array, sets[:])
+        camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
+        fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+        grid_camera = fx * per_px, fy * per_px, cx * per_px, cy * per_px
+        frame = T_camera_world, grid.depth_mm, grid.instances, grid_camera
+        changed = cell_beliefs.judge(
+            self._table[:], self._firsts, owner_array, values, frame, self.cell_m
+        )
+        return CellSets(*changed)
+
+    def points_in(self, sets: CellSets, nodes: NodeTable, rows: Sequence[int]) -> Bool:
+        """Which surface points of nodes lie in a cell of a set: (n, K), by row and by set."""
+        return cell_kernels.points_in(
+            nodes.surface_points_world,
+            nodes.surface_counts,
+            np.array(rows, np.int64),
+            sets[:],
+            self.cell_m,
+        )
 
     def overlaps(self, sets: CellSets) -> tuple[list[int], Float64]:
         """Overlap fraction of each set with each owner.
@@ -131,21 +193,24 @@ class VoxelMap:
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""
         cells = self.cells(owner)
-        _, slots = self._slots_of(owner)
-        self._table.masks[slots] = 0
+        slots = self._slots_of(owner)
+        self._table.masks[slots] = self._table.rejected[slots] = 0
+        self._table.scores[slots] = 0
         self._table.owners[slots] = -1
-        if self._blocks_of.pop(owner, None) is not None:
-            self._counts[owner] = 0
+        if len(slots):
+            self._counts[owner], self._firsts[owner] = 0, -1
         return cells
 
-    def _slots_of(self, owner: int) -> tuple[Int64, Int64]:
-        """Blocks in which an owner has cells, and the slots of these cells."""
-        blocks = np.concatenate([np.zeros(0, np.int64), *self._blocks_of.get(owner, [])])
-        return blocks, cell_kernels.slots_of(self._table[:], owner, blocks)
+    def _slots_of(self, owner: int) -> Int64:
+        """Slots of an owner."""
+        first = int(self._firsts[owner]) if owner < len(self._firsts) else -1
+        return cell_kernels.slots_of(self._table[:], first)
 
     def _make_room(self, owner_count: int) -> None:
         if owner_count > len(self._counts):
-            self._counts = np.pad(self._counts, (0, 2 * owner_count - len(self._counts)))
+            more = (0, 2 * owner_count - len(self._counts))
+            self._counts = np.pad(self._counts, more)
+            self._firsts = np.pad(self._firsts, more, constant_values=-1)
 
     def _grow(self, more_slots: int) -> None:
         # Slots of removed owners are not copied.
@@ -154,5 +219,5 @@ class VoxelMap:
         while capacity < 3 * slots:
             capacity *= 2
         larger = cell_kernels.new_table(capacity)
-        self._used = cell_kernels.rehash(self._table[:], larger[:])
+        self._used = cell_kernels.rehash(self._table[:], larger[:], self._firsts)
         self._table = larger

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import NodeIds
 from deworldsg_ros.scene.nodes import NodeTable, Observations
@@ -150,6 +150,12 @@ class NodeStore:
         self.nodes.weights[row] *= factor
         self.nodes.set_surface(row, points_world)
         self._changed([row])
+
+    def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
+        """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
+        rows = [self.nodes.row(node_id) for node_id in node_ids]
+        self.nodes.drop_points(rows, dropped)
+        self._changed([row for row, some in zip(rows, dropped) if some.any()])
 
     def set_confirmed(self, node_id: int, confirmed: bool) -> None:
         """Make a live node confirmed or tentative."""

@@ -14,7 +14,7 @@ from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt64
 from deworldsg_ros.scene.columns import Columns
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
-from deworldsg_ros.scene.surface import add_points
+from deworldsg_ros.scene.surface import add_points, drop_points
 
 # Saved columns of a node, beside its surface points; the other columns follow from these.
 SAVED_COLUMNS = (
@@ -220,6 +220,16 @@ class NodeTable(Columns):
         """Replace the surface points of a row by a sample of these (k, 3)."""
         self.surface_counts[row] = 0
         self._add_surfaces([row], [points_world])
+
+    def drop_points(self, rows: list[int], dropped: Bool) -> None:
+        """Remove some of the surface points of n rows, (n, K); but never all points of a row."""
+        drop_points(
+            self.surface_hashes,
+            self.surface_points_world,
+            self.surface_counts,
+            np.array(rows, np.int64),
+            dropped,
+        )
 
     def restore(self, columns: Mapping[str, NDArray[Any]], surfaces: Sequence[Float32]) -> None:
         """Fill an empty table with saved columns and the surface points of each row."""

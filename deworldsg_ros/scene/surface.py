@@ -13,7 +13,7 @@ from itertools import accumulate
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt32, UInt64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt32, UInt64
 
 # Radius in which the density of points is counted: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015
@@ -112,6 +112,27 @@ def _add(
             hashes[row, place] = all_hashes[place]
             for axis in range(3):
                 bits[row, place, axis] = all_bits[place, axis]
+
+
+@kernel
+def drop_points(
+    hashes: UInt64, points_world: Float32, counts: Int64, rows: Int64, dropped: Bool
+) -> None:
+    """Remove points of n different samples, `dropped` (n, K), but never all points of a sample.
+
+    The other arguments are those of `add_points`.
+    """
+    for index in range(len(rows)):
+        row = rows[index]
+        if dropped[index, : counts[row]].all():
+            continue
+        kept = 0
+        for place in range(counts[row]):
+            hashes[row, kept] = hashes[row, place]
+            for axis in range(3):
+                points_world[row, kept, axis] = points_world[row, place, axis]
+            kept += int(not dropped[index, place])
+        counts[row] = kept
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:

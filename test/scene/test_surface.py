@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import seeds
 
-from deworldsg_ros.scene.surface import add_points, even_moments
+from deworldsg_ros.scene.surface import add_points, drop_points, even_moments
 
 
 class Samples:
@@ -21,6 +21,9 @@ class Samples:
 
     def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
         add_points(self.hashes, self.points_world, self.counts, rows, point_sets)
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.hashes, self.points_world, self.counts
 
     def of(self, row: int) -> tuple[list[int], list[list[float]]]:
         count = self.counts[row]
@@ -108,3 +111,28 @@ def test_even_moments_move_with_the_world_frame() -> None:
     moved = even_moments((points @ rotation.T + (1, 2, 3)).astype(np.float32))
     assert np.allclose(moved[0], rotation @ mean + (1, 2, 3), atol=1e-3)
     assert np.allclose(moved[1], rotation @ covariance @ rotation.T, atol=1e-4)
+
+
+def test_dropped_points_leave_a_sample_that_goes_on() -> None:
+    points = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
+    samples = Samples(2, 40)
+    samples.add([0, 1], [points, points])
+    whole = samples.of(0)
+    dropped = np.zeros((2, 40), bool)
+    dropped[0, ::3] = True
+    kept = samples.points(0)[~dropped[0]]
+    drop_points(*samples.arrays(), np.arange(2), dropped)
+    np.testing.assert_array_equal(samples.points(0), kept)
+    assert samples.of(1) == whole
+    # The same points give the same sample again.
+    samples.add([0], [points])
+    assert samples.of(0) == whole
+
+
+def test_a_sample_is_never_dropped_as_a_whole() -> None:
+    sample = sample_of(np.random.default_rng(0).normal(size=(10, 3)), 40)
+    before = sample.of(0)
+    drop_points(*sample.arrays(), np.arange(1), np.arange(40)[None] < 10)
+    assert sample.of(0) == before
+    drop_points(*sample.arrays(), np.arange(1), np.arange(40)[None] < 9)
+    assert len(sample.points(0)) == 1

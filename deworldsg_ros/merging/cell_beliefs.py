@@ -1,0 +1,165 @@
+"""Evidence that a cell of an owner is its surface: how many of the frames that saw it say so.
+
+A mask may include a part of another object, or of the floor. Its cells are then cells of the owner.
+So each cell has a score. A frame that shows the owner and the cell raises the score if the pixel of
+the cell is in the owner's mask, and lowers it if not. Cells with a negative score are rejected.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.merging.absence import NEAR_M
+from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, TableArrays
+from deworldsg_ros.scene.arrays import Float64, Int8, Int64, UInt16, UInt64
+
+# A cell is rejected if less than 60 % of the frames that saw it say that it is the owner's. With
+# 50 %, more of a bleeding mask stays; with 67 %, more of the true surface is lost if masks are cut
+# (docs/dev/notebook.md).
+HIT = 2
+MISS = 3
+# Bounds of a score, so that a cell can be rejected or accepted again: 60 hits, 40 misses.
+MAX_SCORE = 120
+# A frame shows a cell if the measured depth differs from that of its centre by at most SHOWN_M and
+# SHOWN_FRACTION of it: the distance of a cell's corner from its centre, and the noise of cameras.
+SHOWN_M = 0.03
+SHOWN_FRACTION = 0.01
+
+# A frame: T_camera_world (4, 4); depth in millimetres and instances, both (h, w); and fx, fy, cx
+# and cy of these images in their own pixels.
+FrameArrays = tuple[Float64, UInt16, UInt16, tuple[float, float, float, float]]
+
+
+@kernel
+def judge(
+    table: TableArrays,
+    firsts: Int64,
+    owners: Int64,
+    values: Int64,
+    frame: FrameArrays,
+    cell_m: float,
+) -> tuple[Int64, UInt64, Int64]:
+    """Update the scores of all cells of some owners by one frame.
+
+    Args:
+        table: marked cells are hit, whatever the images say; the marks are removed.
+        firsts: first slot of each owner.
+        owners: (n,) owners that the frame shows.
+        values: (n,) value of each in the instance image.
+        frame: the frame.
+        cell_m: edge of a cell, metres.
+
+    Returns:
+        Arrays of the `CellSets` of each owner's cells that this frame has rejected, and of its
+        rejected cells that were marked.
+    """
+    keys, masks, _, marks, rejected, scores, nexts = table
+    offsets = _offsets(frame[0], cell_m)
+    blocks, cells = np.empty(64, np.int64), np.empty(64, np.uint64)
+    starts = np.zeros(len(owners) + 1, np.int64)
+    count = 0
+    for index in range(len(owners)):
+        slot = firsts[owners[index]]
+        while slot >= 0:
+            marked = masks[slot] & marks[slot]
+            others = masks[slot] & ~marked
+            marks[slot] = 0
+            hit, missed = _shown(keys[slot], others, values[index], frame, offsets, cell_m)
+            lost = _score(scores[slot], marked | hit, missed)
+            changed = marked | hit | missed
+            dropped = (lost & ~rejected[slot]) | (lost & marked)
+            rejected[slot] = (rejected[slot] & ~changed) | lost
+            if dropped != 0:
+                if count == len(blocks):
+                    blocks = np.concatenate((blocks, blocks))
+                    cells = np.concatenate((cells, cells))
+                blocks[count], cells[count] = keys[slot], dropped
+                count += 1
+            slot = nexts[slot]
+        starts[index + 1] = count
+    return blocks[:count].copy(), cells[:count].copy(), starts
+
+
+@kernel
+def _offsets(T_camera_world: Float64, cell_m: float) -> Float64:
+    """Position of each cell of a block from its first one, in camera axes (64, 3), metres."""
+    offsets = np.empty((64, 3))
+    for cell in range(64):
+        for axis in range(3):
+            row = T_camera_world[axis]
+            steps = row[0] * (cell >> 4) + row[1] * ((cell >> 2) & 3) + row[2] * (cell & 3)
+            offsets[cell, axis] = cell_m * steps
+    return offsets
+
+
+@kernel
+def _index(bit: np.uint64) -> int:
+    """Index of a single bit."""
+    index = 0
+    index += 32 * int(bit & np.uint64(0xFFFFFFFF00000000) != 0)
+    index += 16 * int(bit & np.uint64(0xFFFF0000FFFF0000) != 0)
+    index += 8 * int(bit & np.uint64(0xFF00FF00FF00FF00) != 0)
+    index += 4 * int(bit & np.uint64(0xF0F0F0F0F0F0F0F0) != 0)
+    index += 2 * int(bit & np.uint64(0xCCCCCCCCCCCCCCCC) != 0)
+    index += int(bit & np.uint64(0xAAAAAAAAAAAAAAAA) != 0)
+    return index
+
+
+@kernel
+def _shown(
+    block: np.int64,
+    cells: np.uint64,
+    value: int,
+    frame: FrameArrays,
+    offsets: Float64,
+    cell_m: float,
+) -> tuple[np.uint64, np.uint64]:
+    """Cells of a block that a frame shows: those in a pixel with this value, and the others."""
+    T, depth_mm, instances, (fx, fy, cx, cy) = frame
+    rows, columns = depth_mm.shape
+    hit = missed = np.uint64(0)
+    # Centre of the block's first cell.
+    x = cell_m * (4 * (block >> 42) - INDEX_BIAS + 0.5)
+    y = cell_m * (4 * ((block >> 21) & INDEX_MASK) - INDEX_BIAS + 0.5)
+    z = cell_m * (4 * (block & INDEX_MASK) - INDEX_BIAS + 0.5)
+    right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    while cells != 0:
+        bit = cells & (~cells + np.uint64(1))
+        cells ^= bit
+        cell = _index(bit)
+        depth_m = ahead + offsets[cell, 2]
+        if depth_m < NEAR_M:
+            continue
+        u = fx * (right + offsets[cell, 0]) / depth_m + cx
+        v = fy * (down + offsets[cell, 1]) / depth_m + cy
+        if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+            continue
+        row, column = int(v), int(u)
+        measured_mm = depth_mm[row, column]
+        apart_m = abs(0.001 * measured_mm - depth_m)
+        if measured_mm == 0 or apart_m > SHOWN_M + SHOWN_FRACTION * depth_m:
+            continue
+        if instances[row, column] == value:
+            hit |= bit
+        else:
+            missed |= bit
+    return hit, missed
+
+
+@kernel
+def _score(scores: Int8, hit: np.uint64, missed: np.uint64) -> np.uint64:
+    """Update the scores of the cells of a slot (64,); returns those now negative."""
+    lost = np.uint64(0)
+    rest = hit | missed
+    while rest != 0:
+        bit = rest & (~rest + np.uint64(1))
+        rest ^= bit
+        cell = _index(bit)
+        score = scores[cell] + (HIT if hit & bit != 0 else -MISS)
+        scores[cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
+        if score < 0:
+            lost |= bit
+    return lost
