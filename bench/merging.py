@@ -41,10 +41,12 @@ VOCABULARY = Vocabulary(
 LOCAL_NODES = 12
 DENSITY_PER_M2 = 3.0
 POINTS = 200  # surface points per object, as from lifting
-# A wall behind all objects. The surface rule compares the depth of nodes with it.
-DEPTH = DepthGrid(
-    np.full((60, 80), 60_000, np.uint16), 8, Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
-)
+CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
+STRIDE_PX = 8
+# Distance of the camera from the middle of the objects that it shows.
+DISTANCE_M = 2.5
+# A wall behind all objects.
+WALL_MM = 60_000
 
 
 class World:
@@ -97,6 +99,9 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
         centre = world.means[rng.integers(len(world.means))]
         rows = np.argsort(np.linalg.norm(world.means - centre, axis=1))[:LOCAL_NODES]
         n = len(rows)
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, 3] = world.means[rows].mean(axis=0) - [0.0, 0.0, DISTANCE_M]
+        surfaces = tuple(world.surface_points(row, rng) for row in rows)
         pairs = np.array([[0, 1 + index] for index in range(min(10, n - 1))])
         frames.append(
             LocalGraph(
@@ -104,7 +109,7 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
                 frame_id="world",
                 width=640,
                 height=480,
-                T_world_camera=np.eye(4),
+                T_world_camera=T_world_camera,
                 vocabulary=VOCABULARY,
                 instance_ids=np.arange(1, n + 1),
                 boxes_xyxy=np.zeros((n, 4)),
@@ -114,12 +119,27 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
                 covariances_world=world.covariances[rows],
                 depths_m=np.ones(n),
                 pixel_counts=np.full(n, 1000),
-                surface_points_world=tuple(world.surface_points(row, rng) for row in rows),
-                depth_grid=DEPTH,
+                surface_points_world=surfaces,
+                depth_grid=depth_grid(surfaces, T_world_camera[:3, 3]),
                 relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(10)),
             )
         )
     return frames
+
+
+def depth_grid(surfaces: tuple[np.ndarray, ...], camera_world: np.ndarray) -> DepthGrid:
+    """What a camera that points along z shows of surfaces (k, 3) and of the wall behind them."""
+    shape = (CAMERA.height // STRIDE_PX, CAMERA.width // STRIDE_PX)
+    depth_mm, instances = np.full(shape, WALL_MM, np.uint16), np.zeros(shape, np.uint16)
+    for index, points in enumerate(surfaces):
+        x, y, z = (points - camera_world).T
+        columns = np.floor((CAMERA.fx * x / z + CAMERA.cx) / STRIDE_PX).astype(int)
+        rows = np.floor((CAMERA.fy * y / z + CAMERA.cy) / STRIDE_PX).astype(int)
+        inside = (columns >= 0) & (rows >= 0) & (columns < shape[1]) & (rows < shape[0])
+        for row, column, depth in zip(rows[inside], columns[inside], 1000 * z[inside]):
+            if depth < depth_mm[row, column]:
+                depth_mm[row, column], instances[row, column] = depth, index + 1
+    return DepthGrid(depth_mm, STRIDE_PX, CAMERA, instances)
 
 
 def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
