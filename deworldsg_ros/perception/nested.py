@@ -17,6 +17,9 @@ from deworldsg_ros.scene.boxes import areas, shared_areas
 SAME_CLASS = 0.3
 # A box is nested if more than this fraction of it is inside another: edges are a few pixels off.
 NESTED_FRACTION = 0.8
+# A part has less than this fraction of the area of the whole. From there on the IoU is 0.5 or more,
+# and detectors suppress one of two such boxes. Objects in a row have similar sizes.
+PART_OF_AREA = 0.5
 # Two surfaces are at one depth if their median depths differ by less: a constant, and a fraction of
 # the depth for the noise of the sensor.
 DEPTH_STEP_M = 0.05
@@ -31,7 +34,8 @@ def join_nested(
     A box inside a larger box of its class and at its depth is a part of the same object, such as
     the lit part of a screen. The joined object has both boxes and both masks, and the class and
     score of the better detection. A box with several such boxes inside is a group of objects and
-    is removed. At different depths, both objects are kept: one is seen through the other's gaps.
+    is removed. At different depths, both objects are kept: one is seen through the other's gaps. A
+    row of equal objects is kept: a box of similar size, or beside another one of similar size.
 
     Args:
         objects: n objects, best score first.
@@ -72,9 +76,20 @@ def in_front_of(objects: Detections, weak: Detections) -> Detections:
 
 
 def _nested(objects: Detections) -> Bool:
-    """(n, n) bool: the row's box is inside the larger box of the column, which has its class."""
-    inside, _, same_class = _compare(objects, objects)
-    return inside & same_class
+    """(n, n) bool: the row's box may be a part of the object of the column's box, of its class.
+
+    Neighbours in a row of equal objects, such as books, also have boxes inside each other.
+    """
+    inside, overlaps, same_class = _compare(objects, objects)
+    area = areas(objects.boxes_xyxy)
+    ratio = area[:, None] / area[None, :]
+    part = inside & same_class & (ratio < PART_OF_AREA)
+    similar = (ratio > PART_OF_AREA) & (ratio < 1.0 / PART_OF_AREA)
+    beside = overlaps & same_class & similar & ~inside & ~inside.T
+    np.fill_diagonal(beside, False)
+    in_row = np.flatnonzero(beside.any(axis=1))
+    part[:, in_row] = False
+    return np.asarray(part)
 
 
 def _compare(a: Detections, b: Detections) -> tuple[Bool, Bool, Bool]:

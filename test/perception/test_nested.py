@@ -72,6 +72,30 @@ def test_a_chain_of_nested_boxes_is_one_object():
     assert joined.boxes_xyxy.tolist() == [OUTER]
 
 
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        # Two leaning books, the box of one inside that of the other.
+        ([10, 10, 40, 70], [12, 20, 38, 70]),
+        # A thin book inside the box of a leaning one, which overlaps the next book.
+        ([10, 10, 40, 70], [12, 20, 22, 70], [35, 15, 60, 70]),
+    ],
+)
+def test_a_row_of_equal_objects_is_not_one_object(boxes):
+    objects, masks = detections(*((box, SCREEN, 0.9 - 0.1 * k) for k, box in enumerate(boxes)))
+    joined, _ = join_nested(objects, masks, depth_of(masks, [2.0] * len(boxes)))
+    assert joined.boxes_xyxy.tolist() == [list(box) for box in boxes]
+
+
+def test_a_larger_object_beside_the_whole_makes_no_row():
+    part, other = [12, 20, 22, 70], [35, 5, 99, 79]
+    objects, masks = detections(
+        ([10, 10, 40, 70], SCREEN, 0.8), (part, SCREEN, 0.6), (other, SCREEN, 0.5)
+    )
+    joined, _ = join_nested(objects, masks, depth_of(masks, (2.0, 2.0, 2.0)))
+    assert joined.boxes_xyxy.tolist() == [[10, 10, 40, 70], other]
+
+
 def test_no_detections():
     none = Detections(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0))
     joined, masks = join_nested(none, [], np.zeros((80, 100), np.float32))
