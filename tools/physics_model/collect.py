@@ -1,0 +1,58 @@
+#!/usr/bin/env python3
+"""Run the pipeline with true boxes on rooms with ground truth, and keep each graph as a map.
+
+    python tools/physics_model/collect.py ROOT OUT [SCENE ...]
+
+ROOT has the layout of rendered rooms (tools/physics_rooms). OUT/SCENE.npz is a map file with
+surfaces, classes and votes; tools/physics_model/train.py reads it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import msgspec
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.map_file import write_map
+from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.recordings.recording import Recording, open_source
+
+
+def collect(root: Path, layout: str, scene: str, out: Path, choice: FrontEndChoice) -> None:
+    """Run one scene and write its map."""
+    annotations = open_annotations(root, layout)
+    source = open_source(annotations.scan_folder(scene))
+    config = Config()
+    config = msgspec.structs.replace(
+        config, perception=msgspec.structs.replace(config.perception, max_relations=1000)
+    )
+    pipeline = Pipeline(config, build_front_end(choice, annotations, scene, source, config))
+    for frame in Recording(source).frames():
+        pipeline.process(frame)
+    assert pipeline.builder is not None
+    out.mkdir(parents=True, exist_ok=True)
+    write_map(pipeline.builder, out / f"{scene}.npz")
+    print(scene, len(pipeline.builder.graph), "nodes", flush=True)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("root", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("scenes", nargs="*")
+    parser.add_argument("--layout", default="replica")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    annotations = open_annotations(arguments.root, arguments.layout)
+    for scene in arguments.scenes or annotations.scans():
+        choice = FrontEndChoice("boxes", seed=arguments.seed)
+        collect(arguments.root, arguments.layout, scene, arguments.out, choice)
+
+
+if __name__ == "__main__":
+    main()

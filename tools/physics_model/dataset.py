@@ -1,0 +1,153 @@
+"""Pairs of nodes of mapped rooms, with their true states."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.relations.pair_geometry import NodeShapes, pair_features, pairs_in_reach
+from deworldsg_ros.relations.pair_table import floor_height
+from deworldsg_ros.relations.physical_states import DIRECTED, RELATIONS, relation_of_predicates
+from deworldsg_ros.relations.vote_model import relation_counts
+from deworldsg_ros.scene import graph_io
+from deworldsg_ros.scene.graph import SceneGraph
+
+# A node is in the box of an object if its mean is; the box is this much larger on every side.
+BOX_MARGIN_M = 0.05
+
+Truth = dict[tuple[int, int], str]
+
+
+@dataclass(frozen=True)
+class Room:
+    """The m pairs in reach of one room whose nodes are matched to two objects.
+
+    Attributes:
+        classes: names.
+        class_probabilities: (n, C) of the nodes.
+        observations: (n,) number of frames that showed each node.
+        pairs: (m, 2) rows of the nodes.
+        features: (2, m, F) of first and second, and of second and first.
+        states: (m,) true state.
+        near: (m,) bool.
+        counts: (m, 2, NONE) votes by relation, in both directions.
+        frames: (m,) number of frames that showed both.
+        bottoms_m, heights_m: (n,) of the nodes: bottom over the floor, and height.
+        on_floor: (n,) 1 = stands on the floor, 0 = does not, -1 = unknown.
+    """
+
+    classes: tuple[str, ...]
+    class_probabilities: NDArray[np.float64]
+    observations: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    features: NDArray[np.float64]
+    states: NDArray[np.int64]
+    near: NDArray[np.bool_]
+    counts: NDArray[np.float64]
+    frames: NDArray[np.float64]
+    bottoms_m: NDArray[np.float64]
+    heights_m: NDArray[np.float64]
+    on_floor: NDArray[np.int64]
+
+
+def load_room(map_path: Path, truth_path: Path) -> Room:
+    """The pairs of a map (collect.py), with the ground truth of its room."""
+    content = json.loads(truth_path.read_text())
+    objects = [item for item in content["objects"] if item.get("detectable") and item.get("vg")]
+    truth = {(s, o): name for s, o, _, name in content["relationships"]}
+    graph = graph_io.load(map_path)
+    for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
+        graph.remove_node(node_id)
+    nodes = graph.nodes
+    shapes = NodeShapes()
+    for row, node_id in enumerate(nodes.ids.tolist()):
+        shapes.put(shapes.append(node_id), nodes.surface(row), np.eye(3))
+    at = _match(graph, objects)
+    floor_m = floor_height(shapes)
+    pairs = pairs_in_reach(np.arange(len(nodes)), shapes.low, shapes.high, shapes.counts)
+    pairs = pairs[(at[pairs] >= 0).all(axis=1) & (at[pairs[:, 0]] != at[pairs[:, 1]])]
+    # Two people may judge these differently.
+    unclear = {tuple(ids) for ids in content.get("unclear", ())}
+    ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
+    pairs = pairs[[not {(a, b), (b, a)} & unclear for a, b in ids]]
+    columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
+    ends = (pairs, pairs[:, ::-1])
+    features = [
+        pair_features(p[:, 0].copy(), p[:, 1].copy(), *columns, shapes.points, floor_m)
+        for p in ends
+    ]
+    ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
+    states = np.array([_state(truth, a, b) for a, b in ids], np.int64)
+    near = np.array(["near" in (truth.get((a, b)), truth.get((b, a))) for a, b in ids], np.bool_)
+    counts, frames = _votes(graph, nodes.ids[pairs])
+    return Room(
+        classes=graph.vocabulary.classes,
+        class_probabilities=nodes.class_probabilities.copy(),
+        observations=nodes.observations.copy(),
+        pairs=pairs,
+        features=np.stack(features),
+        states=states,
+        near=near & (states == 0),
+        counts=counts,
+        frames=frames,
+        bottoms_m=shapes.low[:, 2] - floor_m,
+        heights_m=(shapes.high - shapes.low)[:, 2],
+        on_floor=np.array([_stands_on_floor(objects[k]) if k >= 0 else -1 for k in at], np.int64),
+    )
+
+
+def _match(graph: SceneGraph, objects: list[dict[str, Any]]) -> NDArray[np.int64]:
+    """Index of the object of each node, -1 = none: its class, and its box around the mean."""
+    low = np.array([item["aabb"][0] for item in objects]) - BOX_MARGIN_M
+    high = np.array([item["aabb"][1] for item in objects]) + BOX_MARGIN_M
+    seen = np.array([item["visible_centroid"] for item in objects])
+    names = np.array([item["vg"] for item in objects])
+    nodes = graph.nodes
+    result = np.full(len(nodes), -1, np.int64)
+    for row in range(len(nodes)):
+        surface = nodes.surface(row)
+        mean = surface.mean(axis=0) if len(surface) else nodes.means[row]
+        label = graph.vocabulary.classes[int(nodes.class_probabilities[row].argmax())]
+        inside = ((mean >= low) & (mean <= high)).all(axis=1) & (names == label)
+        candidates = np.flatnonzero(inside)
+        if len(candidates):
+            nearest = np.linalg.norm(seen[candidates] - mean, axis=1).argmin()
+            result[row] = candidates[nearest]
+    return result
+
+
+def _state(truth: Truth, a: int, b: int) -> int:
+    """True state of a pair of object ids."""
+    for first, second, offset in ((a, b, 1), (b, a, 2)):
+        name = truth.get((first, second))
+        if name in RELATIONS and RELATIONS.index(name) in DIRECTED:
+            return offset + 2 * DIRECTED.index(RELATIONS.index(name))
+    return 0
+
+
+def _votes(
+    graph: SceneGraph, ids: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Votes by relation (m, 2, NONE) of pairs of node ids (m, 2), and numbers of frames (m,)."""
+    relation_of = relation_of_predicates(graph.vocabulary.predicates)
+    votes = np.zeros((2, len(ids), len(relation_of)))
+    frames = np.zeros(len(ids))
+    for row, (a, b) in enumerate(ids.tolist()):
+        known = graph.votes.get((min(a, b), max(a, b)))
+        if known is not None:
+            frames[row] = known.frames
+            if known.counts is not None:
+                votes[:, row] = known.counts if a < b else known.counts[::-1]
+    return np.stack([relation_counts(votes[end], relation_of) for end in (0, 1)], 1), frames
+
+
+def _stands_on_floor(item: dict[str, Any]) -> bool:
+    """Physics knows it; other rooms list nothing that carries it, and its bottom."""
+    if "physics" in item:
+        return bool(item["physics"]["on_floor"])
+    return item["parent"] is None and abs(item["aabb"][0][2]) < 0.01
