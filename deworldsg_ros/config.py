@@ -135,8 +135,8 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stage d: pairing, world model, prior and fusion (Eq. 8-10)."""
 
     world_model: Annotated[
-        str, option("world model: none (visual evidence only), vjepa2, dinov2, or fake for tests")
-    ] = "none"
+        str, option("world model: none, physics (embedded), vjepa2, dinov2, or fake for tests")
+    ] = "physics"
     geo_cost_threshold: Annotated[
         float,
         option("geometric cost below which two objects are a neighbour pair, Eq. 8", gt=0, le=100),
@@ -144,15 +144,15 @@ class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     clip_length: Annotated[int, option("frames per clip", ge=1, le=256)] = 16
     entropy_threshold_nats: Annotated[
         float,
-        option("entropy of the visual distribution above which the prior is used", ge=0, le=10),
+        option("entropy of the predicates of a pair above which the prior is used", ge=0, le=10),
     ] = 1.0
     fusion_alpha: Annotated[float, option("weight of the prior, Eq. 10", ge=0, le=100)] = 0.5
     edge_belief: Annotated[
         Literal["paper", "robust"],
         option(
-            "evidence of an edge: paper = sum of logits, each direction separately (Eq. 9); robust "
-            "= the evidence of each frame is bounded, and the two directions cannot contradict "
-            "each other"
+            "meaning of the probability of an edge: paper = which predicate, from the sum of "
+            "logits, each direction separately (Eq. 9); robust = whether the relation holds, from "
+            "frames, fused geometry and the prior; an object has one support"
         ),
     ] = "robust"
     max_clips_per_s: Annotated[

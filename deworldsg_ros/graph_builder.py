@@ -19,6 +19,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.publication import Publication
+from deworldsg_ros.scene.up import UpEstimator
 
 
 class GraphBuilder:
@@ -51,7 +52,7 @@ class GraphBuilder:
         output = config.output
         self.graph = graph
         self.merging = build_merging(config.merging)
-        self._edges = EdgeBeliefs(config.relations, graph, prior, output.top_k)
+        self._edges = EdgeBeliefs(config, graph, prior)
         self._publication = Publication(
             graph,
             self._edges.states,
@@ -65,6 +66,11 @@ class GraphBuilder:
     def prior(self) -> ClassPairPrior:
         """The world model's prior of class pairs."""
         return self._edges.prior
+
+    @property
+    def up(self) -> UpEstimator:
+        """Estimates the direction against gravity from the poses of the frames."""
+        return self._edges.up
 
     @property
     def confirmed(self) -> int:
@@ -84,6 +90,7 @@ class GraphBuilder:
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
+        self._edges.observe(local, node_ids)
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids

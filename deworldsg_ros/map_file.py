@@ -1,6 +1,6 @@
 """A graph as a map: a file from which a later run continues.
 
-It contains the graph, the state of merging, and the priors of class pairs.
+It contains the graph, the state of merging, the priors of class pairs, and the up direction.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def write_map(builder: GraphBuilder, path: Path) -> None:
     memory = {_MERGING + name: values for name, values in builder.merging.memory().items()}
     arrays = graph_io.to_arrays(builder.graph.state())
     with _writing(path):
-        graph_io.write(path, {**arrays, **memory, "prior": prior})
+        graph_io.write(path, {**arrays, **memory, "prior": prior, "up": builder.up.state()})
 
 
 def read_map(config: Config, path: Path) -> GraphBuilder:
@@ -67,6 +67,8 @@ def _read(config: Config, path: Path) -> GraphBuilder:
         if name.startswith(_MERGING)
     }
     builder.merging.restore(graph, memory)
+    if "up" in arrays:  # not in maps of older releases
+        builder.up.restore(arrays["up"])
     return builder
 
 

@@ -9,17 +9,20 @@ import msgspec
 import numpy as np
 import pytest
 from support.merging import VOCABULARY, random_local_graphs
-from support.surfaces import CUP, TABLE, WHOLE, frame, slab
+from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
-from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.frame_graph import RelationEvidence
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Relations
 
 MUG = slab((0.5, 0, 1.05), (0.08, 0.08, 0.1))
+# A table and a mug on it in a world whose y axis points up.
+TOP, MUG_ON_TOP = slab((0, 0.7, 1), (1.2, 0.04, 0.8)), slab((0.2, 0.77, 1), (0.08, 0.1, 0.08))
+CHAIR_BESIDE = slab((0.9, 0.25, 1), (0.4, 0.5, 0.4))
 
 
 def builder_of(**merging: object) -> GraphBuilder:
@@ -52,6 +55,58 @@ def test_continuing_from_a_map_equals_not_stopping(tmp_path, association, seed):
     one, other = (graph_io.to_arrays(b.graph.state()) for b in (again, whole))
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def upright_frame(stamp: int) -> LocalGraph:
+    """A table, a mug on it and a chair, from a level camera in a world whose y axis points up."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    relations = Relations(np.array([[1, 0]]), np.array([[3.0, -1.0, -3.0]]), np.ones(1))
+    seen = ((TOP, TABLE), (MUG_ON_TOP, CUP), (CHAIR_BESIDE, CHAIR))
+    return frame(stamp, *seen, T_world_camera=T, relations=relations)
+
+
+@pytest.mark.parametrize("edge_belief", ["robust", "paper"])
+def test_edges_of_a_map_are_equal_and_continue_equally(tmp_path, edge_belief):
+    config = Config(relations=RelationsConfig(edge_belief=edge_belief))
+    whole = GraphBuilder(config, VOCABULARY, "world")
+    for stamp in range(1, 5):
+        whole.integrate(upright_frame(stamp))
+    again = read_map(config, saved(whole, tmp_path))
+    np.testing.assert_array_equal(again.up.up_world(), whole.up.up_world())
+    np.testing.assert_allclose(whole.up.up_world(), [0, 1, 0], atol=1e-9)
+    assert [(e.subject, e.object, e.predicate) for e in whole.full().edges][:1] == [(2, 1, "on")]
+    for stamp in range(5, 9):
+        one, other = again.full(), whole.full()
+        assert (one.nodes, one.edges) == (other.nodes, other.edges)
+        assert dict(again.graph.votes).keys() == dict(whole.graph.votes).keys()
+        assert len(whole.graph.votes) == (3 if edge_belief == "robust" else 0)
+        for pair, votes in whole.graph.votes.items():
+            assert again.graph.votes[pair].frames == votes.frames == stamp - 1
+        for builder in (whole, again):
+            builder.integrate(upright_frame(stamp))
+
+
+def test_a_map_of_an_older_release_has_no_up_direction_and_no_votes(tmp_path):
+    builder = builder_of()
+    for stamp in range(1, 5):
+        builder.integrate(upright_frame(stamp))
+    path = saved(builder, tmp_path)
+    arrays = graph_io.read(path)
+    old = {name: values for name, values in arrays.items() if not name.startswith(("vote_", "up"))}
+    assert len(old) == len(arrays) - 4
+    graph_io.write(path, old)
+    again = read_map(Config(), path)
+    np.testing.assert_array_equal(again.up.up_world(), [0, 0, 1])
+    assert again.full().nodes == builder.full().nodes and not again.graph.votes
+    again.integrate(upright_frame(9))
+    np.testing.assert_allclose(again.up.up_world(), [0, 1, 0], atol=1e-9)
+
+
+def test_an_up_direction_that_is_none_is_refused(tmp_path):
+    path = saved(builder_of(), tmp_path)
+    graph_io.write(path, {**graph_io.read(path), "up": np.zeros(3)})
+    with pytest.raises(ConfigurationError, match=r"cannot be used: state of the up direction has"):
+        read_map(Config(), path)
 
 
 def test_tentative_nodes_are_dropped_and_ids_continue(tmp_path):

@@ -51,7 +51,9 @@ def local_graph(index: int) -> LocalGraph:
 def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
     association: str,
 ) -> None:
-    config = Config(merging=MergingConfig(association=association))
+    # All objects are at one depth: only the sum of Eq. 9 says that one is on the other.
+    relations = RelationsConfig(edge_belief="paper", world_model="none")
+    config = Config(merging=MergingConfig(association=association), relations=relations)
     pipeline = Pipeline(config, Scripted())
     for index in range(200):
         result = pipeline.process(frame(index))
@@ -206,4 +208,5 @@ def test_the_paper_differs_from_the_default_in_these_options() -> None:
         ("merging", "association"),
         ("relations", "max_clips_per_s"),
         ("relations", "edge_belief"),
+        ("relations", "world_model"),
     }

@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
@@ -141,7 +142,7 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
     source = open_source(annotations.scan_folder(task.scan), options=task.dataset)
     opened.callback(source.close)
     front_end = build_front_end(task.front_end, annotations, task.scan, source, task.config)
-    pipeline = build_method(task.method, task.config, front_end)
+    pipeline = build_method(task.method, _with_relation_head(task), front_end)
     recording = Recording(source, task.config.inputs)
     total = len(range(0, recording.frame_count, task.every))
     total = min(total, task.max_frames or total)
@@ -193,6 +194,18 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
         total_ms=total_ms(pipeline.times_s),
         device=device_name(),
     )
+
+
+def _with_relation_head(task: ScanTask) -> Config:
+    """The configuration with the name of the relation head that runs.
+
+    Recorded and annotated relations do not come from the configured head: the beliefs of edges
+    take their votes as independent of the geometry.
+    """
+    config, kind = task.config, task.front_end.kind
+    if kind not in ("recorded", "ground-truth"):
+        return config
+    return replace(config, perception=replace(config.perception, relation_head=kind))
 
 
 def build_method(method: str, config: Config, front_end: Perceiver) -> Pipeline | BaselinePipeline:

@@ -3,7 +3,6 @@
 from deworldsg_ros.relations.clip_policy import ClipPolicy
 from deworldsg_ros.relations.clip_queue import ClipQueue
 from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, union_box
-from deworldsg_ros.relations.consistency import Consistency, contradictions
 from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.evidence import (
     FusedEdges,
@@ -31,7 +30,6 @@ __all__ = [
     "ClipPolicy",
     "ClipQueue",
     "ClipRequest",
-    "Consistency",
     "EdgeBeliefs",
     "EvidenceWorker",
     "FrameBuffer",
@@ -47,7 +45,6 @@ __all__ = [
     "WorldModel",
     "build_world_model",
     "choose_directions",
-    "contradictions",
     "crop_clip",
     "entropy_nats",
     "fuse_distributions",

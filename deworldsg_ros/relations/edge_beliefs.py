@@ -1,65 +1,104 @@
-"""The beliefs of the edges of the global graph (Eq. 9-10), rebuilt only where something changed."""
+"""The beliefs of the edges of the global graph: evidence in, messages out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.consistency import Consistency
+from deworldsg_ros.config import Config
 from deworldsg_ros.relations.evidence import (
     OUTLIER_RATE,
-    PROVENANCES,
-    FusedEdges,
     bounded_logits,
-    choose_directions,
-    fuse_edges,
+    entropy_nats,
+    visual_distribution,
 )
+from deworldsg_ros.relations.pair_table import PairTable
+from deworldsg_ros.relations.paper_beliefs import PaperBeliefs, edge_state
+from deworldsg_ros.relations.physics_model import load_physics_model
+from deworldsg_ros.relations.predicted_prior import predicted_prior
 from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.relations.robust_beliefs import DirectedBeliefs, RobustBeliefs
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Int64
-from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.up import UpEstimator
+from deworldsg_ros.scene.votes import frame_votes
 
-# Revisions of everything that a belief is computed from.
-_Basis = tuple[int, ...]
+# Votes of objects whose means are farther apart are not counted.
+MAX_DISTANCE_M = 2.5
+# An edge is published if its best predicate has at least this probability.
+MIN_PROBABILITY = 0.2
+# Published probabilities have so many decimals: smaller changes are no news.
+DECIMALS = 3
 
 
 class EdgeBeliefs:
     """Takes relation evidence into a graph and computes the messages of its edges.
 
     Args:
-        config: `edge_belief`, `fusion_alpha` and `entropy_threshold_nats` are used.
+        config: every section but ``lifting`` and ``merging`` is used.
         graph: whose edges these are.
-        prior: of class pairs.
-        top_k: number of predicates in the message of an edge.
+        prior: of class pairs, from clips.
 
     Attributes:
-        prior: of class pairs.
+        prior: of class pairs, from clips.
+        up: estimates the direction against gravity from the poses of the frames.
     """
 
-    def __init__(
-        self, config: RelationsConfig, graph: SceneGraph, prior: ClassPairPrior, top_k: int
-    ) -> None:
+    def __init__(self, config: Config, graph: SceneGraph, prior: ClassPairPrior) -> None:
         self.prior = prior
-        self._config = config
+        self.up = UpEstimator(config.inputs.world_up)
         self._graph = graph
-        self._top_k = top_k
-        robust = config.edge_belief == "robust"
-        self._consistency = Consistency(graph.vocabulary.predicates) if robust else None
-        # The last message of each pair, with its basis; None = no belief, no edge.
-        self._known: dict[Pair, tuple[_Basis, wire.EdgeState | None]] = {}
+        self._top_k = config.output.top_k
+        relations = config.relations
+        self._robust = relations.edge_belief == "robust"
+        self._table = PairTable(
+            graph,
+            load_physics_model(),
+            geometry=relations.world_model != "none",
+            tentative=config.output.include_tentative,
+        )
+        self._has_predictions = relations.world_model == "physics"
+        self._paper_beliefs = PaperBeliefs(relations, graph, self._top_k)
+        self._robust_beliefs = RobustBeliefs(config, graph, self._table)
+        # The last message of each pair, with what it was made from.
+        self._known: dict[Pair, tuple[Any, wire.EdgeState]] = {}
 
     def weigh(self, local: LocalGraph) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
-        if self._config.edge_belief == "paper":
+        if not self._robust:
             return local
         logits = bounded_logits(local.relations.logits, OUTLIER_RATE)
         return replace(local, relations=replace(local.relations, logits=logits))
+
+    def observe(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Count the votes of a merged frame, also for pairs without a relation.
+
+        Args:
+            local: the frame, with the logits of the relation head.
+            node_ids: the node of each of its rows.
+        """
+        self.up.observe(local.T_world_camera)
+        if not self._robust or len(node_ids) < 2:
+            return
+        votes = frame_votes(local.relations.logits)
+        counts: dict[tuple[int, int], Float64] = {}
+        for (subject, object_), vote in zip(local.relations.pairs.tolist(), votes):
+            first, second = min(subject, object_), max(subject, object_)
+            pair = counts.setdefault((first, second), np.zeros((2, votes.shape[1])))
+            pair[int(subject > object_)] = vote
+        offsets = local.means_world[:, None] - local.means_world[None]
+        close = (offsets**2).sum(axis=2) < MAX_DISTANCE_M**2
+        for first, second in np.argwhere(np.triu(close, 1)).tolist():
+            a_id, b_id = node_ids[first], node_ids[second]
+            if a_id and b_id and a_id != b_id:
+                self._graph.add_votes(a_id, b_id, counts.get((first, second)))
 
     def add(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs (Eq. 8) and the world model's predictions.
@@ -81,88 +120,54 @@ class EdgeBeliefs:
         for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
             self._graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
 
-    def states(self, pairs: Sequence[Pair]) -> list[wire.EdgeState]:
-        """Messages of the pairs that have a belief; unchanged messages are the same objects."""
-        bases = self._bases(pairs)
-        stale = [
-            pair
-            for pair, basis in bases.items()
-            if pair not in self._known or self._known[pair][0] != basis
-        ]
-        made = self._make(stale)
-        self._known = {
-            pair: (basis, made[pair] if pair in made else self._known[pair][1])
-            for pair, basis in bases.items()
-        }
-        return [state for _, state in self._known.values() if state is not None]
+    def states(self, node_ids: Collection[int]) -> list[wire.EdgeState]:
+        """Messages of the edges between nodes, in order; unchanged ones are the same objects.
 
-    def _bases(self, pairs: Sequence[Pair]) -> dict[Pair, _Basis]:
-        """Revisions of evidence, classes and priors of each pair, in both directions.
-
-        Both, because the belief of one direction depends on the evidence of the other.
+        Args:
+            node_ids: of the published nodes.
         """
-        if not pairs:
-            return {}
-        edges = self._graph.edges
-        classes = self._classes(pairs)
-        there, back = self.prior.revisions(classes), self.prior.revisions(classes[:, ::-1])
-        priors = np.column_stack([classes, there, back]).tolist()
-        reverse = [edges.get((object_, subject)) for subject, object_ in pairs]
-        return {
-            pair: (edges[pair].revision, other.revision if other else 0, *prior)
-            for pair, other, prior in zip(pairs, reverse, priors)
-        }
+        prior = self.prior
+        if self._robust or self._has_predictions:
+            self._table.refresh(self.up.up_world())
+        if self._has_predictions:
+            prior = predicted_prior(self._table, self._graph)
+        if not self._robust:
+            return self._paper_beliefs.states(node_ids, prior)
+        return self._messages(self._robust_beliefs.beliefs(prior))
 
-    def _make(self, pairs: Sequence[Pair]) -> dict[Pair, wire.EdgeState | None]:
-        """Messages of edges (Eq. 9-10); None = no belief."""
-        made: dict[Pair, wire.EdgeState | None] = dict.fromkeys(pairs)
-        if not pairs:
-            return made
-        evidence = [self._graph.edges[pair] for pair in pairs]
-        logits = np.array([item.visual_logits for item in evidence])
-        has_visual = np.array([item.frames > 0 for item in evidence])
-        priors, has_prior = self.prior.lookup(self._classes(pairs))
-        fused = fuse_edges(
-            logits,
-            has_visual,
-            priors,
-            has_prior,
-            self._config.fusion_alpha,
-            self._config.entropy_threshold_nats,
-        )
-        if self._consistency is not None:
-            fused = self._consistency.reconcile(pairs, logits, has_visual, fused)
-        known = np.flatnonzero(fused.known)
-        chosen = choose_directions(
-            [pairs[row] for row in known.tolist()], has_visual[known], fused.probabilities[known]
-        )
-        for row in known[chosen].tolist():
-            made[pairs[row]] = self._state(pairs[row], evidence[row], fused, row)
-        return made
+    def _messages(self, beliefs: DirectedBeliefs) -> list[wire.EdgeState]:
+        """Messages of the edges that are probable enough."""
+        rounded = np.round(beliefs.probabilities, DECIMALS)
+        rows = np.flatnonzero(rounded.max(axis=1, initial=0.0) >= MIN_PROBABILITY)
+        order = np.lexsort((beliefs.pairs[rows, 1], beliefs.pairs[rows, 0]))
+        known: dict[Pair, tuple[Any, wire.EdgeState]] = {}
+        for row in rows[order].tolist():
+            pair = (int(beliefs.pairs[row, 0]), int(beliefs.pairs[row, 1]))
+            evidence = self._graph.edges.get(pair)
+            basis = (rounded[row].tobytes(), evidence and evidence.revision, beliefs.sources(row))
+            last = self._known.get(pair)
+            known[pair] = last if last and last[0] == basis else (
+                basis, self._message(pair, rounded[row], beliefs.sources(row))
+            )  # fmt: skip
+        self._known = known
+        return [state for _, state in known.values()]
 
-    def _classes(self, pairs: Sequence[Pair]) -> Int64:
-        """Arg-max classes of subject and object of each pair, (E, 2)."""
-        table = self._graph.nodes
-        classes = table.class_probabilities.argmax(axis=1)
-        rows = np.array([[table.row(subject), table.row(object_)] for subject, object_ in pairs])
-        return np.asarray(classes[rows], np.int64)
-
-    def _state(
-        self, pair: Pair, evidence: EdgeEvidence, fused: FusedEdges, row: int
+    def _message(
+        self, pair: Pair, probabilities: Float64, provenance: wire.Provenance
     ) -> wire.EdgeState:
-        predicates = self._graph.vocabulary.predicates
-        probabilities = fused.probabilities[row]
-        best = np.argsort(-probabilities, kind="stable")[: self._top_k].tolist()
-        beliefs = [wire.Belief(predicates[index], float(probabilities[index])) for index in best]
-        return wire.EdgeState(
-            subject=pair[0],
-            object=pair[1],
-            predicate=beliefs[0].label,
-            probability=beliefs[0].probability,
-            predicates=beliefs,
-            provenance=PROVENANCES[fused.provenance_codes[row]],
-            entropy_nats=float(fused.entropies_nats[row]),
-            observations=evidence.frames,
+        evidence = self._graph.edges.get(pair)
+        logits = np.zeros(len(probabilities))
+        frames = 0
+        if evidence is not None and evidence.frames:
+            logits, frames = evidence.visual_logits, evidence.frames
+        return edge_state(
+            pair,
+            probabilities,
+            self._graph.vocabulary.predicates,
+            self._top_k,
+            provenance=provenance,
+            entropy_nats=float(entropy_nats(visual_distribution(logits))),
+            observations=frames,
         )
 
     def _check_vocabulary(self, evidence: RelationEvidence) -> None:

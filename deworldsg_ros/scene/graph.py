@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from deworldsg_ros.scene.node_ids import IdState, NodeIds
 from deworldsg_ros.scene.node_states import NodeStateCache
 from deworldsg_ros.scene.node_store import NodeStore
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
+from deworldsg_ros.scene.votes import PairVotes, VoteMap
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class GraphState:
         nodes: arrays of n rows, by their names in `NodeTable`.
         surfaces: n arrays (k, 3) float32 of surface points, metres.
         edges: evidence of each directed pair of ids.
+        votes: votes of frames on each unordered pair of ids.
         ids: the id memory.
     """
 
@@ -37,6 +39,7 @@ class GraphState:
     nodes: Mapping[str, NDArray[Any]]
     surfaces: Sequence[Float32]
     edges: Mapping[Pair, EdgeEvidence]
+    votes: Mapping[Pair, PairVotes]
     ids: IdState
     revision: int
     surface_point_capacity: int
@@ -65,6 +68,7 @@ class SceneGraph(NodeStore):
         super().__init__(vocabulary, frame_id, surface_point_capacity, remembered_frames)
         self.even_gaussians = even_gaussians
         self._edges = EdgeMap(len(vocabulary.predicates))
+        self._votes = VoteMap(len(vocabulary.predicates))
         self._states = NodeStateCache(even_gaussians)
 
     @classmethod
@@ -80,6 +84,8 @@ class SceneGraph(NodeStore):
         graph.nodes.restore(state.nodes, state.surfaces)
         for pair, evidence in state.edges.items():
             graph._edges.add(pair, evidence)
+        for pair, votes in state.votes.items():
+            graph._votes.add(pair, votes.frames, votes.counts, votes.revision)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.revision = state.revision
         return graph
@@ -93,6 +99,7 @@ class SceneGraph(NodeStore):
             nodes={name: getattr(nodes, name).copy() for name in SAVED_COLUMNS},
             surfaces=[nodes.surface(row).copy() for row in range(len(nodes))],
             edges=dict(self.edges),
+            votes={pair: replace(votes) for pair, votes in self.votes.items()},
             ids=self._ids.state(),
             revision=self.revision,
             surface_point_capacity=self.surface_point_capacity,
@@ -113,6 +120,7 @@ class SceneGraph(NodeStore):
         self.nodes.merge(row, self.nodes.row(removed_id))
         self._changed([row])
         self._edges.repoint(removed_id, kept_id, self.revision)
+        self._votes.repoint(removed_id, kept_id, self.revision)
         self._remove(removed_id, kept_id)
         return kept_id
 
@@ -126,7 +134,9 @@ class SceneGraph(NodeStore):
         self.nodes.take_over(row, self.nodes.row(new_id))
         self._changed([row])
         self._edges.drop(old_id)
+        self._votes.drop(old_id)
         self._edges.repoint(new_id, old_id, self.revision)
+        self._votes.repoint(new_id, old_id, self.revision)
         self._remove(new_id, old_id)
 
     def remove_node(self, node_id: int) -> None:
@@ -134,6 +144,7 @@ class SceneGraph(NodeStore):
         self.nodes.row(node_id)
         self.revision += 1
         self._edges.drop(node_id)
+        self._votes.drop(node_id)
         self._remove(node_id, 0)
 
     @property
@@ -143,6 +154,27 @@ class SceneGraph(NodeStore):
         Pairs with `frames == 0` are geometric neighbours without visual evidence.
         """
         return self._edges.evidence
+
+    @property
+    def votes(self) -> Mapping[Pair, PairVotes]:
+        """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
+        return self._votes.pairs
+
+    def take_changed_votes(self) -> set[Pair]:
+        """Pairs whose votes changed since the last call; some may have been removed."""
+        return self._votes.take_changed()
+
+    def seen_together(self, node_id: int) -> set[int]:
+        """Ids of the nodes that frames showed together with a node; do not change it."""
+        return self._votes.partners(node_id)
+
+    def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
+        """Count a frame that showed two different live nodes, with its votes (2, R) or None.
+
+        The first row of the votes has `a_id` as the subject.
+        """
+        self.revision += 1
+        self._votes.add((a_id, b_id), 1, counts, self.revision)
 
     def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
         """Sum a frame's visual relation logits (R,) into an edge (Eq. 9).

@@ -22,6 +22,7 @@ from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.graph import GraphState, SceneGraph
 from deworldsg_ros.scene.node_ids import IdState
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
+from deworldsg_ros.scene.votes import PairVotes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -59,6 +60,7 @@ def to_arrays(state: GraphState) -> Arrays:
         "surface_points": np.concatenate([np.zeros((0, 3), np.float32), *state.surfaces]),
         "surface_point_counts": np.array([len(points) for points in state.surfaces], np.int64),
         **_edge_arrays(state),
+        **_vote_arrays(state),
         **_id_arrays(state.ids),
     }
 
@@ -71,6 +73,17 @@ def _edge_arrays(state: GraphState) -> Arrays:
         "edge_pairs": np.array(list(state.edges), np.int64).reshape(-1, 2),
         "edge_visual_logits": logits.reshape(-1, len(state.vocabulary.predicates)),
         "edge_counts": np.array(counts, np.int64).reshape(-1, 4),
+    }
+
+
+def _vote_arrays(state: GraphState) -> Arrays:
+    votes, width = state.votes.values(), len(state.vocabulary.predicates)
+    voted = [item.counts for item in votes if item.counts is not None]
+    known = [(v.frames, v.revision, v.counts is not None) for v in votes]
+    return {
+        "vote_pairs": np.array(list(state.votes), np.int64).reshape(-1, 2),
+        "vote_known": np.array(known, np.int64).reshape(-1, 3),
+        "vote_counts": np.array(voted, np.float64).reshape(-1, 2, width),
     }
 
 
@@ -114,6 +127,7 @@ def _state(arrays: Arrays) -> GraphState:
         nodes={name: arrays[name] for name in SAVED_COLUMNS},
         surfaces=_split(arrays["surface_points"], arrays["surface_point_counts"]),
         edges=_edges(arrays),
+        votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
         ids=_ids(arrays, int(header["next_id"])),
         revision=int(header["revision"]),
         surface_point_capacity=header["surface_point_capacity"],
@@ -132,6 +146,16 @@ def _edges(arrays: Arrays) -> dict[Pair, EdgeEvidence]:
             logits, frames, last_seen_ns, neighbour_frames, revision
         )
     return edges
+
+
+def _votes(arrays: Arrays) -> dict[Pair, PairVotes]:
+    counts = iter(arrays["vote_counts"])
+    return {
+        (first, second): PairVotes(frames, next(counts) if voted else None, revision)
+        for (first, second), (frames, revision, voted) in zip(
+            arrays["vote_pairs"].tolist(), arrays["vote_known"].tolist()
+        )
+    }
 
 
 def _ids(arrays: Arrays, next_id: int) -> IdState:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.delta import diff, empty_scene_graph
-from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
 
 
@@ -16,8 +15,8 @@ class Publication:
 
     Args:
         graph: to publish.
-        edge_states: the messages of directed pairs, in order; pairs without a belief are left out,
-            and unchanged messages are the same objects.
+        edge_states: the messages of the edges between nodes, in order; unchanged messages are the
+            same objects.
         top_k: number of labels of each node.
         include_tentative: whether tentative nodes are published.
         include_surface_points: whether snapshots and updates contain surface points.
@@ -26,7 +25,7 @@ class Publication:
     def __init__(
         self,
         graph: SceneGraph,
-        edge_states: Callable[[Sequence[Pair]], list[wire.EdgeState]],
+        edge_states: Callable[[Collection[int]], list[wire.EdgeState]],
         *,
         top_k: int,
         include_tentative: bool,
@@ -71,12 +70,11 @@ class Publication:
     def _message(self, sequence: int, with_points: bool) -> wire.SceneGraphMessage:
         graph = self._graph
         nodes = graph.node_states(self._top_k, self._include_tentative, with_points)
-        pairs = [pair for pair in sorted(graph.edges) if pair[0] in nodes and pair[1] in nodes]
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=wire.stamp_from_ns(self._stamp_ns),
             frame_id=graph.frame_id,
             sequence=sequence,
             nodes=list(nodes.values()),
-            edges=self._edge_states(pairs),
+            edges=self._edge_states(nodes.keys()),
         )

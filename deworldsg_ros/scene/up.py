@@ -43,6 +43,18 @@ class UpEstimator:
         self._image_up -= T_world_camera[:3, 1]
         self._count += 1
 
+    def state(self) -> Float64:
+        """Everything that it knows, (13,) float64, for `restore`."""
+        return np.concatenate([[self._count], self._rows.ravel(), self._image_up])
+
+    def restore(self, state: Float64) -> None:
+        """Continue from a state; ValueError if it is none."""
+        if state.shape != (13,) or not np.isfinite(state).all() or state[0] < 0:
+            raise ValueError(f"state of the up direction has shape {state.shape}: expected (13,)")
+        self._count = int(state[0])
+        self._rows = state[1:10].reshape(3, 3).copy()
+        self._image_up = state[10:].copy()
+
     def up_world(self) -> Float64:
         """Up, (3,) float64 unit vector; +z before the first pose."""
         if self._axis != "auto":

@@ -192,10 +192,25 @@ class EdgeState(msgspec.Struct, frozen=True):
 
     subject: Annotated[int, msgspec.Meta(ge=1)]
     object: Annotated[int, msgspec.Meta(ge=1)]
-    predicate: str
-    probability: Probability
-    predicates: Annotated[list[Belief], msgspec.Meta(description="most probable first, top k")]
-    provenance: Provenance
+    predicate: Annotated[str, msgspec.Meta(description="the most probable one")]
+    probability: Annotated[
+        Probability,
+        msgspec.Meta(
+            description="that this relation holds at all; with edge_belief paper: that it is this "
+            "one, if any"
+        ),
+    ]
+    predicates: Annotated[
+        list[Belief],
+        msgspec.Meta(
+            description="most probable first, top k; the probabilities of all predicates sum to "
+            "at most 1, and the rest is the probability of no relation"
+        ),
+    ]
+    provenance: Annotated[
+        Provenance,
+        msgspec.Meta(description="visual = frames, prior = world model, fused = both"),
+    ]
     entropy_nats: Annotated[
         float, msgspec.Meta(ge=0.0, description="of the visual distribution (uniform if none)")
     ]

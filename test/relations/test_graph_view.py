@@ -140,7 +140,9 @@ def test_the_number_of_remembered_frames_is_bounded(monkeypatch):
 
 def test_the_chosen_clips_give_the_edges_of_all_clips():
     def final(**changes):
-        relations = RelationsConfig(world_model="fake", clip_length=4, **changes)
+        relations = RelationsConfig(
+            world_model="fake", clip_length=4, edge_belief="paper", **changes
+        )
         config = msgspec.structs.replace(PAPER, relations=relations)
         pipeline = Pipeline(config, Scripted(UNSURE))
         for index in range(30):

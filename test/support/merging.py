@@ -12,6 +12,7 @@ from deworldsg_ros.scene.graph import SceneGraph
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 
 seeds = st.integers(0, 2**32 - 1)
+EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "votes", "frame"]
 
 
 def random_covariances(
@@ -123,9 +124,7 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
         ever = int(max([*live, 1]))
         gaussian = (rng.normal(size=3), random_covariances(rng, 1)[0], random_classes(rng, 1)[0])
         points = rng.normal(size=(4, 3)).astype(np.float32)
-        action = rng.choice(
-            ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "frame"]
-        )
+        action = rng.choice(EDITS)
         if action == "add" or len(live) < 2:
             graph.add_node(*gaussian, stamp_ns, points, confirmed=bool(rng.integers(2)))
         elif action == "observe":
@@ -141,5 +140,8 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
             graph.add_visual(*pair, rng.normal(size=3), stamp_ns)
         elif action == "neighbour":
             graph.add_neighbour(*rng.integers(1, ever + 1, 2).tolist(), stamp_ns)
+        elif action == "votes":
+            counts = rng.uniform(0, 1, (2, 3)) if rng.integers(2) else None
+            graph.add_votes(*rng.choice(live, 2, replace=False).tolist(), counts)
         elif action == "frame":
             graph.remember_frame(stamp_ns, rng.choice(live, 3).tolist())

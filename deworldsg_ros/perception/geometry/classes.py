@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-CONTAINERS = frozenset(
-    [
-        "vase", "pot", "basket", "bowl", "cup", "sink", "bag", "box", "drawer", "backpack",
-        "handbag", "suitcase", "bathtub",
-    ]
-)  # fmt: skip
-TABLES = frozenset({"table", "dining table", "desk", "counter", "bench"})
-SEATS = frozenset({"chair", "couch", "seat", "sofa", "stool"})
+from deworldsg_ros.scene.class_kinds import SEATS, TABLES
+
 # Classes that are furniture even if only a small part is visible.
 FURNITURE = (
     TABLES
@@ -23,17 +17,6 @@ FURNITURE = (
 )  # fmt: skip
 # Classes that stand on the floor, and on nothing else that is furniture.
 FLOOR_STANDING = (TABLES - {"counter"}) | SEATS | frozenset({"bed", "bathtub", "toilet"})
-PLANTS = frozenset({"plant", "potted plant", "flower"})
-# Classes of the objects that a class is fixed to. The layout cannot show it.
-FIXED_TO = {
-    "sink": frozenset({"counter", "cabinet"}),
-    "curtain": frozenset({"window", "wall"}),
-    "shower curtain": frozenset({"wall", "bathtub"}),
-    "picture": frozenset({"wall"}),
-    "window": frozenset({"wall"}),
-    "door": frozenset({"wall"}),
-    "handle": frozenset({"door", "cabinet", "drawer"}),
-}
 BUILT_IN = frozenset({"sink", "window"})
 FLOORS = frozenset({"floor"})
 WALLS = frozenset({"wall"})

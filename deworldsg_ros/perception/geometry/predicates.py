@@ -14,19 +14,15 @@ import numpy as np
 
 from deworldsg_ros.perception.geometry.classes import (
     BUILT_IN,
-    CONTAINERS,
-    FIXED_TO,
     FLOOR_STANDING,
     FLOORS,
     FURNITURE,
     HUNG,
-    PLANTS,
-    SEATS,
-    TABLES,
     WALLS,
 )
 from deworldsg_ros.perception.geometry.layout import Layout
 from deworldsg_ros.scene.arrays import Bool, Float64
+from deworldsg_ros.scene.class_kinds import CONTAINERS, FIXED_TO, PLANTS, SEATS, TABLES
 
 # Logit of predicates that the layout cannot judge. The softmax of 50 logits at -6 beside one at 3
 # gives that one 99.4 % of the mass. Sums over frames (Eq. 9) stay of the order of a network's.

@@ -1,0 +1,165 @@
+"""What relations of different pairs exclude: one support an object, no circles, and what is near.
+
+Pairs are rows of parallel arrays; an object is an index from 0 to n - 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.special import expit
+
+from deworldsg_ros.relations.physical_states import RELATIONS_OF_STATE, STATE_COUNT, SUPPORTS
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+
+# States in which the first object rests on, in or at the second one, and the opposite.
+_CARRIED = np.isin(RELATIONS_OF_STATE, SUPPORTS)
+CARRIED_FIRST, CARRIED_SECOND = _CARRIED[:, 0], _CARRIED[:, 1]
+# Odds are finite.
+_MOST = 1.0 - 1e-6
+
+# Near: horizontal gap of furniture on the floor, and of objects on one support; and the standard
+# deviation of a measured gap.
+NEAR_FLOOR_M, NEAR_FLOOR_SPREAD_M = 0.5, 0.05
+NEAR_SUPPORT_M, NEAR_SUPPORT_SPREAD_M = 0.10, 0.012
+# Near, on one support: difference of the bottoms, which neighbours hide.
+NEAR_LEVEL_M, NEAR_LEVEL_SPREAD_M = 0.10, 0.02
+# Near: each object is among so many nearest neighbours of the other.
+NEAREST = 2
+# Near: the distance of the centres counts this much beside the gap, when neighbours are ranked. The
+# gaps of books in a row are all 0.
+CENTRE_FRACTION = 0.1
+# Near: a seat is with a table within this gap, whatever else is near it.
+SEAT_GAP_M = 0.35
+# A definition holds or not; measured surfaces are wrong in some of the pairs.
+NEAR_CERTAINTY = 0.97
+
+
+def one_support(
+    states: Float64, pairs: Int64, floor_odds: Float64
+) -> tuple[Float64, Float64, Float64]:
+    """State probabilities if each object has one support at most.
+
+    The probabilities of the supports of an object become those of independent events of which one
+    at most holds: odds_j / (1 + odds of the floor + sum of all odds). The other states of a pair
+    share the rest in proportion.
+
+    Args:
+        states: (m, STATE_COUNT) probabilities, rows sum to one.
+        pairs: (m, 2) objects.
+        floor_odds: (n,) odds that an object stands on the floor.
+
+    Returns:
+        (m, STATE_COUNT) probabilities; (m, 2) probability that the first object rests on the
+        second one, and the opposite; and (n,) probability that an object stands on the floor.
+    """
+    carried = np.column_stack([states[:, CARRIED_FIRST].sum(1), states[:, CARRIED_SECOND].sum(1)])
+    carried = np.minimum(carried, _MOST)
+    odds = carried / (1.0 - carried)
+    total = 1.0 + floor_odds
+    np.add.at(total, pairs, odds)
+    kept = odds / total[pairs]
+    kept *= np.minimum(1.0, _MOST / np.maximum(kept.sum(axis=1, keepdims=True), 1e-300))
+    _cut_circles(kept, pairs, len(floor_odds))
+    result = states.copy()
+    for end, chosen in enumerate((CARRIED_FIRST, CARRIED_SECOND)):
+        factor = kept[:, end] / np.maximum(carried[:, end], 1e-300)
+        result[:, chosen] = states[:, chosen] * factor[:, None]
+    rest = ~(CARRIED_FIRST | CARRIED_SECOND)
+    left = states[:, rest].sum(axis=1)
+    factor = (1.0 - result[:, ~rest].sum(axis=1)) / np.maximum(left, 1e-300)
+    result[:, rest] = states[:, rest] * factor[:, None]
+    return result, kept, floor_odds / total
+
+
+def _cut_circles(kept: Float64, pairs: Int64, count: int) -> None:
+    """Halve the weakest likely support of each circle, in place, until support is a forest."""
+    while True:
+        rows, ends = np.nonzero(kept > 0.5)
+        parent = np.full(count, -1)
+        parent[pairs[rows, ends]] = pairs[rows, 1 - ends]
+        place = {int(pairs[row, end]): (row, end) for row, end in zip(rows, ends)}
+        state = np.zeros(count, np.int8)  # 0 = new, 1 = on this walk, 2 = leads to a root
+        for start in np.flatnonzero(parent >= 0).tolist():
+            walk = []
+            node = start
+            while node >= 0 and state[node] == 0:
+                state[node] = 1
+                walk.append(node)
+                node = int(parent[node])
+            if node >= 0 and state[node] == 1:
+                circle = walk[walk.index(node) :]
+                weakest = min(circle, key=lambda item: kept[place[item]])
+                kept[place[weakest]] *= 0.5
+                break
+            state[walk] = 2
+        else:
+            return
+
+
+def near_probabilities(
+    pairs: Int64,
+    carried: Float64,
+    on_floor: Float64,
+    gaps_m: Float64,
+    bottom_steps_m: Float64,
+    centre_steps_m: Float64,
+    unrelated: Float64,
+    table_and_seat: Bool,
+) -> Float64:
+    """Probability that two objects are near, if no more specific relation holds between them.
+
+    Both stand on one support, within reach, and each is among the nearest neighbours of the other.
+
+    Args:
+        pairs: (m, 2) objects.
+        carried: (m, 2) probability that the first rests on the second, and the opposite.
+        on_floor: (n,) probability that an object stands on the floor.
+        gaps_m: (m,) horizontal gap of the bounds.
+        bottom_steps_m: (m,) difference of the heights of the bottoms.
+        centre_steps_m: (m,) horizontal distance of the centres.
+        unrelated: (m,) probability that no more specific relation holds.
+        table_and_seat: (m,) bool; a table and a seat, in any order.
+
+    Returns:
+        (m,) from 0 to `NEAR_CERTAINTY`.
+    """
+    count = len(on_floor)
+    children = np.concatenate([pairs[:, 0], pairs[:, 1]])
+    parents = np.concatenate([pairs[:, 1], pairs[:, 0]])
+    supports = csr_matrix(
+        (np.concatenate([carried[:, 0], carried[:, 1]]), (children, parents)), (count, count)
+    )
+    first, second = pairs[:, 0], pairs[:, 1]
+    together = np.asarray(supports[first].multiply(supports[second]).sum(axis=1)).ravel()
+    floor_reach = np.where(table_and_seat, SEAT_GAP_M, NEAR_FLOOR_M)
+    on_one_floor = (
+        on_floor[first] * on_floor[second]
+        * expit((floor_reach - gaps_m) / NEAR_FLOOR_SPREAD_M)
+    )  # fmt: skip
+    on_one_support = (
+        together
+        * expit((NEAR_SUPPORT_M - gaps_m) / NEAR_SUPPORT_SPREAD_M)
+        * expit((NEAR_LEVEL_M - np.abs(bottom_steps_m)) / NEAR_LEVEL_SPREAD_M)
+    )
+    near = np.minimum(on_one_floor + on_one_support, 1.0)
+    eligible = near * unrelated > 0.3
+    ranks = _ranks(pairs, gaps_m + CENTRE_FRACTION * centre_steps_m, eligible, count)
+    near = np.where((ranks.max(axis=1) < NEAREST) | table_and_seat, near, 0.0)
+    return np.asarray(NEAR_CERTAINTY * near)
+
+
+def _ranks(pairs: Int64, distances_m: Float64, eligible: Bool, count: int) -> Int64:
+    """Rank (m, 2) of each pair's distance among the eligible pairs of either object."""
+    rows = np.flatnonzero(eligible)
+    objects = pairs[rows].T.ravel()
+    order = np.lexsort((np.tile(distances_m[rows], 2), objects))
+    starts = np.searchsorted(objects[order], np.arange(count))
+    position = np.empty(len(order), np.int64)
+    position[order] = np.arange(len(order)) - starts[objects[order]]
+    ranks = np.full((len(pairs), 2), max(len(pairs), NEAREST), np.int64)
+    ranks[rows] = position.reshape(2, -1).T
+    return ranks
+
+
+assert len(CARRIED_FIRST) == STATE_COUNT

@@ -1,0 +1,215 @@
+"""The embedded world model: what physics says of two objects, learnt from simulated rooms.
+
+A few small networks map the fused geometry and the classes of an ordered pair to logits. They are
+trained on rooms in which a physics engine knows every contact, and what falls when an object is
+taken away (tools/physics_rooms, tools/physics_model). docs/relations.md has the model card.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass, fields
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.special import log_softmax
+
+from deworldsg_ros.relations.evidence import entropy_nats
+from deworldsg_ros.relations.pair_geometry import FEATURES
+from deworldsg_ros.relations.physical_states import DIRECTED, states_of_relations
+from deworldsg_ros.relations.vote_model import VoteScales
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
+from deworldsg_ros.scene.errors import ConfigurationError
+
+PATH = Path(__file__).with_name("weights") / "physics.npz"
+
+# Inputs of the network: the geometry, the kinds of both classes, whether one class is usually fixed
+# to the other, whether the classes are equal, and the entropies and observations of both.
+INPUT_COUNT = len(FEATURES) + 2 * len(KINDS) + 7
+# Standardised inputs are limited to this many standard deviations.
+MAX_INPUT = 6.0
+
+
+@dataclass(frozen=True)
+class PhysicsModel:
+    """The trained network, and what each source of evidence is worth.
+
+    Attributes:
+        input_means, input_scales: (INPUT_COUNT,) standardise the inputs.
+        weights_1, biases_1, weights_2, biases_2: hidden layers with ReLU, of `MEMBERS` networks.
+        weights_3, biases_3: logits of the relations of `DIRECTED`, relative to "not related". The
+            mean of the networks counts.
+        prior: (len(DIRECTED),) logits of a pair without geometry.
+        vote_scales: (4,) of `VoteScales`.
+        source_weights: (3,) exponents of geometry, and of independent votes; and the fraction of
+            pairs whose geometry is broken; see `believed_logits`.
+        floor: (3,) offset and slopes of the logit that an object stands on the floor, for the
+            height of its bottom over the floor in metres, and the log of its height.
+    """
+
+    input_means: Float64
+    input_scales: Float64
+    weights_1: Float32
+    biases_1: Float32
+    weights_2: Float32
+    biases_2: Float32
+    weights_3: Float32
+    biases_3: Float32
+    prior: Float64
+    vote_scales: Float64
+    source_weights: Float64
+    floor: Float64
+
+    @property
+    def votes(self) -> VoteScales:
+        """What votes are worth."""
+        return VoteScales(*self.vote_scales.tolist())
+
+    def relation_logits(self, inputs: Float64) -> Float64:
+        """Logits (m, len(DIRECTED)) of ordered pairs with inputs (m, INPUT_COUNT)."""
+        scaled = (inputs - self.input_means) / self.input_scales
+        x = np.clip(scaled, -MAX_INPUT, MAX_INPUT).astype(np.float32)
+        x = np.maximum(x @ self.weights_1 + self.biases_1[:, None], 0.0)
+        x = np.maximum(x @ self.weights_2 + self.biases_2[:, None], 0.0)
+        logits = x @ self.weights_3 + self.biases_3[:, None]
+        return np.asarray(logits.mean(axis=0), np.float64)
+
+    def state_logits(self, there: Float64, back: Float64) -> Float64:
+        """Logits (m, STATE_COUNT) of pairs, from the inputs of both directions."""
+        return states_of_relations(
+            np.stack([self.relation_logits(there), self.relation_logits(back)])
+        )
+
+    def floor_logits(self, bottoms_m: Float64, heights_m: Float64) -> Float64:
+        """Logits (n,) that objects stand on the floor.
+
+        Args:
+            bottoms_m: (n,) height of the bottoms over the floor.
+            heights_m: (n,) from bottom to top.
+        """
+        offset, by_bottom, by_height = self.floor
+        rise = np.abs(bottoms_m)
+        return np.asarray(offset + by_bottom * rise + by_height * np.log(heights_m + 0.01))
+
+
+def believed_logits(
+    model: PhysicsModel, geometry: Float64, votes: Float64, independent: Bool
+) -> Float64:
+    """Logits of the states of pairs from both sources.
+
+    A fraction of surfaces is broken: masks bleed, and nodes merge. Geometry therefore never
+    excludes a state. The embedded relation head errs where the geometry is misleading: beside
+    geometry, its votes are worth less than independent ones.
+
+    Args:
+        model: its prior and its source weights are used.
+        geometry: (m, STATE_COUNT) of `state_logits`; zeros = not judged.
+        votes: (m, STATE_COUNT) of `vote_logits`.
+        independent: (m,) bool; the votes do not come from the embedded head, or the geometry was
+            not judged.
+    """
+    by_geometry, by_independent, broken = model.source_weights
+    prior = np.concatenate([[0.0], np.repeat(model.prior, 2)])
+    judged = (geometry != 0).any(axis=1)[:, None]
+    sound = np.where(judged, by_geometry * geometry, prior)
+    mixed = np.logaddexp(
+        np.log1p(-broken) + log_softmax(sound, axis=1),
+        np.log(broken) + log_softmax(prior),
+    )
+    return np.asarray(mixed + np.where(independent, by_independent, 1.0)[:, None] * votes)
+
+
+class PairInputs:
+    """Makes the inputs of the network for a vocabulary.
+
+    Args:
+        classes: names of the C classes.
+    """
+
+    def __init__(self, classes: tuple[str, ...]) -> None:
+        self._kinds = kind_table(classes)
+        self._fixed = fixed_table(classes).astype(np.float64)
+
+    def make(
+        self,
+        features: Float64,
+        class_probabilities: Float64,
+        observations: Int64,
+        subjects: Int64,
+        objects: Int64,
+    ) -> Float64:
+        """Inputs (m, INPUT_COUNT) of ordered pairs.
+
+        Args:
+            features: (m, len(FEATURES)) of `pair_features`.
+            class_probabilities: (n, C), rows sum to one.
+            observations: (n,) number of frames that showed each node.
+            subjects: (m,) rows of `class_probabilities`, and
+            objects: (m,) rows.
+        """
+        kinds = class_probabilities @ self._kinds
+        entropies = entropy_nats(class_probabilities)
+        first, second = class_probabilities[subjects], class_probabilities[objects]
+        return np.column_stack(
+            [
+                features,
+                kinds[subjects],
+                kinds[objects],
+                ((first @ self._fixed) * second).sum(axis=1),
+                ((second @ self._fixed) * first).sum(axis=1),
+                (first * second).sum(axis=1),
+                entropies[subjects],
+                entropies[objects],
+                np.log(observations[subjects]),
+                np.log(observations[objects]),
+            ]
+        )
+
+
+@cache
+def load_physics_model(path: Path = PATH) -> PhysicsModel:
+    """Read the model.
+
+    Raises:
+        ConfigurationError: the file is missing or is no such model.
+    """
+    try:
+        with path.open("rb") as file:
+            if not zipfile.is_zipfile(file):
+                raise ValueError("it is no .npz archive")
+        with np.load(path, allow_pickle=False) as archive:
+            model = PhysicsModel(*(archive[field.name] for field in fields(PhysicsModel)))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigurationError(
+            f"world model 'physics': {path} cannot be read ({error}); reinstall the package"
+        ) from error
+    for name, shape in _shapes(model).items():
+        values = getattr(model, name)
+        if values.shape != shape or values.dtype.kind != "f":
+            raise ConfigurationError(
+                f"world model 'physics': {path} has {name} of {values.dtype} {values.shape}: "
+                f"expected floats {shape}; reinstall the package"
+            )
+    return model
+
+
+def _shapes(model: PhysicsModel) -> dict[str, tuple[int, ...]]:
+    """The shape of each array, for the number of networks and the widths of a model."""
+    members, first = (*model.biases_1.shape, 0, 0)[:2]
+    second = (0, *model.biases_2.shape)[-1]
+    return {
+        "input_means": (INPUT_COUNT,),
+        "input_scales": (INPUT_COUNT,),
+        "weights_1": (members, INPUT_COUNT, first),
+        "biases_1": (members, first),
+        "weights_2": (members, first, second),
+        "biases_2": (members, second),
+        "weights_3": (members, second, len(DIRECTED)),
+        "biases_3": (members, len(DIRECTED)),
+        "prior": (len(DIRECTED),),
+        "vote_scales": (4,),
+        "source_weights": (3,),
+        "floor": (3,),
+    }

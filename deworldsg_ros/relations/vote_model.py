@@ -1,0 +1,88 @@
+"""The evidence of frame votes: how much the votes of many frames speak for each relation.
+
+Of the n frames that showed both objects, a fraction x voted for a relation. Its evidence, in nats
+against "not related", is
+
+    n / (n + n_half) · slope · log((x + floor) / (even + floor)).
+
+It grows with the fraction, and saturates with the number of frames, because the frames of one pair
+are not independent. A relation with fewer votes than the fraction `even` is less likely than
+without votes. The four numbers are fitted to simulated rooms (tools/physics_model).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from deworldsg_ros.relations.physical_states import (
+    NEAR,
+    NONE,
+    RELATIONS,
+    RELATIONS_OF_STATE,
+    STATE_COUNT,
+)
+from deworldsg_ros.scene.arrays import Float64, Int64
+
+
+@dataclass(frozen=True)
+class VoteScales:
+    """The numbers of the formula above.
+
+    Attributes:
+        slope: nats for each factor e of the fraction.
+        n_half: frames that give half of the evidence of infinitely many.
+        floor: fraction below which fewer votes hardly matter.
+        even: fraction without evidence.
+    """
+
+    slope: float
+    n_half: float
+    floor: float
+    even: float
+
+    def evidence(self, votes: Float64, frames: Float64) -> Float64:
+        """Evidence in nats of votes among frames; 0 without frames."""
+        fraction = votes / np.maximum(frames, 1e-9)
+        ratio = np.log((fraction + self.floor) / (self.even + self.floor))
+        return np.asarray(frames / (frames + self.n_half) * self.slope * ratio)
+
+
+def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
+    """Votes by relation.
+
+    Args:
+        votes: (m, R) sums of the votes.
+        relation_of: (R,) relation of each predicate, -1 = it names none.
+
+    Returns:
+        (m, NONE) float64.
+    """
+    return np.stack([votes[:, relation_of == r].sum(axis=1) for r in range(NONE)], axis=1)
+
+
+def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
+    """Logits (m, STATE_COUNT) of the states of pairs.
+
+    A relation that has a converse has the votes of both.
+
+    Args:
+        counts: (m, 2, NONE) of `relation_counts` in both directions.
+        frames: (m,) number of frames that showed both objects.
+        scales: of the evidence.
+    """
+    logits = np.zeros((len(counts), STATE_COUNT))
+    for state in range(1, STATE_COUNT):
+        ends = [end for end in (0, 1) if RELATIONS_OF_STATE[state, end] != NONE]
+        votes = [counts[:, end, RELATIONS_OF_STATE[state, end]] for end in ends]
+        logits[:, state] = scales.evidence(np.mean(votes, axis=0), frames)
+    return logits
+
+
+def near_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
+    """Logits (m,) of near against "not related"; arguments as in `vote_logits`."""
+    return scales.evidence(counts[..., NEAR].mean(axis=1), frames)
+
+
+assert len(RELATIONS) == NONE + 1

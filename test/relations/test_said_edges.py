@@ -1,0 +1,211 @@
+"""What the graph says of small rooms: the true support, and none of the edges once said wrongly.
+
+Each room is a few objects of COCO classes with sampled surfaces. An edge is said if its predicate
+has a probability of at least 0.5.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+from support.room_nodes import Thing, bowl, chair, plant, room, said, table, thing, vote
+
+from deworldsg_ros.config import Config, RelationsConfig
+
+Edge = tuple[str, str, str]
+# Frames that showed all objects of a room.
+FRAMES = 40
+# Relations that hold in the other direction too, under another name.
+CONVERSES = {"above": "under", "under": "above"}
+
+
+class Case(NamedTuple):
+    """A room with the edges that hold in it, and some that were once said of such a room."""
+
+    name: str
+    things: dict[str, Thing]
+    true: tuple[Edge, ...]
+    wrong: tuple[Edge, ...]
+
+
+def on_table(label: str, x: float, y: float, width: float, depth: float, height: float) -> Thing:
+    return thing(label, x, y, 0.74, width, depth, height)
+
+
+CUP = on_table("cup", 0.4, 0.1, 0.09, 0.09, 0.1)
+BOTTLE = on_table("bottle", 0.3, 0.25, 0.075, 0.075, 0.3)
+FRIDGE = thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76)
+OVEN = thing("oven", 0.0, 0.0, 0.0, 0.6, 0.6, 0.86)
+
+CASES = [
+    Case(
+        "a chair under a table",
+        {"table": table(0, 0), "chair": chair(0, 0.45)},
+        (),
+        (("chair", "on", "table"), ("table", "on", "chair"), ("chair", "under", "table")),
+    ),
+    Case(
+        "a bottle on a table, a chair beside it",
+        {"table": table(0, 0), "chair": chair(0.3, 0.5), "bottle": BOTTLE},
+        (("bottle", "on", "table"),),
+        (("bottle", "on", "chair"), ("bottle", "above", "chair")),
+    ),
+    Case(
+        "a bottle 2.5 m from a refrigerator",
+        {"table": table(0, 0), "fridge": FRIDGE, "bottle": BOTTLE},
+        (("bottle", "on", "table"),),
+        (("bottle", "against", "fridge"), ("table", "against", "fridge")),
+    ),
+    Case(
+        "a tv on the wall, 1.8 m from a table and higher",
+        {"table": table(0, 0), "tv": thing("tv", 0, 2.25, 1.0, 1.1, 0.06, 0.65)},
+        (),
+        (("tv", "above", "table"), ("tv", "on", "table"), ("table", "under", "tv")),
+    ),
+    Case(
+        "a microwave on an oven",
+        {"oven": OVEN, "microwave": thing("microwave", 0, 0.05, 0.86, 0.5, 0.4, 0.29)},
+        (("microwave", "on", "oven"),),
+        (("microwave", "above", "oven"), ("oven", "on", "microwave"), ("microwave", "in", "oven")),
+    ),
+    Case(
+        "a microwave on a counter, beside an oven",
+        {
+            "counter": table(-0.87, 0, 1.1, 0.6, 0.9),
+            "oven": OVEN,
+            "microwave": thing("microwave", -0.6, 0.05, 0.9, 0.5, 0.4, 0.29),
+        },
+        (("microwave", "on", "counter"),),
+        (("microwave", "on", "oven"), ("microwave", "above", "oven")),
+    ),
+    Case(
+        "a vase beside a plant on a table",
+        {
+            "table": table(0, 0),
+            "vase": on_table("vase", -0.2, 0, 0.14, 0.14, 0.26),
+            "plant": plant(0.05, 0, 0.74),
+        },
+        (("vase", "on", "table"), ("plant", "on", "table")),
+        (
+            ("vase", "against", "plant"),
+            ("plant", "in", "vase"),
+            ("vase", "on", "plant"),
+            ("table", "against", "vase"),
+            ("table", "against", "plant"),
+        ),
+    ),
+    Case(
+        "a bowl on a counter, beside a refrigerator",
+        {
+            "counter": table(0, 0, 1.6, 0.6, 0.9),
+            "fridge": thing("refrigerator", 1.16, 0, 0, 0.66, 0.66, 1.76),
+            "bowl": bowl(0.6, 0, 0.9),
+        },
+        (("bowl", "on", "counter"),),
+        (("bowl", "on", "fridge"), ("bowl", "against", "fridge"), ("bowl", "in", "fridge")),
+    ),
+    Case(
+        "a screen on a table",
+        {"table": table(0, 0), "screen": on_table("tv", 0, 0.1, 0.55, 0.12, 0.4)},
+        (("screen", "on", "table"),),
+        (("table", "under", "screen"), ("screen", "above", "table"), ("table", "on", "screen")),
+    ),
+    Case(
+        "a cup on one of two tables",
+        {"table": table(0, 0), "other": table(0, 0.81), "cup": CUP},
+        (("cup", "on", "table"),),
+        (("cup", "on", "other"), ("table", "on", "other"), ("cup", "above", "other")),
+    ),
+    Case(
+        "things side by side on a table",
+        {
+            "table": table(0, 0),
+            "cup": on_table("cup", 0.1, 0, 0.09, 0.09, 0.1),
+            "bowl": bowl(0.3, 0, 0.74),
+            "book": on_table("book", -0.2, 0, 0.2, 0.28, 0.03),
+        },
+        (("cup", "on", "table"), ("bowl", "on", "table"), ("book", "on", "table")),
+        (
+            ("cup", "on", "bowl"),
+            ("bowl", "on", "cup"),
+            ("cup", "on", "book"),
+            ("cup", "in", "bowl"),
+        ),
+    ),
+]
+every_case = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+
+
+def see(builder, ids, votes: dict[Edge, int]) -> None:
+    """All objects were seen in `FRAMES` frames; some of these voted for the edges."""
+    voted: dict[frozenset[str], int] = {}
+    for (subject, predicate, object_), frames in votes.items():
+        pair = frozenset((subject, object_))
+        frames = min(frames, FRAMES - voted.get(pair, 0))
+        voted[pair] = voted.get(pair, 0) + frames
+        vote(builder, ids[subject], ids[object_], predicate, frames, CONVERSES.get(predicate))
+    names = list(ids)
+    for row, name in enumerate(names):
+        for other in names[:row]:
+            rest = FRAMES - voted.get(frozenset((name, other)), 0)
+            vote(builder, ids[name], ids[other], None, rest)
+
+
+@every_case
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_surfaces_alone_give_the_true_support(case: Case, seed: int) -> None:
+    edges = said(*room(case.things, seed=seed))
+    assert {edge: edges.get(edge, 0.0) for edge in case.wrong if edges.get(edge, 0.0) >= 0.5} == {}
+    assert {edge: edges.get(edge, 0.0) for edge in case.true if edges.get(edge, 0.0) < 0.5} == {}
+
+
+@every_case
+def test_with_the_usual_votes(case: Case) -> None:
+    """In nearly half of the frames the head saw the true edges, in a few it saw the wrong ones."""
+    builder, ids = room(case.things)
+    see(builder, ids, {**dict.fromkeys(case.true, 18), **dict.fromkeys(case.wrong, 2)})
+    edges = said(builder, ids)
+    assert {edge: edges.get(edge, 0.0) for edge in case.wrong if edges.get(edge, 0.0) >= 0.5} == {}
+    assert {edge: edges.get(edge, 0.0) for edge in case.true if edges.get(edge, 0.0) < 0.5} == {}
+
+
+@pytest.mark.parametrize(
+    ("case", "edge"),
+    [
+        pytest.param(case, edge, id=f"{case.name}: {' '.join(edge)}")
+        for case in CASES
+        for edge in case.wrong
+        # Leaves hide the rim of a vase: what every frame says may be so.
+        if edge != ("plant", "in", "vase")
+    ],
+)
+def test_not_even_if_every_frame_says_so(case: Case, edge: Edge) -> None:
+    """The embedded head errs where its rules are misled, and then in all frames."""
+    builder, ids = room(case.things)
+    see(builder, ids, {edge: FRAMES})
+    assert said(builder, ids).get(edge, 0.0) < 0.5
+
+
+@every_case
+def test_no_object_is_on_two_supports(case: Case) -> None:
+    """The head votes for every other object as a support, in every frame."""
+    builder, ids = room(case.things)
+    see(builder, ids, {(a, "on", b): FRAMES for a in ids for b in ids if a < b})
+    edges = said(builder, ids)
+    for name in ids:
+        supports = [
+            p for (subject, predicate, _), p in edges.items()
+            if subject == name and predicate in ("on", "in", "attached to")
+        ]  # fmt: skip
+        assert sum(supports) <= 1.0 + 0.001 * len(supports)  # each is rounded
+
+
+@every_case
+def test_without_a_world_model_the_frames_alone_count(case: Case) -> None:
+    config = Config(relations=RelationsConfig(world_model="none"))
+    builder, ids = room(case.things, config)
+    assert said(builder, ids) == {}
+    see(builder, ids, dict.fromkeys(case.true, 36))
+    edges = said(builder, ids)
+    assert {edge: edges.get(edge, 0.0) for edge in case.true if edges.get(edge, 0.0) < 0.5} == {}

@@ -1,0 +1,36 @@
+"""Kinds of classes by name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from deworldsg_ros.scene.class_kinds import FIXED_TO, KINDS, fixed_table, kind_table
+from deworldsg_ros.scene.vocabularies import COCO_CLASSES, SCANNET_CLASSES, VISUAL_GENOME_CLASSES
+
+VOCABULARIES = (COCO_CLASSES, SCANNET_CLASSES, VISUAL_GENOME_CLASSES)
+
+
+@pytest.mark.parametrize("classes", [(), *VOCABULARIES])
+def test_the_tables_name_each_kind_of_each_class(classes: tuple[str, ...]) -> None:
+    kinds, fixed = kind_table(classes), fixed_table(classes)
+    assert kinds.shape == (len(classes), len(KINDS)) and kinds.dtype == np.float64
+    assert fixed.shape == (len(classes),) * 2 and fixed.dtype == np.bool_
+    for row, name in enumerate(classes):
+        assert kinds[row].tolist() == [name in kind for kind in KINDS]
+        held_by = {other for column, other in enumerate(classes) if fixed[row, column]}
+        assert held_by == FIXED_TO.get(name, frozenset()) & set(classes)
+
+
+@pytest.mark.parametrize("kind", range(len(KINDS)))
+def test_each_kind_has_classes_that_a_detector_knows(kind: int) -> None:
+    assert any(KINDS[kind] & set(classes) for classes in VOCABULARIES)
+
+
+def test_what_is_fixed_has_a_name_in_a_vocabulary() -> None:
+    known = set().union(*VOCABULARIES)
+    assert set(FIXED_TO).union(*FIXED_TO.values()) <= known
+
+
+def test_names_without_a_kind() -> None:
+    assert not kind_table(("unicorn", "")).any() and not fixed_table(("unicorn", "wall")).any()
