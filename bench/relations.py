@@ -18,9 +18,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.config import Config, RelationsConfig
+from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import (
     ClassPairPrior,
+    EdgeBeliefs,
     RelationReasoner,
     build_world_model,
     choose_directions,
@@ -28,6 +30,7 @@ from deworldsg_ros.relations import (
     neighbour_pairs,
 )
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 WIDTH, HEIGHT = 640, 480
 CLASSES, PREDICATES = 80, 50
@@ -126,6 +129,44 @@ def frame_costs(count: int, turns: int) -> None:
     )
 
 
+def belief_costs(objects: int, nodes: int, turns: int) -> None:
+    """Processor time of the beliefs of a frame: its votes, and the edges after it."""
+    generator = np.random.default_rng(2)
+    builder = GraphBuilder(Config(), Vocabulary(COCO_CLASSES, REPLICA_SSG_PREDICATES), "map")
+    graph, beliefs = builder.graph, EdgeBeliefs(Config(), builder.graph, builder.prior)
+
+    def cloud(node: int, count: int) -> np.ndarray:
+        centre = np.array([0.45 * (node % 20), 0.45 * (node // 20), 0.3 * (node % 3)])
+        return (centre + generator.uniform(-0.1, 0.1, (count, 3))).astype(np.float32)
+
+    def vote(seen: list[int], counts: np.ndarray) -> None:
+        for a in seen:
+            for b in range(a + 1, seen[-1] + 1):
+                graph.add_votes(a, b, counts if b == a + 1 else None)
+
+    classes = generator.dirichlet(np.full(len(COCO_CLASSES), 0.05), nodes)
+    for node in range(nodes):
+        points = cloud(node, 512)
+        graph.add_node(points.mean(0).astype(float), np.eye(3) * 0.01, classes[node], 1, points)
+    ids = set(graph.nodes.ids.tolist())
+    beliefs.states(ids)
+    votes, states = [], []
+    for turn in range(turns):
+        first = int(generator.integers(nodes - objects))
+        seen = list(range(first + 1, first + objects + 1))
+        for node in seen:
+            row = graph.nodes.row(node)
+            mean, known = graph.nodes.means[row].copy(), graph.nodes.class_probabilities[row]
+            graph.observe(node, mean, np.eye(3) * 0.01, known, turn + 2, cloud(node - 1, 64))
+        pair_votes = np.zeros((2, len(REPLICA_SSG_PREDICATES)))
+        pair_votes[0, REPLICA_SSG_PREDICATES.index("on")] = 0.9
+        votes.append(timed(lambda seen=seen, counts=pair_votes: vote(seen, counts)))
+        states.append(timed(lambda: beliefs.states(ids)))
+    size = f"{objects} objects, {nodes} nodes"
+    print(f"votes of a frame, {size}        {1e3 * np.median(votes):8.3f} ms")
+    print(f"edges after a frame, {size}     {1e3 * np.median(states):8.3f} ms")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--objects", type=int, default=12, help="objects per frame")
@@ -178,6 +219,7 @@ def main() -> None:
     ]
     print(f"directions of {edges} edges           {1e3 * np.median(times):8.3f} ms")
     frame_costs(options.objects, 10 * options.turns)
+    belief_costs(options.objects, 300, options.turns)
 
 
 if __name__ == "__main__":

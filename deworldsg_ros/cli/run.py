@@ -29,6 +29,7 @@ from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.relations import pair_geometry
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
@@ -134,6 +135,7 @@ def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> 
     with working(console, LOADING):
         pipeline = Pipeline(config)
         pipeline.lifting.warm_up()
+        pair_geometry.warm_up()
     if map_path is not None and map_path.exists():
         pipeline.go_on_with(read_map(config, map_path))
         console.print(f"loaded the map {map_path}", highlight=False, soft_wrap=True)

@@ -16,6 +16,7 @@ from deworldsg_ros.files import write_atomically
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.merging.stage import build_merging
+from deworldsg_ros.relations import pair_geometry
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.qos import reliable
@@ -41,6 +42,7 @@ class GraphNode(StageNode):
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
         build_merging(self.parameters.merging).warm_up()
+        pair_geometry.warm_up()
         # None until a map or the first local graph gives the world frame and the vocabulary.
         self._builder: GraphBuilder | None = None
         map_path = self.parameters.node.map_path

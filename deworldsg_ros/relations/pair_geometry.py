@@ -108,6 +108,17 @@ class NodeShapes(Columns):
         self.covariances[row] = offsets.T @ offsets / count
 
 
+def warm_up() -> None:
+    """Compile the kernels, or load them from the cache."""
+    shapes = NodeShapes()
+    points = np.indices((2, 2, 2)).reshape(3, -1).T.astype(np.float32)
+    for node_id in (1, 2):
+        shapes.put(shapes.append(node_id), points, np.eye(3))
+    pairs = pairs_in_reach(np.arange(2), shapes.low, shapes.high, shapes.counts)
+    columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
+    pair_features(pairs[:, 0], pairs[:, 1], *columns, shapes.points, 0.0)
+
+
 def rotation_to_upright(up_world: Float64) -> Float64:
     """Rotation (3, 3) from the world frame to a frame whose axis 2 is `up_world` (3,).
 
@@ -240,9 +251,11 @@ def _contact(
         if -0.05 < step < 0.3:
             off_x = max(0.0, -x, x - width_x)
             off_y = max(0.0, -y, y - width_y)
-            weight = math.exp(-(off_x * off_x + off_y * off_y) / SOFT_RADIUS_M**2)
-            soft += weight
-            soft_step += weight * step
+            radii = (off_x * off_x + off_y * off_y) / SOFT_RADIUS_M**2
+            if radii < 9.0:  # beyond, the weight is below 1e-3
+                weight = math.exp(-radii)
+                soft += weight
+                soft_step += weight * step
         if x < 0.0 or y < 0.0 or x > width_x or y > width_y:
             continue
         around += 1

@@ -133,9 +133,8 @@ class PairTable(Columns):
     def _judge(self, changed: list[int]) -> None:
         """Judge all pairs in reach of the changed nodes anew."""
         shapes, nodes = self.shapes, self._graph.nodes
-        for node_id in changed:
-            for pair_key in self._of_node.get(node_id, ()):
-                self._judge_apart(self.row(pair_key))
+        stale = {pair_key for node_id in changed for pair_key in self._of_node.get(node_id, ())}
+        self._judge_apart([self.row(pair_key) for pair_key in stale])
         changed_rows = np.array([shapes.row(node_id) for node_id in changed], np.int64)
         found = pairs_in_reach(changed_rows, shapes.low, shapes.high, shapes.counts)
         if not len(found):
@@ -164,13 +163,17 @@ class PairTable(Columns):
         centres = (shapes.low[:, :2] + shapes.high[:, :2]) / 2.0
         self.centre_steps_m[rows] = np.linalg.norm(centres[first] - centres[second], axis=1)
 
-    def _judge_apart(self, row: int) -> None:
-        """Judge a pair that is out of reach: it is not related."""
-        ends = [self.shapes.row(node_id) for node_id in self.nodes[row].tolist()]
-        self.judged[row] = (self.shapes.counts[ends] >= MIN_SHAPE_POINTS).all()
-        self.state_logits[row] = APART_LOGIT
-        self.state_logits[row, 0] = 0.0
-        self.gaps_m[row] = np.inf
+    def _judge_apart(self, rows: list[int]) -> None:
+        """Judge pairs that are out of reach: they are not related."""
+        if not rows:
+            return
+        shapes = self.shapes
+        ends = [shapes.row(node_id) for node_id in self.nodes[rows].ravel().tolist()]
+        solid = shapes.counts[ends] >= MIN_SHAPE_POINTS
+        self.judged[rows] = solid.reshape(-1, 2).all(axis=1)
+        self.state_logits[rows] = APART_LOGIT
+        self.state_logits[rows, 0] = 0.0
+        self.gaps_m[rows] = np.inf
 
     def _count(self, changed: Iterable[Pair]) -> None:
         """Take in the votes of pairs whose votes changed."""
@@ -192,7 +195,8 @@ class PairTable(Columns):
 
     def _rows_of(self, pairs: Iterable[Iterable[int]]) -> Int64:
         """Rows of pairs of ids (smaller first); missing ones are added."""
-        rows = []
+        rows: list[int] = []
+        added: list[int] = []
         for first, second in pairs:
             pair_key = key(first, second)
             if pair_key in self:
@@ -202,9 +206,10 @@ class PairTable(Columns):
             self.nodes[row] = first, second
             self._of_node.setdefault(first, set()).add(pair_key)
             self._of_node.setdefault(second, set()).add(pair_key)
-            if self._geometry:
-                self._judge_apart(row)
             rows.append(row)
+            added.append(row)
+        if self._geometry:
+            self._judge_apart(added)
         return np.array(rows, np.int64)
 
 

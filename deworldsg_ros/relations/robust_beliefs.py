@@ -39,6 +39,10 @@ from deworldsg_ros.scene.graph import SceneGraph
 
 # Votes that a predicate without votes counts for, among the predicates of one relation.
 NAMING_VOTES = 0.5
+# A predicate beyond the physical relations needs so many votes. Every vote leaves a trace on all.
+MIN_OTHER_VOTES = 0.5
+# Pairs that are related with a smaller probability have no beliefs: no edge would be published.
+MIN_RELATED = 0.01
 # Odds, before any vote, that a predicate beyond the physical relations holds.
 OTHER_ODDS = 0.02
 
@@ -101,21 +105,33 @@ class RobustBeliefs:
         classes = classes.reshape(-1, nodes.class_probabilities.shape[1])
         relations = self._relations(pairs, ids, classes)
         with_ = self._tables_with_seats(pairs, classes)
+        rows = self._related_rows(relations)
+        votes, frames = table.votes[rows], table.frames[rows]
+        by_votes = self._by_votes()[rows]
         named = [
-            self._named(relations[:, end], table.votes[:, end], with_[:, end])
-            + self._others(relations[:, end, NONE], table.votes[:, end], table.frames)
+            self._named(relations[rows, end], votes[:, end], with_[rows, end])
+            + self._others(relations[rows, end, NONE], votes[:, end], frames, by_votes)
             for end in (0, 1)
         ]
-        best = classes.argmax(axis=1).astype(np.int64)[pairs]
+        best = classes.argmax(axis=1).astype(np.int64)[pairs[rows]]
         probabilities, judged = self._with_prior(
-            np.concatenate(named), np.concatenate([best, best[:, ::-1]]), prior
+            np.concatenate(named),
+            np.concatenate([best, best[:, ::-1]]),
+            np.tile(table.judged[rows], 2),
+            prior,
         )
         return DirectedBeliefs(
-            np.concatenate([table.nodes, table.nodes[:, ::-1]]),
+            np.concatenate([table.nodes[rows], table.nodes[rows, ::-1]]),
             probabilities,
-            np.concatenate([table.votes[:, end].any(axis=1) for end in (0, 1)]),
+            np.concatenate([votes[:, end].any(axis=1) for end in (0, 1)]),
             judged,
         )
+
+    def _related_rows(self, relations: Float64) -> Int64:
+        """Rows of the pairs that may be related: few of those in reach are."""
+        columns = self._relation_of < 0
+        other = self._table.votes[:, :, columns].max(axis=(1, 2), initial=0.0) >= MIN_OTHER_VOTES
+        return np.flatnonzero((relations[..., NONE].min(axis=1) < 1.0 - MIN_RELATED) | other)
 
     def _relations(self, pairs: Int64, ids: Int64, classes: Float64) -> Float64:
         """Probabilities (m, 2, len(RELATIONS)) of the relations in both directions."""
@@ -193,19 +209,21 @@ class RobustBeliefs:
             result += relations[:, relation, None] * weights
         return result
 
-    def _others(self, unrelated: Float64, votes: Float32, frames: Float64) -> Float64:
+    def _others(
+        self, unrelated: Float64, votes: Float32, frames: Float64, by_votes: Float64
+    ) -> Float64:
         """Probabilities (m, R) of predicates that name no physical relation, from votes alone.
 
         Their votes are believed as those on "on" are.
         """
         result = np.zeros(votes.shape)
         columns = np.flatnonzero(self._relation_of < 0)
-        rows = np.flatnonzero(votes[:, columns].any(axis=1))
+        rows = np.flatnonzero(votes[:, columns].max(axis=1, initial=0.0) >= MIN_OTHER_VOTES)
         if not len(rows):
             return result
         hits = votes[np.ix_(rows, columns)].astype(np.float64)
         logs = self._model.votes.evidence(hits, frames[rows, None])
-        logs *= self._by_votes()[rows, None]
+        logs *= by_votes[rows, None]
         odds = OTHER_ODDS * np.exp(np.clip(logs, -30.0, 30.0))
         result[np.ix_(rows, columns)] = (
             unrelated[rows, None] * odds / (1.0 + odds.sum(axis=1, keepdims=True))
@@ -222,7 +240,7 @@ class RobustBeliefs:
         return np.asarray(np.where(self._independent(), by_independent, 1.0))
 
     def _with_prior(
-        self, probabilities: Float64, classes: Int64, prior: ClassPairPrior
+        self, probabilities: Float64, classes: Int64, judged: Bool, prior: ClassPairPrior
     ) -> tuple[Float64, Bool]:
         """Eq. 10 with the prior of class pairs; and whether a world model spoke of each pair."""
         priors, has_prior = prior.lookup(classes)
@@ -233,7 +251,7 @@ class RobustBeliefs:
             self._config.fusion_alpha,
             self._config.entropy_threshold_nats,
         )
-        return fused, np.tile(self._table.judged, 2) | active
+        return fused, judged | active
 
 
 def fuse_prior(
