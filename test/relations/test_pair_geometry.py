@@ -127,7 +127,8 @@ def contact(low, high, low_b, high_b, points) -> dict[str, float]:
     corner, size = low[:2] - MARGIN_M, (high - low)[:2] + 2 * MARGIN_M
     z, bottom = points[:, 2], low[2]
     off = np.maximum(np.maximum(corner - points[:, :2], points[:, :2] - corner - size), 0)
-    weights = np.exp(-(off**2).sum(axis=1) / SOFT_RADIUS_M**2)
+    radii = (off**2).sum(axis=1) / SOFT_RADIUS_M**2
+    weights = np.where(radii < 9.0, np.exp(-radii), 0.0)
     weights *= (bottom - z > -0.05) & (bottom - z < 0.3)
     around = (off == 0).all(axis=1)
     layer = around & (np.abs(z - bottom) < LAYER_M)
