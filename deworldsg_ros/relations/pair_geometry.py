@@ -116,7 +116,8 @@ def warm_up() -> None:
         shapes.put(shapes.append(node_id), points, np.eye(3))
     pairs = pairs_in_reach(np.arange(2), shapes.low, shapes.high, shapes.counts)
     columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
-    pair_features(pairs[:, 0], pairs[:, 1], *columns, shapes.points, 0.0)
+    first, second = np.ascontiguousarray(pairs.T)
+    pair_features(first, second, *columns, shapes.points, 0.0)
 
 
 def rotation_to_upright(up_world: Float64) -> Float64:

@@ -142,7 +142,7 @@ class PairTable(Columns):
         # The smaller id first.
         swapped = shapes.ids[found[:, 0]] > shapes.ids[found[:, 1]]
         found[swapped] = found[swapped, ::-1]
-        first, second = found[:, 0], found[:, 1]
+        first, second = np.ascontiguousarray(found.T)  # the layout that is compiled
         columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
         there = pair_features(first, second, *columns, shapes.points, self.floor_m)
         back = pair_features(second, first, *columns, shapes.points, self.floor_m)

@@ -100,6 +100,8 @@ def run(tmp_path_factory: pytest.TempPathFactory, recording_path: Path) -> Itera
             for count, _ in enumerate(camera.frames(), 1):
                 me.spin_until(lambda n=count: len(result.evidence) >= n - 3, LIMIT_S, "evidence")
             me.spin_until(lambda: len(result.evidence) >= FRAMES, LIMIT_S, "all evidence")
+            # A start with an empty cache compiles for seconds.
+            me.spin_until(lambda: len(result.associations()) >= FRAMES, LIMIT_S, "all frames")
             me.spin_for(1.5)
             yield result
     finally:
