@@ -38,7 +38,7 @@ class PhysicsModel:
 
     Attributes:
         input_means, input_scales: (INPUT_COUNT,) standardise the inputs.
-        weights_1, biases_1, weights_2, biases_2: hidden layers with ReLU, of `MEMBERS` networks.
+        weights_1, biases_1, weights_2, biases_2: hidden layers with ReLU, of several networks.
         weights_3, biases_3: logits of the relations of `DIRECTED`, relative to "not related". The
             mean of the networks counts.
         prior: (len(DIRECTED),) logits of a pair without geometry.

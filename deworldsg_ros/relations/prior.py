@@ -71,13 +71,6 @@ class ClassPairPrior:
         priors[has_prior] = self._sums[known] / self._counts[known, None]
         return priors, has_prior
 
-    def revisions(self, pair_classes: Int64) -> Int64:
-        """How often each class pair's prior has changed, (E,) int64; 0 if it has none."""
-        rows = self._rows[pair_classes[:, 0], pair_classes[:, 1]]
-        revisions = np.zeros(len(rows), np.int64)
-        revisions[rows >= 0] = self._counts[rows[rows >= 0]]
-        return revisions
-
     def to_state(self) -> dict[str, Any]:
         """Plain values from which `from_state` makes an equal prior."""
         pairs = np.argwhere(self._rows >= 0)

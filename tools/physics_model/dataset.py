@@ -34,7 +34,6 @@ class Room:
         pairs: (m, 2) rows of the nodes.
         features: (2, m, F) of first and second, and of second and first.
         states: (m,) true state.
-        near: (m,) bool.
         counts: (m, 2, NONE) votes by relation, in both directions.
         frames: (m,) number of frames that showed both.
         bottoms_m, heights_m: (n,) of the nodes: bottom over the floor, and height.
@@ -47,7 +46,6 @@ class Room:
     pairs: NDArray[np.int64]
     features: NDArray[np.float64]
     states: NDArray[np.int64]
-    near: NDArray[np.bool_]
     counts: NDArray[np.float64]
     frames: NDArray[np.float64]
     bottoms_m: NDArray[np.float64]
@@ -83,7 +81,6 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
     ]
     ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
     states = np.array([_state(truth, a, b) for a, b in ids], np.int64)
-    near = np.array(["near" in (truth.get((a, b)), truth.get((b, a))) for a, b in ids], np.bool_)
     counts, frames = _votes(graph, nodes.ids[pairs])
     return Room(
         classes=graph.vocabulary.classes,
@@ -92,7 +89,6 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
         pairs=pairs,
         features=np.stack(features),
         states=states,
-        near=near & (states == 0),
         counts=counts,
         frames=frames,
         bottoms_m=shapes.low[:, 2] - floor_m,
