@@ -18,6 +18,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import best_beliefs
 
 # What a belief is computed from: revisions of the evidence, classes, and the priors as bytes.
 _Basis = tuple[int, int, int, int, bytes, bytes]
@@ -50,8 +51,9 @@ class PaperBeliefs:
         if not pairs:
             self._known = {}
             return []
-        priors, has_prior = prior.lookup(self._classes(pairs))
-        bases = self._bases(pairs, prior)
+        classes = self._classes(pairs)
+        priors, has_prior = prior.lookup(classes)
+        bases = self._bases(pairs, classes, priors, prior.lookup(classes[:, ::-1])[0])
         stale = [
             row
             for row, (pair, basis) in enumerate(bases.items())
@@ -64,14 +66,14 @@ class PaperBeliefs:
         }
         return [state for _, state in self._known.values() if state is not None]
 
-    def _bases(self, pairs: Sequence[Pair], prior: ClassPairPrior) -> dict[Pair, _Basis]:
+    def _bases(
+        self, pairs: Sequence[Pair], classes: Int64, there: Float64, back: Float64
+    ) -> dict[Pair, _Basis]:
         """Evidence, classes and priors of each pair, in both directions.
 
         Both, because the belief of one direction depends on the evidence of the other.
         """
         edges = self._graph.edges
-        classes = self._classes(pairs)
-        there, back = prior.lookup(classes)[0], prior.lookup(classes[:, ::-1])[0]
         reverse = [edges.get((object_, subject)) for subject, object_ in pairs]
         return {
             pair: (
@@ -142,8 +144,7 @@ def edge_state(
     observations: int,
 ) -> wire.EdgeState:
     """The message of an edge with the probabilities (R,) of its predicates, the best first."""
-    best = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
-    beliefs = [wire.Belief(predicates[index], float(probabilities[index])) for index in best]
+    beliefs = best_beliefs(probabilities, predicates, top_k)
     return wire.EdgeState(
         subject=pair[0],
         object=pair[1],

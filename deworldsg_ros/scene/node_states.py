@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.nodes import NodeTable
 from deworldsg_ros.scene.surface import even_moments
 
@@ -52,13 +55,18 @@ class NodeStateCache:
             known.pop(node_id, None)
 
 
+def best_beliefs(probabilities: Float64, names: Sequence[str], top_k: int) -> list[wire.Belief]:
+    """The labels with the highest probabilities (n,), the best first, at most `top_k`."""
+    # A stable sort: labels of equal probability stay in the order of the vocabulary.
+    order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
+    return [wire.Belief(names[index], float(probabilities[index])) for index in order]
+
+
 def _state(
     nodes: NodeTable, row: int, classes: tuple[str, ...], top_k: int, with_points: bool, even: bool
 ) -> wire.NodeState:
     probabilities = nodes.class_probabilities[row]
-    # A stable sort: classes of equal probability stay in the order of the vocabulary.
-    order = np.argsort(-probabilities, kind="stable")[:top_k].tolist()
-    beliefs = [wire.Belief(classes[index], float(probabilities[index])) for index in order]
+    beliefs = best_beliefs(probabilities, classes, top_k)
     possible = probabilities[probabilities > 0]
     points = nodes.surface(row)
     mean, covariance = nodes.means[row], nodes.covariances[row]

@@ -15,6 +15,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.frame_graph import Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import fuse
+from deworldsg_ros.scene.node_states import best_beliefs
 
 # Number of classes and predicates of each node and edge in the message.
 TOP_K = 5
@@ -217,7 +218,4 @@ def _fractions(scores: Float64 | Int64) -> Float64:
 
 
 def _beliefs(fractions: Float64, names: Sequence[str]) -> list[wire.Belief]:
-    best = np.argsort(-fractions, kind="stable")[:TOP_K].tolist()
-    return [
-        wire.Belief(names[index], float(fractions[index])) for index in best if fractions[index] > 0
-    ]
+    return [item for item in best_beliefs(fractions, names, TOP_K) if item.probability > 0]
