@@ -311,15 +311,20 @@ def _enclosure(
 
 
 @kernel
+def _within(point: Float32, low: Float64, high: Float64, margin_m: float) -> bool:
+    """Whether a point is inside bounds, or at most a margin outside."""
+    within = True
+    for axis in range(3):
+        within &= low[axis] - margin_m < point[axis] < high[axis] + margin_m
+    return within
+
+
+@kernel
 def _inside(a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32) -> float:
     """Fraction of the points of a inside the bounds of b."""
     inside = 0
     for k in range(counts[a]):
-        within = True
-        for axis in range(3):
-            value = points[a, k, axis]
-            within &= low[b, axis] - 0.01 < value < high[b, axis] + 0.01
-        inside += int(within)
+        inside += int(_within(points[a, k], low[b], high[b], 0.01))
     fraction: float = inside / max(1, counts[a])
     return fraction
 
@@ -345,15 +350,11 @@ def _distance(a: int, b: int, low: Float64, high: Float64, counts: Int64, points
 
 @kernel
 def _near(a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32) -> Int64:
-    """The first 48 points of a that are within 0.15 m of the bounds of b, or of any place."""
+    """Indices of the first 48 points of a that are within 0.15 m of the bounds of b."""
     found = np.empty(48, np.int64)
     count = 0
     for k in range(counts[a]):
-        within = True
-        for axis in range(3):
-            value = points[a, k, axis]
-            within &= low[b, axis] - 0.15 < value < high[b, axis] + 0.15
-        if within:
+        if _within(points[a, k], low[b], high[b], 0.15):
             found[count] = k
             count += 1
             if count == len(found):

@@ -103,8 +103,8 @@ class RobustBeliefs:
         pairs = ends.reshape(-1, 2)
         classes = nodes.class_probabilities[[nodes.row(node_id) for node_id in ids.tolist()]]
         classes = classes.reshape(-1, nodes.class_probabilities.shape[1])
-        relations = self._relations(pairs, ids, classes)
         with_ = self._tables_with_seats(pairs, classes)
+        relations = self._relations(pairs, ids, np.asarray(with_.any(axis=1)))
         rows = self._related_rows(relations)
         votes, frames = table.votes[rows], table.frames[rows]
         by_votes = self._by_votes()[rows]
@@ -133,7 +133,7 @@ class RobustBeliefs:
         other = self._table.votes[:, :, columns].max(axis=(1, 2), initial=0.0) >= MIN_OTHER_VOTES
         return np.flatnonzero((relations[..., NONE].min(axis=1) < 1.0 - MIN_RELATED) | other)
 
-    def _relations(self, pairs: Int64, ids: Int64, classes: Float64) -> Float64:
+    def _relations(self, pairs: Int64, ids: Int64, seated: Bool) -> Float64:
         """Probabilities (m, 2, len(RELATIONS)) of the relations in both directions."""
         table, model = self._table, self._model
         geometry = np.where(table.judged[:, None], table.state_logits, 0.0)
@@ -141,7 +141,7 @@ class RobustBeliefs:
         states = softmax(believed_logits(model, geometry, votes, self._independent()), axis=1)
         floor_odds = self._floor_odds(ids)
         states, carried, on_floor = one_support(states, pairs, floor_odds)
-        near = self._near(pairs, classes, carried, on_floor, states[:, 0])
+        near = self._near(pairs, seated, carried, on_floor, states[:, 0])
         result = np.zeros((len(pairs), 2, len(RELATIONS)))
         for end in (0, 1):
             for state in range(1, states.shape[1]):
@@ -162,7 +162,7 @@ class RobustBeliefs:
         return np.where(known, np.exp(np.clip(logits, -20.0, 20.0)), 0.0)
 
     def _near(
-        self, pairs: Int64, classes: Float64, carried: Float64, on_floor: Float64, free: Float64
+        self, pairs: Int64, seated: Bool, carried: Float64, on_floor: Float64, free: Float64
     ) -> Float64:
         """Probability (m,) that a pair is near if it is in no more specific relation."""
         table = self._table
@@ -174,7 +174,7 @@ class RobustBeliefs:
             table.bottom_steps_m,
             table.centre_steps_m,
             free,
-            np.asarray(self._tables_with_seats(pairs, classes).any(axis=1)),
+            seated,
         )
         near = np.clip(near, 1.0 - NEAR_CERTAINTY, NEAR_CERTAINTY)
         votes = near_logits(table.counts, table.frames, self._model.votes)
