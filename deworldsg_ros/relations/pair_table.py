@@ -30,6 +30,9 @@ from deworldsg_ros.scene.graph import SceneGraph
 FLOOR_QUANTILE = 0.05
 # Steps of the height of the floor, so that it changes seldom.
 FLOOR_STEP_M = 0.02
+# Steps of the components of the up direction, so that it changes less often: every change means
+# that all pairs are judged anew. The error is at most half a degree.
+UP_STEP = 0.01
 # Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
 APART_LOGIT = -12.0
 _GAP, _BOTTOM_STEP = FEATURES.index("gap_m"), FEATURES.index("bottom_over_bottom_m")
@@ -88,13 +91,17 @@ class PairTable(Columns):
         self._of_node: dict[int, set[int]] = {}
 
     def refresh(self, up_world: Float64) -> None:
-        """Follow the graph: its nodes, their surfaces and classes, and the votes."""
+        """Follow the graph: its nodes, their surfaces and classes, and the votes.
+
+        Args:
+            up_world: (3,) direction that points up in the world frame; it is used in `UP_STEP`s.
+        """
         nodes, shapes = self._graph.nodes, self.shapes
         included = np.flatnonzero(nodes.confirmed | self._tentative)
         ids = nodes.ids[included].tolist()
         for node_id in set(shapes.ids.tolist()).difference(ids):
             self._forget(node_id)
-        turned = rotation_to_upright(up_world)
+        turned = rotation_to_upright(stepped_up(up_world))
         all_changed = not np.array_equal(turned, self._R_up_world)
         self._R_up_world = turned
         changed: list[int] = []
@@ -219,6 +226,14 @@ def floor_height(shapes: NodeShapes) -> float:
     if not len(bottoms):
         return 0.0
     return float(np.round(np.quantile(bottoms, FLOOR_QUANTILE) / FLOOR_STEP_M) * FLOOR_STEP_M)
+
+
+def stepped_up(up_world: Float64) -> Float64:
+    """The direction (3,) `up_world` with components in steps of `UP_STEP`, not of unit length.
+
+    The axes of the world stay as they are.
+    """
+    return np.round(up_world / np.linalg.norm(up_world) / UP_STEP) * UP_STEP
 
 
 def key(first: int, second: int) -> int:

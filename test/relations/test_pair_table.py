@@ -30,6 +30,7 @@ from deworldsg_ros.relations.pair_table import (
     PairTable,
     floor_height,
     key,
+    stepped_up,
 )
 from deworldsg_ros.relations.physical_states import (
     NONE,
@@ -161,6 +162,32 @@ def test_what_did_not_change_is_not_judged_again(monkeypatch: pytest.MonkeyPatch
     builder.graph.observe(ids["2"], np.zeros(3), np.eye(3), np.ones(80), 9)
     followed.refresh(Z)
     assert put == [followed.shapes.row(ids["2"])]
+
+
+def test_a_small_change_of_the_up_direction_judges_nothing_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    builder, _ = room({str(index): item for index, item in enumerate(THINGS[:4])})
+    followed = table_of(builder.graph)
+    followed.refresh(np.array([0.0, -0.9, -0.44]))
+    put: list[int] = []
+    original = NodeShapes.put
+    monkeypatch.setattr(
+        NodeShapes, "put", lambda self, row, *args: (put.append(row), original(self, row, *args))
+    )
+    followed.refresh(np.array([0.001, -0.9, -0.439]))
+    assert put == []
+    followed.refresh(np.array([0.0, -0.9, -0.41]))
+    assert sorted(put) == sorted(followed.shapes.row(node_id) for node_id in followed.shapes.ids)
+
+
+def test_the_steps_of_the_up_direction() -> None:
+    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+        np.testing.assert_array_equal(stepped_up(3.0 * axis), axis)
+    ups = np.random.default_rng(0).normal(size=(1000, 3))
+    for up in ups / np.linalg.norm(ups, axis=1, keepdims=True):
+        stepped = stepped_up(up)
+        assert np.degrees(np.arccos(stepped @ up / np.linalg.norm(stepped))) < 0.5
 
 
 def test_an_empty_graph() -> None:
