@@ -1,0 +1,355 @@
+"""Run the graph builder over captured local graphs, and score its graphs: a line a capture.
+
+    python tools/merging_lab/replay.py CAPTURES --only 'rooms_0.*' --settings merging.x=y
+
+The graph of a capture equals that of `deworldsg evaluate run` with the same detections and poses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatch
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from captures import SUFFIX, Capture, read_capture
+from msgspec.structs import replace
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.config import Config
+from deworldsg_ros.evaluation.measures.calibration import (
+    Calibrated,
+    calibration_error,
+    reliability,
+)
+from deworldsg_ros.evaluation.measures.graph_measures import (
+    BOX_MARGIN_M,
+    Measures,
+    NodeView,
+    ReferenceScene,
+    measure,
+    measure_views,
+    read_reference,
+)
+from deworldsg_ros.evaluation.measures.graph_measures import pool as pool_measures
+from deworldsg_ros.evaluation.protocol.labels import translate, translation
+from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
+from deworldsg_ros.evaluation.protocol.scoring import (
+    ProtocolOptions,
+    ScanResult,
+    pool,
+    score_scan,
+)
+from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
+from deworldsg_ros.relations.graph_view import LiveGraph
+from deworldsg_ros.relations.stage import RelationReasoner
+from deworldsg_ros.relations.world_model import build_world_model
+from deworldsg_ros.scene import wire
+
+NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
+HEADER = (
+    f"{'':32s} {'objects':>7s} {'seen':>4s} {'nodes':>5s} {'found':>5s} {'dup.':>4s} {'wrong':>5s} "
+    f"{'stray':>5s} {'prec.':>5s} {'rel.':>5s} {'ms':>5s}"
+)
+
+
+@dataclass(frozen=True)
+class Replay:
+    """The graph of a capture.
+
+    Attributes:
+        graph: the whole graph, with surface points.
+        node_ids: for each frame, the node that each row became, 0 = none; merges are followed.
+        median_ms: of `GraphBuilder.integrate` a frame, processor time.
+    """
+
+    graph: wire.SceneGraphMessage
+    node_ids: list[list[int]]
+    median_ms: float
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The annotation of a scan."""
+
+    annotations: Annotations
+    scan: str
+    points: ScanPoints
+    reference: ReferenceScene
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of one capture, or of several.
+
+    Attributes:
+        name: of the capture.
+        measures: of the graph.
+        results: of the official protocol, a scan each.
+        annotations: of these scans.
+        seen: objects that have the right class in one detection at least: the most to be found.
+        median_ms: of `GraphBuilder.integrate` a frame, processor time.
+        existence: that each node states, and whether it is the first node of a true object.
+    """
+
+    name: str
+    measures: Measures
+    results: list[ScanResult]
+    annotations: Annotations
+    seen: int
+    median_ms: float
+    existence: list[Calibrated] = field(default_factory=list)
+
+    def numbers(self) -> dict[str, float]:
+        """Every number by name; recalls and precisions are fractions."""
+        numbers = self.measures.numbers()
+        numbers |= pool(self.results, self.annotations.vocabulary).numbers()
+        numbers |= {"seen": self.seen, "integrate_ms": self.median_ms}
+        if self.existence:
+            numbers["existence_calibration_error"] = calibration_error(self.existence)
+        return numbers
+
+    def line(self) -> str:
+        """The line of the table."""
+        n = self.numbers()
+        return (
+            f"{self.name:32s} {n['objects']:7.0f} {n['seen']:4.0f} {n['nodes']:5.0f} "
+            f"{n['found']:5.0f} {n['duplicates']:4.0f} {n['wrong_class']:5.0f} {n['stray']:5.0f} "
+            f"{100 * n['node_precision']:5.1f} {100 * n['relationship_recall']:5.1f} "
+            f"{n['integrate_ms']:5.2f}"
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Replay and score every capture of a folder."""
+    options = _parser().parse_args(arguments)
+    config = effective_config(options.config, options.settings)
+    paths = chosen_paths(options.folder, options.only, options.skip)
+    if not paths:
+        raise SystemExit(f"{options.folder}: no capture of this name: expected NAME{SUFFIX}")
+    print(HEADER)
+    scores = []
+    for path in paths:
+        capture = read_capture(path)
+        replayed = replay(capture, config)
+        if not capture.layout:
+            print(f"{capture.name:32s} {_nodes_line(replayed)}", flush=True)
+            continue
+        scores.append(score(capture, replayed))
+        print(scores[-1].line(), flush=True)
+        if options.missed:
+            print(*missed_lines(capture, replayed), sep="\n", flush=True)
+    pooled = list(pool_scenes(scores))
+    for item in pooled:
+        print(item.line())
+    print(*calibration_lines([belief for item in scores for belief in item.existence]), sep="\n")
+    if options.json:
+        numbers = {item.name: item.numbers() for item in [*scores, *pooled]}
+        options.json.write_text(json.dumps(numbers, indent=1))
+
+
+def chosen_paths(folder: Path, only: Sequence[str], skip: Sequence[str] = ()) -> list[Path]:
+    """The captures of a folder whose names match a pattern of `only` and none of `skip`."""
+
+    def matches(path: Path, patterns: Sequence[str]) -> bool:
+        return any(fnmatch(path.name.removesuffix(SUFFIX), pattern) for pattern in patterns)
+
+    paths = sorted(folder.glob(f"*{SUFFIX}"))
+    return [path for path in paths if matches(path, only) and not matches(path, skip)]
+
+
+def replay(capture: Capture, config: Config) -> Replay:
+    """Merge the local graphs and relate their nodes, as `Pipeline` does.
+
+    Raises:
+        SystemExit: for a world model that needs images.
+    """
+    perception = replace(config.perception, relation_head=capture.relation_head)
+    config = replace(config, perception=perception)
+    if build_world_model(config.relations) is not None:
+        raise SystemExit(
+            f"relations.world_model is {config.relations.world_model}: it needs images; "
+            "expected physics or none"
+        )
+    first = capture.local_graphs[0]
+    builder = GraphBuilder(config, first.vocabulary, first.frame_id)
+    reasoner = RelationReasoner(config.relations, None)
+    reasoner.watch(LiveGraph(builder.graph))
+    times_s, node_ids = [], []
+    for local in capture.local_graphs:
+        start = time.thread_time()
+        node_ids.append(builder.integrate(local))
+        times_s.append(time.thread_time() - start)
+        builder.add_evidence(reasoner.observe(local, NO_IMAGE))
+    followed = [[builder.graph.resolve(node) or 0 for node in row] for row in node_ids]
+    return Replay(builder.full(), followed, 1e3 * float(np.median(times_s)))
+
+
+def score(capture: Capture, replayed: Replay) -> Score:
+    """Score the graph of an annotated capture."""
+    truth = read_truth(capture.root, capture.layout, capture.scan)
+    annotations = truth.annotations
+    graph = translate(replayed.graph, annotations)
+    result = score_scan(
+        annotations.scan(truth.scan),
+        truth.points,
+        to_prediction(graph, annotations.vocabulary),
+        ProtocolOptions(),
+    )
+    detections = measure_views(list(detection_views(capture, annotations)), [], truth.reference)
+    return Score(
+        capture.name,
+        measure(graph, truth.reference),
+        [result],
+        annotations,
+        detections.found,
+        replayed.median_ms,
+        existence_beliefs(graph.nodes, truth.reference),
+    )
+
+
+def pool_scenes(scores: Sequence[Score]) -> Iterator[Score]:
+    """The sum over the scenes of each data set, for each kind with several scenes."""
+    groups: dict[tuple[Path, str], list[Score]] = {}
+    for item in scores:
+        kind = item.name.partition(".")[2]
+        groups.setdefault((item.annotations.root, kind), []).append(item)
+    for (_, kind), items in groups.items():
+        if len(items) > 1:
+            yield Score(
+                f"{len(items)} scenes: {kind}",
+                pool_measures(item.measures for item in items),
+                [result for item in items for result in item.results],
+                items[0].annotations,
+                sum(item.seen for item in items),
+                float(np.mean([item.median_ms for item in items])),
+                [belief for item in items for belief in item.existence],
+            )
+
+
+@cache
+def read_truth(root: Path, layout: str, scan: str) -> Truth:
+    """The annotation of a scan; read once."""
+    annotations = open_annotations(root, layout)
+    points = annotations.points(scan, aligned=False)
+    return Truth(annotations, scan, points, read_reference(annotations, scan, points))
+
+
+def detection_views(capture: Capture, annotations: Annotations) -> Iterator[NodeView]:
+    """Every detection as a node of its own."""
+    names = translation(annotations)
+    number = 0
+    for local in capture.local_graphs:
+        best = local.class_probabilities.argmax(axis=1)
+        for row, mean_m in enumerate(local.means_world):
+            label = local.vocabulary.classes[best[row]]
+            number += 1
+            probability = float(local.class_probabilities[row, best[row]])
+            no_points = np.zeros((0, 3))
+            yield NodeView(number, names.get(label, label), probability, mean_m, no_points, 1.0)
+
+
+def existence_beliefs(
+    nodes: Iterable[wire.NodeState], reference: ReferenceScene
+) -> list[Calibrated]:
+    """The existence that each node states, and whether it is the first node of a true object.
+
+    The surest nodes choose first. Nodes without the field are left out.
+    """
+    stated = [
+        (float(existence), node)
+        for node in nodes
+        if (existence := getattr(node, "existence", None)) is not None
+    ]
+    low, high = reference.boxes_min - BOX_MARGIN_M, reference.boxes_max + BOX_MARGIN_M
+    free = np.ones(len(reference), bool)
+    labels = np.array(reference.labels)
+    beliefs = []
+    for existence, node in sorted(stated, key=lambda item: -item[0]):
+        mean_m = np.array(node.mean_m)
+        inside = ((mean_m >= low) & (mean_m <= high)).all(axis=1) & (labels == node.label)
+        rows = np.flatnonzero(inside & free)
+        if len(rows):
+            distances_m = np.linalg.norm(reference.centroids[rows] - mean_m, axis=1)
+            free[rows[distances_m.argmin()]] = False
+        beliefs.append(Calibrated(existence, bool(len(rows))))
+    return beliefs
+
+
+def calibration_lines(beliefs: Sequence[Calibrated]) -> list[str]:
+    """The table of calibration of the nodes' existence; empty without beliefs."""
+    if not beliefs:
+        return []
+    lines = [f"\n{'existence':>9s} {'nodes':>5s} {'true':>5s}"]
+    lines += [f"{b.probability:9.2f} {b.size:5d} {b.right:5.2f}" for b in reliability(beliefs)]
+    return [*lines, f"expected calibration error {100 * calibration_error(beliefs):.1f} %"]
+
+
+def missed_lines(capture: Capture, replayed: Replay) -> list[str]:
+    """The objects without a node of their class, and the nodes that their detections went to."""
+    truth = read_truth(capture.root, capture.layout, capture.scan)
+    graph = translate(replayed.graph, truth.annotations)
+    nodes = {node.id: node for node in graph.nodes}
+    found = {
+        row
+        for row, label in enumerate(truth.reference.labels)
+        for node in nodes.values()
+        if node.label == label and _inside(node.mean_m, truth.reference, row)
+    }
+    lines = []
+    for row, object_id in enumerate(truth.reference.ids):
+        if row in found:
+            continue
+        into: Counter[int] = Counter()
+        for ids, went_to in zip(capture.object_ids, replayed.node_ids):
+            into.update(node for true, node in zip(ids.tolist(), went_to) if true == object_id)
+        parts = []
+        for node_id, count in into.most_common(4):
+            node = nodes.get(node_id)
+            parts.append(f"{count} in {node.label if node else 'no published node'} {node_id}")
+        label = truth.reference.labels[row]
+        lines.append(
+            f"    {label} {object_id}: {sum(into.values())} detections; {', '.join(parts)}"
+        )
+    return lines
+
+
+def _inside(mean_m: Sequence[float], reference: ReferenceScene, row: int) -> bool:
+    low, high = reference.boxes_min[row] - BOX_MARGIN_M, reference.boxes_max[row] + BOX_MARGIN_M
+    return bool(((np.array(mean_m) >= low) & (np.array(mean_m) <= high)).all())
+
+
+def _nodes_line(replayed: Replay) -> str:
+    labels = Counter(node.label for node in replayed.graph.nodes)
+    listed = ", ".join(f"{count} {label}" for label, count in labels.most_common())
+    return f"{len(replayed.graph.nodes)} nodes, {replayed.median_ms:.2f} ms: {listed}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("folder", type=Path, help="captures of capture.py")
+    add("--only", nargs="+", default=["*"], metavar="PATTERN", help="captures of these names")
+    add("--skip", nargs="+", default=[], metavar="PATTERN", help="leave these captures out")
+    add("--config", type=Path, help="ROS parameter file; default: the built-in defaults")
+    add("--settings", nargs="+", default=[], metavar="SECTION.FIELD=VALUE", help="set options")
+    add("--missed", action="store_true", help="list the objects that have no node")
+    add("--json", type=Path, help="write every number by name to this file")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
