@@ -34,7 +34,7 @@ from deworldsg_ros.scene.votes import frame_votes
 MAX_DISTANCE_M = 2.5
 # An edge is published if its best predicate has at least this probability.
 MIN_PROBABILITY = 0.2
-# Published probabilities have so many decimals: smaller changes are no news.
+# Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
 
 

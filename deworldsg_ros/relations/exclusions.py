@@ -24,7 +24,8 @@ NEAR_FLOOR_M, NEAR_FLOOR_SPREAD_M = 0.5, 0.05
 NEAR_SUPPORT_M, NEAR_SUPPORT_SPREAD_M = 0.10, 0.012
 # Near, on one support: difference of the bottoms, which neighbours hide.
 NEAR_LEVEL_M, NEAR_LEVEL_SPREAD_M = 0.10, 0.02
-# Near: each object is among so many nearest neighbours of the other.
+# Near: each object is one of this many nearest neighbours of the other. The ground truth of the
+# simulated rooms has the same rule (tools/physics_rooms).
 NEAREST = 2
 # Near: the distance of the centres counts this much beside the gap, when neighbours are ranked. The
 # gaps of books in a row are all 0.
@@ -40,9 +41,11 @@ def one_support(
 ) -> tuple[Float64, Float64, Float64]:
     """State probabilities if each object has one support at most.
 
-    The probabilities of the supports of an object become those of independent events of which one
-    at most holds: odds_j / (1 + odds of the floor + sum of all odds). The other states of a pair
-    share the rest in proportion.
+    Every pair says how probable it is that one object rests on the other. For each object, these
+    are independent events, and the floor is one more. The condition is that at most one of them
+    holds. Support j then has the probability odds_j / (1 + odds of the floor + sum of all odds).
+    Circles of supports are cut. The other states of a pair share what its supports leave, in
+    proportion.
 
     Args:
         states: (m, STATE_COUNT) probabilities, rows sum to one.

@@ -37,9 +37,11 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.class_kinds import SEATS, TABLES
 from deworldsg_ros.scene.graph import SceneGraph
 
-# Votes that a predicate without votes counts for, among the predicates of one relation.
+# Several predicates may name one relation, and share its probability by their votes. The default
+# name gets these votes in addition, so that a relation without votes has a name.
 NAMING_VOTES = 0.5
-# A predicate beyond the physical relations needs so many votes. Every vote leaves a trace on all.
+# Least sum of votes for a predicate that names no physical relation. Less is no evidence: a frame
+# that votes gives every predicate a small probability.
 MIN_OTHER_VOTES = 0.5
 # Pairs that are related with a smaller probability have no beliefs: no edge would be published.
 MIN_RELATED = 0.01
