@@ -1,7 +1,7 @@
 """One typed configuration for the nodes and the command line.
 
-The defaults are the paper's values, plus extensions that measured better. config/paper.yaml turns
-the extensions off.
+The defaults are the paper's values, plus extensions that measured better. config/paper_rules.yaml
+turns the extensions off; config/paper.yaml adds the paper's networks.
 
 Each section configures one stage. Description and range of a field are stated here only: the nodes
 declare their ROS parameters `section.field` from this module. A ROS parameter file also works with

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Protocol
 
+from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
@@ -62,6 +63,7 @@ class Pipeline:
 
     def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
         self.config = config
+        require_checkpoints(config.perception if perceiver is None else None, config.relations)
         world_model = build_world_model(config.relations, config.perception.device)
         self.perception: Perceiver
         if perceiver is None:

@@ -1,5 +1,6 @@
 """Checkpoints of pretrained networks: import, cards and loading. No stage is imported here.
 
+- `required`: the checkpoints that a configuration needs, and how to get the missing ones.
 - `loading`: finds a checkpoint, loads it with `transformers`, chooses device and data type.
 - `card`: `deworldsg.json`, how a detector's checkpoint is read.
 - `architectures`: detector classes by model type, and the file name of the relation head.
@@ -10,5 +11,5 @@
 - `probe_network`: the probe's network, saved and loaded.
 - `published_probe`: imports the published probe of V-JEPA 2.
 
-The cards need no torch. All other modules are imported only if a network is used.
+`required` and the cards need no torch. All other modules are imported only if a network is used.
 """

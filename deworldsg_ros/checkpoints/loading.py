@@ -14,6 +14,7 @@ from typing import Any
 import torch
 import transformers
 
+from deworldsg_ros.checkpoints.required import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
@@ -42,7 +43,7 @@ class CheckpointSource:
         folder = Path(name).expanduser()
         if folder.is_dir():
             return CheckpointSource(parameter, str(folder), local_files_only)
-        if name.startswith(("/", "~", ".")) or name.count("/") != 1:
+        if not is_hub_id(name):
             raise ConfigurationError(
                 f"{parameter} '{name}': there is no such folder; expected a folder with "
                 "config.json and model.safetensors, or a hub id"

@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 
 from deworldsg_ros import __version__
+from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.installation import find_shared, node_command
@@ -89,6 +90,7 @@ def run_demo(
         DeWorldSGError: for unusable input, or if a process ends early.
     """
     config = effective_config(config_path, settings)
+    require_checkpoints(config.perception, config.relations)
     # Opened first, so that a problem of the recording is reported before any process starts.
     recording = _check_recording(path or _shipped(), config, options)
     outputs.prepare_folder(out, config)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
+from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -130,6 +131,12 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
     Raises:
         DeWorldSGError: the scan cannot be read or evaluated.
     """
+    uses_perception = task.front_end.kind == "backend"
+    # A baseline has no world model.
+    require_checkpoints(
+        task.config.perception if uses_perception else None,
+        task.config.relations if task.method == PIPELINE else None,
+    )
     with ExitStack() as opened:
         return _evaluate(task, opened)
 

@@ -12,6 +12,7 @@ from typing import Any
 from std_msgs.msg import String
 
 from deworldsg_ros.checkpoints.card import graph_predicates
+from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
@@ -33,6 +34,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         super().__init__("relation_node", "evidence messages", **options)
         config = self.parameters.relations
         report = self.get_logger().warning
+        require_checkpoints(relations=config)
         world_model = build_world_model(config, self.parameters.perception.device)
         predicates = graph_predicates(self.parameters.perception)
         if predicates is not None:  # else the first local graph contains them

@@ -8,6 +8,7 @@ from typing import Any
 
 from sensor_msgs.msg import Image
 
+from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
 from deworldsg_ros.ros.joining import JoiningNode
@@ -26,7 +27,9 @@ class SegmentationNode(JoiningNode[RgbdFrame]):
     def __init__(self, **options: Any) -> None:
         super().__init__("segmentation_node", "frame graphs", **options)
         inputs = self.parameters.inputs
-        self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
+        perception = self.parameters.perception
+        require_checkpoints(perception)
+        self._perception = build_perception(perception, world_up=inputs.world_up)
         self._publish_graph = self.json_publisher("deworldsg/frame_graph", 10)
         self._instances = self.create_publisher(Image, "deworldsg/instances", reliable(10))
         frames = self._frames = FrameAssembler(inputs, **self.assembler_options())

@@ -275,7 +275,7 @@ def test_the_paper_on_the_rendered_rooms(
             tmp_path / "rooms" / "noisy",
             tmp_path / "out",
             scan=scan,
-            config=load_config(root_dir / "config" / "paper.yaml"),
+            config=load_config(root_dir / "config" / "paper_rules.yaml"),
             front_end=FrontEndChoice("recorded", flip=flip),
         )
     )

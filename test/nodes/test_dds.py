@@ -212,7 +212,7 @@ def test_a_missing_parameter_file_ends_the_start_with_2(tmp_path: Path) -> None:
 
 
 def test_parameters_come_from_a_file(tmp_path: Path, root_dir: Path) -> None:
-    arguments = ("--ros-args", "--params-file", str(root_dir / "config" / "paper.yaml"))
+    arguments = ("--ros-args", "--params-file", str(root_dir / "config" / "paper_rules.yaml"))
     process = NodeProcess("graph_node", tmp_path, *arguments, "-p", "use_sim_time:=true")
     try:
         process.wait_ready()

@@ -141,7 +141,9 @@ def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_d
         if folder != "launch":
             wanted = {name for name in wanted if not name.endswith(".py")}
         assert wanted <= files_below(share / folder)
-    assert {"default.yaml", "paper.yaml", "fastdds.xml"} <= files_below(share / "config")
+    assert {"default.yaml", "paper.yaml", "paper_rules.yaml", "fastdds.xml"} <= files_below(
+        share / "config"
+    )
     assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
 
 

@@ -13,7 +13,7 @@ from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 CONFIGURATIONS = Path(__file__).resolve().parents[2] / "config"
 # The paper publishes a node after one observation, so tests need few frames.
-PAPER = load_config(CONFIGURATIONS / "paper.yaml")
+PAPER = load_config(CONFIGURATIONS / "paper_rules.yaml")
 VOCABULARY = Vocabulary(("cup", "table", "chair"), ("on", "near", "under"))
 INTRINSICS = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
 # Box in the image, depth and class of each object; the cup is close to the table.

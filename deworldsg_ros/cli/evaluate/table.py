@@ -22,16 +22,24 @@ from deworldsg_ros.cli.evaluate.score import finish, header, print_files
 from deworldsg_ros.cli.exit_codes import EXIT_NOTHING_DONE
 from deworldsg_ros.cli.installation import find_shared
 from deworldsg_ros.cli.progress import frame_progress
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.pose_sources import KINDS
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.evaluation.reports.evaluation import evaluate_prediction_file
+from deworldsg_ros.evaluation.runner import ScanTask
 from deworldsg_ros.evaluation.tables import row_results, terminal
 from deworldsg_ros.evaluation.tables.jobs import Job, JobResult, jobs_of
 from deworldsg_ros.evaluation.tables.parallel import run_jobs
-from deworldsg_ros.evaluation.tables.rows import Row, table_rows
+from deworldsg_ros.evaluation.tables.rows import Configurations, Row, table_rows
 from deworldsg_ros.scene.errors import ConfigurationError
+
+# Tables that the paper prints, too.
+PRINTED = ("main", "pose", "ablation", "runtime")
+NOT_PRINTED = (
+    "Numbers of the paper appear only beside a row of the same method, on its whole test split. "
+    "This table has none. docs/models.md says how to get the paper's networks."
+)
 
 
 def make_table(
@@ -61,10 +69,15 @@ def make_table(
         )
     tasks = scan_tasks(annotations, data, detections, running, scoring, out)
     front_end = tasks[0].front_end
-    rows = table_rows(kind, poses, front_end, partial(_configure, kind, running))
+    configurations = Configurations(
+        partial(_configure, kind, running),
+        load_config(_config_path("paper", None)),
+        running.config.stem if running.config else "default",
+    )
+    rows = table_rows(kind, poses, front_end, configurations)
     _check_prefixes(rows, running.settings or [])
     done = _run(jobs_of(rows, tasks, fresh=comparing.fresh), kind, comparing, console)
-    lines = row_results.paper_rows(kind, annotations.layout.name)
+    lines = _printed(kind, annotations.layout.name, data, tasks, rows, [name for name, _ in files])
     dataset = annotations.root.resolve().name
     for row in rows:
         own = sorted((item for item in done if item.row == row.name), key=lambda item: item.scan)
@@ -72,6 +85,8 @@ def make_table(
     for name, path in files:
         evaluation = evaluate_prediction_file(annotations, path, tasks[0].options, data.scans)
         lines.append(row_results.predicted_row(name, evaluation))
+    if not lines[0].printed and kind in PRINTED:
+        console.print(NOT_PRINTED, highlight=False, soft_wrap=True)
     title = f"{kind}: {dataset}, {front_end.describe()} detections"
     if kind == "runtime":
         terminal.print_runtime(console, lines, title)
@@ -87,6 +102,21 @@ def make_table(
         "rows": [line.values() for line in lines],
     }
     finish(values, json_file, console)
+
+
+def _printed(
+    kind: str,
+    layout: str,
+    data: DataOptions,
+    tasks: Sequence[ScanTask],
+    rows: Sequence[Row],
+    predicted: Sequence[str],
+) -> list[row_results.RowResult]:
+    """The paper's rows of the methods in the table, if it covers a whole test split."""
+    if data.scans or data.split != "test" or any(task.max_frames for task in tasks):
+        return []
+    titles = {row.printed for row in rows if row.printed}.union(predicted)
+    return row_results.paper_rows(kind, layout, {task.scan for task in tasks}, titles)
 
 
 def _configure(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -106,15 +106,26 @@ def predicted_row(title: str, evaluation: Evaluation) -> RowResult:
     return RowResult(title, title, evaluation.dataset, False, numbers, scans=len(result.scans))
 
 
-def paper_rows(table: str, layout: str) -> list[RowResult]:
-    """The paper's rows of a table."""
+def paper_rows(
+    table: str, layout: str, scans: Collection[str], titles: Collection[str]
+) -> list[RowResult]:
+    """The paper's rows of a table, of the methods that the table ran or got predictions of.
+
+    Args:
+        table: name of the table.
+        layout: layout of the data set.
+        scans: the evaluated scans.
+        titles: titles of these rows.
+    """
     if table == "runtime":
         title = "DeWorldSG as printed"
         times = dict(RUNTIME_MS)
-        return [RowResult("printed", title, "ReplicaSSG", True, {}, times, RUNTIME_DEVICE)]
+        row = RowResult("printed", title, "ReplicaSSG", True, {}, times, RUNTIME_DEVICE)
+        return [row] if "DeWorldSG" in titles else []
     return [
         RowResult(f"printed {row.title}", row.title, row.dataset, True, row.numbers())
-        for row in printed_rows(table, layout)
+        for row in printed_rows(table, layout, scans)
+        if row.title in titles
     ]
 
 
