@@ -49,8 +49,8 @@ CONDITIONS = {
 }
 KINDS = (*CONDITIONS, BACKEND)
 KINDS_BY_LAYOUT = {"replica": KINDS, "recording": ("clean", BACKEND), "": (BACKEND,)}
-# Known detections of each layout.
-FRONT_ENDS = {"replica": "recorded", "recording": "ground-truth"}
+# A data set with this file of a frame has recorded detections.
+RECORDED = "sequence/frame-000000.frontend.json"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -132,8 +132,9 @@ def _front_end(
     choice = FrontEndChoice()
     head = config.perception.relation_head
     if condition.name != BACKEND:
-        head = FRONT_ENDS[annotations.layout.name]
-        choice = condition.apply(FrontEndChoice(head))
+        recorded = (annotations.scan_folder(scan) / RECORDED).exists()
+        choice = condition.apply(FrontEndChoice("recorded" if recorded else "ground-truth"))
+        head = choice.kind
     return build_front_end(choice, annotations, scan, source, config), head
 
 

@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         capture = read_capture(path)
         replayed = replay(capture, config)
         if not capture.layout:
-            print(f"{capture.name:32s} {_nodes_line(replayed)}", flush=True)
+            print(f"{capture.name:32s} {unannotated_line(capture, replayed)}", flush=True)
             continue
         scores.append(score(capture, replayed))
         print(scores[-1].line(), flush=True)
@@ -330,10 +330,36 @@ def _inside(mean_m: Sequence[float], reference: ReferenceScene, row: int) -> boo
     return bool(((np.array(mean_m) >= low) & (np.array(mean_m) <= high)).all())
 
 
-def _nodes_line(replayed: Replay) -> str:
-    labels = Counter(node.label for node in replayed.graph.nodes)
+def unannotated_line(capture: Capture, replayed: Replay) -> str:
+    """The nodes by label; with a list ``SCENE.json`` beside this file, which of it was found."""
+    nodes = replayed.graph.nodes
+    labels = Counter(node.label for node in nodes)
     listed = ", ".join(f"{count} {label}" for label, count in labels.most_common())
-    return f"{len(replayed.graph.nodes)} nodes, {replayed.median_ms:.2f} ms: {listed}"
+    counts = f"{len(nodes)} nodes, {replayed.median_ms:.2f} ms"
+    path = Path(__file__).parent / f"{capture.scene}.json"
+    if not path.exists():
+        return f"{counts}: {listed}"
+    m = measure(replayed.graph, read_list(path))
+    others = m.nodes - m.matched
+    return (
+        f"{counts}; of {m.objects} large objects {m.found} found, {m.duplicates} duplicates; "
+        f"{others} other nodes: {listed}"
+    )
+
+
+def read_list(path: Path) -> ReferenceScene:
+    """The objects of a list, without relations."""
+    objects = json.loads(path.read_text())["objects"]
+    boxes = np.array([item["aabb"] for item in objects], np.float64)
+    return ReferenceScene(
+        list(range(1, len(objects) + 1)),
+        [item["label"] for item in objects],
+        boxes[:, 0],
+        boxes[:, 1],
+        boxes.mean(axis=1),
+        frozenset(),
+        exact=False,
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
