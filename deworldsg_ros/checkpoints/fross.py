@@ -72,12 +72,15 @@ class Imported:
         parameters: number of values in detector and head.
         card: the card in the new folder.
         layers: number of decoder layers.
+        unknown_bias: the checkpoint has class-pair statistics, and neither the caller nor a
+            config.json says whether they were used. They are then off.
     """
 
     architecture: str
     parameters: int
     card: CheckpointCard
     layers: int
+    unknown_bias: bool = False
 
 
 def import_checkpoint(
@@ -117,6 +120,9 @@ def import_checkpoint(
     _check_counts(names, config.num_labels, network.predicates, str(path))
     evaluated = int(settings.get("rt_detr_transformer_eval_idx", EVALUATED_LAYER))
     layers = evaluated % config.decoder_layers + 1 if evaluated < config.decoder_layers else 0
+    unknown_bias = (
+        frequency_bias is None and "use_freq_bias" not in settings and "triplet_dist" in head
+    )
     if frequency_bias is None:
         frequency_bias = bool(settings.get("use_freq_bias", False))
     card = CheckpointCard(
@@ -131,7 +137,8 @@ def import_checkpoint(
     model.config.label2id = {name: index for index, name in enumerate(names.classes)}
     _write(out, model, network, card)
     values = [*model.state_dict().values(), *network.state_dict().values()]
-    return Imported(config.model_type, sum(v.numel() for v in values), card, config.decoder_layers)
+    count = sum(value.numel() for value in values)
+    return Imported(config.model_type, count, card, config.decoder_layers, unknown_bias)
 
 
 def split(state: Tensors, where: str) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import msgspec
 import typer
@@ -11,6 +11,9 @@ from rich.console import Console
 
 from deworldsg_ros.cli.exit_codes import EXIT_USAGE
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+
+if TYPE_CHECKING:
+    from deworldsg_ros.checkpoints.fross import Imported
 
 app = typer.Typer(name="models", help="Convert published checkpoints.")
 
@@ -48,12 +51,19 @@ def import_fross(
 ) -> None:
     """Convert a checkpoint of FROSS (RT-DETR with EGTR) to a folder for perception."""
     console = Console(highlight=False, soft_wrap=True)
+    errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
     try:
         made = _import(checkpoint, out, names, frequency_bias)
     except DeWorldSGError as error:
-        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(f"error: {error}")
+        errors.print(f"error: {error}")
         raise typer.Exit(EXIT_USAGE) from error
-    console.print(made, markup=False)
+    console.print(_summary(made, out), markup=False)
+    if made.unknown_bias:
+        errors.print(
+            "warning: the checkpoint has class-pair statistics (triplet_dist), and no config.json "
+            "says whether they were used: they are off. Put FROSS's config.json into the folder of "
+            "the checkpoint and import again, or give --frequency-bias or --no-frequency-bias"
+        )
     console.print(
         f"use it: --set perception.detector=rtdetr --set perception.detector_path={out} "
         "--set perception.relation_head=egtr",
@@ -63,7 +73,7 @@ def import_fross(
 
 def _import(
     checkpoint: Path, out: Path, names_file: Path | None, frequency_bias: bool | None
-) -> str:
+) -> Imported:
     try:
         from deworldsg_ros.checkpoints.fross import Names, import_checkpoint
     except ImportError as error:
@@ -77,7 +87,10 @@ def _import(
             names = msgspec.json.decode(names_file.read_bytes(), type=Names)
         except (OSError, msgspec.MsgspecError) as error:
             raise ConfigurationError(f"names {names_file}: {error}") from error
-    made = import_checkpoint(checkpoint, out, names=names, frequency_bias=frequency_bias)
+    return import_checkpoint(checkpoint, out, names=names, frequency_bias=frequency_bias)
+
+
+def _summary(made: Imported, out: Path) -> str:
     card = made.card
     return (
         f"{out}: {made.architecture}, {made.parameters / 1e6:.1f} million values, "

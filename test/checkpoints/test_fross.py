@@ -364,6 +364,24 @@ def test_names_have_to_fit_the_outputs(tmp_path):
     assert again.exit_code == 2
 
 
+@pytest.mark.parametrize(
+    "config, flags, told",
+    [
+        (None, [], True),
+        ({"num_queries": 300}, [], True),
+        ({"use_freq_bias": False}, [], False),
+        (None, ["--no-frequency-bias"], False),
+    ],
+)
+def test_statistics_without_a_config_json_are_asked_about(tmp_path, config, flags, told):
+    path = save_published(tmp_path, published_state(), config)
+    arguments = ["import-fross", str(path), str(tmp_path / "out"), *flags]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert ("Put FROSS's config.json" in result.output) == told
+    assert not read_card(tmp_path / "out" / "deworldsg.json").frequency_bias
+
+
 class Surprise:
     """What a pickle may do when it is loaded."""
 
