@@ -25,7 +25,6 @@ from deworldsg_ros.relations import (
     EdgeBeliefs,
     RelationReasoner,
     build_world_model,
-    choose_directions,
     fuse_edges,
     neighbour_pairs,
 )
@@ -211,13 +210,6 @@ def main() -> None:
         lambda: [prior.lookup(pair[None]) for pair in classes],
         options.turns,
     )
-    ids = np.stack([np.arange(edges) // 2, np.arange(edges) // 2 + 1], axis=1)
-    ids[1::2] = ids[1::2, ::-1]
-    times = [
-        timed(lambda: choose_directions(ids, has_visual, fused.probabilities))
-        for _ in range(options.turns)
-    ]
-    print(f"directions of {edges} edges           {1e3 * np.median(times):8.3f} ms")
     frame_costs(options.objects, 10 * options.turns)
     belief_costs(options.objects, 300, options.turns)
 

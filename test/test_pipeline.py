@@ -79,8 +79,9 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
         pipeline.process(frame(index))
     builder = pipeline.builder
     assert builder is not None
-    (edge,) = pipeline.graph().edges  # cup and table alone are neighbours (Eq. 8)
-    assert edge.provenance == "fused"
+    edge, back = pipeline.graph().edges  # cup and table alone are neighbours (Eq. 8)
+    assert edge.provenance == "fused" and back.provenance == "prior"
+    assert (back.subject, back.object) == (edge.object, edge.subject)
     assert edge.entropy_nats == pytest.approx(np.log(3), abs=1e-4)
     prior = mean_of(builder.prior, 0, 1)
     visual = np.exp([0.003, 0.0, 0.0]) / np.exp([0.003, 0.0, 0.0]).sum()
@@ -100,9 +101,12 @@ def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
 
 
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
-    pipeline = Pipeline(ASKING, Scripted())
-    late = GraphBuilder(ASKING, VOCABULARY, "map")
-    reasoner = RelationReasoner(ASKING.relations, build_world_model(ASKING.relations))
+    # Without a graph the reasoner encodes every clip; so must the pipeline.
+    every_clip = msgspec.structs.replace(ASKING.relations, max_clips_per_s=0.0)
+    config = msgspec.structs.replace(ASKING, relations=every_clip)
+    pipeline = Pipeline(config, Scripted())
+    late = GraphBuilder(config, VOCABULARY, "map")
+    reasoner = RelationReasoner(every_clip, build_world_model(every_clip))
     evidence = []
     for index in range(8):
         pipeline.process(frame(index))

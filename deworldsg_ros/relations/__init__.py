@@ -6,7 +6,6 @@ from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, un
 from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.evidence import (
     FusedEdges,
-    choose_directions,
     entropy_nats,
     fuse_distributions,
     fuse_edges,
@@ -44,7 +43,6 @@ __all__ = [
     "RelationReasoner",
     "WorldModel",
     "build_world_model",
-    "choose_directions",
     "crop_clip",
     "entropy_nats",
     "fuse_distributions",

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import softmax
 
-from deworldsg_ros.scene.arrays import Bool, Float64, Int8, Int64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int8
 from deworldsg_ros.scene.wire import Provenance
 
 PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
@@ -19,13 +18,6 @@ _VISUAL, _PRIOR, _FUSED = range(3)
 # would leave more than 1 nat of entropy among 50 predicates, and the prior would enter every pair
 # that was seen once.
 OUTLIER_RATE = 0.1
-
-# If the prior completed both directions of a pair, one is published: the second one only if its
-# best predicate is more probable by this margin. Predictions for the clips of one class pair have a
-# standard deviation of about 0.2. At the paper's weight, a third of it remains in the fused
-# distribution. With a smaller margin than a few clips can resolve, an edge would change its
-# direction again and again while predictions arrive.
-DIRECTION_MARGIN = 0.05
 
 
 def bounded_logits(logits: Float64, outlier_rate: float) -> Float64:
@@ -136,51 +128,3 @@ def fuse_edges(
     )
     codes = np.where(active, np.where(has_visual, _FUSED, _PRIOR), _VISUAL).astype(np.int8)
     return FusedEdges(probabilities, codes, entropies, has_visual | active)
-
-
-def opposite_rows(edges: Int64 | Sequence[tuple[int, int]]) -> tuple[Int64, Int64]:
-    """Rows of the pairs with both directions among the edges.
-
-    Args:
-        edges: (E, 2) subject and object ids, each directed edge at most once, any order.
-
-    Returns:
-        (P,) int64 each: the rows with the smaller subject id, and those of the opposite direction.
-    """
-    ids = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    low, high = ids.min(axis=1), ids.max(axis=1)
-    # Both directions of a pair become neighbours in this order, the smaller subject first.
-    order = np.lexsort((ids[:, 0], high, low))
-    first, second = order[:-1], order[1:]
-    both = (low[first] == low[second]) & (high[first] == high[second])
-    return first[both], second[both]
-
-
-def choose_directions(
-    edges: Int64 | Sequence[tuple[int, int]], has_visual: Bool, probabilities: Float64
-) -> Bool:
-    """Which directed edges are published, if the prior completed pairs.
-
-    The prior completes both directions of a pair, usually with a predicate and a similar inverse.
-    A direction without visual evidence is published only if the other direction has none either.
-    Of two such directions, one is published: the one whose best predicate is more probable by
-    `DIRECTION_MARGIN`, otherwise the one with the smaller subject id.
-
-    Args:
-        edges: (E, 2) subject and object ids, each directed edge at most once, any order.
-        has_visual: (E,) bool.
-        probabilities: (E, R) float64 fused distributions.
-
-    Returns:
-        (E,) bool; true for every edge with visual evidence, and for every edge whose reverse is
-        not among the edges.
-    """
-    first, second = opposite_rows(edges)
-    kept = np.ones(len(has_visual), dtype=np.bool_)
-    seen_first, seen_second = has_visual[first], has_visual[second]
-    greatest = probabilities.max(axis=1)
-    # Neither was seen: one stays. One was seen: that one stays. Both were seen: both stay.
-    second_wins = greatest[second] > greatest[first] + DIRECTION_MARGIN
-    kept[first] = seen_first | (~seen_second & ~second_wins)
-    kept[second] = seen_second | (~seen_first & second_wins)
-    return kept

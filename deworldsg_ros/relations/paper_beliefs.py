@@ -7,12 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.evidence import (
-    PROVENANCES,
-    FusedEdges,
-    choose_directions,
-    fuse_edges,
-)
+from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -20,8 +15,8 @@ from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.node_states import best_beliefs
 
-# What a belief is computed from: revisions of the evidence, classes, and the priors as bytes.
-_Basis = tuple[int, int, int, int, bytes, bytes]
+# What a belief is computed from: revision of the evidence, classes, and the prior as bytes.
+_Basis = tuple[int, int, int, bytes]
 
 
 class PaperBeliefs:
@@ -53,7 +48,10 @@ class PaperBeliefs:
             return []
         classes = self._classes(pairs)
         priors, has_prior = prior.lookup(classes)
-        bases = self._bases(pairs, classes, priors, prior.lookup(classes[:, ::-1])[0])
+        bases = {
+            pair: (self._graph.edges[pair].revision, *ends, priors[row].tobytes())
+            for row, (pair, ends) in enumerate(zip(pairs, classes.tolist()))
+        }
         stale = [
             row
             for row, (pair, basis) in enumerate(bases.items())
@@ -65,26 +63,6 @@ class PaperBeliefs:
             for pair, basis in bases.items()
         }
         return [state for _, state in self._known.values() if state is not None]
-
-    def _bases(
-        self, pairs: Sequence[Pair], classes: Int64, there: Float64, back: Float64
-    ) -> dict[Pair, _Basis]:
-        """Evidence, classes and priors of each pair, in both directions.
-
-        Both, because the belief of one direction depends on the evidence of the other.
-        """
-        edges = self._graph.edges
-        reverse = [edges.get((object_, subject)) for subject, object_ in pairs]
-        return {
-            pair: (
-                edges[pair].revision,
-                other.revision if other else 0,
-                *ends,
-                there[row].tobytes(),
-                back[row].tobytes(),
-            )
-            for row, (pair, other, ends) in enumerate(zip(pairs, reverse, classes.tolist()))
-        }
 
     def _make(
         self, pairs: Sequence[Pair], priors: Float64, has_prior: Bool
@@ -104,11 +82,7 @@ class PaperBeliefs:
             self._config.fusion_alpha,
             self._config.entropy_threshold_nats,
         )
-        known = np.flatnonzero(fused.known)
-        chosen = choose_directions(
-            [pairs[row] for row in known.tolist()], has_visual[known], fused.probabilities[known]
-        )
-        for row in known[chosen].tolist():
+        for row in np.flatnonzero(fused.known).tolist():
             made[pairs[row]] = self._state(pairs[row], evidence[row], fused, row)
         return made
 

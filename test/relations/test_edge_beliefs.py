@@ -275,9 +275,34 @@ def test_the_paper_completes_neighbours_with_the_prior_of_the_physical_model() -
     assert builder.full().edges == []
     for pair in ((ids["cup"], ids["table"]), (ids["table"], ids["cup"])):
         builder.graph.add_neighbour(*pair, 1)
+    # The physical model says nothing of the table on the cup: there is no prior of that direction.
     (edge,) = builder.full().edges
     assert (edge.subject, edge.object) == (ids["cup"], ids["table"])
     assert (edge.predicate, edge.provenance) == ("on", "prior")
+
+
+@pytest.mark.parametrize("seen", [(), ("cup",), ("cup", "table")])
+def test_the_paper_states_both_directions_of_a_pair(seen: tuple[str, ...]) -> None:
+    """Eq. 10 defines each direction for itself, whatever is known of the other one."""
+    builder, ids = room(DESK, config(world_model="fake", edge_belief="paper"))
+    pairs = {"cup": (ids["cup"], ids["table"]), "table": (ids["table"], ids["cup"])}
+    names = VOCABULARY.classes
+    ends = names.index("cup"), names.index("dining table")
+    # A probe that sees the clip alone predicts the same for both directions.
+    prediction = np.full(WIDTH, 0.5 / WIDTH)
+    prediction[PREDICATES.index("on")] += 0.5
+    builder.prior.update(np.array([ends, ends[::-1]]), np.stack([prediction] * 2))
+    for subject, pair in pairs.items():
+        builder.graph.add_neighbour(*pair, 1)
+        if subject in seen:
+            builder.graph.add_visual(*pair, np.zeros(WIDTH), 1)
+    edges = {(edge.subject, edge.object): edge for edge in builder.full().edges}
+    assert set(edges) == set(pairs.values())
+    expected = (1 / WIDTH + 0.5 * prediction) / 1.5
+    for subject, pair in pairs.items():
+        assert edges[pair].provenance == ("fused" if subject in seen else "prior")
+        assert edges[pair].predicate == "on"
+        assert edges[pair].probability == pytest.approx(expected.max())
 
 
 # --- the prior of Eq. 10 -------------------------------------------------------------------------

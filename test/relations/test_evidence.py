@@ -12,7 +12,6 @@ from support.relations import fuse_edge, provenances
 
 from deworldsg_ros.relations.evidence import (
     PROVENANCES,
-    choose_directions,
     entropy_nats,
     fuse_distributions,
     fuse_edges,
@@ -173,60 +172,3 @@ def test_every_provenance_occurs():
     fused = fuse_edges(0.3 * logits, seen, priors, told, 0.5, 1.0)
     known = [name for name, known in zip(provenances(fused), fused.known) if known]
     assert set(known) == set(PROVENANCES)
-
-
-SURE, UNSURE = [0.9, 0.05, 0.05], [0.4, 0.3, 0.3]
-
-
-@pytest.mark.parametrize(
-    ("edges", "seen", "probabilities", "kept"),
-    [
-        ([], [], np.zeros((0, 3)), []),
-        ([(1, 2)], [False], [UNSURE], [True]),  # there is no other direction
-        ([(1, 2), (2, 1)], [False, False], [UNSURE, SURE], [False, True]),
-        ([(1, 2), (2, 1)], [False, False], [SURE, UNSURE], [True, False]),
-        ([(2, 1), (1, 2)], [False, False], [SURE, UNSURE], [True, False]),
-        ([(2, 1), (1, 2)], [False, False], [UNSURE, UNSURE], [False, True]),  # tie: smaller id
-        ([(1, 2), (2, 1)], [False, True], [UNSURE, SURE], [False, True]),  # only one was seen
-        ([(1, 2), (2, 1)], [True, True], [UNSURE, SURE], [True, True]),
-        ([(1, 2), (2, 3), (3, 1)], [False] * 3, [SURE, SURE, SURE], [True] * 3),
-        (
-            [(5, 3), (1, 2), (3, 5), (2, 1)],
-            [False] * 4,
-            [SURE, UNSURE, UNSURE, SURE],
-            [True, False, False, True],
-        ),
-    ],
-)
-def test_one_direction_of_an_unseen_pair_is_chosen(edges, seen, probabilities, kept):
-    chosen = choose_directions(edges, np.array(seen, bool), np.array(probabilities, float))
-    assert chosen.tolist() == kept
-
-
-@settings(max_examples=30, deadline=None)
-@given(seeds)
-def test_choice_of_directions_equals_the_reference(seed):
-    generator = np.random.default_rng(seed)
-    edges = [(a, b) for a in range(6) for b in range(6) if a != b and generator.random() < 0.7]
-    edges = [edges[index] for index in generator.permutation(len(edges))]
-    seen = generator.random(len(edges)) < 0.3
-    probabilities = np.array([SURE, UNSURE])[generator.integers(0, 2, len(edges))]
-    chosen = choose_directions(edges, seen, probabilities)
-    greatest = probabilities.max(axis=1)
-    for row, (a, b) in enumerate(edges):
-        wanted = True
-        if (b, a) in edges:
-            other = edges.index((b, a))
-            unseen_wins = (-greatest[row], a) < (-greatest[other], b)
-            wanted = seen[row] or (not seen[other] and unseen_wins)
-        assert chosen[row] == wanted
-
-
-@pytest.mark.parametrize("difference", [1e-14, 0.04])
-def test_neither_rounding_nor_one_more_prediction_reverses_an_edge(difference):
-    """Two priors that were summed in another order differ in their last bits."""
-    almost = np.array([UNSURE, UNSURE])
-    almost[1] += (difference, -difference, 0)
-    for probabilities in (almost, almost[::-1]):
-        chosen = choose_directions([(1, 2), (2, 1)], np.zeros(2, bool), probabilities)
-        assert chosen.tolist() == [True, False]
