@@ -29,6 +29,8 @@ class BackboneIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         image_size: edge of the square input, pixels.
         clip_length: T, frames of a clip.
         fingerprint: hash of the weights; empty = not known.
+        fit: how a crop becomes the square input: ``stretch`` = the whole crop; ``centre`` = its
+            middle only, as for probes that version 0.2 trained.
     """
 
     family: str
@@ -36,12 +38,14 @@ class BackboneIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     image_size: Annotated[int, msgspec.Meta(ge=1)]
     clip_length: Annotated[int, msgspec.Meta(ge=1)]
     fingerprint: str = ""
+    # Cards without this field are those of version 0.2.
+    fit: Literal["stretch", "centre"] = "centre"
 
     def __str__(self) -> str:
         weights = f", weights {self.fingerprint}" if self.fingerprint else ""
         return (
             f"{self.family} with {self.feature_dim} features of {self.clip_length} frames at "
-            f"{self.image_size} px{weights}"
+            f"{self.image_size} px ({self.fit}){weights}"
         )
 
 
@@ -76,8 +80,17 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.backbone.feature_dim + (BOX_INPUTS if self.inputs == "clip_and_boxes" else 0)
 
     def require_backbone(self, backbone: BackboneIdentity) -> None:
-        """Raise ConfigurationError unless the probe was trained on this backbone."""
+        """Raise ConfigurationError unless the probe was trained on this backbone.
+
+        A probe that does not know the weights of its backbone accepts all weights.
+        """
         expected = self.backbone
+        if expected.fit != backbone.fit:
+            raise ConfigurationError(
+                f"the probe was trained with crops brought to the square by '{expected.fit}', and "
+                f"this version uses '{backbone.fit}': train the probe again with "
+                "`deworldsg train-probe`"
+            )
         if not expected.fingerprint or not backbone.fingerprint:
             expected = msgspec.structs.replace(expected, fingerprint=backbone.fingerprint)
         if expected != backbone:

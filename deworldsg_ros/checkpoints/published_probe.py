@@ -11,7 +11,8 @@ from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard
 from deworldsg_ros.checkpoints.probe_network import Probe, with_weights
 
 # The backbone of the published probe: V-JEPA 2 ViT-g, 1408 features of 16 frames at 384 pixels.
-PUBLISHED_BACKBONE = BackboneIdentity("vjepa2", 1408, 384, 16)
+# The released code stretches the crops.
+PUBLISHED_BACKBONE = BackboneIdentity("vjepa2", 1408, 384, 16, fit="stretch")
 
 
 def import_published(path: Path, predicates: tuple[str, ...]) -> Probe:

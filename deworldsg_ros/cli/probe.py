@@ -211,7 +211,7 @@ def import_probe(
         Path, typer.Argument(metavar="CHECKPOINT", help="the published vjepa_probe_mlp.pt")
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="folder to write")],
-    predicates: PredicateSet = "replica_ssg",
+    predicates: PredicateSet = "3dssg",
 ) -> None:
     """Convert the published probe of V-JEPA 2 ViT-g 384 to a folder for relations.probe_path."""
     names = read_predicates(predicates)
@@ -223,6 +223,10 @@ def import_probe(
         save_probe(out, probe)
     Console(highlight=False, soft_wrap=True).print(
         f"{out}: probe of {probe.card.backbone}, {len(names)} predicates", markup=False
+    )
+    Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(
+        "warning: the file does not know the weights of its backbone, and the released code may "
+        "not have loaded any (docs/models.md, The published probe): measure it before you trust it"
     )
 
 

@@ -33,9 +33,10 @@ from deworldsg_ros.checkpoints.published_probe import (  # noqa: E402
 )
 from deworldsg_ros.relations import build_world_model  # noqa: E402
 from deworldsg_ros.relations.world_model import require_predicates  # noqa: E402
+from deworldsg_ros.relations.world_models import vjepa2  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
-BACKBONE = BackboneIdentity("vjepa2", 48, 32, 4, "0123456789abcdef")
+BACKBONE = BackboneIdentity("vjepa2", 48, 32, 4, "0123456789abcdef", "stretch")
 PREDICATES = tuple(f"predicate {n}" for n in range(7))
 
 
@@ -161,6 +162,41 @@ def test_a_probe_accepts_only_the_backbone_of_its_training(changes, fits):
     with pytest.raises(ConfigurationError, match="trained on vjepa2 with 48 features") as refusal:
         card.require_backbone(other)
     assert str(other) in str(refusal.value)
+
+
+def test_a_probe_of_version_0_2_is_refused(tmp_path):
+    """Its card has no field `fit`: it was trained on the middle of crops."""
+    save_random_probe(tmp_path, BACKBONE)
+    card = json.loads((tmp_path / "config.json").read_text())
+    assert card["backbone"].pop("fit") == "stretch"
+    (tmp_path / "config.json").write_text(json.dumps(card))
+    with pytest.raises(ConfigurationError, match="by 'centre', and this version uses 'stretch'"):
+        load_probe(tmp_path).card.require_backbone(BACKBONE)
+
+
+def warnings_of(tmp_path, caplog, identity_changes, edge_belief="robust", **card_changes):
+    """Warnings at the start of a world model with a probe."""
+    folder = save_vjepa2(tmp_path / "backbone")
+    identity = vjepa2.load_backbone(config_of("vjepa2", folder)).identity
+    identity = msgspec.structs.replace(identity, **identity_changes)
+    probe = save_random_probe(tmp_path / "probe", identity, **card_changes)
+    config = config_of("vjepa2", folder, probe_path=str(probe), edge_belief=edge_belief)
+    build_world_model(config)
+    return [record.getMessage() for record in caplog.records]
+
+
+def test_a_probe_without_a_fingerprint_is_told(tmp_path, caplog):
+    assert warnings_of(tmp_path / "a", caplog, {}) == []
+    (told,) = warnings_of(tmp_path / "b", caplog, {"fingerprint": ""})
+    assert "does not know the weights of its backbone" in told
+
+
+def test_a_probe_that_knows_the_subject_is_told_beside_the_papers_rule(tmp_path, caplog):
+    boxes = {"inputs": "clip_and_boxes"}
+    assert warnings_of(tmp_path / "a", caplog, {}, **boxes) == []
+    assert warnings_of(tmp_path / "b", caplog, {}, "paper") == []
+    (told,) = warnings_of(tmp_path / "c", caplog, {}, "paper", **boxes)
+    assert "the paper's probe sees the clip only" in told
 
 
 @pytest.mark.parametrize(

@@ -123,10 +123,11 @@ def test_a_published_probe_is_imported(tmp_path):
     assert result.exit_code == 0, result.output
     probe = load_probe(tmp_path / "out")
     assert probe.card.predicates == ("on", "near")
+    assert "does not know the weights of its backbone" in result.output
     rows = probe.predict(np.zeros((1, 1408), np.float32), np.zeros((1, 8), np.float32))
     assert rows.shape == (1, 2)
     wrong = run("import-probe", tmp_path / "p.pt", tmp_path / "out2")
-    assert wrong.exit_code == 2 and "50 predicates" in wrong.output
+    assert wrong.exit_code == 2 and "7 predicates" in wrong.output
     assert not (tmp_path / "out2").exists()
 
 

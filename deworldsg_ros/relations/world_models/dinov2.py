@@ -50,7 +50,12 @@ def load_backbone(
         config, Dinov2Model, unused=("embeddings.mask_token",), download=download
     )
     identity = BackboneIdentity(
-        "dinov2", model.config.hidden_size, image_size, config.clip_length, fingerprint(model)
+        "dinov2",
+        model.config.hidden_size,
+        image_size,
+        config.clip_length,
+        fingerprint(model),
+        fit="stretch",
     )
     placed, where, dtype = to_device(model, device)
 
@@ -63,8 +68,8 @@ def load_backbone(
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
-    """Resizing of the published processor: short edge 256 for 224 pixels."""
-    return ClipGeometry(image_size * 256 // 224, image_size, "bicubic")
+    """Interpolation of the published processor."""
+    return ClipGeometry(image_size, "bicubic")
 
 
 def build(config: RelationsConfig, device: str) -> ProbedWorldModel:

@@ -46,7 +46,12 @@ def load_backbone(
         )
     model.predictor = torch.nn.Identity()
     identity = BackboneIdentity(
-        "vjepa2", settings.hidden_size, settings.crop_size, config.clip_length, fingerprint(model)
+        "vjepa2",
+        settings.hidden_size,
+        settings.crop_size,
+        config.clip_length,
+        fingerprint(model),
+        fit="stretch",
     )
     placed, where, dtype = to_device(model, device)
 
@@ -59,8 +64,8 @@ def load_backbone(
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
-    """Resizing of the published processor: short edge 292 for 256 pixels, 438 for 384."""
-    return ClipGeometry(image_size * 256 // 224, image_size, "bilinear")
+    """Interpolation of the published processor and of the paper's released code."""
+    return ClipGeometry(image_size, "bilinear")
 
 
 def build(config: RelationsConfig, device: str) -> ProbedWorldModel:

@@ -25,7 +25,7 @@ from support.relations import VOCABULARY, pair_graph, picture  # noqa: E402
 
 from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype  # noqa: E402
 from deworldsg_ros.relations import RelationReasoner, build_world_model  # noqa: E402
-from deworldsg_ros.relations.probing.preprocessing import normalise, resize_and_crop  # noqa: E402
+from deworldsg_ros.relations.probing.preprocessing import normalise, stretch  # noqa: E402
 from deworldsg_ros.relations.world_models import dinov2, vjepa2  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
@@ -65,7 +65,7 @@ def test_a_clip_has_the_same_feature_in_every_batch(checkpoints, family):
 def test_vjepa2_is_the_mean_of_the_encoders_tokens(checkpoints):
     backbone = load("vjepa2", checkpoints["vjepa2"])
     model = transformers.VJEPA2Model.from_pretrained(checkpoints["vjepa2"]).eval()
-    images = normalise(resize_and_crop(clip(), backbone.geometry), torch.float32)[None]
+    images = normalise(stretch(clip(), backbone.geometry), torch.float32)[None]
     assert images.shape == (1, CLIP_LENGTH, 3, 32, 32)
     with torch.inference_mode():
         tokens = model(images, skip_predictor=True).last_hidden_state
@@ -76,7 +76,7 @@ def test_vjepa2_is_the_mean_of_the_encoders_tokens(checkpoints):
 def test_dinov2_is_the_mean_of_the_frames_class_tokens(checkpoints):
     backbone = load("dinov2", checkpoints["dinov2"])
     model = transformers.Dinov2Model.from_pretrained(checkpoints["dinov2"]).eval()
-    images = normalise(resize_and_crop(clip(), backbone.geometry), torch.float32)
+    images = normalise(stretch(clip(), backbone.geometry), torch.float32)
     with torch.inference_mode():
         frames = model(images).pooler_output
     np.testing.assert_allclose(backbone.encode([clip()])[0], frames.mean(dim=0), atol=1e-5)

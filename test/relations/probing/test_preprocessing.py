@@ -1,4 +1,4 @@
-"""Resizing, cutting and normalising against a plain reference."""
+"""Stretching and normalising against a plain reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD  # noqa: 
 from deworldsg_ros.relations.probing.preprocessing import (  # noqa: E402  after the guards
     ClipGeometry,
     normalise,
-    resize_and_crop,
+    stretch,
 )
 from deworldsg_ros.relations.world_models import dinov2, vjepa2  # noqa: E402
 
@@ -39,49 +39,45 @@ def resize_matrix(before, after, kernel):
 
 def reference(clip, geometry):
     kernel = triangle if geometry.interpolation == "bilinear" else keys_cubic
-    height, width = clip.shape[1:3]
-    short = min(height, width)
-    new_height, new_width = (geometry.short_edge * edge // short for edge in (height, width))
-    rows = resize_matrix(height, new_height, kernel)
-    columns = resize_matrix(width, new_width, kernel)
-    resized = np.einsum("yh,thwc,xw->tcyx", rows, clip.astype(np.float64), columns)
-    top, left = round((new_height - geometry.crop) / 2), round((new_width - geometry.crop) / 2)
-    middle = resized[:, :, top : top + geometry.crop, left : left + geometry.crop]
-    return np.clip(middle, 0, 255)
+    rows = resize_matrix(clip.shape[1], geometry.edge, kernel)
+    columns = resize_matrix(clip.shape[2], geometry.edge, kernel)
+    return np.clip(np.einsum("yh,thwc,xw->tcyx", rows, clip.astype(np.float64), columns), 0, 255)
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
-@pytest.mark.parametrize("size", [(60, 80), (80, 60), (7, 25), (36, 36), (500, 300)])
-def test_resizing_equals_the_plain_filter(interpolation, size):
+@pytest.mark.parametrize("size", [(60, 80), (80, 60), (7, 25), (32, 32), (500, 300)])
+def test_stretching_equals_the_plain_filter(interpolation, size):
     generator = np.random.default_rng(0)
     # Away from black and white: the cubic overshoots, and is cut off there between its two passes.
     clip = generator.integers(80, 176, (2, *size, 3)).astype(np.uint8)
-    geometry = ClipGeometry(36, 32, interpolation)
-    resized = resize_and_crop(clip, geometry)
-    assert resized.dtype == torch.uint8 and resized.shape == (2, 3, 32, 32)
+    geometry = ClipGeometry(32, interpolation)
+    stretched = stretch(clip, geometry)
+    assert stretched.dtype == torch.uint8 and stretched.shape == (2, 3, 32, 32)
     # Each of two passes rounds to whole values, and the cubic's weights are fixed-point.
-    np.testing.assert_allclose(resized.numpy(), reference(clip, geometry), atol=2.5)
+    np.testing.assert_allclose(stretched.numpy(), reference(clip, geometry), atol=2.5)
 
 
-def test_the_middle_of_a_very_long_crop_is_used():
-    clip = np.zeros((1, 4, 400, 3), np.uint8)
-    clip[:, :, 198:202] = 200
-    resized = resize_and_crop(clip, ClipGeometry(36, 32, "bilinear"))
-    # 36 pixels for 4: the middle 32 are the middle 3.6, bright but for what bleeds in.
-    assert resized.shape == (1, 3, 32, 32) and (resized > 150).all()
-    assert (resized == resized.flip(-1)).all()
+@pytest.mark.parametrize("size", [(40, 200), (200, 40)])
+def test_both_ends_of_a_long_crop_are_in_view(size):
+    """The two objects of a pair are at the sides of their crop."""
+    clip = np.zeros((1, *size, 3), np.uint8)
+    clip[:, :20, :20] = 200
+    clip[:, -20:, -20:] = 100
+    stretched = stretch(clip, ClipGeometry(32, "bilinear"))[0, 0]
+    # A tenth of the long side, and half of the short one.
+    assert (stretched == 200).sum() >= 2 * 15 and (stretched == 100).sum() >= 2 * 15
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 640), (480, 1)])
 def test_any_crop_gives_a_whole_square(size):
     clip = np.full((2, *size, 3), 77, np.uint8)
-    assert (resize_and_crop(clip, vjepa2.clip_geometry(256)) == 77).all()
+    stretched = stretch(clip, vjepa2.clip_geometry(256))
+    assert stretched.shape == (2, 3, 256, 256) and (stretched == 77).all()
 
 
-def test_geometry_is_that_of_the_published_processors():
-    assert vjepa2.clip_geometry(256) == ClipGeometry(292, 256, "bilinear")
-    assert vjepa2.clip_geometry(384) == ClipGeometry(438, 384, "bilinear")
-    assert dinov2.clip_geometry(224) == ClipGeometry(256, 224, "bicubic")
+def test_interpolation_is_that_of_the_published_processors():
+    assert vjepa2.clip_geometry(384) == ClipGeometry(384, "bilinear")
+    assert dinov2.clip_geometry(224) == ClipGeometry(224, "bicubic")
 
 
 def test_normalisation_is_per_channel():
