@@ -5,10 +5,11 @@ Only backends that need torch import this module, and only when they are chosen.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -90,13 +91,20 @@ class CheckpointSource:
             )
         return found
 
-    def load(self, model_class: Any, config: Any, unused: Sequence[str] = ()) -> Any:
+    def load(
+        self,
+        model_class: Any,
+        config: Any,
+        unused: Sequence[str] = (),
+        copies: Mapping[str, str] = MappingProxyType({}),
+    ) -> Any:
         """The network, complete and frozen, in float32 on the CPU.
 
         Args:
             model_class: class of `transformers` to load it into.
             config: configuration of the checkpoint, from `config`.
             unused: prefixes of parameters that the checkpoint may lack.
+            copies: buffers that the checkpoint may lack, with the buffer that has their values.
 
         Raises:
             ConfigurationError: the checkpoint cannot be read, or lacks parameters.
@@ -116,7 +124,12 @@ class CheckpointSource:
                 raise
             except Exception as error:
                 raise ConfigurationError(self._cannot_load(error)) from error
-        missing = sorted(key for key in report["missing_keys"] if not key.startswith(tuple(unused)))
+        absent = set(report["missing_keys"])
+        for name, origin in copies.items():
+            if name in absent and origin not in absent:
+                model.get_buffer(name).copy_(model.get_buffer(origin))
+                absent.remove(name)
+        missing = sorted(key for key in absent if not key.startswith(tuple(unused)))
         if missing:
             raise ConfigurationError(
                 f"{self.parameter} '{self.name}' lacks {len(missing)} parameters of "

@@ -113,9 +113,8 @@ def save_paper_checkpoint(folder, card_changes=None, **changes):
     return folder
 
 
-def save_sam2(folder, video=False):
-    """Save a small SAM 2, in the format of images or videos."""
-    torch.manual_seed(0)
+def sam2_config(video=False):
+    """Configuration of a small SAM 2, in the format of images or videos."""
     backbone = {
         "hidden_size": 12,
         "image_size": [128, 128],
@@ -133,36 +132,39 @@ def save_sam2(folder, video=False):
     )
     prompt = {"hidden_size": 32, "image_size": 128, "patch_size": 16, "mask_input_channels": 4}
     decoder = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
-    if video:
-        config = transformers.Sam2VideoConfig(
-            vision_config=vision,
-            prompt_encoder_config=prompt,
-            mask_decoder_config=decoder,
-            image_size=128,
-            memory_attention_hidden_size=32,
-            memory_attention_feed_forward_hidden_size=32,
-            memory_encoder_hidden_size=32,
-            memory_encoder_output_channels=16,
-            mask_downsampler_embed_dim=32,
-            memory_fuser_embed_dim=32,
-            memory_fuser_intermediate_dim=32,
-        )
-        model = transformers.Sam2VideoModel(config)
-    else:
-        model = transformers.Sam2Model(
-            transformers.Sam2Config(
-                vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=decoder
-            )
-        )
+    parts = {
+        "vision_config": vision,
+        "prompt_encoder_config": prompt,
+        "mask_decoder_config": decoder,
+    }
+    if not video:
+        return transformers.Sam2Config(**parts)
+    return transformers.Sam2VideoConfig(
+        **parts,
+        image_size=128,
+        memory_attention_hidden_size=32,
+        memory_attention_feed_forward_hidden_size=32,
+        memory_encoder_hidden_size=32,
+        memory_encoder_output_channels=16,
+        mask_downsampler_embed_dim=32,
+        memory_fuser_embed_dim=32,
+        memory_fuser_intermediate_dim=32,
+    )
+
+
+def save_sam2(folder, video=False):
+    """Save a small SAM 2, in the format of images or videos."""
+    torch.manual_seed(0)
+    family = transformers.Sam2VideoModel if video else transformers.Sam2Model
+    model = family(sam2_config(video))
     _randomise_decoder(model)
     model.save_pretrained(folder)
     return folder
 
 
-def save_sam(folder):
-    """Save a small SAM."""
-    torch.manual_seed(0)
-    config = transformers.SamConfig(
+def sam_config():
+    """Configuration of a small SAM."""
+    return transformers.SamConfig(
         vision_config={
             "hidden_size": 24,
             "output_channels": 32,
@@ -182,7 +184,12 @@ def save_sam(folder):
         },
         mask_decoder_config={"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32},
     )
-    model = transformers.SamModel(config)
+
+
+def save_sam(folder):
+    """Save a small SAM."""
+    torch.manual_seed(0)
+    model = transformers.SamModel(sam_config())
     _randomise_decoder(model)
     model.save_pretrained(folder)
     return folder

@@ -13,6 +13,13 @@ from deworldsg_ros.perception.networks.box_prompts import BoxPromptedSegmenter
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing, resize
 from deworldsg_ros.scene.arrays import UInt8
 
+# transformers below 5 ties the two and saves the second one only.
+SHARED_EMBEDDING = {
+    "prompt_encoder.shared_embedding.positional_embedding": (
+        "shared_image_embedding.positional_embedding"
+    )
+}
+
 
 class Sam2Segmenter(BoxPromptedSegmenter):
     """Boxes to masks. The image is stretched to the square input."""
@@ -25,7 +32,8 @@ class Sam2Segmenter(BoxPromptedSegmenter):
             prompt_encoder_config=_fields(found.prompt_encoder_config),
             mask_decoder_config=_fields(found.mask_decoder_config),
         )
-        return source.load(Sam2Model, config), int(config.prompt_encoder_config.image_size)
+        model = source.load(Sam2Model, config, copies=SHARED_EMBEDDING)
+        return model, int(config.prompt_encoder_config.image_size)
 
     def _input(self, rgb: UInt8) -> torch.Tensor:
         preprocess = Preprocessing(self.image_size, self.image_size, IMAGENET_MEAN, IMAGENET_STD)
