@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, Kind, build_front_end
 from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom, open_annotations
 from deworldsg_ros.evaluation.tables.rows import HARD, Condition
@@ -71,7 +71,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     print(f"{name}: exists", flush=True)
                     continue
                 start = time.monotonic()
-                capture = make_capture(name, root, layout, scan, kind, config, options.every)
+                capture = make_capture(
+                    name, root, layout, scan, kind, config, options.every, known=options.known
+                )
                 write_capture(options.out, capture)
                 seconds = time.monotonic() - start
                 print(f"{name}: {len(capture.local_graphs)} frames, {seconds:.0f} s", flush=True)
@@ -95,9 +97,18 @@ def scans_of(root: Path, layout: str, chosen: Sequence[str]) -> list[str]:
 
 
 def make_capture(
-    name: str, root: Path, layout: str, scan: str, kind: str, config: Config, every: int = 1
+    name: str,
+    root: Path,
+    layout: str,
+    scan: str,
+    kind: str,
+    config: Config,
+    every: int = 1,
+    known: Kind | None = None,
 ) -> Capture:
     """Lift every N-th frame of a scan with the detections and poses of a kind.
+
+    Known detections are `known`; None = recorded ones if there are any, else ground truth.
 
     Raises:
         DeWorldSGError: the data set cannot be read.
@@ -111,7 +122,13 @@ def make_capture(
         annotations = open_annotations(root, layout) if layout else None
         source = open_source(annotations.scan_folder(scan) if annotations else root)
         opened.callback(source.close)
-        front_end, head = _front_end(condition, annotations, scan, source, config)
+        if known is None and annotations is not None:
+            recorded = (annotations.scan_folder(scan) / RECORDED).exists()
+            known = "recorded" if recorded else "ground-truth"
+        choice = FrontEndChoice()
+        if known is not None and kind != BACKEND:
+            choice = condition.apply(FrontEndChoice(known))
+        front_end, head = _front_end(choice, annotations, scan, source, config)
         frames = islice(Recording(source, config.inputs).frames(), 0, None, every)
         frames = repose(frames, condition.poses or PoseSource(), source, Counter())
         graphs, object_ids = [], []
@@ -123,18 +140,16 @@ def make_capture(
 
 
 def _front_end(
-    condition: Condition, annotations: Annotations | None, scan: str, source: Source, config: Config
+    choice: FrontEndChoice,
+    annotations: Annotations | None,
+    scan: str,
+    source: Source,
+    config: Config,
 ) -> tuple[Perceiver, str]:
     """The front end, and the name of its relation head."""
+    head = config.perception.relation_head if choice.kind == BACKEND else choice.kind
     if annotations is None:
-        perception = build_perception(config.perception, world_up=config.inputs.world_up)
-        return perception, config.perception.relation_head
-    choice = FrontEndChoice()
-    head = config.perception.relation_head
-    if condition.name != BACKEND:
-        recorded = (annotations.scan_folder(scan) / RECORDED).exists()
-        choice = condition.apply(FrontEndChoice("recorded" if recorded else "ground-truth"))
-        head = choice.kind
+        return build_perception(config.perception, world_up=config.inputs.world_up), head
     return build_front_end(choice, annotations, scan, source, config), head
 
 
@@ -190,6 +205,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--out", required=True, type=Path, help="folder of the captures")
     add("--kinds", default="", help=f"of {','.join(KINDS)}; default: all that the data allow")
     add("--scan", nargs="+", default=[], help="scans of the data sets; default: the test split")
+    choices = ("recorded", "ground-truth")
+    add("--known", choices=choices, help="known detections; default: recorded if there are any")
     add("--min-score", type=float, help="minimum score of the backend's detections")
     add("--every", type=int, default=1, help="take every N-th frame")
     add("--config", type=Path, help="ROS parameter file; default: the built-in defaults")
