@@ -16,6 +16,9 @@ from deworldsg_ros.scene.errors import ConfigurationError
 CARD_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
 
+# The frames of a clip, see `ProbeCard`.
+Window = Literal["last_frames", "valid_interval"]
+
 # Inputs for the two boxes of a pair: four corner coordinates each, as fractions of the crop.
 BOX_INPUTS = 8
 
@@ -61,6 +64,8 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         inputs: ``clip`` is the paper's: only the clip's feature, so that both directions of a pair
             get the same prediction. ``clip_and_boxes`` adds the boxes of subject and object.
         hidden_dim: width of the hidden layer.
+        window: frames of its clips: ``last_frames`` = the last T frames; ``valid_interval`` = those
+            of them since both objects were seen without a break.
         training: record of the training, plain values.
         schema, version: of the file format.
     """
@@ -70,6 +75,7 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     layout: Literal["two_layer", "batch_norm"] = "two_layer"
     inputs: Literal["clip", "clip_and_boxes"] = "clip"
     hidden_dim: Annotated[int, msgspec.Meta(ge=1)] = 512
+    window: Window = "last_frames"
     training: dict[str, Any] = {}
     schema: Literal["deworldsg/probe"] = "deworldsg/probe"
     version: Literal[1] = 1
@@ -78,6 +84,14 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def input_dim(self) -> int:
         """Number of inputs per pair."""
         return self.backbone.feature_dim + (BOX_INPUTS if self.inputs == "clip_and_boxes" else 0)
+
+    @property
+    def seen_groups(self) -> frozenset[str]:
+        """Scans or rooms that decided the weights, in the training or by stopping it."""
+        groups = self.training.get("groups_by_part", {})
+        return frozenset(
+            str(group) for part in ("train", "validation") for group in groups.get(part, ())
+        )
 
     def require_backbone(self, backbone: BackboneIdentity) -> None:
         """Raise ConfigurationError unless the probe was trained on this backbone.

@@ -55,6 +55,22 @@ Inputs = Annotated[
         "--inputs", help="clip (the paper), or clip_and_boxes, which distinguishes directions"
     ),
 ]
+Window = Annotated[
+    str,
+    typer.Option(
+        "--window",
+        help="frames of a clip of a data set: last_frames, or valid_interval (those since both "
+        "objects were seen without a break)",
+    ),
+]
+DataSplit = Annotated[
+    str,
+    typer.Option(
+        "--split",
+        help="split of a data set to train on: train; validation or test only on purpose, because "
+        "a probe cannot be measured on scans that it has seen",
+    ),
+]
 HeldOut = Annotated[
     Optional[list[str]],
     typer.Option("--held-out", metavar="GROUP", help="hold out this room; may be repeated"),
@@ -99,6 +115,7 @@ class ProbeTraining:
         download: whether the checkpoint may be downloaded.
         predicates: names of the probe's outputs.
         clips_per_pair: clips per related pair of a data set.
+        data_split: split of a data set.
         training: architecture, split and fit.
         cache: folder for the features; None = `out`/features.
     """
@@ -110,6 +127,7 @@ class ProbeTraining:
     download: bool
     predicates: tuple[str, ...]
     clips_per_pair: int
+    data_split: str
     training: TrainingOptions
     cache: Path | None
 
@@ -122,6 +140,8 @@ def train_probe(
     predicates: PredicateSet = "replica_ssg",
     layout: Layout = "two_layer",
     inputs: Inputs = "clip",
+    window: Window = "last_frames",
+    split: DataSplit = "train",
     held_out: HeldOut = None,
     held_out_fraction: HeldOutFraction = 0.2,
     clips_per_pair: ClipsPerPair = 4,
@@ -144,6 +164,7 @@ def train_probe(
     training = TrainingOptions(
         layout=_one_of("layout", layout, ("two_layer", "batch_norm")),
         inputs=_one_of("inputs", inputs, ("clip", "clip_and_boxes")),
+        window=_one_of("window", window, ("last_frames", "valid_interval")),
         held_out_fraction=held_out_fraction,
         held_out_groups=tuple(held_out or ()),
         batch_size=batch_size,
@@ -157,6 +178,7 @@ def train_probe(
         download=download,
         predicates=read_predicates(predicates),
         clips_per_pair=clips_per_pair,
+        data_split=_one_of("split", split, ("train", "validation", "test")),
         training=training,
         cache=cache,
     )
@@ -166,11 +188,17 @@ def train_probe(
 
 def run_training(options: ProbeTraining, console: Console) -> None:
     """Train and save a probe, and print its accuracy; raises DeWorldSGError."""
-    from deworldsg_ros.training.dataset_clips import read_clips
+    from deworldsg_ros.training.dataset_clips import ClipChoice, is_data_set, read_clips
     from deworldsg_ros.training.train import Progress
     from deworldsg_ros.training.train import train_probe as train
 
-    clips = read_clips(options.source, options.relations.clip_length, options.clips_per_pair)
+    choice = ClipChoice(
+        options.relations.clip_length,
+        options.clips_per_pair,
+        options.data_split,
+        options.training.window,
+    )
+    clips = read_clips(options.source, choice)
     backbone = _load_backbone(options)
     with frame_progress(console) as bar:
         encoding = bar.add_task("features", total=len(clips), note="")
@@ -188,6 +216,7 @@ def run_training(options: ProbeTraining, console: Console) -> None:
             options.training,
             cache=options.cache,
             source=options.source.name,
+            data_split=options.data_split if is_data_set(options.source) else "",
             progress=Progress(lambda count: bar.update(encoding, advance=count), epoch),
         )
     held = metrics["held_out"]

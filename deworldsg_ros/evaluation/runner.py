@@ -6,6 +6,7 @@ cluster. Its only side effect is the folder of its results.
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -15,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from deworldsg_ros.checkpoints.required import require_checkpoints
-from deworldsg_ros.config import Config, to_yaml
+from deworldsg_ros.checkpoints.probe_card import read_card
+from deworldsg_ros.checkpoints.required import WORLD_MODELS, require_checkpoints
+from deworldsg_ros.config import Config, RelationsConfig, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
@@ -40,6 +42,8 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import device_name, total_ms
+
+logger = logging.getLogger(__name__)
 
 CONFIG_FILE = "config.yaml"
 PIPELINE = "deworldsg"
@@ -137,8 +141,22 @@ def evaluate_scan(task: ScanTask) -> ScanOutcome:
         task.config.perception if uses_perception else None,
         task.config.relations if task.method == PIPELINE else None,
     )
+    if task.method == PIPELINE:
+        warn_of_training(task.config.relations, task.scan)
     with ExitStack() as opened:
         return _evaluate(task, opened)
+
+
+def warn_of_training(config: RelationsConfig, scan: str) -> None:
+    """Log a warning if the configured probe was trained on this scan."""
+    if config.world_model not in WORLD_MODELS:
+        return
+    if scan in read_card(Path(config.probe_path).expanduser()).seen_groups:
+        logger.warning(
+            "scan %s was in the training of probe %s: its figures say nothing about other scans",
+            scan,
+            config.probe_path,
+        )
 
 
 def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:

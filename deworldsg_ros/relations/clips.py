@@ -35,6 +35,7 @@ class QueuedClip:
         geo_cost: the geometric cost of Eq. 8.
         pixels: (T, h, w, 3) uint8, the cropped clip; None while its frames are in the frame
             buffer.
+        skipped: number of its first frames that are left out.
     """
 
     stamp_ns: int
@@ -46,6 +47,7 @@ class QueuedClip:
     boxes_xyxy: tuple[Float64, Float64]
     geo_cost: float
     pixels: Rgb | None = None
+    skipped: int = 0
 
 
 class FrameBuffer:
@@ -129,6 +131,30 @@ def union_box(box_a_xyxy: Float64, box_b_xyxy: Float64, width: int, height: int)
     x2 = max(min(math.ceil(right + 0.5), width), x1 + 1)
     y2 = max(min(math.ceil(bottom + 0.5), height), y1 + 1)
     return x1, y1, x2, y2
+
+
+def interval_start(seen: Sequence[bool | None]) -> int:
+    """First frame of the valid interval of a clip: since then, both objects were seen in each.
+
+    Args:
+        seen: for each frame whether both objects were seen, oldest first; None = not known, which
+            does not end the interval. In the last frame both were seen.
+
+    Returns:
+        the index of a frame in which both were seen.
+    """
+    start = last = len(seen) - 1
+    for index in range(last - 1, -1, -1):
+        if seen[index] is False:
+            break
+        if seen[index]:
+            start = index
+    return start
+
+
+def without_first(clip: Rgb, count: int) -> Rgb:
+    """A clip (T, h, w, 3) without its first frames, filled with copies of its last frame."""
+    return np.concatenate([clip[count:], np.repeat(clip[-1:], count, axis=0)]) if count else clip
 
 
 def crop_clip(images: Sequence[Rgb], crop_xyxy: CropBox, length: int) -> Rgb:

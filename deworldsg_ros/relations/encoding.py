@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from deworldsg_ros.relations.clips import QueuedClip, Rgb, crop_clip
+from deworldsg_ros.relations.clips import QueuedClip, Rgb, crop_clip, without_first
 from deworldsg_ros.relations.prior import SUM_TOLERANCE
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 from deworldsg_ros.scene.arrays import Float64
@@ -85,7 +85,7 @@ def clip_request(clip: QueuedClip, images: list[Rgb], clip_length: int) -> ClipR
     pixels = clip.pixels
     if pixels is None:
         pixels = crop_clip(images, clip.crop_xyxy, clip_length)
-    return ClipRequest(pixels, directions, clip.vocabulary)
+    return ClipRequest(without_first(pixels, clip.skipped), directions, clip.vocabulary)
 
 
 def checked_distributions(output: Float64, pair_count: int, predicate_count: int) -> Float64:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.clip_policy import ClipPolicy
 from deworldsg_ros.relations.clip_queue import ClipQueue
-from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, Rgb, union_box
+from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, Rgb, interval_start, union_box
 from deworldsg_ros.relations.encoding import ClipEncoder
 from deworldsg_ros.relations.graph_view import GraphView
 from deworldsg_ros.relations.pairing import neighbour_pairs
@@ -81,6 +81,8 @@ class RelationReasoner:
         self.source = "none" if world_model is None else world_model.name
         self._config = config
         self._encoder = None if world_model is None else ClipEncoder(world_model, report)
+        self._valid_only = getattr(world_model, "window", "") == "valid_interval"
+        self._graph: GraphView | None = None
         self._lock = threading.Lock()
         self._frames = FrameBuffer(BUFFERED_CLIP_LENGTHS * config.clip_length)
         self._queued = 0
@@ -92,6 +94,7 @@ class RelationReasoner:
     def watch(self, graph: GraphView) -> None:
         """Choose clips by the state of this graph from now on."""
         with self._lock:
+            self._graph = graph
             self._policy.watch(graph)
 
     def learn(self, change: Callable[[], None]) -> None:
@@ -210,9 +213,24 @@ class RelationReasoner:
             while (clip := self._queue.take()) is not None:
                 images = self._frames.images(clip.frame_stamps_ns)
                 if images is not None or clip.pixels is not None:
-                    return clip, images or []
+                    return replace(clip, skipped=self._invalid(clip)), images or []
                 self._drop("stale")  # images of another size have replaced its frames
         return None
+
+    def _invalid(self, clip: QueuedClip) -> int:
+        """Number of first frames that the world model wants left out.
+
+        The graph knows which objects a frame shows. Without it, all frames count as valid.
+        """
+        if not self._valid_only or self._graph is None:
+            return 0
+        nodes_of_frame = self._graph.nodes_of_frame
+        nodes = nodes_of_frame(clip.stamp_ns)
+        if nodes is None or max(clip.rows) >= len(nodes):
+            return 0
+        pair = {nodes[row] for row in clip.rows}
+        frames = [nodes_of_frame(stamp_ns) for stamp_ns in clip.frame_stamps_ns]
+        return interval_start([None if ids is None else pair <= set(ids) for ids in frames])
 
 
 def _clip_of(

@@ -56,7 +56,11 @@ class ClipRequest:
 
 
 class WorldModel(Protocol):
-    """A frozen video model with its probe: maps a clip to predicate distributions."""
+    """A frozen video model with its probe: maps a clip to predicate distributions.
+
+    A world model whose attribute `window` is ``valid_interval`` gets clips of the frames since both
+    objects were seen without a break.
+    """
 
     @property
     def name(self) -> str:

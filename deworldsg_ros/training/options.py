@@ -32,6 +32,7 @@ class TrainingOptions:
 
     Attributes:
         layout, inputs: of the probe, see `ProbeCard`.
+        window: frames of the clips of a data set, see `ProbeCard`.
         held_out_fraction: fraction of the groups that is kept for the final scores.
         held_out_groups: keep these groups instead.
         batch_size: clips encoded at once.
@@ -40,6 +41,7 @@ class TrainingOptions:
 
     layout: Literal["two_layer", "batch_norm"] = "two_layer"
     inputs: Literal["clip", "clip_and_boxes"] = "clip"
+    window: Literal["last_frames", "valid_interval"] = "last_frames"
     held_out_fraction: float = 0.2
     held_out_groups: tuple[str, ...] = ()
     batch_size: int = 1

@@ -8,51 +8,55 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deworldsg_ros.checkpoints.probe_card import relative_box_pair
-from deworldsg_ros.relations.clips import CropBox, Rgb, crop_clip, union_box
+from deworldsg_ros.checkpoints.probe_card import Window, relative_box_pair
+from deworldsg_ros.relations.clips import CropBox, Rgb, crop_clip, interval_start, union_box
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.training.labelled_clips import LabelledClip
 
 # Boxes of the objects in a frame by object id, (4,) float64 xyxy pixels.
 Boxes = Mapping[int, Float64]
+# Image file of a frame, and its boxes; None = not known.
+ScanFrame = tuple[Path, Boxes | None]
 
 
 def cut_clips(
     scan: str,
-    frames: Sequence[tuple[Path, Boxes]],
+    frames: Sequence[ScanFrame],
     image_size: tuple[int, int],
     relations: Sequence[tuple[int, int, str]],
     *,
     clip_length: int,
     clips_per_pair: int,
+    window: Window = "last_frames",
     rotated: bool = False,
 ) -> list[LabelledClip]:
     """Clips of each related pair, spread evenly over the frames in which both are visible.
 
     Args:
         scan: id of the scan, the group of its clips.
-        frames: image file and boxes by object id, in order of time.
+        frames: in order of time.
         image_size: width and height of all images.
         relations: subject id, object id, predicate.
         clip_length: T.
         clips_per_pair: maximum number of clips per pair.
+        window: frames of a clip, see `ProbeCard`.
         rotated: whether boxes and sizes are those of the images rotated by 90 degrees clockwise.
     """
     width, height = image_size
     clips = []
     for subject, object_, predicate in relations:
-        visible = [
-            index
-            for index, (_, boxes) in enumerate(frames)
-            if all(_is_visible(boxes.get(end)) for end in (subject, object_))
-        ]
+        seen = [_shows(boxes, subject, object_) for _, boxes in frames]
+        visible = [index for index, shown in enumerate(seen) if shown]
         for index in _spread(visible, clips_per_pair):
-            boxes = frames[index][1]
+            boxes = frames[index][1] or {}
             crop = union_box(boxes[subject], boxes[object_], width, height)
             x1, y1, x2, y2 = crop
             corner = np.array([x1, y1, x1, y1], np.float64)
-            paths = [path for path, _ in frames[max(0, index - clip_length + 1) : index + 1]]
+            first = max(0, index - clip_length + 1)
+            if window == "valid_interval":
+                first += interval_start(seen[first : index + 1])
+            paths = [path for path, _ in frames[first : index + 1]]
             modified = paths[-1].stat().st_mtime_ns
             clips.append(
                 LabelledClip(
@@ -90,6 +94,13 @@ def read_boxes(path: Path) -> dict[int, Float64]:
                 "unreadable_boxes", f"{path}, line {number}: '{line}', expected id x1 y1 x2 y2"
             ) from error
     return boxes
+
+
+def _shows(boxes: Boxes | None, subject: int, object_: int) -> bool | None:
+    """Whether a frame shows both objects; None = not known."""
+    if boxes is None:
+        return None
+    return _is_visible(boxes.get(subject)) and _is_visible(boxes.get(object_))
 
 
 def _is_visible(box_xyxy: Float64 | None) -> bool:

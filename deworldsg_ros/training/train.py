@@ -51,6 +51,7 @@ def train_probe(
     *,
     cache: Path | None = None,
     source: str = "",
+    data_split: str = "",
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Train a probe and save it.
@@ -63,6 +64,8 @@ def train_probe(
         options: of the training.
         cache: folder of the features; default: a folder in `out`.
         source: origin of the clips, for the record.
+        data_split: split of the data set that they come from, for the record; empty = a folder of
+            clips.
         progress: callbacks for progress.
 
     Returns:
@@ -72,7 +75,7 @@ def train_probe(
         ConfigurationError: the clips do not fit the predicates, or cannot be split.
     """
     progress = progress or Progress()
-    card = ProbeCard(backbone.identity, predicates, options.layout, options.inputs)
+    card = _card(backbone, predicates, options)
     labels = _labels(clips, predicates)
     boxes = _boxes(clips, options)
     split = _split(clips, options)
@@ -93,15 +96,33 @@ def train_probe(
     }
     training = {
         "source": source,
+        "data_split": data_split,
         "options": msgspec.to_builtins(asdict(options)),
         "preprocessing": backbone.description,
-        "clips": {name: len(rows) for name, rows in split.parts().items()},
-        "groups": sorted({clip.group for clip in clips}),
-        "held_out_groups": list(split.held_out_groups),
-        "validation_by": split.validation_by,
         "torch": str(torch.__version__),
+        **_parts(clips, split),
     }
     return _save(out, fit, scores, training)
+
+
+def _card(
+    backbone: FrozenBackbone, predicates: tuple[str, ...], options: TrainingOptions
+) -> ProbeCard:
+    return ProbeCard(
+        backbone.identity, predicates, options.layout, options.inputs, window=options.window
+    )
+
+
+def _parts(clips: Sequence[LabelledClip], split: Split) -> dict[str, Any]:
+    """The clips and rooms of each part, for the record."""
+    parts = split.parts()
+    groups = {name: sorted({clips[row].group for row in rows}) for name, rows in parts.items()}
+    return {
+        "clips": {name: len(rows) for name, rows in parts.items()},
+        "groups_by_part": groups,
+        "held_out_groups": list(split.held_out_groups),
+        "validation_by": split.validation_by,
+    }
 
 
 def _split(clips: Sequence[LabelledClip], options: TrainingOptions) -> Split:

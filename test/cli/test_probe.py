@@ -48,6 +48,8 @@ def write_data_set(root, scans=3, frames=6):
     }
     for name, content in files.items():
         (annotations / name).write_text(json.dumps(content))
+    (annotations / "train_scans.txt").write_text("\n".join(names))
+    (annotations / "test_scans.txt").write_text("")
     for seed, name in enumerate(names):
         sequence = root / "data" / name / "sequence"
         sequence.mkdir(parents=True)
@@ -79,6 +81,20 @@ def test_a_probe_from_a_data_set(tmp_path):
     assert card.predicates == REPLICA_SSG_PREDICATES
     assert card.training["clips"] == {"train": 8, "validation": 8, "held_out": 8}
     assert card.training["held_out_groups"] == ["scan_1"]
+    assert card.training["data_split"] == "train" and card.window == "last_frames"
+    assert card.training["groups_by_part"]["held_out"] == ["scan_1"]
+    assert card.seen_groups == {"scan_0", "scan_2"}
+
+
+def test_scans_of_another_split_need_a_word(tmp_path):
+    data = write_data_set(tmp_path / "data_set")
+    lists = data / "ReplicaSSG"
+    (lists / "train_scans.txt").rename(lists / "validation_scans.txt")
+    refused = run("train-probe", data, *options(tmp_path))
+    assert refused.exit_code == 2 and "has no scans of the split 'train'" in refused.output
+    told = run("train-probe", data, *options(tmp_path, split="validation"))
+    assert told.exit_code == 0, told.output
+    assert load_probe(tmp_path / "probe").card.training["data_split"] == "validation"
 
 
 @pytest.mark.parametrize(
@@ -88,6 +104,8 @@ def test_a_probe_from_a_data_set(tmp_path):
         ({"model": "/absent"}, "--model '/absent': there is no such folder"),
         ({"world-model": "fake"}, "expected vjepa2 or dinov2"),
         ({"layout": "three"}, "expected two_layer or batch_norm"),
+        ({"window": "all"}, "expected last_frames or valid_interval"),
+        ({"split": "all"}, "expected train or validation or test"),
         ({"predicates": "/absent"}, "expected replica_ssg, 3dssg, a file"),
         ({"predicates": "3dssg"}, "which is not one of the 7 of the chosen set"),
     ],

@@ -12,6 +12,7 @@ from support.evaluation import write_dataset, write_json, write_predictions
 from support.sequences import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
 from typer.testing import CliRunner
 
+from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, write_card
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, RelationsConfig, load_config
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -26,6 +27,7 @@ from deworldsg_ros.evaluation.runner import (
     ScanTask,
     evaluate_graph,
     evaluate_scan,
+    warn_of_training,
 )
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -243,6 +245,21 @@ def test_a_failed_scan_is_reported_and_does_not_stop_the_rest(tmp_path: Path) ->
     split.write_text("absent\n")
     arguments = ("--layout", "replica", root, "--front-end", "recorded", "--out", tmp_path / "out")
     assert invoke("run", *arguments)[0] == 1
+
+
+def test_a_scan_of_the_training_of_the_probe_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    parts = {"train": ["a"], "validation": ["b"], "held_out": ["c"]}
+    backbone = BackboneIdentity("vjepa2", 48, 32, 4)
+    write_card(tmp_path, ProbeCard(backbone, ("on",), training={"groups_by_part": parts}))
+    probed = RelationsConfig(world_model="vjepa2", probe_path=str(tmp_path))
+    for scan in "abcd":
+        warn_of_training(probed, scan)
+        warn_of_training(RelationsConfig(), scan)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 2
+    assert told[0].startswith("scan a was in the training") and told[1].startswith("scan b ")
 
 
 def test_latex() -> None:

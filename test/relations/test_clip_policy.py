@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -238,3 +239,67 @@ def test_clips_that_wait_for_the_budget_are_encoded_when_it_has_grown():
     assert len(stage.drain()) == 1
     stage.observe(crowd_graph(1 + 60 * SECOND_NS, 0), picture(1))
     assert len(stage.drain()) == 2  # a long pause saves up one second of budget
+
+
+class ValidIntervalModel(RecordingModel):
+    window = "valid_interval"
+
+
+def frames_of_last_clip(model, alone, stamps=(1, 2, 3, 4), **changes):
+    """Stamps of the frames in the clip of the last frame; frames `alone` show one object."""
+    graph = of_pair()
+    graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns in alone else [1, 2]
+    stage = watching(graph, model, **changes)
+    for stamp in stamps:
+        if stamp in alone:
+            stage.observe(crowd_graph(stamp, 1), picture(stamp))
+        else:
+            stage.observe(pair_graph(stamp), picture(stamp))
+    while stage.work() is not None:
+        pass
+    # The clip of the newest frame comes first.
+    x1, y1 = 10, 10
+    shown = model.requests[0].clip
+    height, width = shown.shape[1:3]
+    crops = {s: picture(s)[y1 : y1 + height, x1 : x1 + width] for s in stamps}
+    return [next(s for s, crop in crops.items() if (crop == frame).all()) for frame in shown]
+
+
+@pytest.mark.parametrize("every_clip", [{}, {"max_clips_per_s": 0.0}])
+def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(every_clip):
+    """A probe's card says which frames its clips have; the graph knows what a frame shows."""
+    model = ValidIntervalModel()
+    assert frames_of_last_clip(model, {2}, **every_clip) == [3, 4, 4, 4]
+    assert frames_of_last_clip(ValidIntervalModel(), set(), **every_clip) == [1, 2, 3, 4]
+    assert frames_of_last_clip(RecordingModel(), {2}, **every_clip) == [1, 2, 3, 4]
+
+
+def test_without_a_graph_every_frame_is_valid():
+    model = ValidIntervalModel()
+    stage = RelationReasoner(config(), model, report=lambda _: None)
+    for stamp in (1, 2, 3, 4):
+        stage.observe(pair_graph(stamp), picture(stamp))
+    stage.drain()
+    assert len(np.unique(model.requests[0].clip, axis=0)) == 4
+
+
+def test_a_clip_that_waited_is_cut_to_its_valid_interval():
+    """Its pixels were stored when its frames left the buffer."""
+    model = ValidIntervalModel()
+    graph = of_pair()
+    graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns == 2 else [1, 2]
+    graph.tentative = {1}
+    stage = watching(graph, model)
+    stage.observe(pair_graph(1), picture(1))
+    stage.observe(crowd_graph(2, 1), picture(2))
+    for stamp in (3, 4):
+        stage.observe(pair_graph(stamp), picture(stamp))
+    for stamp in range(5, 14):
+        stage.observe(crowd_graph(stamp, 1), picture(stamp))
+    assert model.requests == []
+    graph.tentative = set()
+    assert stage.work() is not None
+    x1, y1, shown = 10, 10, model.requests[0].clip
+    height, width = shown.shape[1:3]
+    for frame, stamp in zip(shown, (3, 4, 4, 4)):
+        assert (frame == picture(stamp)[y1 : y1 + height, x1 : x1 + width]).all()

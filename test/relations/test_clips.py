@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.relations import HEIGHT, WIDTH, picture
 
-from deworldsg_ros.relations.clips import FrameBuffer, crop_clip, union_box
+from deworldsg_ros.relations.clips import (
+    FrameBuffer,
+    crop_clip,
+    interval_start,
+    union_box,
+    without_first,
+)
 
 
 def filled(stamps, capacity=32):
@@ -116,3 +122,27 @@ def test_clip_is_a_copy():
 def test_clip_refuses_no_frames_and_too_many(count):
     with pytest.raises(ValueError, match=f"clip of {count} frames: expected 1 to 2"):
         crop_clip([picture(0)] * count, (0, 0, 9, 9), 2)
+
+
+@pytest.mark.parametrize(
+    "seen, start",
+    [
+        ([True], 0),
+        ([None], 0),
+        ([True, True, True], 0),
+        ([True, False, True], 2),
+        ([True, False, True, True], 2),
+        ([False, None, True], 2),  # nothing is known of the frame before
+        ([False, True, None, True], 1),
+        ([None, None, True], 2),
+        ([True, None, None, None], 0),
+    ],
+)
+def test_the_valid_interval_is_the_last_one_in_which_both_objects_are_seen(seen, start):
+    assert interval_start(seen) == start
+
+
+@pytest.mark.parametrize("count, frames", [(0, [0, 1, 2]), (1, [1, 2, 2]), (2, [2, 2, 2])])
+def test_first_frames_are_left_out_and_the_last_one_fills(count, frames):
+    clip = np.arange(3, dtype=np.uint8).reshape(3, 1, 1, 1) * np.ones((3, 2, 2, 3), np.uint8)
+    assert without_first(clip, count)[:, 0, 0, 0].tolist() == frames

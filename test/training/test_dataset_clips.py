@@ -18,10 +18,18 @@ from support.sequences import (
 )
 
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.training.dataset_clips import read_clips
+from deworldsg_ros.training.dataset_clips import ClipChoice, read_clips
+
+CHOICE = ClipChoice(clip_length=4, clips_per_pair=2)
 
 # Blue, green, red of each block.
 COLOURS = {1: (250, 10, 10), 2: (10, 250, 10), 3: (10, 10, 250)}
+
+
+def write_lists(rio, **lists):
+    for split, scans in lists.items():
+        text = "".join(f"{scan}\n" for scan in scans)
+        (rio / "3DSSG_subset" / f"{split}_scans.txt").write_text(text)
 
 
 @pytest.fixture
@@ -29,6 +37,7 @@ def rio(tmp_path):
     """3RScan's layout: one scan of three blocks in a row, whose images are rotated."""
     objects = [(name, number) for number, name, _, _ in BLOCKS]
     root = write_dataset(tmp_path / "set", {"a": (objects, RELATIONS)}, layout="3rscan")
+    write_lists(root, train=["a"], test=[])
     write_surface(write_sequence(root / "data" / "a", frames=10))
     picture = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
     for number, colour in COLOURS.items():
@@ -39,7 +48,7 @@ def rio(tmp_path):
 
 
 def test_clips_of_3rscan_are_upright_and_show_visible_objects(rio):
-    clips = read_clips(rio, clip_length=4, clips_per_pair=2)
+    clips = read_clips(rio, CHOICE)
     # Boxes are computed in every eighth frame: the first and the ninth.
     assert [clip.predicate for clip in clips] == ["near", "near", "on", "on"]
     assert {clip.group for clip in clips} == {"a"}
@@ -61,12 +70,42 @@ def test_hidden_objects_have_no_boxes(rio):
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         depth[:, BLOCKS[1][2] :] = 1000  # something else is in front of the table and the book
         cv2.imwrite(str(path), depth)
-    with pytest.raises(ConfigurationError, match="no frame shows a related pair"):
-        read_clips(rio, clip_length=4, clips_per_pair=2)
+    with pytest.raises(
+        ConfigurationError, match="no frame of the split 'train' shows a related pair"
+    ):
+        read_clips(rio, CHOICE)
 
 
 def test_an_unreadable_frame_has_no_boxes(rio):
     sequence = rio / "data" / "a" / "sequence"
     (sequence / "frame-000000.pose.txt").write_text("no matrix")
-    clips = read_clips(rio, clip_length=4, clips_per_pair=2)
+    clips = read_clips(rio, CHOICE)
     assert [clip.predicate for clip in clips] == ["near", "on"]
+
+
+@pytest.mark.parametrize(
+    "lists, split, message",
+    [
+        ({"train": [], "test": ["a"]}, "train", "has no scans of the split 'train'.*lists 0"),
+        ({"train": ["absent"], "test": []}, "train", "has no scans of the split 'train'.*lists 1"),
+        ({"train": ["a"], "test": ["a"]}, "train", "'train'.* are test scans, too, first 'a'"),
+        ({"validation": ["a"], "test": ["a"]}, "validation", "'validation'.* are test scans"),
+    ],
+)
+def test_scans_outside_of_the_split_are_refused(rio, lists, split, message):
+    write_lists(rio, **lists)
+    with pytest.raises(ConfigurationError, match=message):
+        read_clips(rio, ClipChoice(4, 2, split))
+
+
+def test_test_scans_are_taken_only_when_named(rio):
+    write_lists(rio, train=[], test=["a"])
+    assert {clip.group for clip in read_clips(rio, ClipChoice(4, 2, "test"))} == {"a"}
+
+
+def test_the_valid_interval_of_3rscan_goes_across_frames_without_boxes(rio):
+    """Boxes are known in every eighth frame; both objects are seen in all of them."""
+    window = ClipChoice(10, 2, window="valid_interval")
+    lengths = [len(np.unique(clip.read(), axis=0)) for clip in read_clips(rio, window)]
+    whole = [len(np.unique(clip.read(), axis=0)) for clip in read_clips(rio, ClipChoice(10, 2))]
+    assert lengths == whole

@@ -85,6 +85,7 @@ def test_a_trained_probe_is_better_than_chance_on_held_out_rooms(
     assert probe.card.backbone == backbone.identity and probe.card.predicates == PREDICATES
     training = probe.card.training
     assert training["held_out_groups"] == ["room0", "room1"]
+    assert probe.card.seen_groups == {f"room{n}" for n in range(2, ROOMS)}
     assert training["options"]["fit"]["seed"] == 1 and training["validation_by"] == "group"
     saved = json.loads((tmp_path / "probe" / "metrics.json").read_text())
     assert saved["held_out"] == held_out
@@ -320,6 +321,26 @@ def test_clips_are_cropped_from_scans_as_at_run_time(tmp_path):
     np.testing.assert_allclose(clips[0].boxes[4:], [0, 0, 20 / 46, 15 / 31])
     assert len({clip.key for clip in clips}) == 2
     assert cut_clips("scan", [], (60, 40), relations, **options) == []
+
+
+def test_the_valid_interval_begins_when_both_objects_are_seen(tmp_path):
+    """Frame 2 shows one object, frame 4 is not annotated."""
+    frames = []
+    for number in range(7):
+        path = tmp_path / f"{number}.png"
+        cv2.imwrite(str(path), np.full((40, 60, 3), 10 * number, np.uint8))
+        boxes = {1: np.array([5.0, 5, 25, 20]), 2: np.array([20.0, 10, 50, 35])}
+        if number == 2:
+            del boxes[2]
+        frames.append((path, None if number == 4 else boxes))
+    options = {"clip_length": 6, "clips_per_pair": 9}
+
+    def last(window):
+        clip = cut_clips("scan", frames, (60, 40), [(2, 1, "on")], **options, window=window)[-1]
+        return clip.read()[:, 0, 0, 0].tolist()
+
+    assert last("last_frames") == [10, 20, 30, 40, 50, 60]
+    assert last("valid_interval") == [30, 40, 50, 60, 60, 60]
 
 
 def test_boxes_of_a_frame(tmp_path):

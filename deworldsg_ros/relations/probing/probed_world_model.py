@@ -26,6 +26,7 @@ class ProbedWorldModel:
         name: family of the backbone.
         clip_length: T, frames of a clip.
         predicates: names of the probe's outputs.
+        window: frames of a clip, see `ProbeCard`.
 
     Raises:
         ConfigurationError: the probe was trained on another backbone.
@@ -36,6 +37,7 @@ class ProbedWorldModel:
         self.name = backbone.identity.family
         self.clip_length = backbone.identity.clip_length
         self.predicates = probe.card.predicates
+        self.window = probe.card.window
         self._backbone = backbone
         self._probe = probe
 
