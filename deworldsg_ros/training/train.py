@@ -94,15 +94,8 @@ def train_probe(
         name: score(fit.probe.distributions(inputs[rows]), labels[rows], labels[split.train])
         for name, rows in split.parts().items()
     }
-    training = {
-        "source": source,
-        "data_split": data_split,
-        "options": msgspec.to_builtins(asdict(options)),
-        "preprocessing": backbone.description,
-        "torch": str(torch.__version__),
-        **_parts(clips, split),
-    }
-    return _save(out, fit, scores, training)
+    origin = {"source": source, "data_split": data_split}
+    return _save(out, fit, scores, {**origin, **_record(clips, split, backbone, options)})
 
 
 def _card(
@@ -113,11 +106,16 @@ def _card(
     )
 
 
-def _parts(clips: Sequence[LabelledClip], split: Split) -> dict[str, Any]:
-    """The clips and rooms of each part, for the record."""
+def _record(
+    clips: Sequence[LabelledClip], split: Split, backbone: FrozenBackbone, options: TrainingOptions
+) -> dict[str, Any]:
+    """How a probe was trained, for its card."""
     parts = split.parts()
     groups = {name: sorted({clips[row].group for row in rows}) for name, rows in parts.items()}
     return {
+        "options": msgspec.to_builtins(asdict(options)),
+        "preprocessing": backbone.description,
+        "torch": str(torch.__version__),
         "clips": {name: len(rows) for name, rows in parts.items()},
         "groups_by_part": groups,
         "held_out_groups": list(split.held_out_groups),
