@@ -28,7 +28,10 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         str, option("detector: nanodet (shipped weights, COCO classes) or rtdetr (the paper's)")
     ] = "nanodet"
     segmenter: Annotated[
-        str, option("segmenter of the detected boxes: rgbd (no weights), sam2 (the paper's) or sam")
+        str,
+        option(
+            "segmenter of the detected boxes: rgbd (no weights), sam2 (the paper's), sam3 or sam"
+        ),
     ] = "rgbd"
     relation_head: Annotated[
         str, option("relation head: geometric (no weights) or egtr (the paper's, needs rtdetr)")
@@ -64,7 +67,7 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         option("checkpoint of rtdetr and egtr: a folder, or a hub id in the local cache"),
     ] = ""
     segmenter_path: Annotated[
-        str, option("checkpoint of sam2 or sam: a folder, or a hub id in the local cache")
+        str, option("checkpoint of sam2, sam3 or sam: a folder, or a hub id in the local cache")
     ] = ""
     device: Annotated[
         Literal["auto", "cpu", "cuda"],

@@ -18,6 +18,8 @@ import transformers
 from deworldsg_ros.checkpoints.required import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError
 
+NONE: Mapping[str, str] = MappingProxyType({})
+
 
 @dataclass(frozen=True)
 class CheckpointSource:
@@ -96,7 +98,8 @@ class CheckpointSource:
         model_class: Any,
         config: Any,
         unused: Sequence[str] = (),
-        copies: Mapping[str, str] = MappingProxyType({}),
+        copies: Mapping[str, str] = NONE,
+        renamed: Mapping[str, str] = NONE,
     ) -> Any:
         """The network, complete and frozen, in float32 on the CPU.
 
@@ -105,6 +108,7 @@ class CheckpointSource:
             config: configuration of the checkpoint, from `config`.
             unused: prefixes of parameters that the checkpoint may lack.
             copies: buffers that the checkpoint may lack, with the buffer that has their values.
+            renamed: regular expressions of names in the checkpoint, with those of the network.
 
         Raises:
             ConfigurationError: the checkpoint cannot be read, or lacks parameters.
@@ -119,6 +123,7 @@ class CheckpointSource:
                     dtype=torch.float32,
                     local_files_only=self.local_files_only,
                     output_loading_info=True,
+                    key_mapping=dict(renamed) or None,
                 )
             except (MemoryError, torch.OutOfMemoryError):
                 raise

@@ -52,6 +52,13 @@ def _sam(config: PerceptionConfig) -> Segmenter:
     return SamSegmenter(config)
 
 
+def _sam3(config: PerceptionConfig) -> Segmenter:
+    with _torch("perception.segmenter", config.segmenter, config):
+        from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
+
+    return Sam3Segmenter(config)
+
+
 def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
     from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 
@@ -77,6 +84,7 @@ DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,
+    "sam3": _sam3,
     "sam": _sam,
 }
 # A relation head may read features of its detector.

@@ -162,6 +162,67 @@ def save_sam2(folder, video=False):
     return folder
 
 
+def sam3_parts():
+    """Configurations of the parts of a small SAM 3: vision, prompt encoder, mask decoder."""
+    vision = {
+        "backbone_config": {
+            **{"model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 64},
+            **{"num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 112},
+            **{"window_size": 4, "global_attn_indexes": [1], "pretrain_image_size": 56},
+        },
+        "fpn_hidden_size": 32,
+        "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
+    }
+    prompt = {"hidden_size": 32, "image_size": 112, "patch_size": 14, "mask_input_channels": 4}
+    decoder = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
+    return vision, prompt, decoder
+
+
+def save_sam3(folder, video=False):
+    """Save a small SAM 3: its tracker alone, or detector and tracker as published."""
+    torch.manual_seed(0)
+    vision, prompt, decoder = sam3_parts()
+    if video:
+        small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
+        config = transformers.Sam3VideoConfig(
+            detector_config=transformers.Sam3Config(
+                vision_config=transformers.Sam3VisionConfig(**vision),
+                text_config={
+                    **{**small, "num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99},
+                    "model_type": "clip_text_model",
+                },
+                geometry_encoder_config={**small, "num_layers": 1},
+                detr_encoder_config={**small, "num_layers": 1},
+                detr_decoder_config={**small, "num_layers": 1, "num_queries": 4},
+                mask_decoder_config={"hidden_size": 32, "num_attention_heads": 2},
+            ),
+            tracker_config=transformers.Sam3TrackerVideoConfig(
+                vision_config=transformers.Sam3VisionConfig(**vision),
+                prompt_encoder_config=prompt,
+                mask_decoder_config=decoder,
+                **{"memory_attention_hidden_size": 32, "memory_attention_num_layers": 1},
+                **{"memory_attention_feed_forward_hidden_size": 32},
+                **{"memory_encoder_hidden_size": 32, "memory_encoder_output_channels": 16},
+                **{"mask_downsampler_embed_dim": 32, "memory_fuser_embed_dim": 32},
+                **{"memory_fuser_intermediate_dim": 32, "memory_attention_rope_feat_sizes": [8, 8]},
+            ),
+        )
+        config.image_size = prompt["image_size"]  # of all parts
+        model = transformers.Sam3VideoModel(config)
+        _randomise_decoder(model.tracker_model)
+    else:
+        model = transformers.Sam3TrackerModel(
+            transformers.Sam3TrackerConfig(
+                vision_config=transformers.Sam3VisionConfig(**vision),
+                prompt_encoder_config=prompt,
+                mask_decoder_config=decoder,
+            )
+        )
+        _randomise_decoder(model)
+    model.save_pretrained(folder)
+    return folder
+
+
 def sam_config():
     """Configuration of a small SAM."""
     return transformers.SamConfig(

@@ -19,6 +19,7 @@ NAMES = {
     "rgbd": "RGB-D masks",
     "sam": "SAM",
     "sam2": "SAM 2",
+    "sam3": "SAM 3",
     "geometric": "geometric relations",
     "egtr": "EGTR",
     "physics": "embedded world model",

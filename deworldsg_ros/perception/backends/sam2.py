@@ -29,8 +29,8 @@ class Sam2Segmenter(BoxPromptedSegmenter):
         found = source.config(("sam2", "sam2_video"))
         config: Any = Sam2Config(
             vision_config=found.vision_config.to_dict(),
-            prompt_encoder_config=_fields(found.prompt_encoder_config),
-            mask_decoder_config=_fields(found.mask_decoder_config),
+            prompt_encoder_config=fields(found.prompt_encoder_config),
+            mask_decoder_config=fields(found.mask_decoder_config),
         )
         model = source.load(Sam2Model, config, copies=SHARED_EMBEDDING)
         return model, int(config.prompt_encoder_config.image_size)
@@ -46,7 +46,7 @@ class Sam2Segmenter(BoxPromptedSegmenter):
         return resize(logits, (height, width))
 
 
-def _fields(part: Any) -> dict[str, Any]:
+def fields(part: Any) -> dict[str, Any]:
     """A part of the video model's configuration without its type name, for the image model."""
     fields: dict[str, Any] = part.to_dict()
     fields.pop("model_type", None)

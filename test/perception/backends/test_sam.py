@@ -10,6 +10,7 @@ from support.torch_models import (
     save_rtdetr,
     save_sam,
     save_sam2,
+    save_sam3,
     settings,
     torch,
     transformers,
@@ -17,6 +18,7 @@ from support.torch_models import (
 
 from deworldsg_ros.perception.backends.sam import SamSegmenter
 from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
+from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
 from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.networks.box_prompts import as_patch
 from deworldsg_ros.scene.camera import Intrinsics
@@ -24,7 +26,13 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
 
-BACKENDS = {"sam2": Sam2Segmenter, "sam2_video": Sam2Segmenter, "sam": SamSegmenter}
+BACKENDS = {
+    "sam2": Sam2Segmenter,
+    "sam2_video": Sam2Segmenter,
+    "sam3": Sam3Segmenter,
+    "sam3_video": Sam3Segmenter,
+    "sam": SamSegmenter,
+}
 HEIGHT, WIDTH = 60, 80
 INTRINSICS = Intrinsics(70.0, 70.0, 39.5, 29.5, WIDTH, HEIGHT)
 DEPTH = np.ones((HEIGHT, WIDTH), np.float32)
@@ -39,6 +47,8 @@ def folders(tmp_path_factory):
     return {
         "sam2": save_sam2(root / "sam2"),
         "sam2_video": save_sam2(root / "sam2_video", video=True),
+        "sam3": save_sam3(root / "sam3"),
+        "sam3_video": save_sam3(root / "sam3_video", video=True),
         "sam": save_sam(root / "sam"),
     }
 
@@ -106,6 +116,27 @@ def test_sam2_masks_equal_those_of_the_network_on_the_stretched_image(folders):
     assert (masks(segmenter(folders, "sam2"), rgb) != expected).mean() < 1e-3
 
 
+def test_sam3_takes_its_tracker_from_the_published_layout(folders):
+    """The published checkpoint has detector and tracker, with one vision encoder for both."""
+    whole = transformers.Sam3VideoModel.from_pretrained(folders["sam3_video"]).state_dict()
+    found = segmenter(folders, "sam3_video").model.state_dict()
+    prefixes = {
+        "vision_encoder.backbone.": "detector_model.vision_encoder.backbone.",
+        "vision_encoder.neck.": "tracker_neck.",
+        "": "tracker_model.",
+    }
+    for name, value in found.items():
+        prefix = next(prefix for prefix in prefixes if name.startswith(prefix))
+        assert torch.equal(value, whole[prefixes[prefix] + name.removeprefix(prefix)]), name
+
+
+def test_sam3_normalises_to_plus_minus_one(folders):
+    backend = segmenter(folders, "sam3")
+    black, white = (np.full((8, 8, 3), value, np.uint8) for value in (0, 255))
+    assert float(backend._input(black).mean()) == pytest.approx(-1)
+    assert float(backend._input(white).mean()) == pytest.approx(1)
+
+
 def test_sam_keeps_the_aspect_ratio_of_the_image(folders):
     """A square image and the same image with black below: the upper masks are the same."""
     backend = segmenter(folders, "sam")
@@ -149,6 +180,8 @@ def test_a_checkpoint_of_another_architecture_is_refused(folders, tmp_path):
         Sam2Segmenter(settings(segmenter_path=str(folders["sam"])))
     with pytest.raises(ConfigurationError, match="of rt_detr: expected sam"):
         SamSegmenter(settings(segmenter_path=str(save_rtdetr(tmp_path))))
+    with pytest.raises(ConfigurationError, match="of sam2: expected sam3_tracker"):
+        Sam3Segmenter(settings(segmenter_path=str(folders["sam2"])))
 
 
 def test_a_missing_path_and_missing_cuda_are_refused(folders, monkeypatch):
