@@ -1,5 +1,7 @@
 """Checkpoints of pretrained networks: import, cards and loading. No stage is imported here.
 
+- `catalogue`: published models by name, with source and licence.
+- `hub`: downloads and verifies them. `headers`: names and shapes in a file.
 - `required`: the checkpoints that a configuration needs, and how to get the missing ones.
 - `loading`: finds a checkpoint, loads it with `transformers`, chooses device and data type.
 - `card`: `deworldsg.json`, how a detector's checkpoint is read.
@@ -11,5 +13,6 @@
 - `probe_network`: the probe's network, saved and loaded.
 - `published_probe`: imports the published probe of V-JEPA 2.
 
-`required` and the cards need no torch. All other modules are imported only if a network is used.
+`catalogue`, `hub`, `required` and the cards need no torch. All other modules are imported only if a
+network is used.
 """

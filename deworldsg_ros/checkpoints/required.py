@@ -4,28 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from deworldsg_ros.checkpoints.catalogue import CATALOGUE, MODELS_FOLDER, NOT_ON_THE_HUB
 from deworldsg_ros.config import PerceptionConfig, RelationsConfig
 from deworldsg_ros.scene.errors import ConfigurationError
 
-FROSS = (
-    "download 3RScan20.zip or VG.zip (links in FROSS's README), unpack it, and run `deworldsg "
-    "models import-fross WEIGHTS/version_0 {folder}`"
-)
-PROBE = (
-    "run `deworldsg import-probe vjepa_probe_mlp.pt {folder} --predicates SET` for the published "
-    "probe, or train one with `deworldsg train-probe`"
-)
-# How to get the checkpoint of a backend into a folder.
-DETECTORS = {
-    "rtdetr": ("RT-DETR", "run `hf download PekingU/rtdetr_r50vd --local-dir {folder}`"),
-}
+# How to get the checkpoint of a backend: title, name for `deworldsg models get`.
+DETECTORS = {"rtdetr": ("RT-DETR", "rtdetr_r50vd")}
 SEGMENTERS = {
-    "sam2": ("SAM 2", "run `hf download facebook/sam2.1-hiera-tiny --local-dir {folder}`"),
-    "sam": ("SAM", "run `hf download facebook/sam-vit-base --local-dir {folder}`"),
+    "sam2": ("SAM 2", "sam2.1-hiera-tiny"),
+    "sam3": ("SAM 3", "sam3"),
+    "sam": ("SAM", "sam-vit-base"),
 }
 WORLD_MODELS = {
-    "vjepa2": ("V-JEPA 2", "run `hf download facebook/vjepa2-vitg-fpc64-384 --local-dir {folder}`"),
-    "dinov2": ("DINOv2", "run `hf download facebook/dinov2-small --local-dir {folder}`"),
+    "vjepa2": ("V-JEPA 2", "vjepa2-vitg-fpc64-384"),
+    "dinov2": ("DINOv2", "dinov2-small"),
 }
 
 
@@ -62,12 +54,15 @@ def missing_perception(config: PerceptionConfig) -> list[str]:
     """One line for each network of perception whose checkpoint is missing."""
     lines = []
     if config.detector in DETECTORS and _is_missing(config.detector_path):
-        title, advice = DETECTORS[config.detector]
+        title, name = DETECTORS[config.detector]
         if config.relation_head == "egtr":
-            title, advice = f"{title} and EGTR", FROSS
+            (_, title, advice), _ = NOT_ON_THE_HUB
+        else:
+            advice = _get(config.detector_path, name)
         lines.append(_line(title, "perception.detector_path", config.detector_path, advice))
     if config.segmenter in SEGMENTERS and _is_missing(config.segmenter_path):
-        title, advice = SEGMENTERS[config.segmenter]
+        title, name = SEGMENTERS[config.segmenter]
+        advice = _get(config.segmenter_path, name)
         lines.append(_line(title, "perception.segmenter_path", config.segmenter_path, advice))
     return lines
 
@@ -76,18 +71,28 @@ def missing_world_model(config: RelationsConfig) -> list[str]:
     """One line for a world model of clips whose checkpoint or probe is missing."""
     if config.world_model not in WORLD_MODELS:
         return []
-    title, advice = WORLD_MODELS[config.world_model]
+    title, name = WORLD_MODELS[config.world_model]
     parts = []
     if _is_missing(config.world_model_path):
-        name = "relations.world_model_path"
-        parts.append(_line(title, name, config.world_model_path, advice))
+        advice = _get(config.world_model_path, name)
+        parts.append(_line(title, "relations.world_model_path", config.world_model_path, advice))
     if not is_folder(config.probe_path):
-        parts.append(_line(f"probe of {title}", "relations.probe_path", config.probe_path, PROBE))
+        _, (_, _, advice) = NOT_ON_THE_HUB
+        probe = f"probe of {title}"
+        parts.append(_line(probe, "relations.probe_path", config.probe_path, advice))
     return ["; ".join(parts)] if parts else []
 
 
 def _is_missing(name: str) -> bool:
     return not is_folder(name) and not is_hub_id(name)
+
+
+def _get(name: str, default: str) -> str:
+    """The command that gets a model into the folder of this name."""
+    folder = Path(name)
+    model = folder.name if folder.name in CATALOGUE else default
+    into = "" if folder.parent == MODELS_FOLDER or not name else f" --into {folder.parent}"
+    return f"run `deworldsg models get {model}{into}`"
 
 
 def _line(title: str, parameter: str, name: str, advice: str) -> str:

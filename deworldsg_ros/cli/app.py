@@ -12,7 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import models, probe
+from deworldsg_ros.cli import models as models_command
+from deworldsg_ros.cli import probe
 from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
 from deworldsg_ros.recordings.bags.topics import TopicChoice
@@ -240,15 +241,23 @@ def demo(
     pose: PoseTopic = "",
     intrinsics: CameraIntrinsics = "",
     odometry: OdometryPoses = False,
+    models: Annotated[
+        str,
+        typer.Option(
+            "--models",
+            help="paper: config/paper.yaml with the folder models/ (`deworldsg models get paper`); "
+            "embedded: the default",
+        ),
+    ] = "embedded",
 ) -> None:
     """Build it with the four ROS 2 nodes, from a replay."""
     with _reporting_errors():
-        from deworldsg_ros.cli.demo import DemoOptions, run_demo
+        from deworldsg_ros.cli.demo import DemoOptions, configuration_of, run_demo
 
         run_demo(
             recording,
             out,
-            config,
+            configuration_of(models, config),
             settings or [],
             DemoOptions(
                 rate=rate,
@@ -324,4 +333,4 @@ for parent, function, summary in (
 ):
     parent.command(short_help=summary)(_reporting_errors()(function))
 app.add_typer(evaluation)
-app.add_typer(models.app)
+app.add_typer(models_command.app)

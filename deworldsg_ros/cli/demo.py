@@ -29,6 +29,7 @@ from deworldsg_ros.recordings.messages import ODOMETRY, Role
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -106,6 +107,18 @@ def run_demo(
     outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
     _write_report(out, recording, graph, finished, wall_s)
     _print_summary(out, finished, console)
+
+
+def configuration_of(models: str, config_path: Path | None) -> Path | None:
+    """The configuration file of ``--models``, unless a file is given; raises ConfigurationError."""
+    if models not in ("embedded", "paper"):
+        raise ConfigurationError(f"--models {models}: expected embedded or paper")
+    if models == "embedded" or config_path is not None:
+        return config_path
+    found = find_shared("config/paper.yaml")
+    if found is None:
+        raise ConfigurationError("config/paper.yaml is missing: install the package again")
+    return found
 
 
 def dds_environment() -> dict[str, str]:

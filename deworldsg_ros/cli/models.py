@@ -1,7 +1,9 @@
-"""`deworldsg models`: conversion of published checkpoints."""
+"""`deworldsg models`: published checkpoints are fetched, listed, inspected and converted."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
@@ -9,18 +11,69 @@ import msgspec
 import typer
 from rich.console import Console
 
+from deworldsg_ros.checkpoints.catalogue import MODELS_FOLDER
 from deworldsg_ros.cli.exit_codes import EXIT_USAGE
+from deworldsg_ros.cli.model_folder import get_models, inspect_file, list_models
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 if TYPE_CHECKING:
     from deworldsg_ros.checkpoints.fross import Imported
 
-app = typer.Typer(name="models", help="Convert published checkpoints.")
+app = typer.Typer(name="models", help="Get, list, inspect and convert published models.")
 
 
 @app.callback()
 def _models() -> None:
-    """Convert published checkpoints."""
+    """Get, list, inspect and convert published models."""
+
+
+IntoFolder = Annotated[
+    Path, typer.Option("--into", metavar="DIR", help="folder of the models; created if missing")
+]
+
+
+@contextmanager
+def _terminal() -> Iterator[Console]:
+    """The terminal. An error of the user is printed as one sentence."""
+    try:
+        yield Console(highlight=False, soft_wrap=True, markup=False)
+    except DeWorldSGError as error:
+        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(f"error: {error}")
+        raise typer.Exit(EXIT_USAGE) from error
+
+
+@app.command()
+def get(
+    names: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="NAME…",
+            help="paper, embedded, a name of `models list`, or OWNER/NAME of the hub",
+        ),
+    ],
+    into: IntoFolder = MODELS_FOLDER,
+) -> None:
+    """Download models from the Hugging Face hub, and verify them."""
+    with _terminal() as console:
+        get_models(names, into, console)
+
+
+@app.command("list")
+def list_command(into: IntoFolder = MODELS_FOLDER) -> None:
+    """List models that are there or missing, with their licences."""
+    with _terminal() as console:
+        list_models(into, console)
+
+
+@app.command()
+def inspect(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="safetensors, .pt or .ckpt file, or a folder")
+    ],
+) -> None:
+    """Print names, dtypes and shapes of a checkpoint, and no weights."""
+    with _terminal() as console:
+        inspect_file(file, console)
 
 
 @app.command("import-fross")

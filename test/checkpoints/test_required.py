@@ -22,8 +22,12 @@ def test_the_paper_without_weights_names_each_network_in_a_line(root_dir: Path) 
     with pytest.raises(Exception, match="checkpoints of the configuration are missing") as error:
         require_checkpoints(config.perception, config.relations)
     _, detector, segmenter, world_model = str(error.value).splitlines()
-    assert detector.startswith("RT-DETR and EGTR (perception.detector_path './models/fross_3dssg')")
+    assert detector.startswith(
+        "RT-DETR and EGTR of FROSS (perception.detector_path './models/fross_3dssg')"
+    )
     assert "models import-fross" in detector
+    assert "deworldsg models get sam2.1-hiera-tiny`" in segmenter
+    assert "deworldsg models get vjepa2-vitg-fpc64-384`" in world_model
     assert segmenter.startswith("SAM 2 (perception.segmenter_path './models/sam2.1-hiera-tiny')")
     assert world_model.startswith("V-JEPA 2 (relations.world_model_path './models/vjepa2-vitg-")
     assert "relations.probe_path './models/probe_3dssg'" in world_model

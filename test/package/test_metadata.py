@@ -18,7 +18,11 @@ from deworldsg_ros.config import Config, load_config, to_mapping
 
 ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
 # Modules whose distribution has another name.
-DISTRIBUTIONS = {"cv2": "opencv-python-headless", "yaml": "pyyaml"}
+DISTRIBUTIONS = {
+    "cv2": "opencv-python-headless",
+    "yaml": "pyyaml",
+    "huggingface_hub": "huggingface-hub",
+}
 
 
 def requirements(root: Path, *extras: str) -> dict[str, str]:
