@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from support.evaluation import write_predictions
 from support.sequences import write_room
 from typer.testing import CliRunner, Result
 
+from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, write_card
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
@@ -329,6 +331,17 @@ def test_rows_with_the_papers_networks_are_named_and_compared_with_the_paper(
     assert posed["paper-ground-truth"] == "DeWorldSG"
     assert posed["fross-slam"] == "FROSS, estimated poses"
     assert posed["paper-odometry"] == posed["paper-perturbed"] == ""
+
+
+@pytest.mark.parametrize(("inputs", "printed"), [("clip", True), ("clip_and_boxes", False)])
+def test_a_probe_that_knows_the_subject_has_no_printed_row(
+    root_dir: Path, tmp_path: Path, inputs: Literal["clip", "clip_and_boxes"], printed: bool
+) -> None:
+    files = configurations(root_dir, tmp_path)
+    backbone = BackboneIdentity("vjepa2", 48, 32, 16)
+    write_card(tmp_path, ProbeCard(backbone, ("on",), inputs=inputs))
+    rows = table_rows("ablation", [PoseSource()], FrontEndChoice("backend"), files)
+    assert {row.name: bool(row.printed) for row in rows}["e"] == printed
 
 
 @pytest.mark.parametrize(

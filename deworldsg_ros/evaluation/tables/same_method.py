@@ -6,9 +6,12 @@ same rules.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
-from deworldsg_ros.config import Config, to_mapping
+from deworldsg_ros.checkpoints.probe_card import CARD_FILE, read_card
+from deworldsg_ros.checkpoints.required import WORLD_MODELS
+from deworldsg_ros.config import Config, RelationsConfig, to_mapping
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.runner import PIPELINE
 
@@ -73,7 +76,16 @@ def runs_the_paper(
         known[section][field] = value
     if method != PIPELINE:
         return all(known["perception"][name] == found["perception"][name] for name in DETECTION)
-    return all(_method(known, stage) == _method(found, stage) for stage in STAGES)
+    same = all(_method(known, stage) == _method(found, stage) for stage in STAGES)
+    return same and _has_the_papers_probe(config.relations)
+
+
+def _has_the_papers_probe(config: RelationsConfig) -> bool:
+    """Whether the probe sees the clip alone; true without a probe, because such a row fails."""
+    folder = Path(config.probe_path).expanduser()
+    if config.world_model not in WORLD_MODELS or not (folder / CARD_FILE).is_file():
+        return True
+    return read_card(folder).inputs == "clip"
 
 
 def _method(mapping: dict[str, Any], stage: str) -> dict[str, Any]:
