@@ -4,6 +4,7 @@
 - `hub`: downloads and verifies them. `headers`: names and shapes in a file.
 - `required`: the checkpoints that a configuration needs, and how to get the missing ones.
 - `loading`: finds a checkpoint, loads it with `transformers`, chooses device and data type.
+- `precision`: compares half with single precision at start-up, and refuses NaN.
 - `card`: `deworldsg.json`, how a detector's checkpoint is read.
 - `architectures`: detector classes by model type, and the file name of the relation head.
 - `egtr_network`: the network of the relation head EGTR.

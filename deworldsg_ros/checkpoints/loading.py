@@ -222,13 +222,21 @@ def choose_device(parameter: str, choice: str) -> torch.device:
     return torch.device("cuda" if available and choice != "cpu" else "cpu")
 
 
-def choose_dtype(device: torch.device) -> torch.dtype:
-    """float16 on CUDA, float32 on a CPU, for every network.
+def choose_dtype(device: torch.device, *, wide_range: bool = False) -> torch.dtype:
+    """float16 on CUDA, float32 on a CPU.
 
-    float16 has more mantissa bits than bfloat16, which boxes and masks need. All CUDA devices
-    support it; bfloat16 is emulated before Ampere.
+    float16 has more mantissa bits than bfloat16, which boxes need, and all CUDA devices support it.
+
+    Args:
+        device: of the network.
+        wide_range: prefer bfloat16, in which SAM 2 and 3 were trained and published, if the device
+            has it (Ampere and later); it cannot overflow.
     """
-    return torch.float16 if device.type == "cuda" else torch.float32
+    if device.type != "cuda":
+        return torch.float32
+    # Before Ampere, bfloat16 is emulated.
+    native = wide_range and torch.cuda.is_bf16_supported(including_emulation=False)
+    return torch.bfloat16 if native else torch.float16
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -36,6 +36,8 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import STAGES, device_name, total_ms
 
+# Clips that the world model lost.
+FAILURES = ("world_model_error", "nan_features")
 LOADING = "loading the models … (the first run compiles kernels, which takes a minute or two)"
 
 
@@ -121,8 +123,10 @@ def run_recording(options: RunOptions, console: Console) -> None:
         )
     graph = pipeline.graph()
     _write_results(options, pipeline, graph, processed, console)
-    if failed := pipeline.relations.counters().dropped.get("world_model_error"):
-        drops["world model"] = {"world_model_error": failed}
+    dropped = pipeline.relations.counters().dropped
+    failed = {reason: dropped[reason] for reason in FAILURES if reason in dropped}
+    if failed:
+        drops["world model"] = failed
     outputs.write_report(options.out, _report(recording, pipeline, graph, processed, drops))
     outputs.print_drops(console, recording.losses, drops, recording.reasons)
     _print_summary(options, pipeline, processed, console)

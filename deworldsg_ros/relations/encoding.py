@@ -11,6 +11,7 @@ from deworldsg_ros.relations.clips import QueuedClip, Rgb, crop_clip, without_fi
 from deworldsg_ros.relations.prior import SUM_TOLERANCE
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 
 
@@ -20,6 +21,9 @@ class ClipEncoder:
     Args:
         world_model: encodes the clips.
         report: called with one sentence on each new failure; default: the log.
+
+    Attributes:
+        failure: reason of the last failure: that of a refusal, else ``world_model_error``.
     """
 
     def __init__(
@@ -28,6 +32,7 @@ class ClipEncoder:
         self._world_model = world_model
         self._report = logging.getLogger(__name__).warning if report is None else report
         self._last_report = ""
+        self.failure = ""
 
     def encode(self, clip: QueuedClip, images: list[Rgb]) -> RelationEvidence | None:
         """Predictions for both directions of a clip's pair; None if the world model failed.
@@ -44,6 +49,9 @@ class ClipEncoder:
                 len(request.vocabulary.predicates),
             )
         except Exception as error:  # a backend may raise anything; the other stages go on
+            self.failure = "world_model_error"
+            if isinstance(error, RefusedInput):
+                self.failure = error.reason
             self._report_once(
                 f"world model '{self._world_model.name}' failed: {type(error).__name__}: {error}"
             )

@@ -39,7 +39,8 @@ class RelationCounters:
             their nodes to be confirmed, or for the budget.
         encoded: clips with predictions.
         dropped: clips that were not encoded, by reason: the reasons of `ClipPolicy.judge` and
-            `ClipQueue`; ``world_model_error`` (the world model failed); ``cleared`` (by `clear`);
+            `ClipQueue`; ``world_model_error`` (the world model failed), ``nan_features`` (its
+            features are not numbers); ``cleared`` (by `clear`);
             ``no_frame`` (never queued: the frame's image came too late or has another size).
     """
 
@@ -146,7 +147,7 @@ class RelationReasoner:
                 if evidence is not None:
                     self._encoded += 1
                     return evidence
-                self._drop("world_model_error")
+                self._drop(self._encoder.failure)
         return None
 
     def drain(self) -> list[RelationEvidence]:

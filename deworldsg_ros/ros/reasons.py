@@ -40,6 +40,9 @@ REASONS: dict[str, str] = {
     "another device.",
     "world_model_error": "The world model failed on a clip. The clip gives no prediction. Read the "
     "message in the log; if memory is short, choose another device.",
+    "nan_features": "The world model computed NaN or infinity for a clip. The clip gives no "
+    "prediction. Run it on the CPU (`perception.device: cpu`), and report it with "
+    "`deworldsg models inspect`.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
     "the stamps of the depth images.",

@@ -393,7 +393,7 @@ def test_printed_rows_are_of_the_same_data_set_and_method() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("first",), "expected main, hard, pose, ablation, switches, runtime"),
+        (("first",), "expected main, predictions, hard, pose, ablation, switches, runtime"),
         (("main", "--predictions", "p.json"), "expected NAME=FILE"),
         (("main", "--predictions", "IMP=none.json"), "none.json is not a file"),
         (("main", "--poses", "guessed"), "--poses guessed"),

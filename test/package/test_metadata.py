@@ -86,7 +86,9 @@ def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
     assert libraries <= known
 
 
-@pytest.mark.parametrize("name", ["default.yaml", "paper.yaml", "paper_rules.yaml"])
+@pytest.mark.parametrize(
+    "name", ["default.yaml", "paper.yaml", "paper_rules.yaml", "released.yaml"]
+)
 def test_a_shipped_configuration_contains_only_changed_values(root_dir: Path, name: str) -> None:
     path = root_dir / "config" / name
     content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]

@@ -62,7 +62,9 @@ def run(
 def table(
     kind: Annotated[
         str,
-        typer.Argument(metavar="TABLE", help="main, hard, pose, ablation, switches or runtime"),
+        typer.Argument(
+            metavar="TABLE", help="main, predictions, hard, pose, ablation, switches or runtime"
+        ),
     ],
     data: DataOptions,
     detections: DetectionOptions,

@@ -35,7 +35,7 @@ from deworldsg_ros.evaluation.tables.rows import Configurations, Row, table_rows
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # Tables that the paper prints, too.
-PRINTED = ("main", "pose", "ablation", "runtime")
+PRINTED = ("main", "predictions", "pose", "ablation", "runtime")
 NOT_PRINTED = (
     "Numbers of the paper appear only beside a row of the same method, on its whole test split. "
     "This table has none. docs/models.md says how to get the paper's networks."
@@ -59,7 +59,7 @@ def make_table(
         DeWorldSGError: the options or the data set cannot be used; a scan that fails is reported.
         typer.Exit: every scan failed.
     """
-    files = [_named_predictions(item) for item in comparing.predictions or []]
+    files = _named_files(kind, comparing.predictions or [])
     annotations = open_annotations(data.dataset, data.layout)
     poses = pose_sources(running, KINDS if kind == "pose" else ())
     if len(poses) > 1 and kind != "pose":
@@ -85,15 +85,15 @@ def make_table(
     for name, path in files:
         evaluation = evaluate_prediction_file(annotations, path, tasks[0].options, data.scans)
         lines.append(row_results.predicted_row(name, evaluation))
-    if not lines[0].printed and kind in PRINTED:
+    if not (lines and lines[0].printed) and kind in PRINTED:
         console.print(NOT_PRINTED, highlight=False, soft_wrap=True)
-    title = f"{kind}: {dataset}, {front_end.describe()} detections"
+    title = f"{kind}: {dataset}" + (f", {front_end.describe()} detections" if rows else "")
     if kind == "runtime":
         terminal.print_runtime(console, lines, title)
     else:
         terminal.print_table(console, lines, title, timed=kind == "switches")
     print_files(row_results.write_table(out, lines), console)
-    if not any(item.outcome for item in done):
+    if not any(item.outcome for item in done) and not files:
         raise typer.Exit(EXIT_NOTHING_DONE)
     values = {
         **header(data, scoring),
@@ -144,6 +144,12 @@ def _run(
             note = f"{reused} from before, {failed} failed" if reused or failed else ""
             progress.update(bar, advance=1, note=note)
     return done
+
+
+def _named_files(kind: str, texts: Sequence[str]) -> list[tuple[str, Path]]:
+    if kind == "predictions" and not texts:
+        raise EvaluationError("evaluate table predictions needs --predictions NAME=FILE")
+    return [_named_predictions(text) for text in texts]
 
 
 def _named_predictions(text: str) -> tuple[str, Path]:

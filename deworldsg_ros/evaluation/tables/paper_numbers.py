@@ -98,7 +98,9 @@ def printed_rows(table: str, layout: str, scans: Collection[str]) -> list[Printe
         scans: the evaluated scans; those of another data set than ReplicaSSG have no printed rows.
     """
     if layout == "replica" and set(scans) == REPLICA_TEST_SCANS:
-        return {"main": POSE_REPLICA[:2], "pose": POSE_REPLICA}.get(table, [])
+        rows = {"main": POSE_REPLICA[:2], "predictions": POSE_REPLICA, "pose": POSE_REPLICA}
+        return rows.get(table, [])
     if layout == "3rscan":
-        return {"main": MAIN_3DSSG, "ablation": ABLATION_3DSSG}.get(table, [])
+        rows = {"main": MAIN_3DSSG, "predictions": MAIN_3DSSG, "ablation": ABLATION_3DSSG}
+        return rows.get(table, [])
     return []

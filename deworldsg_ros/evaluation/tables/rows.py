@@ -15,8 +15,10 @@ from deworldsg_ros.evaluation.runner import PIPELINE
 from deworldsg_ros.evaluation.tables.same_method import networks, runs_the_paper
 from deworldsg_ros.poses.perturbation import PoseNoise
 
-Kind = Literal["main", "hard", "pose", "ablation", "switches", "runtime"]
-TABLES: tuple[Kind, ...] = ("main", "hard", "pose", "ablation", "switches", "runtime")
+Kind = Literal["main", "predictions", "hard", "pose", "ablation", "switches", "runtime"]
+TABLES: tuple[Kind, ...] = (
+    *("main", "predictions", "hard", "pose", "ablation", "switches", "runtime"),
+)
 POSE_TITLES = {
     "ground-truth": "ground-truth poses",
     "slam": "SLAM poses",
@@ -170,6 +172,8 @@ def table_rows(
     """
     if table not in TABLES:
         raise EvaluationError(f"table {table}: expected {', '.join(TABLES)}")
+    if table == "predictions":  # its rows are the prediction files
+        return []
     if table == "ablation":
         return _ablation(poses[0], front_end, files)
     if table == "switches":

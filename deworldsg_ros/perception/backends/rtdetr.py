@@ -23,6 +23,7 @@ from deworldsg_ros.checkpoints.loading import (
     choose_dtype,
     enough_memory,
 )
+from deworldsg_ros.checkpoints.precision import in_best_precision, noise_pattern, require_finite
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.networks.image_tensors import Preprocessing
 from deworldsg_ros.perception.protocols import Detections
@@ -57,7 +58,6 @@ class RtDetrDetector:
             config.detector_path,
         )
         self.device = choose_device("perception.device", config.device)
-        self.dtype = choose_dtype(self.device)
         network = self.source.config(DETECTORS)
         self.card = read_card(self.source.file(CARD_FILE))
         self.classes = _class_names(network, self.card, self.source)
@@ -71,7 +71,10 @@ class RtDetrDetector:
         _use_layers(model, self.card.decoder_layers, self.source)
         self._recorder: QueryRecorder | None = None
         with enough_memory("loading the detector", "choose a smaller perception.detector_path"):
-            self.model = model.to(self.device, self.dtype, memory_format=torch.channels_last)
+            model, self.dtype = in_best_precision(
+                model, self.device, choose_dtype(self.device), self._test_scores, "the detector"
+            )
+            self.model = model.to(memory_format=torch.channels_last)
             # The first pass allocates memory and tunes kernels; do it at start-up.
             self._forward(np.zeros((self._preprocess.height, self._preprocess.width, 3), np.uint8))
 
@@ -83,6 +86,8 @@ class RtDetrDetector:
     def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8, with score >= `score_threshold`, best first."""
         output = self._forward(rgb)
+        require_finite(output.logits, "detector_error", "the class logits")
+        require_finite(output.pred_boxes, "detector_error", "the boxes")
         probabilities, scores = class_distributions(output.logits[0].float(), self.card)
         rows = torch.nonzero(scores >= score_threshold)[:, 0]
         rows = rows[torch.argsort(scores[rows], descending=True, stable=True)]
@@ -96,6 +101,13 @@ class RtDetrDetector:
             _numpy(scores[rows]),
             features,
         )
+
+    @torch.inference_mode()
+    def _test_scores(self, model: Any, dtype: torch.dtype) -> torch.Tensor:
+        """Sorted scores of the queries for a fixed image; their order may differ by rounding."""
+        image = noise_pattern(self._preprocess.height, self._preprocess.width, 3).numpy()
+        logits: torch.Tensor = model(self._preprocess(image, self.device, dtype)).logits
+        return logits.float().amax(dim=-1).sort().values
 
     @torch.inference_mode()
     def _forward(self, rgb: UInt8) -> Any:

@@ -24,6 +24,8 @@ SHARED_EMBEDDING = {
 class Sam2Segmenter(BoxPromptedSegmenter):
     """Boxes to masks. The image is stretched to the square input."""
 
+    wide_range = True
+
     def _load(self, source: CheckpointSource) -> tuple[Any, int]:
         # The published checkpoints are of the video model; only its image part is used.
         found = source.config(("sam2", "sam2_video"))

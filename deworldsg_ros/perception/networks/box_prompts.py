@@ -14,6 +14,7 @@ from deworldsg_ros.checkpoints.loading import (
     choose_dtype,
     enough_memory,
 )
+from deworldsg_ros.checkpoints.precision import in_best_precision, noise_pattern, require_finite
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import MaskPatch
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, UInt8
@@ -35,16 +36,23 @@ class BoxPromptedSegmenter(ABC):
 
     Raises:
         ConfigurationError: no checkpoint, another architecture, no CUDA, no memory.
+
+    Attributes:
+        wide_range: whether the network was trained in bfloat16 and runs in it on CUDA.
     """
+
+    wide_range = False
 
     def __init__(self, config: PerceptionConfig, *, box_batch: int = BOX_BATCH) -> None:
         source = CheckpointSource.find("perception.segmenter_path", config.segmenter_path)
         self.device = choose_device("perception.device", config.device)
-        self.dtype = choose_dtype(self.device)
         self._box_batch = box_batch
         model, self.image_size = self._load(source)
         with enough_memory("loading the segmenter", "choose a smaller perception.segmenter_path"):
-            self.model = model.to(self.device, self.dtype)
+            half = choose_dtype(self.device, wide_range=self.wide_range)
+            self.model, self.dtype = in_best_precision(
+                model, self.device, half, self._test_logits, "the segmenter"
+            )
             # The first pass allocates memory and tunes kernels; do it at start-up.
             side = self.image_size
             boxes = np.tile([0.0, 0.0, side - 1.0, side - 1.0], (box_batch, 1))
@@ -65,6 +73,16 @@ class BoxPromptedSegmenter(ABC):
     @abstractmethod
     def _at_image_size(self, logits: torch.Tensor, height: int, width: int) -> torch.Tensor:
         """Mask logits (n, 1, s, s) of the input, resampled to (n, 1, height, width)."""
+
+    @torch.inference_mode()
+    def _test_logits(self, model: Any, dtype: torch.dtype) -> torch.Tensor:
+        """Mask logits of one box in a fixed image."""
+        self.dtype, side = dtype, self.image_size
+        embeddings = model.get_image_embeddings(self._input(noise_pattern(side, side, 3).numpy()))
+        box = torch.tensor([[[0.2, 0.2, 0.8, 0.8]]], device=self.device) * side
+        output = model(image_embeddings=embeddings, input_boxes=box, multimask_output=False)
+        logits: torch.Tensor = output.pred_masks
+        return logits
 
     def segment(
         self,
@@ -92,6 +110,7 @@ class BoxPromptedSegmenter(ABC):
                 multimask_output=False,
             )
             # (1, boxes, 1, s, s): one mask for each box.
+            require_finite(output.pred_masks, "segmenter_error", "the mask logits")
             logits = output.pred_masks[0].float()
             masks.append((self._at_image_size(logits, height, width)[:, 0] > 0).cpu().numpy())
         return np.concatenate(masks)

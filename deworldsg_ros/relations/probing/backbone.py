@@ -16,6 +16,7 @@ from deworldsg_ros.checkpoints.loading import (
     choose_dtype,
     enough_memory,
 )
+from deworldsg_ros.checkpoints.precision import in_best_precision, noise_pattern, require_finite
 from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry, normalise, stretch
@@ -60,6 +61,7 @@ class FrozenBackbone:
 
         Raises:
             ConfigurationError: the device has too little memory for the batch.
+            RefusedInput: ``nan_features``.
             ValueError: a clip has another length than T.
         """
         expected = self.identity.clip_length
@@ -73,6 +75,7 @@ class FrozenBackbone:
             if self.device.type == "cuda":
                 images = images.pin_memory().to(self.device, non_blocking=True)
             features = self.features(normalise(images, self.dtype))
+            require_finite(features, "nan_features", f"a feature of {self.identity.family}")
             return np.asarray(features.to("cpu", torch.float32).numpy(), np.float32)
 
 
@@ -102,17 +105,34 @@ def load_checkpoint(
 
 
 def to_device(
-    model: torch.nn.Module, choice: str
+    model: torch.nn.Module,
+    choice: str,
+    identity: BackboneIdentity,
+    features: Callable[[Any, torch.Tensor], torch.Tensor],
 ) -> tuple[torch.nn.Module, torch.device, torch.dtype]:
-    """Move a model to a device (auto, cpu or cuda), in the precision of that device.
+    """Move a model to a device (auto, cpu or cuda), in a precision that is exact enough there.
+
+    Args:
+        model: in float32.
+        choice: the device.
+        identity: sizes of a clip.
+        features: of normalised clips, by a model.
 
     Raises:
         ConfigurationError: no CUDA device, or too little memory.
     """
     device = choose_device("perception.device", choice)
-    dtype = choose_dtype(device)
+    shape = (1, identity.clip_length, 3, identity.image_size, identity.image_size)
+
+    @torch.inference_mode()
+    def of_test_clip(model: Any, dtype: torch.dtype) -> torch.Tensor:
+        return features(model, normalise(noise_pattern(*shape).to(device), dtype))
+
     with enough_memory(f"moving the backbone to {device}", REMEDY):
-        return model.to(device, dtype), device, dtype
+        placed, dtype = in_best_precision(
+            model, device, choose_dtype(device), of_test_clip, f"the backbone {identity.family}"
+        )
+    return placed, device, dtype
 
 
 def fingerprint(model: torch.nn.Module) -> str:

@@ -6,6 +6,7 @@ its frames' features.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -57,14 +58,15 @@ def load_backbone(
         fingerprint(model),
         fit="stretch",
     )
-    placed, where, dtype = to_device(model, device)
 
-    def features(videos: torch.Tensor) -> torch.Tensor:
+    def features(network: Any, videos: torch.Tensor) -> torch.Tensor:
         clips, frames = videos.shape[:2]
-        tokens: torch.Tensor = placed(videos.flatten(0, 1)).last_hidden_state
+        tokens: torch.Tensor = network(videos.flatten(0, 1)).last_hidden_state
         return tokens[:, 0].to(torch.float32).reshape(clips, frames, -1).mean(dim=1)
 
-    return FrozenBackbone(identity, clip_geometry(image_size), where, dtype, features)
+    placed, where, dtype = to_device(model, device, identity, features)
+    geometry = clip_geometry(image_size)
+    return FrozenBackbone(identity, geometry, where, dtype, partial(features, placed))
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:

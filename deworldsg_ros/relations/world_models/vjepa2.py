@@ -6,6 +6,7 @@ All published sizes work: ViT-L, ViT-H and ViT-g at 256 pixels, ViT-g at 384 pix
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -53,14 +54,15 @@ def load_backbone(
         fingerprint(model),
         fit="stretch",
     )
-    placed, where, dtype = to_device(model, device)
 
-    def features(videos: torch.Tensor) -> torch.Tensor:
-        hidden: torch.Tensor = placed(videos, skip_predictor=True).last_hidden_state
+    def features(network: Any, videos: torch.Tensor) -> torch.Tensor:
+        hidden: torch.Tensor = network(videos, skip_predictor=True).last_hidden_state
         # Half precision is too coarse for the mean of thousands of tokens.
         return hidden.mean(dim=1, dtype=torch.float32)
 
-    return FrozenBackbone(identity, clip_geometry(settings.crop_size), where, dtype, features)
+    placed, where, dtype = to_device(model, device, identity, features)
+    geometry = clip_geometry(settings.crop_size)
+    return FrozenBackbone(identity, geometry, where, dtype, partial(features, placed))
 
 
 def clip_geometry(image_size: int) -> ClipGeometry:
