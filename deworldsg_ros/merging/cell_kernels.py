@@ -19,8 +19,6 @@ INDEX_BIAS = 1 << 20
 INDEX_MASK = (1 << 21) - 1
 # An owner with fewer cells says too little by lying within a set.
 MIN_OWNER_CELLS = 4
-# Score of a cell that another object has taken: as after one miss (`cell_beliefs`).
-CONTESTED_SCORE = -3
 # The six faces of a block. For each face: its cells, the rotation to the right that turns their
 # bits into the bits of the cells that they touch in the adjacent block, and the step to that block.
 _FACES = np.array(
@@ -147,21 +145,6 @@ def _cell_of(point: Float32, cells_per_m: float) -> tuple[np.int64, np.uint64]:
         block = (block << 21) | (step >> 2)
         bit = (bit << 2) | (step & 3)
     return (block if inside else np.int64(-1)), np.uint64(1) << np.uint64(bit)
-
-
-@kernel
-def contains(table: TableArrays, owner: int, points: Float32, cell_m: float) -> Bool:
-    """Whether each point (k, 3) lies in a cell of an owner."""
-    keys, masks, slot_owners, marks, _, _, _ = table
-    contained = np.zeros(len(points), np.bool_)
-    for index in range(len(points)):
-        block, bit = _cell_of(points[index], 1.0 / cell_m)
-        slot = _home_slot(keys, block)
-        while keys[slot] != -1:
-            if keys[slot] == block and slot_owners[slot] == owner:
-                contained[index] = masks[slot] & bit != 0
-            slot = (slot + 1) & (len(keys) - 1)
-    return contained
 
 
 @kernel
@@ -422,76 +405,6 @@ def _fractions(
                     fraction = max(fraction, of_owner[index, owner] / counts[owner])
                 fractions[index, column] = fraction
     return fractions
-
-
-@kernel
-def _dilated_set(
-    block: np.int64, blocks: Int64, set_masks: UInt64, start: int, stop: int
-) -> np.uint64:
-    """Cells of a block that are in a set, or share a face with a cell of the set."""
-    near = np.uint64(0)
-    for at in range(start, stop):
-        if blocks[at] == block:
-            near |= _dilated(set_masks[at])
-        for face in range(6):
-            if blocks[at] + _STEPS[face] == block:
-                near |= _rotated(set_masks[at] & _FACES[face], _ROTATIONS[face])
-    return near
-
-
-@kernel
-def contest(
-    table: TableArrays,
-    counts: Int64,
-    used: int,
-    owners: Int64,
-    sets: SetArrays,
-    min_fraction: float,
-) -> Int64:
-    """Number of cells that each owner lost; see `VoxelMap.contest`."""
-    keys, masks, slot_owners, marks, rejected, scores, _ = table
-    blocks, set_masks, starts = sets
-    set_of = np.full(len(counts), -1, np.int64)
-    for index in range(len(owners)):
-        if owners[index] >= 0:
-            set_of[owners[index]] = index
-    lost = np.zeros(len(counts), np.int64)
-    marked = np.empty(used, np.int64)
-    marked_count = 0
-    for index in range(len(owners)):
-        for at in range(starts[index], starts[index + 1]):
-            slot = _home_slot(keys, blocks[at])
-            while keys[slot] != -1:
-                owner = slot_owners[slot]
-                cells = set_masks[at] & masks[slot] & ~marks[slot]
-                is_block = keys[slot] == blocks[at] and cells != 0
-                if is_block and owner != owners[index] and set_of[owner] >= 0:
-                    start, stop = starts[set_of[owner]], starts[set_of[owner] + 1]
-                    cells &= ~_dilated_set(blocks[at], blocks, set_masks, start, stop)
-                    marked_count = _mark(slot, cells, marks, marked, marked_count)
-                    lost[owner] += _bit_count(cells)
-                slot = (slot + 1) & (len(keys) - 1)
-    for owner in range(len(counts)):
-        if lost[owner] <= min_fraction * counts[owner]:
-            lost[owner] = 0
-    for position in range(marked_count):
-        slot = marked[position]
-        if lost[slot_owners[slot]] > 0:
-            masks[slot] &= ~marks[slot]
-            _reject(scores[slot], marks[slot])
-            rejected[slot] |= marks[slot]
-        marks[slot] = 0
-    for owner in range(len(counts)):
-        counts[owner] -= lost[owner]
-    return lost
-
-
-@kernel
-def _reject(scores: Int8, cells: np.uint64) -> None:
-    """Give some of the cells of a slot (64,) the score of a cell whose only frame is a miss."""
-    for cell in range(64):
-        if (cells >> np.uint64(cell)) & np.uint64(1):
-            scores[cell] = CONTESTED_SCORE
 
 
 @kernel

@@ -52,7 +52,6 @@ class NodeRecords:
         cells = spare_map.cells_of([np.zeros((1, 3), np.float32)])
         spare_map.add([0], cells)
         spare_map.overlaps(cells)
-        spare_map.contest([0], cells, 0.0)
         one = np.ones((1, 1), np.uint16)
         grid = DepthGrid(one, 8, Intrinsics(1.0, 1.0, 0.0, 0.0, 8, 8), one)
         spare_map.judge([0], cells, np.ones(1, np.int64), np.eye(4), grid)

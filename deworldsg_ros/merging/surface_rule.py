@@ -24,9 +24,6 @@ from deworldsg_ros.scene.graph import SceneGraph
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0
-# A node loses contested cells if they are more than this fraction of its cells. Fewer are a common
-# border of two surfaces that touch.
-MIN_CONTESTED_FRACTION = 0.1
 
 
 class SurfaceMerging:
@@ -71,7 +68,6 @@ class SurfaceMerging:
         )
         matched = one_to_one(scores)
         matched_owners = [owners[column] if column >= 0 else -1 for column in matched]
-        self._contest(graph, cells, matched_owners)
         node_ids = self._fuse(graph, local, cells, matched_owners)
         object_owners = [records.owners.of(node_id) for node_id in node_ids]
         records.joint.add_frame(object_owners, owners, scores, touching, matched)
@@ -95,18 +91,6 @@ class SurfaceMerging:
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
         self._records.apply_correction(graph, node_ids, T_correction)
-
-    def _contest(self, graph: SceneGraph, cells: CellSets, owners: list[int]) -> None:
-        """Correct nodes that contain a part of an object that this frame shows as another node.
-
-        The node loses the cells, the surface points in them, and the same fraction of its weight.
-        """
-        lost_fractions = self._records.map.contest(owners, cells, MIN_CONTESTED_FRACTION)
-        for owner, fraction in lost_fractions.items():
-            node_id = self._records.owners.node(owner)
-            points = graph.nodes.surface(graph.nodes.row(node_id))
-            kept = points[self._records.map.contains(owner, points)]
-            graph.correct(node_id, 1.0 - fraction, kept)
 
     def _judge(
         self,

@@ -159,37 +159,6 @@ class VoxelMap:
         owners, fractions = cell_kernels.overlaps(self._table[:], self._counts, self._used, sets[:])
         return owners.tolist(), fractions
 
-    def contest(
-        self, owners: Sequence[int], sets: CellSets, min_fraction: float
-    ) -> dict[int, float]:
-        """Remove cells from an owner where a frame shows another owner instead.
-
-        Args:
-            owners: (n,) owner of each set; -1 = none yet.
-            sets: cells in which the frame shows each owner. An owner keeps the cells that are in or
-                next to its own set.
-            min_fraction: an owner that would lose at most this fraction of its cells keeps them.
-
-        Returns:
-            The fraction of cells lost, for each owner that lost some.
-        """
-        self._make_room(max(owners, default=-1) + 1)
-        lost = cell_kernels.contest(
-            self._table[:],
-            self._counts,
-            self._used,
-            np.array(owners, np.int64),
-            sets[:],
-            min_fraction,
-        )
-        losers = np.flatnonzero(lost)
-        fractions = lost[losers] / (lost[losers] + self._counts[losers])
-        return dict(zip(losers.tolist(), fractions.tolist()))
-
-    def contains(self, owner: int, points: Float32) -> Bool:
-        """Whether each point (k, 3), metres, lies in a cell of an owner, (k,)."""
-        return cell_kernels.contains(self._table[:], owner, points, self.cell_m)
-
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""
         cells = self.cells(owner)

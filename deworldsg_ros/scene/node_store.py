@@ -138,19 +138,6 @@ class NodeStore:
         )
         self._changed(rows)
 
-    def correct(self, node_id: int, factor: float, points_world: Float32) -> None:
-        """Remove from a live node the part that belongs to another object.
-
-        Args:
-            node_id: of the node.
-            factor: by which its weight w (Eq. 7) is multiplied.
-            points_world: (k, 3) the surface points that stay.
-        """
-        row = self.nodes.row(node_id)
-        self.nodes.weights[row] *= factor
-        self.nodes.set_surface(row, points_world)
-        self._changed([row])
-
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
         rows = [self.nodes.row(node_id) for node_id in node_ids]

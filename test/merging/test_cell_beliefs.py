@@ -241,7 +241,7 @@ def indices(block: int, mask: int) -> list[tuple[int, tuple[int, ...]]]:
     ]
 
 
-def test_scores_of_merged_owners_are_added_and_a_contested_cell_is_doubtful() -> None:
+def test_scores_of_merged_owners_are_added() -> None:
     surfaces = VoxelMap()
     points = np.array([[0.01, 0.01, 1.0], [0.2, 0.01, 1.0]], np.float32)
     cells = surfaces.cells_of([points])
@@ -253,15 +253,6 @@ def test_scores_of_merged_owners_are_added_and_a_contested_cell_is_doubtful() ->
     surfaces.add([1], surfaces.cells_of([points[:1]]))
     surfaces.add_scores(1, surfaces.cells(0).blocks, surfaces.scores(0))
     assert list(scores_of(surfaces, 1).values()) == [3 * HIT]
-
-    # Another owner is shown in the second cell: it is lost, and doubted when it returns.
-    first, second = points[:1], points[1:]
-    surfaces.contest([0, 2], surfaces.cells_of([first, second]), 0.1)
-    assert len(scores_of(surfaces, 0)) == 1
-    surfaces.add([0], cells)
-    rejected = surfaces.judge([0], cells, np.array([1]), np.eye(4), grid)
-    assert len(cells_in(rejected, 0)) == 1
-    assert sorted(scores_of(surfaces, 0).values()) == [HIT - MISS, 4 * HIT]
 
 
 def test_a_removed_owner_leaves_no_scores() -> None:

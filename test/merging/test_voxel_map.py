@@ -47,22 +47,6 @@ def random_points(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 @given(seeds)
-@settings(max_examples=20)
-def test_an_owner_contains_the_points_in_its_cells(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    surfaces = VoxelMap(CELL_M)
-    known = [random_points(rng, 20) for _ in range(2)]
-    surfaces.add([0, 1], surfaces.cells_of(known))
-    queried = random_points(rng, 40)
-    for owner in (0, 1):
-        cells = cells_of(known[owner])
-        expected = [tuple(c) in cells for c in np.floor(queried.astype(np.float64) / CELL_M)]
-        assert surfaces.contains(owner, queried).tolist() == expected
-        assert surfaces.contains(owner, known[owner]).all()
-    assert not surfaces.contains(0, np.full((1, 3), 1e6, np.float32)).any()
-
-
-@given(seeds)
 @settings(max_examples=30)
 def test_overlaps_equal_the_reference(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -81,32 +65,6 @@ def test_overlaps_equal_the_reference(seed: int) -> None:
             assert overlaps[row, owner] == pytest.approx(expected, abs=1e-12)
     for owner in range(3):
         assert len(surfaces.centres(owner)) == len(known[owner])
-
-
-@given(seeds)
-@settings(max_examples=30)
-def test_contested_cells_equal_the_reference(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    surfaces = VoxelMap(CELL_M)
-    known = [random_points(rng, int(rng.integers(1, 60))) for _ in range(4)]
-    for owner, points in enumerate(known):
-        surfaces.add([owner], surfaces.cells_of([points]))
-    seen = [random_points(rng, int(rng.integers(0, 60))) for _ in range(4)]
-    owners = [2, -1, 0, 1]  # the second is a new node; the last node is out of view
-    min_fraction = float(rng.choice([0.0, 0.1]))
-    lost = surfaces.contest(owners, surfaces.cells_of(seen), min_fraction)
-    for owner, points in enumerate(known):
-        had, own = cells_of(points), set()
-        shown = cells_of(seen[owners.index(owner)]) if owner in owners else set()
-        if owner in owners:
-            others = [s for s, o in zip(seen, owners) if o != owner]
-            own = had & set().union(*map(cells_of, others))
-            own = {cell for cell in own if not shown & set(neighbourhood(cell))}
-        fraction = len(own) / len(had)
-        own = own if fraction > min_fraction else set()
-        assert lost.get(owner, 0.0) == pytest.approx(fraction if own else 0.0)
-        assert cells_of(surfaces.centres(owner)) == had - own
-        assert len(surfaces.centres(owner)) == len(had - own)
 
 
 def test_sets_without_points_overlap_nothing() -> None:
