@@ -150,7 +150,8 @@ def _update_points(
 
 
 @kernel
-def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
+def in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """A world point in camera axes, metres."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
@@ -163,7 +164,7 @@ def _is_out_of_view(
     ball: Float64, T_camera_world: Float64, width_px: int, height_px: int, camera: _Camera
 ) -> bool:
     """Whether a ball is behind the camera, or completely beyond one side of the image."""
-    x, y, z = _in_camera(T_camera_world, ball[0], ball[1], ball[2])
+    x, y, z = in_camera(T_camera_world, ball[0], ball[1], ball[2])
     radius = ball[3]
     fx, fy, cx, cy, _ = camera
     right, below = cx - width_px, cy - height_px
@@ -189,7 +190,7 @@ def _compare(
         # Too little of the node is visible already; the other points do not matter.
         if index - through - present > most_hidden:
             break
-        x, y, z = _in_camera(
+        x, y, z = in_camera(
             T_camera_world,
             np.float64(points[index, 0]),
             np.float64(points[index, 1]),

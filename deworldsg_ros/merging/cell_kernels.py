@@ -310,7 +310,7 @@ def _mark(slot: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_coun
 @kernel
 def overlaps(
     table: TableArrays, counts: Int64, used: int, sets: SetArrays
-) -> tuple[Int64, Float64]:
+) -> tuple[Int64, Float64, Float64]:
     """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
     keys, masks, slot_owners, marks, _, _, _ = table
     blocks, set_masks, starts = sets
@@ -339,7 +339,19 @@ def overlaps(
             of_owner[index, slot_owners[slot]] += _bit_count(marks[slot])
             marks[slot] = 0
     columns = np.flatnonzero(met)
-    return columns, _fractions(columns, on_owner, of_owner, counts, sets)
+    on_fractions = np.zeros((set_count, len(columns)))
+    of_fractions = np.zeros((set_count, len(columns)))
+    for index in range(set_count):
+        cell_count = 0
+        for at in range(starts[index], starts[index + 1]):
+            cell_count += _bit_count(set_masks[at])
+        for column in range(len(columns)):
+            owner = columns[column]
+            if on_owner[index, owner] > 0:
+                on_fractions[index, column] = on_owner[index, owner] / cell_count
+                if counts[owner] >= MIN_OWNER_CELLS:
+                    of_fractions[index, column] = of_owner[index, owner] / counts[owner]
+    return columns, on_fractions, of_fractions
 
 
 @kernel
@@ -383,28 +395,6 @@ def _meet(
                     on_block[owner] |= _dilated(masks[slot]) & set_mask
             slot = (slot + 1) & (len(keys) - 1)
     return owner_count, marked_count
-
-
-@kernel
-def _fractions(
-    columns: Int64, on_owner: Int64, of_owner: Int64, counts: Int64, sets: SetArrays
-) -> Float64:
-    """Overlap fraction of each set (row) with each of some owners (column)."""
-    blocks, set_masks, starts = sets
-    set_count = len(starts) - 1
-    fractions = np.zeros((set_count, len(columns)))
-    for index in range(set_count):
-        cell_count = 0
-        for at in range(starts[index], starts[index + 1]):
-            cell_count += _bit_count(set_masks[at])
-        for column in range(len(columns)):
-            owner = columns[column]
-            if on_owner[index, owner] > 0:
-                fraction = on_owner[index, owner] / cell_count
-                if counts[owner] >= MIN_OWNER_CELLS:
-                    fraction = max(fraction, of_owner[index, owner] / counts[owner])
-                fractions[index, column] = fraction
-    return fractions
 
 
 @kernel

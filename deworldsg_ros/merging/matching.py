@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -12,12 +13,9 @@ from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
 
-# Minimum overlap fraction of a match whose classes differ. Without a match of different classes,
-# labels that flip create nodes of their own (docs/dev/notebook.md).
+# Minimum overlap of a match whose classes differ. Without a match of different classes, labels that
+# flip create nodes of their own (docs/dev/notebook.md).
 OVERLAP_THRESHOLD_OTHER_CLASS = 0.55
-# Maximum size ratio of two matched objects whose classes differ. A book lies wholly on the cells of
-# the table below it.
-SIZE_RATIO_OTHER_CLASS = 5.0
 # Classes agree if two labels, one drawn from each distribution, are equal with this probability.
 CLASS_AGREEMENT = 0.3
 # Weights of the agreement of classes and of Gaussians in the match score; the overlap fraction has
@@ -33,38 +31,63 @@ MAX_DEVIATIONS = 4.0
 _Items = tuple[Float64, Float64, Float64]
 
 
-def match_scores(
+class Matches(NamedTuple):
+    """How n objects of a frame match k nodes.
+
+    Attributes:
+        owners: the k owners of the nodes.
+        on_nodes: (n, k) float64, fraction of each object's cells that lie on each node.
+        scores: (n, k) float64, 0 = no match possible.
+        touching: (n, k) bool, whether the surfaces touch and the classes agree.
+        columns: column of the node that each object matched, one to one; -1 = none.
+    """
+
+    owners: list[int]
+    on_nodes: Float64
+    scores: Float64
+    touching: Bool
+    columns: list[int]
+
+
+def match(
     local: LocalGraph,
     nodes: NodeTable,
     rows: Int64,
-    overlaps: Float64,
+    owners: list[int],
+    on_nodes: Float64,
+    covered: Float64,
     overlap_threshold: float,
     cell_m: float,
-) -> tuple[Float64, Bool]:
-    """Match score of each object of a frame with each of some nodes.
+) -> Matches:
+    """Match the objects of a frame with some nodes.
+
+    The score of a match is overlap + CLASS_WEIGHT · Σ p q + GAUSSIAN_WEIGHT · exp(-BD), where BD is
+    the Bhattacharyya distance of the two Gaussians, both blurred by the size of a cell. The overlap
+    is one of two fractions: of the object on the node, or of the node in the object. If the classes
+    agree, the larger counts: either may be a partial view of the other. If not, the smaller: a
+    thing on a larger one lies wholly on it.
 
     Args:
         local: n objects.
         nodes: the nodes of the graph.
         rows: (k,) rows of the nodes to compare with.
-        overlaps: (n, k) overlap fractions of their surfaces.
-        overlap_threshold: minimum overlap fraction of a match whose classes agree.
+        owners: the owner of each.
+        on_nodes: (n, k) fraction of each object's cells that lie on each node.
+        covered: (n, k) fraction of each node's surface that lies in each object.
+        overlap_threshold: minimum overlap of a match whose classes agree.
         cell_m: edge of a cell, metres.
-
-    Returns:
-        (n, k) float64: overlap + CLASS_WEIGHT · Σ p q + GAUSSIAN_WEIGHT · exp(-BD); 0 = no match.
-        BD is the Bhattacharyya distance of the two Gaussians, both blurred by the size of a cell.
-        And (n, k) bool: whether the surfaces touch and the classes agree.
     """
-    return _match_scores(
+    scores, touching = _match_scores(
         (local.means_world, local.covariances_world, local.class_probabilities),
         (nodes.means, nodes.covariances, nodes.class_probabilities),
         rows,
-        overlaps,
+        on_nodes,
+        covered,
         overlap_threshold,
         # Variance of a point in a cell along each axis, if only the cell is known.
         cell_m**2 / 12,
     )
+    return Matches(owners, on_nodes, scores, touching, one_to_one(scores))
 
 
 def one_to_one(scores: Float64) -> list[int]:
@@ -79,7 +102,7 @@ def one_to_one(scores: Float64) -> list[int]:
 def warm_up() -> None:
     """Compile the kernel, or load it from the cache."""
     item = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
-    _match_scores(item, item, np.zeros(1, np.int64), np.ones((1, 1)), 0.5, 1.0)
+    _match_scores(item, item, np.zeros(1, np.int64), np.ones((1, 1)), np.ones((1, 1)), 0.5, 1.0)
 
 
 @kernel
@@ -102,19 +125,20 @@ def _match_scores(
     objects: _Items,
     nodes: _Items,
     rows: Int64,
-    overlaps: Float64,
+    on_nodes: Float64,
+    covered: Float64,
     overlap_threshold: float,
     blur_m2: float,
 ) -> tuple[Float64, Bool]:
     means, covariances, classes = objects
     node_means, node_covariances, node_classes = nodes
-    scores = np.zeros(overlaps.shape)
-    touching = np.zeros(overlaps.shape, np.bool_)
+    scores = np.zeros(on_nodes.shape)
+    touching = np.zeros(on_nodes.shape, np.bool_)
     blur = blur_m2 * np.eye(3)
-    for index in range(len(overlaps)):
+    for index in range(len(on_nodes)):
         for column in range(len(rows)):
-            overlap = overlaps[index, column]
-            if overlap == 0.0:
+            on_node, cover = on_nodes[index, column], covered[index, column]
+            if on_node == 0.0:
                 continue
             row = rows[column]
             agreement = 0.0
@@ -122,15 +146,11 @@ def _match_scores(
                 agreement += classes[index, label] * node_classes[row, label]
             agree = agreement > CLASS_AGREEMENT
             touching[index, column] = agree
+            overlap = max(on_node, cover) if agree else min(on_node, cover)
             if overlap < (overlap_threshold if agree else OVERLAP_THRESHOLD_OTHER_CLASS):
                 continue
             a = covariances[index] + blur
             b = node_covariances[row] + blur
-            if not agree:
-                size_a = a[0, 0] + a[1, 1] + a[2, 2]
-                size_b = b[0, 0] + b[1, 1] + b[2, 2]
-                if max(size_a, size_b) > SIZE_RATIO_OTHER_CLASS**2 * min(size_a, size_b):
-                    continue
             d0 = means[index, 0] - node_means[row, 0]
             d1 = means[index, 1] - node_means[row, 1]
             d2 = means[index, 2] - node_means[row, 2]

@@ -8,6 +8,7 @@ from deworldsg_ros.merging.absence import AbsenceEvidence
 from deworldsg_ros.merging.alignment import PoseAlignment
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory
+from deworldsg_ros.merging.coverage import coverage
 from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.joint import JointEvidence
 from deworldsg_ros.merging.limits import LifeCycleLimits
@@ -58,6 +59,8 @@ class NodeRecords:
         nodes = NodeTable(1, 1)
         nodes.append(1)
         nodes.drop_points([0], spare_map.points_in(cells, nodes, [0]))
+        zeros = np.zeros(1, np.int64)
+        coverage(nodes, zeros, np.ones(1, np.int64), np.eye(4), grid, np.zeros((1, 1)))
         spare_map.remove(0)
         spare_absence = AbsenceEvidence(1)
         spare_absence.update_points([0], nodes, [0])

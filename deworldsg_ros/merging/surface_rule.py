@@ -12,9 +12,10 @@ import numpy as np
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
+from deworldsg_ros.merging.coverage import coverage
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.limits import LifeCycleLimits
-from deworldsg_ros.merging.matching import match_scores, one_to_one
+from deworldsg_ros.merging.matching import match
 from deworldsg_ros.merging.matching import warm_up as warm_up_matching
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.scene.arrays import Float64
@@ -57,20 +58,26 @@ class SurfaceMerging:
         if self._config.align_poses:
             local = records.alignment.align(graph, local)
         cells = records.map.cells_of(local.surface_points_world)
-        owners, overlaps = records.map.overlaps(cells)
-        scores, touching = match_scores(
+        owners, on_nodes, of_nodes = records.map.overlaps(cells)
+        rows = np.array(records.rows(graph, owners), np.int64)
+        T_camera_world = invert_pose(local.T_world_camera)
+        covered = coverage(
+            graph.nodes, rows, local.instance_ids, T_camera_world, local.depth_grid, of_nodes
+        )
+        matches = match(
             local,
             graph.nodes,
-            np.array(records.rows(graph, owners), np.int64),
-            overlaps,
+            rows,
+            owners,
+            on_nodes,
+            covered,
             self._config.overlap_threshold,
             records.map.cell_m,
         )
-        matched = one_to_one(scores)
-        matched_owners = [owners[column] if column >= 0 else -1 for column in matched]
+        matched_owners = [owners[column] if column >= 0 else -1 for column in matches.columns]
         node_ids = self._fuse(graph, local, cells, matched_owners)
         object_owners = [records.owners.of(node_id) for node_id in node_ids]
-        records.joint.add_frame(object_owners, owners, scores, touching, matched)
+        records.joint.add_frame(object_owners, matches, local.scores, local.T_world_camera[:3, 3])
         self._life_cycle.merge_parts(graph)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         self._life_cycle.observe_depth(graph, local, node_ids)

@@ -146,18 +146,17 @@ class VoxelMap:
             self.cell_m,
         )
 
-    def overlaps(self, sets: CellSets) -> tuple[list[int], Float64]:
-        """Overlap fraction of each set with each owner.
+    def overlaps(self, sets: CellSets) -> tuple[list[int], Float64, Float64]:
+        """How much of each set lies on each owner, and of each owner on each set.
 
-        It is the larger of two fractions: that of the set's cells that are cells of the owner or
-        share a face with one; and that of the owner's cells that the set meets in this way. A
-        partial view of an object thus overlaps fully with the whole object, and vice versa.
+        A cell lies on a surface if it is a cell of it or shares a face with one.
 
         Returns:
-            The k owners that any set meets, ascending, and the fractions (n, k) float64 in [0, 1].
+            The k owners that any set meets, ascending; and two fractions (n, k) float64 in [0, 1]:
+            of the set's cells that lie on the owner, and of the owner's cells that lie on the set.
         """
-        owners, fractions = cell_kernels.overlaps(self._table[:], self._counts, self._used, sets[:])
-        return owners.tolist(), fractions
+        owners, on, of = cell_kernels.overlaps(self._table[:], self._counts, self._used, sets[:])
+        return owners.tolist(), on, of
 
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""

@@ -10,15 +10,23 @@ from hypothesis import given, settings
 from numpy.typing import ArrayLike
 from support.merging import local_graph, random_classes, random_covariances, seeds
 
-from deworldsg_ros.merging.joint import SEPARATE_WEIGHT, JointEvidence
+from deworldsg_ros.merging.joint import (
+    NESTED_FRACTION,
+    OVERLAPPING_WEIGHT,
+    SEPARATE_WEIGHT,
+    SURE_SCORE,
+    TOUCHING_WEIGHT,
+    WIDE_STEP_M,
+    JointEvidence,
+)
 from deworldsg_ros.merging.matching import (
     CLASS_AGREEMENT,
     CLASS_WEIGHT,
     GAUSSIAN_WEIGHT,
     MAX_DEVIATIONS,
     OVERLAP_THRESHOLD_OTHER_CLASS,
-    SIZE_RATIO_OTHER_CLASS,
-    match_scores,
+    Matches,
+    match,
     one_to_one,
 )
 from deworldsg_ros.scene.gaussian import bhattacharyya_distance
@@ -44,33 +52,37 @@ def test_match_scores_equal_the_formulas(seed: int) -> None:
         covariance, classes = random_covariances(rng, 1, 0.01)[0], random_classes(rng, 1)[0]
         nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
     rows = rng.permutation(5)[:3]
-    overlaps = rng.uniform(0, 1, (4, 3))
-    scores, touching = match_scores(local, nodes, rows, overlaps, OVERLAP_THRESHOLD, CELL_M)
+    on_nodes, covered = rng.uniform(0, 1, (2, 4, 3))
+    owners = [5, 2, 7]
+    matches = match(local, nodes, rows, owners, on_nodes, covered, OVERLAP_THRESHOLD, CELL_M)
     blur = CELL_M**2 / 12 * np.eye(3)
-    for (index, column), overlap in np.ndenumerate(overlaps):
+    for index, column in np.ndindex(4, 3):
         row = rows[column]
         agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
         same = agreement > CLASS_AGREEMENT
+        fractions = on_nodes[index, column], covered[index, column]
+        overlap = max(fractions) if same else min(fractions)
         threshold = OVERLAP_THRESHOLD if same else OVERLAP_THRESHOLD_OTHER_CLASS
         ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
         difference = local.means_world[index] - nodes.means[row]
         apart = min(deviations(difference, ours), deviations(difference, theirs))
         distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
         score = overlap + CLASS_WEIGHT * agreement + GAUSSIAN_WEIGHT * np.exp(-distance)
-        sizes = np.sqrt([np.trace(ours), np.trace(theirs)])
-        alike = same or sizes.max() <= SIZE_RATIO_OTHER_CLASS * sizes.min()
-        matches = overlap >= threshold and alike and apart <= MAX_DEVIATIONS
-        assert scores[index, column] == pytest.approx(score if matches else 0.0, abs=1e-9)
-        assert touching[index, column] == same
+        possible = overlap >= threshold and apart <= MAX_DEVIATIONS
+        assert matches.scores[index, column] == pytest.approx(score if possible else 0.0, abs=1e-9)
+        assert matches.touching[index, column] == same
+    assert matches.columns == one_to_one(matches.scores)
+    assert matches.owners == owners and matches.on_nodes is on_nodes
 
 
 def test_a_frame_without_objects_has_no_matches() -> None:
     empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
-    scores, touching = match_scores(
-        empty, NodeTable(4), np.zeros(0, np.int64), np.zeros((0, 0)), OVERLAP_THRESHOLD, CELL_M
+    nothing = np.zeros((0, 0))
+    matches = match(
+        empty, NodeTable(4), np.zeros(0, np.int64), [], nothing, nothing, OVERLAP_THRESHOLD, CELL_M
     )
-    assert scores.shape == touching.shape == (0, 0)
-    assert one_to_one(scores) == []
+    assert matches.scores.shape == matches.touching.shape == (0, 0)
+    assert matches.columns == []
     assert one_to_one(np.zeros((2, 0))) == [-1, -1]
 
 
@@ -91,12 +103,24 @@ def test_the_assignment_has_the_greatest_total(seed: int) -> None:
 
 
 def add_frame(
-    evidence: JointEvidence, seen: list[int], known: list[int], scores: ArrayLike
+    evidence: JointEvidence,
+    seen: list[int],
+    known: list[int],
+    match_scores: ArrayLike,
+    touching: ArrayLike | None = None,
+    *,
+    detection_scores: ArrayLike = 0.9,
+    on_nodes: ArrayLike = 0.0,
+    camera_m: float = 0.0,
 ) -> None:
-    """One frame of objects; each touches the owners with which it has a match score."""
-    match_scores = np.array(scores).reshape(len(seen), len(known))
+    """One frame of objects; unless told, each touches the owners with which it has a score."""
+    shape = len(seen), len(known)
+    scores = np.array(match_scores, float).reshape(shape)
+    touching = scores > 0 if touching is None else np.array(touching, bool).reshape(shape)
     matched = [known.index(owner) if owner in known else -1 for owner in seen]
-    evidence.add_frame(seen, known, match_scores, match_scores > 0, matched)
+    matches = Matches(known, np.broadcast_to(on_nodes, shape), scores, touching, matched)
+    detection_scores = np.broadcast_to(detection_scores, len(seen))
+    evidence.add_frame(seen, matches, detection_scores, np.array([camera_m, 0, 0]))
 
 
 def test_a_frame_that_shows_two_objects_outweighs_ten_overlaps() -> None:
@@ -122,12 +146,50 @@ def test_a_frame_that_shows_two_objects_outweighs_ten_overlaps() -> None:
 
 def test_nodes_that_touch_in_nine_frames_are_merged() -> None:
     evidence = JointEvidence()
-    scores, touching = np.array([[1.0, 0.0]]), np.ones((1, 2), bool)
     for _ in range(8):
-        evidence.add_frame([4], [4, 7], scores, touching, [0])
+        add_frame(evidence, [4], [4, 7], [[1, 0]], [[1, 1]])
     assert evidence.next_merge() is None
-    evidence.add_frame([4], [4, 7], scores, touching, [0])
+    add_frame(evidence, [4], [4, 7], [[1, 0]], [[1, 1]])
     assert evidence.next_merge() == (4, 7)
+
+
+def test_after_a_wide_step_one_frame_that_overlaps_both_is_enough() -> None:
+    evidence = JointEvidence()
+    add_frame(evidence, [4], [4], [[1]])
+    add_frame(evidence, [4], [4, 7], [[1, 1]], camera_m=0.9 * WIDE_STEP_M)
+    assert evidence.next_merge() is None
+    add_frame(evidence, [4], [4, 8], [[1, 1]], camera_m=2 * WIDE_STEP_M)
+    assert evidence.next_merge() == (4, 8)
+
+
+NESTED = np.array([[1, 0], [NESTED_FRACTION, 1]])
+TOUCHING = np.array([[1, 0], [1, 1]])
+
+
+@pytest.mark.parametrize(
+    "detection_score, on_nodes, touching, balance",
+    [
+        (SURE_SCORE - 0.01, NESTED, TOUCHING, TOUCHING_WEIGHT),
+        (SURE_SCORE - 0.01, 0.9 * NESTED, TOUCHING, -OVERLAPPING_WEIGHT),
+        (SURE_SCORE - 0.01, NESTED, np.eye(2), -OVERLAPPING_WEIGHT),  # classes differ
+        (SURE_SCORE, NESTED, TOUCHING, -SEPARATE_WEIGHT),
+    ],
+)
+def test_an_unsure_box_in_a_box_may_be_the_same_object(
+    detection_score: float, on_nodes: np.ndarray, touching: np.ndarray, balance: int
+) -> None:
+    evidence = JointEvidence()
+    scores = [0.9, detection_score]
+    add_frame(
+        evidence,
+        [4, 7],
+        [4, 7],
+        np.eye(2),
+        touching,
+        detection_scores=scores,
+        on_nodes=on_nodes,
+    )
+    assert evidence.balances == {(4, 7): balance}
 
 
 def test_a_new_node_is_separate_from_the_others_of_its_frame() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
-from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
+from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab, view
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import SurfaceMerging
@@ -112,28 +112,65 @@ def test_two_halves_of_an_object_are_merged(graph, merging) -> None:
     assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
 
 
-def split_after_one_mask_over_two(graph) -> list[list[int]]:
-    """Ten frames with one mask over two objects, six with two masks, then each object alone."""
+def test_a_node_of_two_objects_loses_the_surface_of_one_when_both_are_detected(graph) -> None:
     merging = SurfaceMerging(CONFIG)
-    left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.1)), slab((0.06, 0, 1), (0.12, 0.3, 0.1))
-    views = [[np.concatenate((left, right))]] * 10 + [[left, right]] * 6 + [[right], [left]]
-    return [
-        merging.merge(graph, frame(stamp, *((points, CUP) for points in view)))
-        for stamp, view in enumerate(views)
+    left, right = slab((-0.06, 0, 1), (0.12, 0.3, 0.004)), slab((0.06, 0, 1), (0.12, 0.3, 0.004))
+    both = np.concatenate((left, right))
+    ids = [merging.merge(graph, view(stamp, (both, CUP))) for stamp in range(10)]
+    ids += [merging.merge(graph, view(stamp, (left, CUP), (right, CUP))) for stamp in range(10, 20)]
+    ids += [
+        merging.merge(graph, view(20, (right, CUP))),
+        merging.merge(graph, view(21, (left, CUP))),
     ]
-
-
-def test_a_node_of_two_objects_is_corrected_when_both_are_detected(graph) -> None:
-    ids = split_after_one_mask_over_two(graph)
-    assert ids[9] == [1] and ids[15] == [1, 2]
-    assert ids[16:] == [[2], [1]]
-    means = graph.nodes.means[:, 0]
-    assert means[1] == pytest.approx(0.06, abs=0.005)
-    # The ten frames of both objects, with twice the pixels, keep half of their weight.
-    pooled_m = 7 * -0.06 / (2 * 10 + 7)
-    assert means[0] < pooled_m - 0.005
+    assert ids[9] == [1] and ids[19:] == [[1, 2], [2], [1]]
     # Its surface ends within two cells of the other object, which extends to 0.12 m.
     assert graph.nodes.surface(0)[:, 0].max() < 2 * CELL_M
+
+
+CHAIR_FRONT = slab((0, 0, 1), (0.5, 0.6, 0.004))
+BOX_FRONT = slab((0, 0, 1), (0.3, 0.3, 0.004))
+COUCH_FRONT = slab((0, 0, 1), (0.95, 0.6, 0.004))
+
+
+@pytest.mark.parametrize(
+    "large, small",
+    [
+        pytest.param(CHAIR_FRONT, slab((0.05, 0.1, 0.99), (0.2, 0.26, 0.004)), id="book on chair"),
+        pytest.param(BOX_FRONT, slab((0.05, 0.05, 0.98), (0.1, 0.1, 0.004)), id="cup on box"),
+        pytest.param(
+            COUCH_FRONT, slab((0.2, 0.1, 0.99), (0.24, 0.16, 0.004)), id="remote on couch"
+        ),
+    ],
+)
+def test_a_thing_that_lies_wholly_on_a_larger_one_is_a_node(graph, merging, large, small) -> None:
+    """Masks of the larger thing include the smaller, until it is detected apart."""
+    for stamp in range(3):
+        assert merging.merge(graph, view(stamp, (large, CHAIR), (small, None))) == [1]
+    assert merging.merge(graph, view(3, (small, CUP), (large, None))) == [2]
+    assert merging.merge(graph, view(4, (large, CHAIR), (small, CUP))) == [1, 2]
+    # The larger one alone, its mask over both, is no evidence that they are one.
+    for stamp in range(5, 25):
+        assert merging.merge(graph, view(stamp, (large, CHAIR), (small, None))) == [1]
+    assert merging.merge(graph, view(25, (small, CUP), (large, None))) == [2]
+
+
+def test_a_second_unsure_box_on_an_object_is_merged(graph, merging) -> None:
+    part = slab((0, 0.1, 0.998), (0.3, 0.25, 0.004))
+    for stamp in range(3):
+        assert merging.merge(graph, view(stamp, (CHAIR_FRONT, CHAIR))) == [1]
+    for stamp in range(3, 23):
+        scores = np.array([0.8, 0.3])
+        merging.merge(graph, view(stamp, (CHAIR_FRONT, CHAIR), (part, CHAIR), scores=scores))
+    assert graph.take_removals() == {2: 1, 3: 1}
+
+
+def test_a_second_sure_box_on_an_object_is_an_object(graph, merging) -> None:
+    part = slab((0, 0.1, 0.998), (0.3, 0.25, 0.004))
+    for stamp in range(3):
+        assert merging.merge(graph, view(stamp, (CHAIR_FRONT, CHAIR))) == [1]
+    for stamp in range(3, 23):
+        objects = (CHAIR_FRONT, CHAIR), (part, CHAIR)
+        assert merging.merge(graph, view(stamp, *objects)) == [1, 2]
 
 
 def test_a_tentative_node_expires(graph, merging) -> None:
@@ -180,10 +217,10 @@ def test_the_result_does_not_depend_on_the_world_frame() -> None:
         graph = SceneGraph(VOCABULARY, "world")
         merging = SurfaceMerging(CONFIG)
         ids = []
-        for stamp, view in enumerate(views):
+        for stamp, objects in enumerate(views):
             moved = [
                 ((points @ rotation.T + shift).astype(np.float32) if move else points, kind)
-                for points, kind in view
+                for points, kind in objects
             ]
             ids.append(merging.merge(graph, frame(stamp, *moved)))
         means = graph.nodes.means if not move else (graph.nodes.means - shift) @ rotation

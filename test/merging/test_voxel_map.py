@@ -25,20 +25,21 @@ def neighbourhood(cell: tuple[int, ...]) -> list[tuple[int, ...]]:
     return [tuple(c + s for c, s in zip(cell, step)) for step in steps]
 
 
-def reference_overlap(seen: set[tuple[int, ...]], known: set[tuple[int, ...]]) -> float:
+def reference_overlaps(
+    seen: set[tuple[int, ...]], known: set[tuple[int, ...]]
+) -> tuple[float, float]:
     on_owner = sum(any(cell in known for cell in neighbourhood(c)) for c in seen)
     met = {cell for c in seen for cell in neighbourhood(c)} & known
-    overlap = on_owner / len(seen) if seen else 0.0
-    if on_owner and len(known) >= MIN_OWNER_CELLS:
-        overlap = max(overlap, len(met) / len(known))
-    return overlap
+    if not on_owner:
+        return 0.0, 0.0
+    return on_owner / len(seen), len(met) / len(known) if len(known) >= MIN_OWNER_CELLS else 0.0
 
 
-def dense(owners: np.ndarray, overlaps: np.ndarray, owner_count: int) -> np.ndarray:
-    """Overlap fractions (n, owner_count), including owners that no set meets."""
-    assert (overlaps > 0).any(axis=0).all()
-    result = np.zeros((len(overlaps), owner_count))
-    result[:, owners] = overlaps
+def dense(owners: list[int], on: np.ndarray, of: np.ndarray, owner_count: int) -> np.ndarray:
+    """Both overlap fractions (2, n, owner_count), including owners that no set meets."""
+    assert (on > 0).any(axis=0).all()
+    result = np.zeros((2, len(on), owner_count))
+    result[:, :, owners] = on, of
     return result
 
 
@@ -61,8 +62,8 @@ def test_overlaps_equal_the_reference(seed: int) -> None:
     overlaps = dense(*surfaces.overlaps(surfaces.cells_of(sets)), 3)
     for row, points in enumerate(sets):
         for owner in range(3):
-            expected = reference_overlap(cells_of(points), known[owner])
-            assert overlaps[row, owner] == pytest.approx(expected, abs=1e-12)
+            expected = reference_overlaps(cells_of(points), known[owner])
+            assert overlaps[:, row, owner] == pytest.approx(expected, abs=1e-12)
     for owner in range(3):
         assert len(surfaces.centres(owner)) == len(known[owner])
 
@@ -85,12 +86,12 @@ def test_growing_keeps_all_cells_and_a_removed_owner_has_none() -> None:
     count = len(surfaces.centres(0))
     removed = surfaces.remove(0)
     assert len(surfaces.centres(0)) == 0
-    after = dense(*surfaces.overlaps(sets), 2)
+    after = dense(*surfaces.overlaps(sets), 2)[0]
     assert after[0, 0] == after[1, 0] == 0.0
     assert after[1, 1] == 1.0
     surfaces.add([2], removed)
     assert len(surfaces.centres(2)) == count
-    assert dense(*surfaces.overlaps(sets), 3)[0].tolist() == [0.0, after[0, 1], 1.0]
+    assert dense(*surfaces.overlaps(sets), 3)[0, 0].tolist() == [0.0, after[0, 1], 1.0]
 
 
 def test_the_number_of_cells_of_an_owner_is_limited() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from support.gaussians import moments
 from support.merging import VOCABULARY
@@ -54,11 +56,34 @@ WALL_M = 1.0  # depth of the wall behind the objects
 HERE = slab((0.3, 0.1, 0.7), (0.08, 0.08, 0.06))
 
 
+def pixels_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of points in the depth grid of a camera at the origin, along z."""
+    columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)
+    rows = np.floor((300 * points[:, 1] / points[:, 2] + 239.5) / 8).astype(int)
+    return rows, columns
+
+
 def depth_grid(*surfaces: np.ndarray, background_m: float = WALL_M) -> DepthGrid:
     """Depth grid of points in front of a wall, from a camera at the origin that points along z."""
     depth_mm = np.full((60, 80), background_m * 1000, np.uint16)
     for points in surfaces:
-        columns = np.floor((300 * points[:, 0] / points[:, 2] + 319.5) / 8).astype(int)
-        rows = np.floor((300 * points[:, 1] / points[:, 2] + 239.5) / 8).astype(int)
-        np.minimum.at(depth_mm, (rows, columns), (points[:, 2] * 1000).astype(np.uint16))
+        np.minimum.at(depth_mm, pixels_of(points), (points[:, 2] * 1000).astype(np.uint16))
     return DepthGrid(depth_mm, 8, CAMERA)
+
+
+def view(stamp: int, *objects: tuple[np.ndarray, int | None], **changes) -> LocalGraph:
+    """A local graph with its depth grid: what is seen of objects from the origin, along z.
+
+    An object without a class is not detected: the masks of those behind it include it.
+    """
+    surfaces = [points for points, _ in objects]
+    grid = depth_grid(*surfaces)
+    instances = np.zeros_like(grid.depth_mm)
+    found = [(points, kind) for points, kind in objects if kind is not None]
+    for value, (points, _) in sorted(
+        enumerate(found, 1), key=lambda item: -float(item[1][0][:, 2].mean())
+    ):
+        instances[pixels_of(points)] = value
+    return frame(
+        stamp, *found, depth_grid=dataclasses.replace(grid, instances=instances), **changes
+    )
