@@ -24,6 +24,7 @@ from deworldsg_ros.merging.matching import (
     CLASS_WEIGHT,
     GAUSSIAN_WEIGHT,
     MAX_DEVIATIONS,
+    MIN_FRACTION_OTHER_CLASS,
     OVERLAP_THRESHOLD_OTHER_CLASS,
     Matches,
     match,
@@ -61,14 +62,14 @@ def test_match_scores_equal_the_formulas(seed: int) -> None:
         agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
         same = agreement > CLASS_AGREEMENT
         fractions = on_nodes[index, column], covered[index, column]
-        overlap = max(fractions) if same else min(fractions)
+        overlap, alike = max(fractions), same or min(fractions) >= MIN_FRACTION_OTHER_CLASS
         threshold = OVERLAP_THRESHOLD if same else OVERLAP_THRESHOLD_OTHER_CLASS
         ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
         difference = local.means_world[index] - nodes.means[row]
         apart = min(deviations(difference, ours), deviations(difference, theirs))
         distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
         score = overlap + CLASS_WEIGHT * agreement + GAUSSIAN_WEIGHT * np.exp(-distance)
-        possible = overlap >= threshold and apart <= MAX_DEVIATIONS
+        possible = overlap >= threshold and alike and apart <= MAX_DEVIATIONS
         assert matches.scores[index, column] == pytest.approx(score if possible else 0.0, abs=1e-9)
         assert matches.touching[index, column] == same
     assert matches.columns == one_to_one(matches.scores)
