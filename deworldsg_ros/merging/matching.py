@@ -16,9 +16,9 @@ from deworldsg_ros.scene.nodes import NodeTable
 # Minimum overlap of a match whose classes differ. Without a match of different classes, labels that
 # flip create nodes of their own (docs/dev/notebook.md).
 OVERLAP_THRESHOLD_OTHER_CLASS = 0.55
-# If the classes differ, at least this fraction of the object lies on the node, and of what is seen of
-# the node in the object: a book on a chair covers less of it. With all faults at once, a rendered
-# room keeps 50 % of its relations at 0.15, 61 % at 0.25 and 60 % at 0.4.
+# If the classes differ, at least this fraction of the object lies on the node, and of what is seen
+# of the node in the object: a book on a chair covers less of it. With all faults at once, a
+# rendered room keeps 50 % of its relations at 0.15, 61 % at 0.25 and 60 % at 0.4.
 MIN_FRACTION_OTHER_CLASS = 0.25
 # Classes agree if two labels, one drawn from each distribution, are equal with this probability.
 CLASS_AGREEMENT = 0.3
