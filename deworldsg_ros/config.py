@@ -126,12 +126,6 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confirm_observations: Annotated[
         int, option("minimum observations of a confirmed node (surface rule)", ge=1, le=1000)
     ] = 3
-    align_poses: Annotated[
-        bool,
-        option(
-            "align each frame with the graph before merging; for poses that drift (surface rule)"
-        ),
-    ] = False
 
 
 class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,7 +13,7 @@ from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import check_pose
+from deworldsg_ros.scene.camera import check_pose, invert_pose
 from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
@@ -103,7 +103,8 @@ class GraphBuilder:
         """Move the nodes first seen since a stamp, after a loop closure corrected the poses.
 
         Older nodes stay, also those seen again since: see `scene.correction`. Frames to come must
-        have corrected poses.
+        have corrected poses. The nodes already contain the drift that merging has corrected; this
+        part is taken back.
 
         Args:
             T_correction: (4, 4), from the old world frame to the corrected one.
@@ -116,6 +117,7 @@ class GraphBuilder:
             RefusedInput: ``invalid_pose`` if it is no rigid transform.
         """
         check_pose(T_correction)
+        T_correction = T_correction @ invert_pose(self.merging.pose_correction())
         node_ids = nodes_since(self.graph, since_ns)
         for node_id in node_ids:
             self.graph.move_node(node_id, T_correction)

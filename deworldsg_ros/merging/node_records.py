@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.merging.absence import AbsenceEvidence
-from deworldsg_ros.merging.alignment import PoseAlignment
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.coverage import coverage
+from deworldsg_ros.merging.drift import Drift
 from deworldsg_ros.merging.existence import Existence
 from deworldsg_ros.merging.joint import JointEvidence
 from deworldsg_ros.merging.limits import LifeCycleLimits
@@ -35,7 +35,7 @@ class NodeRecords:
         existence: evidence that a node is an object.
         absence: evidence that an object is absent from its position.
         changed: owners whose surface has changed since `absence` sampled it.
-        alignment: correction of drifting poses.
+        drift: correction of the poses.
     """
 
     def __init__(self, confirm_observations: int, limits: LifeCycleLimits) -> None:
@@ -45,7 +45,7 @@ class NodeRecords:
         self.existence = Existence(confirm_observations, limits)
         self.absence = AbsenceEvidence(limits.absent_frames)
         self.changed: set[int] = set()
-        self.alignment = PoseAlignment()
+        self.drift = Drift()
 
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
@@ -75,7 +75,6 @@ class NodeRecords:
         """Drop all records of a node; returns its cells, as one set."""
         owner = self.owners.remove(node_id)
         self.existence.forget(owner)
-        self.alignment.forget(node_id)
         self.joint.forget(owner)
         self.absence.forget(owner)
         self.changed.discard(owner)
@@ -84,7 +83,6 @@ class NodeRecords:
     def rename(self, old_id: int, new_id: int) -> None:
         """Continue the records of a node under another id."""
         self.owners.rename(old_id, new_id)
-        self.alignment.forget(old_id)
 
     def merge(self, kept_id: int, removed_id: int) -> None:
         """Combine the records of two nodes that are one object."""
@@ -158,8 +156,8 @@ class NodeRecords:
 
         Their scores start again at 0: rotated cells do not lie on cells.
         """
-        # After a pose-graph correction, reset the alignment offset.
-        self.alignment = PoseAlignment()
+        # After a pose-graph correction, the correction of the poses starts again.
+        self.drift = Drift()
         for node_id in node_ids:
             owner = self.owners.find(node_id)
             if owner is None:  # a lost node has no cells

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.nearest import (
@@ -47,6 +49,10 @@ class PaperMerging:
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """Does nothing: the rule has no state besides the graph."""
+
+    def pose_correction(self) -> Float64:
+        """See `Merging.pose_correction`."""
+        return np.eye(4)
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Does nothing: the rule has no state besides the graph."""

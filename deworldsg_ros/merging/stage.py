@@ -48,6 +48,10 @@ class Merging(Protocol):
         """
         ...
 
+    def pose_correction(self) -> Float64:
+        """(4, 4) from the world of the newest poses to the graph's: drift that is corrected."""
+        ...
+
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Update the state of nodes that a pose-graph correction (4, 4) moved in the graph."""
         ...

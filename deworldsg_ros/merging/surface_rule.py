@@ -43,8 +43,7 @@ class SurfaceMerging:
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
         self._records.warm_up()
-        if self._config.align_poses:
-            self._records.alignment.warm_up()
+        self._records.drift.warm_up()
         warm_up_matching()
         warm_up_graph()
 
@@ -55,8 +54,7 @@ class SurfaceMerging:
         """
         check_fits(graph, local)
         records = self._records
-        if self._config.align_poses:
-            local = records.alignment.align(graph, local)
+        local = records.drift.align(local)
         cells = records.map.cells_of(local.surface_points_world)
         owners, on_nodes, of_nodes = records.map.overlaps(cells)
         rows = np.array(records.rows(graph, owners), np.int64)
@@ -94,6 +92,10 @@ class SurfaceMerging:
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """See `Merging.restore`."""
         self._records.restore(graph, memory)
+
+    def pose_correction(self) -> Float64:
+        """See `Merging.pose_correction`."""
+        return self._records.drift.T_graph_poses
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""

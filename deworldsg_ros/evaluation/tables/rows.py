@@ -118,7 +118,6 @@ HARD = (
 SWITCHES = (
     ("default", "default", ()),
     ("paper", "association of the paper", ("merging.association=paper",)),
-    ("align", "pose alignment", ("merging.align_poses=true",)),
     ("confirmed", "nodes confirmed at once", ("merging.confirm_observations=1",)),
     ("mask", "all mask pixels", ("lifting.pixels=mask",)),
     ("belief", "edge belief of the paper", ("relations.edge_belief=paper",)),

@@ -1,0 +1,312 @@
+"""A map of surfels, small planes of the depth images, that frames are registered with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel, read_only
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
+from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.frame_graph import DepthGrid
+
+# A full map drops the half that was not in view for the longest time. A room needs 10 000.
+MAX_SURFELS = 20_000
+# At most this number of surfels is compared with a frame; fewer than MIN_MATCHES decide nothing.
+SAMPLES, MIN_MATCHES = 400, 100
+# Maximum distance of a surfel from the depth image in each Gauss-Newton step: coarse, then fine.
+REACHES_M = (0.3, 0.2, 0.1, 0.1)
+# Weight of no motion, as a fraction of the mean weight of a translation axis. A radian weighs as
+# much as RADIAN_M metres: the usual distance of surfaces.
+DAMPING, RADIAN_M = 0.03, 2.5
+JOINT = np.array([RADIAN_M**2] * 3 + [1.0] * 3)  # squared rotation and translation, in m²
+# Standard deviation of depth, metres: constant, and times squared depth (structured light).
+# Residuals beyond OUTLIER of them have small weights (Cauchy).
+NOISE_M, NOISE_PER_M, OUTLIER = 0.004, 0.002, 3.0
+# Depth is used in this range: noise grows with its square.
+NEAR_M, FAR_M = 0.2, 4.0
+# A surfel covers this distance around it. It moves onto depth at most ON_M away.
+SURFEL_M, ON_M = 0.05, 0.05
+# A surfel is the mean of its first MAX_COUNT frames: a map that follows its frames would drift
+# with them. Beyond TRUSTED of them, its weight grows no more.
+MAX_COUNT, TRUSTED = 50.0, 10.0
+# Inverse depth is linear on a plane; if it bends by more than this fraction, there is an edge.
+MAX_BEND = 0.02
+
+# fx, fy, cx, cy in pixels of a depth grid, and that grid.
+_View = tuple[float, float, float, float, UInt16]
+
+
+class SurfelMap:
+    """Surfels: position, normal (metres, world frame), number of frames, newest frame."""
+
+    def __init__(self) -> None:
+        self._rows = np.zeros((0, 8))
+        self._count = self._frame = 0
+        self._seen = np.zeros(0, np.int64)
+
+    def register(self, T_world_camera: Float64, grid: DepthGrid) -> Float64 | None:
+        """The pose (4, 4) near a given one at which a frame fits the map; None if unknown.
+
+        Gauss-Newton on the distances of the frame's depth from the planes of the surfels in view,
+        projected into the frame. Directions that these planes leave open are not corrected.
+        """
+        view, rows = _view(grid), self._rows[: self._count]
+        self._seen = _in_view(rows, invert_pose(T_world_camera), view)
+        sample = self._seen[:: max(1, len(self._seen) // SAMPLES)]
+        T, matches = _fit(rows, sample, T_world_camera, view)
+        return T if matches >= MIN_MATCHES else None
+
+    def add(self, T_world_camera: Float64, grid: DepthGrid) -> None:
+        """Fuse a frame; call `register` before."""
+        new = grid.depth_mm.size // 4
+        if self._count + new > MAX_SURFELS:
+            newest = np.argsort(-self._rows[: self._count, 7], kind="stable")[: MAX_SURFELS // 2]
+            self._count = len(newest)
+            self._rows[: self._count] = self._rows[newest]
+            self._seen = np.zeros(0, np.int64)
+        if self._count + new > len(self._rows):
+            more = np.zeros((len(self._rows) + 4 * new, 8))
+            self._rows = np.concatenate((self._rows, more))
+        self._frame += 1
+        arguments = T_world_camera, invert_pose(T_world_camera), _view(grid), self._frame
+        self._count = _fuse(self._rows, self._count, self._seen, *arguments)
+
+
+@kernel
+def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
+    """A rotation vector about the camera and a translation (6,), world axes, as (4, 4)."""
+    T, angle = np.eye(4), np.sqrt((step[:3] ** 2).sum())
+    if angle > 0:
+        x, y, z = step[0] / angle, step[1] / angle, step[2] / angle
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        T[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    for i in range(3):
+        T[i, 3] = step[3 + i] + T_world_camera[i, 3]
+        for j in range(3):
+            T[i, 3] -= T[i, j] * T_world_camera[j, 3]
+    return T
+
+
+@kernel
+def difference(T_a: Float64, T_b: Float64) -> Float64:
+    """The step (6,) of `about_camera` from camera pose a to b."""
+    R = T_b[:3, :3].copy() @ T_a[:3, :3].T.copy()
+    step, double_sine = np.empty(6), 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        step[i], step[3 + i] = R[k, j] - R[j, k], T_b[i, 3] - T_a[i, 3]
+        double_sine += step[i] ** 2
+    double_sine = np.sqrt(double_sine)
+    angle = np.arctan2(double_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    step[:3] *= angle / double_sine if double_sine > 1e-12 else 0.5
+    return step
+
+
+def _view(grid: DepthGrid) -> _View:
+    camera, stride = grid.intrinsics, grid.stride_px
+    cx, cy = (camera.cx - stride // 2) / stride, (camera.cy - stride // 2) / stride
+    return camera.fx / stride, camera.fy / stride, cx, cy, read_only(grid.depth_mm)
+
+
+@kernel
+def _pixel(T: Float64, surfel: Float64, view: _View) -> tuple[int, int, float, float]:
+    """Row and column of a surfel, its depth and the measured one, metres; row -1 if not in view."""
+    fx, fy, cx, cy, depth_mm = view
+    x, y, z = surfel[0], surfel[1], surfel[2]
+    ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if ahead < NEAR_M:
+        return -1, 0, ahead, 0.0
+    right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    column, row = int(fx * right / ahead + cx + 0.5), int(fy * down / ahead + cy + 0.5)
+    if row < 0 or column < 0 or row >= depth_mm.shape[0] or column >= depth_mm.shape[1]:
+        return -1, 0, ahead, 0.0
+    measured = 0.001 * depth_mm[row, column]
+    return (row if measured > NEAR_M else -1), column, ahead, measured
+
+
+@kernel
+def _in_view(rows: Float64, T_camera_world: Float64, view: _View) -> Int64:
+    """Indices of the surfels in view that the depth image does not hide."""
+    indices, count = np.empty(len(rows), np.int64), 0
+    for index in range(len(rows)):
+        row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
+        if row >= 0 and depth < measured + REACHES_M[0]:
+            indices[count] = index
+            count += 1
+    return indices[:count]
+
+
+@kernel
+def _ray(row: int, column: int, view: _View) -> tuple[float, float, float]:
+    fx, fy, cx, cy, depth_mm = view
+    z = 0.001 * depth_mm[row, column]
+    return (column - cx) / fx * z, (row - cy) / fy * z, z
+
+
+@kernel
+def _turned(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
+
+
+@kernel
+def _system(
+    rows: Float64, sample: Int64, T: Float64, view: _View, reach_m: float
+) -> tuple[Float64, Float64, int]:
+    """Normal equations (6, 6) and (6,) of one point-to-plane step, and the number of matches."""
+    hessian, gradient, jacobian, matches = np.zeros((6, 6)), np.zeros(6), np.empty(6), 0
+    inverse = np.zeros((3, 4))
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] = T[j, i]
+            inverse[i, 3] -= T[j, i] * T[j, 3]
+    for index in sample:
+        surfel = rows[index]
+        row, column, _, measured = _pixel(inverse, surfel, view)
+        if row < 0 or measured > FAR_M:
+            continue
+        x, y, z = _ray(row, column, view)
+        x, y, z = _turned(T, x, y, z)
+        a, b, c = surfel[0] - T[0, 3] - x, surfel[1] - T[1, 3] - y, surfel[2] - T[2, 3] - z
+        distance = a * surfel[3] + b * surfel[4] + c * surfel[5]
+        if abs(distance) > reach_m or a * a + b * b + c * c > 4 * reach_m**2:
+            continue
+        noise_m = NOISE_M + NOISE_PER_M * measured**2
+        outlier_m = OUTLIER * noise_m * reach_m / REACHES_M[-1]
+        weight = min(surfel[6], TRUSTED) / (1 + (distance / outlier_m) ** 2) / noise_m**2
+        jacobian[0] = y * surfel[5] - z * surfel[4]
+        jacobian[1] = z * surfel[3] - x * surfel[5]
+        jacobian[2] = x * surfel[4] - y * surfel[3]
+        for i in range(6):
+            if i > 2:
+                jacobian[i] = surfel[i]
+            gradient[i] += weight * distance * jacobian[i]
+            for j in range(i + 1):
+                hessian[i, j] += weight * jacobian[i] * jacobian[j]
+        matches += 1
+    for i in range(6):
+        for j in range(i):
+            hessian[j, i] = hessian[i, j]
+    return hessian, gradient, matches
+
+
+@kernel
+def _fit(rows: Float64, sample: Int64, T: Float64, view: _View) -> tuple[Float64, int]:
+    """The pose that fits, and the number of matches in the last step."""
+    matches = 0
+    for reach_m in REACHES_M:
+        hessian, gradient, matches = _system(rows, sample, T, view, reach_m)
+        if matches < MIN_MATCHES:
+            break
+        mean = (hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / 3
+        for i in range(6):
+            hessian[i, i] += DAMPING * mean * (RADIAN_M**2 if i < 3 else 1.0)
+        step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
+        T = about_camera(step, T) @ T
+    return T, matches
+
+
+@kernel
+def _normal(row: int, column: int, view: _View) -> tuple[float, float, float]:
+    """Unit normal of the depth image at a pixel, camera axes; zero at edges."""
+    depth_mm = view[4]
+    if not (0 < row < depth_mm.shape[0] - 1 and 0 < column < depth_mm.shape[1] - 1):
+        return 0.0, 0.0, 0.0
+    a, b = depth_mm[row, column - 1], depth_mm[row, column + 1]
+    c, d = depth_mm[row - 1, column], depth_mm[row + 1, column]
+    if min(a, b, c, d, depth_mm[row, column]) == 0:
+        return 0.0, 0.0, 0.0
+    middle = 2.0 / depth_mm[row, column]
+    if max(abs(1 / a + 1 / b - middle), abs(1 / c + 1 / d - middle)) > MAX_BEND * middle:
+        return 0.0, 0.0, 0.0
+    (ax, ay, az), (bx, by, bz) = _ray(row, column - 1, view), _ray(row, column + 1, view)
+    (cx, cy, cz), (dx, dy, dz) = _ray(row - 1, column, view), _ray(row + 1, column, view)
+    ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, dx - cx, dy - cy, dz - cz
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+@kernel
+def _cover(covered: Bool, row: int, column: int, half: int) -> None:
+    """Mark the odd pixels at most `half` pixels away."""
+    for i in range(max(0, (row - half) // 2), min(len(covered), (row + half + 1) // 2)):
+        for j in range(
+            max(0, (column - half) // 2), min(covered.shape[1], (column + half + 1) // 2)
+        ):
+            covered[i, j] = True
+
+
+@kernel
+def _update(surfel: Float64, row: int, column: int, T: Float64, view: _View) -> bool:
+    """Average a surfel with a pixel; false if the pixel does not lie on its plane."""
+    x, y, z = _ray(row, column, view)
+    x, y, z = _turned(T, x, y, z)
+    x, y, z = x + T[0, 3] - surfel[0], y + T[1, 3] - surfel[1], z + T[2, 3] - surfel[2]
+    distance = x * surfel[3] + y * surfel[4] + z * surfel[5]
+    if abs(distance) > ON_M or x * x + y * y + z * z > REACHES_M[0] ** 2:
+        return False
+    if surfel[6] < MAX_COUNT:
+        share = 1.0 / (surfel[6] + 1.0)
+        for axis in range(3):
+            surfel[axis] += share * distance * surfel[3 + axis]
+        x, y, z = _normal(row, column, view)
+        if x * x + y * y + z * z > 0:
+            x, y, z = _turned(T, x, y, z)
+            x = (1.0 - share) * surfel[3] + share * x
+            y = (1.0 - share) * surfel[4] + share * y
+            z = (1.0 - share) * surfel[5] + share * z
+            length = np.sqrt(x * x + y * y + z * z)
+            surfel[3], surfel[4], surfel[5] = x / length, y / length, z / length
+        surfel[6] += 1.0
+    return True
+
+
+@kernel
+def _fuse(
+    rows: Float64,
+    count: int,
+    seen: Int64,
+    T: Float64,
+    T_camera_world: Float64,
+    view: _View,
+    frame: int,
+) -> int:
+    """Update the surfels in view, and add new ones where there are none; returns their number."""
+    depth_mm = view[4]
+    covered = np.zeros((depth_mm.shape[0] // 2, depth_mm.shape[1] // 2), np.bool_)
+    for index in seen[::-1]:
+        surfel = rows[index]
+        row, column, depth, measured = _pixel(T_camera_world, surfel, view)
+        if row < 0:
+            continue
+        if measured > depth + REACHES_M[0]:  # seen through: the surface is gone
+            surfel[6] *= 0.8
+            if surfel[6] < 0.5:
+                count -= 1
+                rows[index] = rows[count]
+        elif measured <= FAR_M and _update(surfel, row, column, T, view):
+            surfel[7] = frame
+            _cover(covered, row, column, int(SURFEL_M * view[0] / depth))
+    for i in range(covered.shape[0]):
+        for j in range(covered.shape[1]):
+            row, column = 2 * i + 1, 2 * j + 1
+            depth = 0.001 * depth_mm[row, column]
+            if covered[i, j] or not NEAR_M < depth < FAR_M:
+                continue
+            x, y, z = _normal(row, column, view)
+            if x * x + y * y + z * z == 0:
+                continue
+            surfel = rows[count]
+            surfel[3], surfel[4], surfel[5] = _turned(T, x, y, z)
+            x, y, z = _ray(row, column, view)
+            x, y, z = _turned(T, x, y, z)
+            surfel[0], surfel[1], surfel[2] = x + T[0, 3], y + T[1, 3], z + T[2, 3]
+            surfel[6], surfel[7] = 1.0, frame
+            count += 1
+            _cover(covered, row, column, int(SURFEL_M * view[0] / depth))
+    return count
