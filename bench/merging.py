@@ -195,7 +195,7 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     tracemalloc.start()
     graph = graph_of(world)
     config = MergingConfig(association=association)
-    merging = build_merging(config)
+    merging = build_merging(config, min_existence=0.5)
     merging.restore(graph, {})
     for local in frames:
         merging.merge(graph, local)
@@ -203,7 +203,7 @@ def bench_stage(association: Literal["paper", "surface"], count: int, rounds: in
     tracemalloc.stop()
     graph = graph_of(world)
     before = len(graph)
-    merging = build_merging(config)
+    merging = build_merging(config, min_existence=0.5)
     merging.restore(graph, {})
     times = [milliseconds(lambda frame=local: merging.merge(graph, frame)) for local in frames]
     after = len(graph)
@@ -225,7 +225,7 @@ def main() -> None:
     for count, rounds in ((100, 20),) if quick else ((100, 200), (1000, 40), (10_000, 8)):
         bench_search(count, rounds)
     for association in ("paper", "surface"):
-        build_merging(MergingConfig(association=association)).warm_up()
+        build_merging(MergingConfig(association=association), min_existence=0.5).warm_up()
         for count in (100,) if quick else (300, 1000):
             bench_stage(association, count, rounds=20 if quick else 300)
 

@@ -123,9 +123,6 @@ class MergingConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "minimum overlap fraction of a match whose classes agree (surface rule)", gt=0, le=1
         ),
     ] = 0.3
-    confirm_observations: Annotated[
-        int, option("minimum observations of a confirmed node (surface rule)", ge=1, le=1000)
-    ] = 3
 
 
 class RelationsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -265,9 +262,14 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "number of classes per node and predicates per edge, most probable first", ge=1, le=1000
         ),
     ] = 5
-    include_tentative: Annotated[
-        bool, option("publish tentative nodes too (the paper has none)")
-    ] = False
+    min_existence: Annotated[
+        float,
+        option(
+            "minimum probability of a published node that it is an object (surface rule); 0 = all",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.5
     include_surface_points: Annotated[
         bool, option("publish the surface points of each node (large messages)")
     ] = False

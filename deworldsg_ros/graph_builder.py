@@ -8,7 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.merging.common import check_fits
 from deworldsg_ros.merging.stage import build_merging
+from deworldsg_ros.poses.drift import Drift
+from deworldsg_ros.relations import pair_geometry
 from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
@@ -51,13 +54,14 @@ class GraphBuilder:
             prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         output = config.output
         self.graph = graph
-        self.merging = build_merging(config.merging)
+        self.merging = build_merging(config.merging, output.min_existence)
+        # The paper takes poses as they are.
+        self._drift = Drift() if config.merging.association == "surface" else None
         self._edges = EdgeBeliefs(config, graph, prior)
         self._publication = Publication(
             graph,
             self._edges.states,
             top_k=output.top_k,
-            include_tentative=output.include_tentative,
             include_surface_points=output.include_surface_points,
         )
         self._newest_ns: int | None = None
@@ -77,6 +81,11 @@ class GraphBuilder:
         """Number of confirmed nodes."""
         return int(self.graph.nodes.confirmed.sum())
 
+    @property
+    def hidden(self) -> dict[str, int]:
+        """Number of nodes that are not published, by reason, in words."""
+        return self.merging.hidden(self.graph)
+
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.
 
@@ -89,6 +98,9 @@ class GraphBuilder:
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
+        if self._drift is not None:
+            check_fits(self.graph, local)
+            local = self._drift.align(local)
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
         self._edges.observe(local, node_ids)
         self._newest_ns = local.stamp_ns
@@ -103,8 +115,8 @@ class GraphBuilder:
         """Move the nodes first seen since a stamp, after a loop closure corrected the poses.
 
         Older nodes stay, also those seen again since: see `scene.correction`. Frames to come must
-        have corrected poses. The nodes already contain the drift that merging has corrected; this
-        part is taken back.
+        have corrected poses. The nodes already contain the drift that was corrected; this part is
+        taken back.
 
         Args:
             T_correction: (4, 4), from the old world frame to the corrected one.
@@ -117,7 +129,9 @@ class GraphBuilder:
             RefusedInput: ``invalid_pose`` if it is no rigid transform.
         """
         check_pose(T_correction)
-        T_correction = T_correction @ invert_pose(self.merging.pose_correction())
+        if self._drift is not None:
+            T_correction = T_correction @ invert_pose(self._drift.T_graph_poses)
+            self._drift = Drift()
         node_ids = nodes_since(self.graph, since_ns)
         for node_id in node_ids:
             self.graph.move_node(node_id, T_correction)
@@ -135,6 +149,13 @@ class GraphBuilder:
     def full(self) -> wire.SceneGraphMessage:
         """The present graph with surface points; the next `update` is unaffected."""
         return self._publication.full()
+
+
+def warm_up(config: Config) -> None:
+    """Compile the kernels before the first frame."""
+    build_merging(config.merging, config.output.min_existence).warm_up()
+    Drift().warm_up()
+    pair_geometry.warm_up()
 
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def write_map(builder: GraphBuilder, path: Path) -> None:
 def read_map(config: Config, path: Path) -> GraphBuilder:
     """Continue with the graph of a map; the first `GraphBuilder.update` contains all of it.
 
-    Tentative nodes are dropped: they were never published.
+    Hidden nodes are dropped: they are not published.
 
     Raises:
         ConfigurationError: if the file is no map.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.merging import set_confirmed
 
 from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -105,7 +106,7 @@ def change(builder: GraphBuilder, generator: np.random.Generator) -> None:
     elif kind == "observe":
         graph.observe(one, np.zeros(3), np.eye(3), generator.dirichlet(np.ones(3)), 2)
     elif kind == "confirm":
-        graph.set_confirmed(one, bool(generator.integers(2)))
+        set_confirmed(graph, one, bool(generator.integers(2)))
     elif kind == "add" or len(graph) < 4:
         add_node(builder, float(generator.integers(9)), bool(generator.integers(2)))
     elif kind == "merge":

@@ -11,7 +11,7 @@ import pytest
 from support.merging import VOCABULARY, random_local_graphs
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
-from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.relations.prior import ClassPairPrior
@@ -30,7 +30,10 @@ def builder_of(**merging: object) -> GraphBuilder:
 
 
 def config_of(**merging: object) -> Config:
-    return Config(merging=MergingConfig(**merging))  # type: ignore[arg-type]
+    return Config(
+        merging=MergingConfig(**merging),  # type: ignore[arg-type]
+        output=OutputConfig(min_existence=0.0),
+    )
 
 
 def saved(builder: GraphBuilder, folder: Path) -> Path:
@@ -41,8 +44,8 @@ def saved(builder: GraphBuilder, folder: Path) -> Path:
 @pytest.mark.parametrize("association", ["surface", "paper"])
 @pytest.mark.parametrize("seed", range(4))
 def test_continuing_from_a_map_equals_not_stopping(tmp_path, association, seed):
-    # A map leaves out tentative nodes. Here every node is confirmed.
-    config = config_of(association=association, confirm_observations=1)
+    # A map leaves out hidden nodes. Here every node is published.
+    config = config_of(association=association)
     frames = random_local_graphs(np.random.default_rng(seed), 60)
     whole = GraphBuilder(config, VOCABULARY, "world")
     for local in frames[:30]:
@@ -109,8 +112,8 @@ def test_an_up_direction_that_is_none_is_refused(tmp_path):
         read_map(Config(), path)
 
 
-def test_tentative_nodes_are_dropped_and_ids_continue(tmp_path):
-    builder = builder_of()
+def test_hidden_nodes_are_dropped_and_ids_continue(tmp_path):
+    builder = GraphBuilder(Config(), VOCABULARY, "world")
     for stamp in range(1, 5):
         builder.integrate(frame(stamp, (WHOLE, TABLE)))
     assert builder.integrate(frame(5, (WHOLE, TABLE), (MUG, CUP))) == [1, 2]
@@ -206,7 +209,7 @@ def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
 
     from deworldsg_ros.nodes.graph_node import GraphNode
 
-    values = {"map_path": str(tmp_path / "maps" / "room.map"), "output.include_tentative": True}
+    values = {"map_path": str(tmp_path / "maps" / "room.map"), "output.min_existence": 0.0}
     values |= {"merging.association": "paper"}
     options = {
         "parameter_overrides": [

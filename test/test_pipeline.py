@@ -178,20 +178,16 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
     assert refused.value.reason == "vocabulary_mismatch"
 
 
-def test_tentative_nodes_are_published_only_on_request() -> None:
-    merging = MergingConfig(confirm_observations=2)
-    pipeline = Pipeline(Config(merging=merging), Scripted())
-    asked = Pipeline(
-        Config(merging=merging, output=OutputConfig(include_tentative=True)), Scripted()
-    )
-    pipeline.process(frame(0))
-    asked.process(frame(0))
-    assert pipeline.graph().nodes == [] == pipeline.graph().edges
-    assert [node.confirmed for node in asked.graph().nodes] == [False] * 3
-    pipeline.process(frame(1))
-    asked.process(frame(1))
-    assert len(pipeline.graph().nodes) == 3
-    assert pipeline.graph().nodes == asked.graph().nodes
+def test_nodes_are_published_from_the_chosen_probability_on() -> None:
+    def published(min_existence: float) -> list[wire.NodeState]:
+        pipeline = Pipeline(Config(output=OutputConfig(min_existence=min_existence)), Scripted())
+        pipeline.process(frame(0))
+        assert pipeline.builder is not None
+        assert sum(pipeline.builder.hidden.values()) == 3 - len(pipeline.graph().nodes)
+        return pipeline.graph().nodes
+
+    assert len(published(0.0)) == 3 and published(1.0) == []
+    assert all(0.0 < node.existence < 1.0 for node in published(0.0))
 
 
 def test_the_timed_parts_of_perception_are_its_methods() -> None:

@@ -19,6 +19,7 @@ from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
+from deworldsg_ros.graph_builder import warm_up
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
@@ -29,7 +30,6 @@ from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.relations import pair_geometry
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
@@ -139,7 +139,7 @@ def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> 
     with working(console, LOADING):
         pipeline = Pipeline(config)
         pipeline.lifting.warm_up()
-        pair_geometry.warm_up()
+        warm_up(config)
     if map_path is not None and map_path.exists():
         pipeline.go_on_with(read_map(config, map_path))
         console.print(f"loaded the map {map_path}", highlight=False, soft_wrap=True)
@@ -228,6 +228,7 @@ def _report(
         "drops": {**drops, "objects": dict(pipeline.drops)},
         "losses": recording.losses,
         "nodes": len(graph.nodes),
+        "hidden_nodes": {} if pipeline.builder is None else pipeline.builder.hidden,
         "edges": len(graph.edges),
         "wall_s": round(processed.wall_s, 3),
         "frames_per_s": round(processed.frames_per_s, 2),
@@ -247,6 +248,9 @@ def _print_summary(
     frames = len(processed.poses)
     speed = f"{frames} frames in {processed.wall_s:.1f} s ({processed.frames_per_s:.1f} per second)"
     console.print(speed, highlight=False)
+    if pipeline.builder is not None and (hidden := pipeline.builder.hidden):
+        reasons = ", ".join(f"{count} {reason}" for reason, count in hidden.items())
+        console.print(f"hidden nodes (output.min_existence): {reasons}", highlight=False)
     if options.timings:
         _print_timings(console, pipeline.times_s, frames)
     outputs.print_files(console, options.out)

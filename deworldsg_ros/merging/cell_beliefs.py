@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.merging.absence import NEAR_M
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, TableArrays
+from deworldsg_ros.merging.views import NEAR_M
 from deworldsg_ros.scene.arrays import Float64, Int8, Int64, UInt16, UInt64
 
 # A cell is rejected if less than 60 % of the frames that saw it say that it is the owner's. With

@@ -1,8 +1,19 @@
-"""Evidence that a node is an object: how often it was detected when it was visible.
+"""The probability that a node is an object, from the looks at it.
 
-Frames from one camera position show one picture, and the errors of a detector in them are one
-error. So viewpoints are counted instead of frames. A viewpoint of a node lasts until the camera has
-moved by `baseline_deg` as seen from the node. It detected the node if any of its frames did.
+The frames of one camera position show one picture: the errors of a detector in them are one error.
+So looks are counted instead of frames. A look at a node ends when the camera has moved by LOOK_RAD
+as seen from the node, or after LOOK_NS. It detects the node by the fraction of its frames that do;
+frames in which the node is hidden or out of view do not count.
+
+The log odds of existence are a sum:
+
+    OFFSET + SCORE ln(s / (1 - s)) + LOOKS ln(D) - MISSES ln(1 + M) - MOMENT ln(1 + R)
+
+s is the best detection score, and D the sum of the detected fractions of all looks. M is the
+evidence of the misses: the sum of -(1 - fraction) ln(1 - rate), where `rate` is the fraction of
+looks that detect an object of which as much is visible; it is learned. R is the part of M since the
+last detection; it counts only if all detections lie within MOMENT_NS: a reflection or a shadow
+lasts for a moment. The weights are fitted by logistic regression (tools/merging_lab).
 """
 
 from __future__ import annotations
@@ -14,338 +25,201 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.merging.absence import FULL, VISIBILITIES
-from deworldsg_ros.merging.limits import LifeCycleLimits
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.merging.views import VISIBILITIES
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
-# A second viewpoint is required for at most this long, so that an object is confirmed well within
-# two seconds. A camera that stands still has one viewpoint only and does not wait.
-MAX_WAIT_NS = 500_000_000
-# The camera stands still if it moves less than this.
+OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
+MIN_SCORE, MAX_SCORE = 0.02, 0.5
+LOOK_RAD = math.radians(2.0)
+LOOK_NS = 500_000_000
+MOMENT_NS = 1_000_000_000
+MAX_WEIGHT = 2.0
+# The camera stands still if it moves less than this. A look that only time has ended shows the same
+# picture: it counts as this fraction of a look.
 STILL_M = 0.001
+STILL_WEIGHT = 0.25
 # Beyond the largest distance of a detection, by this factor, a miss is not counted.
 REACH_FACTOR = 1.1
-# Without a detection of `confirm_score`, a node needs this many times the observations.
-LOW_SCORE_FACTOR = 4
-# A false detection lasts for a moment: a reflection, a shadow. If all detections of a node lie
-# within MOMENT_NS, it becomes tentative when the probability that an object would have been missed
-# ever since falls below MISS_PROBABILITY.
-MOMENT_NS = 1_000_000_000
-MISS_PROBABILITY = 0.05
-# The detection rate of objects is learned. At first, PRIOR_VIEWPOINTS viewpoints count as observed,
-# and half of them as having detected the object.
-PRIOR_VIEWPOINTS = 10.0
+# The rates start as if this many looks had been observed, and half of them had detected the object.
+PRIOR_LOOKS = 10.0
 
-RECORD = np.dtype(
-    [
-        ("detections", np.int64),
-        # Largest distance of a detection, and best score.
-        ("reach_m", np.float64),
-        ("best_score", np.float64),
-        ("first_ns", np.int64),
-        ("last_ns", np.int64),
-        # Number of past viewpoints, and of those that detected the node.
-        ("viewpoints", np.int64),
-        ("detecting", np.int64),
-        # The present viewpoint: whether it detected the node, its position, its start, and its best
-        # visibility of the node.
-        ("is_detecting", np.bool_),
-        ("camera_world", np.float64, 3),
-        ("viewpoint_ns", np.int64),
-        ("visibility", np.int64),
-        # Probability that an object is missed from all past viewpoints since the last detection.
-        ("miss_probability", np.float64),
-        # Whether the camera has moved since the first detection.
-        ("has_moved", np.bool_),
-    ],
-    align=True,
-)
+# The part of a node's record that belongs to its existence.
+FIELDS: list[Any] = [
+    ("best_score", np.float64),
+    # D, M and R of the looks that have ended.
+    ("looks", np.float64),
+    ("missed", np.float64),
+    ("missed_since", np.float64),
+    # First and last detection, and the largest distance of one.
+    ("first_ns", np.int64),
+    ("last_ns", np.int64),
+    ("reach_m", np.float64),
+    # The present look: position and start, frames that detected the node and all frames that show
+    # it, its best visibility, and its weight.
+    ("camera_world", np.float64, 3),
+    ("look_ns", np.int64),
+    ("detected", np.float64),
+    ("shown", np.float64),
+    ("visibility", np.int64),
+    ("look_weight", np.float64),
+    # Looks since the last detection, by visibility.
+    ("pending", np.float64, len(VISIBILITIES)),
+]
 
 
-class Existence:
-    """Counts the viewpoints of each owner, and those that detected it.
+def first_counts() -> Float64:
+    """Looks at objects, and those that detected them, by visibility: (len(VISIBILITIES), 2)."""
+    return np.full((len(VISIBILITIES), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
+
+
+def frame_weight(step_ns: int | None) -> float:
+    """Part of a look that a frame is worth, by the time since the frame before (None = the first).
+
+    An error of a detector lasts for a moment. So frames at a high rate are worth less.
+    """
+    return MAX_WEIGHT if step_ns is None else min(MAX_WEIGHT, max(step_ns, 1) / LOOK_NS)
+
+
+@kernel
+def observe(
+    records: NDArray[Any],
+    counts: Float64,
+    owners: Int64,
+    scores: Float64,
+    visibilities: Int64,
+    means_world: Float64,
+    camera_world: Float64,
+    stamp_ns: int,
+    weight: float,
+) -> None:
+    """Add a frame to the looks at n nodes that it shows.
 
     Args:
-        confirm_observations: detections that confirm a node.
-        limits: further conditions.
-
-    Attributes:
-        counts_by_visibility: (len(VISIBILITIES), 2) float64, viewpoints of nodes that are known for
-            longer than a moment, and those of them that detected the node.
+        records: of all nodes, with `FIELDS`; those of the owners are updated.
+        counts: see `first_counts`; updated.
+        owners: (n,) index of each node's record.
+        scores: (n,) score of its detection; 0 = it was not detected.
+        visibilities: (n,) how much of it is visible.
+        means_world: (n, 3) means, metres.
+        camera_world: (3,) position of the camera, metres.
+        stamp_ns: of the frame.
+        weight: of the frame, see `frame_weight`.
     """
-
-    def __init__(self, confirm_observations: int, limits: LifeCycleLimits) -> None:
-        self._confirm_observations = confirm_observations
-        self._limits = limits
-        self._baseline_rad = math.radians(limits.baseline_deg)
-        self._records = np.zeros(0, RECORD)
-        prior = (PRIOR_VIEWPOINTS, PRIOR_VIEWPOINTS / 2)
-        self.counts_by_visibility = np.full((len(VISIBILITIES), 2), prior)
-
-    def warm_up(self) -> None:
-        """Compile the kernels before the first frame."""
-        means = np.zeros((1, 3))
-        spare = Existence(self._confirm_observations, self._limits)
-        spare.add_detections([0], means, np.ones(1), means[0], 0)
-        spare.update_visibility([0], np.ones(1, np.int64))
-        spare.add_misses([0], np.ones(1, np.int64), means, means[0], 0)
-
-    def add_detections(
-        self,
-        owners: list[int],
-        means_world: Float64,
-        scores: Float64,
-        camera_world: Float64,
-        stamp_ns: int,
-    ) -> None:
-        """Add the detections (n) of a frame.
-
-        Args:
-            owners: n owners.
-            means_world: (n, 3) means of the detections, metres.
-            scores: (n,) detection scores.
-            camera_world: (3,) camera position, metres.
-            stamp_ns: of the frame.
-        """
-        if owners:
-            self._make_room(max(owners) + 1)
-            _add_detections(
-                self._records,
-                self.counts_by_visibility,
-                np.array(owners, np.int64),
-                means_world,
-                scores,
-                np.ascontiguousarray(camera_world),
-                stamp_ns,
-                self._baseline_rad,
-            )
-
-    def update_visibility(self, owners: list[int], visibilities: Int64) -> None:
-        """Add the visibilities (n) of detected owners (n) in a frame."""
-        best = self._records["visibility"]
-        best[owners] = np.maximum(best[owners], visibilities)
-
-    def add_misses(
-        self,
-        owners: list[int],
-        visibilities: Int64,
-        means_world: Float64,
-        camera_world: Float64,
-        stamp_ns: int,
-    ) -> list[int]:
-        """Add owners (n) that were visible in a frame but not detected.
-
-        Args:
-            owners: n owners.
-            visibilities: (n,) how much of each is visible.
-            means_world: (n, 3) means of the nodes, metres.
-            camera_world: (3,) camera position, metres.
-            stamp_ns: of the frame.
-
-        Returns:
-            Those of the owners that are more likely an error than an object.
-        """
-        if not owners:
-            return []
-        doubtful: list[int] = _add_misses(
-            self._records,
-            self.counts_by_visibility,
-            np.array(owners, np.int64),
-            visibilities,
-            means_world,
-            np.ascontiguousarray(camera_world),
-            stamp_ns,
-            self._baseline_rad,
-            self._limits.min_detection_rate,
-        ).tolist()
-        return doubtful
-
-    def is_confirmed(self, owner: int) -> bool:
-        """Whether there are enough detections, from more than one viewpoint, and few misses."""
-        record = self._records[owner]
-        has_score = record["best_score"] >= self._limits.confirm_score
-        required = self._confirm_observations * (1 if has_score else LOW_SCORE_FACTOR)
-        has_waited = record["last_ns"] - record["first_ns"] >= MAX_WAIT_NS
-        has_viewpoints = record["viewpoints"] or not record["has_moved"] or has_waited
-        enough = has_viewpoints and record["detections"] >= required
-        return bool(enough and not self._is_doubtful(owner))
-
-    def records(self, owners: list[int]) -> NDArray[np.void]:
-        """The records (n,) of owners (n), for `restore`."""
-        return self._records[owners]
-
-    def restore(
-        self, owners: list[int], records: NDArray[np.void], counts_by_visibility: Float64
-    ) -> None:
-        """Continue with the state of an earlier run."""
-        self._make_room(max(owners, default=-1) + 1)
-        self._records[owners] = records
-        self.counts_by_visibility[:] = counts_by_visibility
-
-    def assume_confirmed(self, owner: int, detections: int) -> None:
-        """Add a confirmed node by its number of detections; its viewpoints are unknown."""
-        self._make_room(owner + 1)
-        record = self._records[owner]
-        record["detections"], record["best_score"] = detections, 1.0
-        record["first_ns"], record["miss_probability"] = -MOMENT_NS, 1.0
-        # Its last detection was from another viewpoint than any to come.
-        record["is_detecting"] = True
-        record["camera_world"] = np.inf
-
-    def merge(self, kept: int, removed: int) -> None:
-        """Combine the records of two owners that are one object."""
-        record, other = self._records[kept], self._records[removed]
-        record["detections"] += other["detections"]
-        for name in ("reach_m", "best_score", "last_ns", "miss_probability"):
-            record[name] = max(record[name], other[name])
-        record["first_ns"] = min(record["first_ns"], other["first_ns"])
-        # Both may have missed or detected the object from the same viewpoints, so their numbers are
-        # not added: the better rate is kept.
-        if other["detecting"] * record["viewpoints"] > record["detecting"] * other["viewpoints"]:
-            record["viewpoints"], record["detecting"] = other["viewpoints"], other["detecting"]
-
-    def forget(self, owner: int) -> None:
-        """Drop the record of a removed owner."""
-        if owner < len(self._records):
-            self._records[owner] = np.zeros((), RECORD)
-
-    def _is_doubtful(self, owner: int) -> bool:
-        rate = self._limits.min_detection_rate
-        return bool(_is_doubtful(self._records, owner, self.counts_by_visibility, rate))
-
-    def _make_room(self, count: int) -> None:
-        if count > len(self._records):
-            more = np.zeros(max(64, 2 * count) - len(self._records), RECORD)
-            self._records = np.concatenate((self._records, more))
-
-
-@kernel
-def _is_doubtful(
-    records: NDArray[Any], owner: int, counts_by_visibility: Float64, min_rate: float
-) -> bool:
-    """Whether a node is more likely an error than an object."""
-    record = records[owner]
-    is_counted = record.is_detecting or record.visibility == FULL
-    if record.detecting + record.is_detecting < min_rate * (record.viewpoints + is_counted):
-        return True
-    probability = record.miss_probability
-    if record.last_ns < record.viewpoint_ns:
-        probability *= _miss_probability(counts_by_visibility, record.visibility)
-    is_momentary = record.last_ns - record.first_ns < MOMENT_NS
-    return bool(probability < MISS_PROBABILITY and is_momentary)
-
-
-@kernel
-def _miss_probability(counts_by_visibility: Float64, visibility: int) -> float:
-    """Probability that a viewpoint with this visibility does not detect an object."""
-    if visibility == 0:
-        return 1.0
-    rate = counts_by_visibility[visibility, 1] / counts_by_visibility[visibility, 0]
-    return float(1.0 - rate)
-
-
-@kernel
-def _update_viewpoint(
-    record: Any,
-    counts_by_visibility: Float64,
-    mean: Float64,
-    camera: Float64,
-    stamp_ns: int,
-    baseline_rad: float,
-) -> float:
-    """Begin a new viewpoint if the camera has moved; returns its distance from the node, metres."""
-    # The clock may be behind that of an earlier run: stamps of that run move into the past.
-    behind_ns = max(0, max(record.last_ns, record.viewpoint_ns) - stamp_ns)
-    record.first_ns -= behind_ns
-    record.last_ns -= behind_ns
-    record.viewpoint_ns -= behind_ns
-    distance = 0.0
-    step = 0.0
-    for axis in range(3):
-        distance += (mean[axis] - camera[axis]) ** 2
-        step += (record.camera_world[axis] - camera[axis]) ** 2
-    distance, step = math.sqrt(distance), math.sqrt(step)
-    record.has_moved = record.has_moved or step > STILL_M
-    is_momentary = record.last_ns - record.first_ns < MOMENT_NS
-    moved = step > STILL_M and step >= baseline_rad * distance
-    if moved and (record.is_detecting or record.visibility == FULL):
-        record.viewpoints += 1
-        record.detecting += record.is_detecting
-    # For a momentary node, a camera that stands still gives a viewpoint each MAX_WAIT_NS.
-    if moved or (is_momentary and stamp_ns - record.viewpoint_ns >= MAX_WAIT_NS):
-        detected = record.last_ns >= record.viewpoint_ns
-        if not detected:
-            record.miss_probability *= _miss_probability(counts_by_visibility, record.visibility)
-        if not is_momentary:
-            counts_by_visibility[record.visibility, 0] += 1
-            counts_by_visibility[record.visibility, 1] += detected
-        record.visibility = 0
-        record.viewpoint_ns = stamp_ns
-    if moved:
-        record.is_detecting = False
-        for axis in range(3):
-            record.camera_world[axis] = camera[axis]
-    return distance
-
-
-@kernel
-def _add_detections(
-    records: NDArray[Any],
-    counts_by_visibility: Float64,
-    owners: Int64,
-    means: Float64,
-    scores: Float64,
-    camera: Float64,
-    stamp_ns: int,
-    baseline_rad: float,
-) -> None:
     for index in range(len(owners)):
         record = records[owners[index]]
-        if record.detections == 0:
-            record.first_ns = record.viewpoint_ns = stamp_ns
-            record.miss_probability = 1.0
+        if record.best_score == 0.0:
+            record.first_ns = record.last_ns = record.look_ns = stamp_ns
+            record.look_weight = 1.0
             for axis in range(3):
-                record.camera_world[axis] = camera[axis]
-        distance = _update_viewpoint(
-            record, counts_by_visibility, means[index], camera, stamp_ns, baseline_rad
-        )
-        # A node marked false restarts when it is detected again.
-        is_momentary = record.last_ns - record.first_ns < MOMENT_NS
-        if record.miss_probability < MISS_PROBABILITY and is_momentary:
-            record.first_ns = stamp_ns
-        record.miss_probability = 1.0
-        record.is_detecting = True
-        record.detections += 1
-        record.last_ns = stamp_ns
-        record.reach_m = max(record.reach_m, distance)
-        record.best_score = max(record.best_score, scores[index])
+                record.camera_world[axis] = camera_world[axis]
+        # The clock may be behind that of an earlier run: stamps of that run move into the past.
+        behind_ns = max(0, max(record.last_ns, record.look_ns) - stamp_ns)
+        record.first_ns -= behind_ns
+        record.last_ns -= behind_ns
+        record.look_ns -= behind_ns
+        distance_m = step_m = 0.0
+        for axis in range(3):
+            distance_m += (means_world[index, axis] - camera_world[axis]) ** 2
+            step_m += (record.camera_world[axis] - camera_world[axis]) ** 2
+        distance_m, step_m = math.sqrt(distance_m), math.sqrt(step_m)
+        if scores[index] == 0.0 and distance_m > REACH_FACTOR * record.reach_m:
+            continue
+        has_moved = step_m > max(STILL_M, LOOK_RAD * distance_m)
+        if has_moved or stamp_ns - record.look_ns > LOOK_NS:
+            _end_look(record, counts, step_m > STILL_M)
+            record.look_ns = stamp_ns
+            for axis in range(3):
+                record.camera_world[axis] = camera_world[axis]
+        record.shown += weight
+        record.visibility = max(record.visibility, visibilities[index])
+        if scores[index] > 0.0:
+            # After a clear miss, a node of a moment starts again: it may be an error that returns.
+            if record.missed_since > 1.0 and record.last_ns - record.first_ns < MOMENT_NS:
+                record.first_ns = stamp_ns
+            record.detected += weight
+            record.missed_since = 0.0
+            record.best_score = max(record.best_score, scores[index])
+            record.last_ns = stamp_ns
+            record.reach_m = max(record.reach_m, distance_m)
 
 
 @kernel
-def _add_misses(
-    records: NDArray[Any],
-    counts_by_visibility: Float64,
-    owners: Int64,
-    visibilities: Int64,
-    means: Float64,
-    camera: Float64,
-    stamp_ns: int,
-    baseline_rad: float,
-    min_rate: float,
-) -> Int64:
-    doubtful = np.empty(len(owners), np.int64)
-    count = 0
+def _end_look(record: Any, counts: Float64, camera_moves: bool) -> None:
+    """Add the present look to those that have ended, and begin a new one."""
+    found, missed = _look(record, counts)
+    record.looks += found
+    record.missed += missed
+    record.missed_since += missed
+    weight = record.look_weight * min(MAX_WEIGHT, record.shown)
+    record.pending[record.visibility] += weight
+    if record.detected > 0:
+        # Misses count for the rates if a detection follows: before that, it may be no object.
+        counts[record.visibility, 1] += weight
+        for visibility in range(len(counts)):
+            counts[visibility, 0] += record.pending[visibility]
+            record.pending[visibility] = 0.0
+    record.detected = record.shown = record.visibility = 0
+    record.look_weight = 1.0 if camera_moves else STILL_WEIGHT
+
+
+@kernel
+def _look(record: Any, counts: Float64) -> tuple[float, float]:
+    """What the present look adds to D and to M."""
+    if record.shown == 0:
+        return 0.0, 0.0
+    fraction = record.detected / record.shown
+    missed = 0.0
+    if record.visibility > 0:
+        rate = counts[record.visibility, 1] / counts[record.visibility, 0]
+        missed = -(1.0 - fraction) * math.log(1.0 - rate)
+    weight = record.look_weight * min(MAX_WEIGHT, record.shown)
+    return weight * fraction, weight * missed
+
+
+@kernel
+def probabilities(records: NDArray[Any], counts: Float64, owners: Int64) -> Float64:
+    """Probability (n,) that each of n nodes is an object."""
+    result = np.empty(len(owners))
     for index in range(len(owners)):
-        record = records[owners[index]]
-        squared = 0.0
-        for axis in range(3):
-            squared += (means[index, axis] - camera[axis]) ** 2
-        if math.sqrt(squared) <= REACH_FACTOR * record.reach_m:
-            _update_viewpoint(
-                record, counts_by_visibility, means[index], camera, stamp_ns, baseline_rad
-            )
-            record.visibility = max(record.visibility, visibilities[index])
-            if _is_doubtful(records, owners[index], counts_by_visibility, min_rate):
-                doubtful[count] = owners[index]
-                count += 1
-    return doubtful[:count]
+        result[index] = _probability(records[owners[index]], counts, True)
+    return result
+
+
+@kernel
+def are_missed(records: NDArray[Any], counts: Float64, owners: Int64, minimum: float) -> Bool:
+    """Whether (n,) only the misses make the probability of each of n nodes less than a minimum."""
+    result = np.empty(len(owners), np.bool_)
+    for index in range(len(owners)):
+        result[index] = _probability(records[owners[index]], counts, False) >= minimum
+    return result
+
+
+@kernel
+def _probability(record: Any, counts: Float64, with_misses: bool) -> float:
+    found, missed = _look(record, counts)
+    score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
+    log_odds = OFFSET + SCORE * math.log(score / (1.0 - score))
+    log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
+    if with_misses:
+        log_odds -= MISSES * math.log1p(record.missed + missed)
+        if record.last_ns - record.first_ns < MOMENT_NS:
+            since = record.missed_since + (missed if record.detected == 0 else 0.0)
+            log_odds -= MOMENT * math.log1p(since)
+    return float(1.0 / (1.0 + math.exp(-log_odds)))
+
+
+def merge(record: Any, other: Any) -> None:
+    """Add to a record what was observed of a second node that is the same object."""
+    # Both may have been looked at, or missed, from the same positions: the sums are not added.
+    for name in ("best_score", "looks", "last_ns", "reach_m"):
+        record[name] = max(record[name], other[name])
+    for name in ("missed", "missed_since", "first_ns"):
+        record[name] = min(record[name], other[name])
+
+
+def assume(record: Any, observations: int) -> None:
+    """Fill the record of a node of which only the number of observations is known."""
+    record["best_score"], record["looks"] = 0.9, max(observations, 3)
+    record["first_ns"] = -MOMENT_NS
+    # Its last detection was from another position than any to come.
+    record["camera_world"] = np.inf

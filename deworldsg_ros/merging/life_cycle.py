@@ -1,134 +1,136 @@
-"""Life cycle of a node under the surface rule: tentative, confirmed, hidden, lost, removed."""
+"""Life cycle of a node under the surface rule: published, hidden, merged, lost, removed."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 
-from deworldsg_ros.merging.limits import LifeCycleLimits
 from deworldsg_ros.merging.lost_nodes import LostNodes, moved_object
 from deworldsg_ros.merging.node_records import NodeRecords
-from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
+# A hidden node that is less probable than FORGOTTEN is removed when unseen for FORGOTTEN_NS. The
+# time is chosen, not measured: longer than a camera needs to return to an object.
+FORGOTTEN = 0.2
+FORGOTTEN_NS = 10_000_000_000
+# A node is removed from its position after this number of consecutive frames that see through it.
+# One frame is not enough: depth images have holes and noise.
+ABSENT_FRAMES = 5
+# A moved object keeps its id if it is detected again within this time. Chosen, not measured.
+LOST_S = 30.0
+
 
 class LifeCycle:
-    """Confirms, hides, merges and removes nodes.
+    """Publishes, hides, merges and removes nodes.
 
     Args:
         records: of all nodes.
-        limits: times and numbers of frames.
+        min_existence: a node is published if it is an object with at least this probability.
     """
 
-    def __init__(self, records: NodeRecords, limits: LifeCycleLimits) -> None:
+    def __init__(self, records: NodeRecords, min_existence: float) -> None:
         self._records = records
-        self._expire_ns = int(limits.expire_tentative_s * 1e9)
-        self._lost = LostNodes(limits.lost_s)
-        # Nodes that were confirmed before and are tentative again. They are hidden and keep their
-        # ids.
-        self._hidden: set[int] = set()
+        self._min_existence = min_existence
+        self._lost = LostNodes(LOST_S)
 
-    def confirm(self, graph: SceneGraph, node_id: int) -> int:
-        """Confirm a node if there is enough evidence; returns its id.
-
-        A new node that is the object of a lost node takes the id of the lost node.
-        """
-        row = graph.nodes.row(node_id)
-        if graph.nodes.confirmed[row]:
-            return node_id
-        if not self._records.existence.is_confirmed(self._records.owners.of(node_id)):
-            return node_id
-        graph.set_confirmed(node_id, True)
-        if node_id in self._hidden:
-            self._hidden.remove(node_id)
-            return node_id
-        lost_id = self._lost.match(graph, node_id)
-        if lost_id is None:
-            return node_id
-        self._lost.remove(lost_id)
-        self._move(graph, lost_id, node_id)
-        return lost_id
-
-    def merge_parts(self, graph: SceneGraph) -> None:
-        """Merge the nodes that are parts of one object."""
-        records = self._records
-        while (pair := records.joint.next_merge()) is not None:
-            a_id, b_id = (records.owners.node(owner) for owner in pair)
-            kept_id = graph.merge_nodes(a_id, b_id)
-            removed_id = b_id if kept_id == a_id else a_id
-            if removed_id in self._hidden and not graph.nodes.confirmed[graph.nodes.row(kept_id)]:
-                self._hidden.add(kept_id)
-            self._hidden.discard(removed_id)
-            records.merge(kept_id, removed_id)
-
-    def observe_depth(self, graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
-        """Compare all nodes with the depth of a frame: hide missed nodes, remove absent ones.
+    def observe(
+        self, graph: SceneGraph, local: LocalGraph, view: View, node_ids: list[int]
+    ) -> None:
+        """Add a frame to the looks at all nodes that it shows; publish, hide and remove nodes.
 
         Args:
             graph: changed.
             local: the frame.
-            node_ids: nodes detected in the frame.
+            view: what the frame shows of the nodes before it was merged.
+            node_ids: node of each row of the frame.
         """
         records = self._records
-        detected = {records.owners.of(node_id) for node_id in node_ids}
-        records.changed |= detected
-        if local.depth_grid is None:
-            return
-        # A detected node is present. Its surface is sampled once it is no longer detected.
-        changed = list(records.changed - detected)
-        records.absence.update_points(changed, graph.nodes, records.rows(graph, changed))
-        records.changed = detected
-        absent, visibilities = records.absence.observe(
-            local.T_world_camera, local.depth_grid, list(detected)
+        self._forget(graph, local.stamp_ns)
+        scores: dict[int, float] = {}
+        for node_id, score in zip(node_ids, local.scores.tolist()):
+            scores[node_id] = max(scores.get(node_id, 0.0), score)
+        shown = {
+            node_id: visibility
+            for node_id, visibility in zip(view.ids.tolist(), view.visibilities.tolist())
+            if node_id in records and (visibility or node_id in scores)
+        }
+        ids = sorted(scores.keys() | shown.keys())
+        records.look(
+            [records.owner(node_id) for node_id in ids],
+            np.array([scores.get(node_id, 0.0) for node_id in ids]),
+            np.array([shown.get(node_id, NOT_VISIBLE) for node_id in ids], np.int64),
+            graph.nodes.means[[graph.nodes.row(node_id) for node_id in ids]].reshape(-1, 3),
+            local.T_world_camera[:3, 3],
+            local.stamp_ns,
         )
-        visible = np.flatnonzero(visibilities).tolist()
-        found = [owner for owner in visible if owner in detected]
-        records.existence.update_visibility(found, visibilities[found])
-        missed = [owner for owner in visible if owner not in detected]
-        self._hide_doubtful(graph, local, missed, visibilities)
-        for owner in absent:
-            # 0: removed while an earlier absent node of this frame was processed.
-            if records.owners.node(owner):
-                self._lose(graph, records.owners.node(owner), local.stamp_ns)
+        self._publish(graph, ids)
+        for node_id in self._absent(view, scores.keys()):
+            # It may be gone: another absent node of this frame has taken its place.
+            if node_id in records:
+                self._lose(graph, node_id, local.stamp_ns)
 
-    def expire(self, graph: SceneGraph, stamp_ns: int) -> None:
-        """Remove tentative nodes that were not seen for long, and nodes lost for too long."""
+    def _absent(self, view: View, detected: Collection[int]) -> list[int]:
+        """Nodes that enough consecutive frames have seen through."""
+        records, absent = self._records, []
+        for node_id, visibility, through in zip(
+            view.ids.tolist(), view.visibilities.tolist(), view.through.tolist()
+        ):
+            if node_id not in records:
+                continue
+            record = records.rows[records.owner(node_id)]
+            if node_id in detected or visibility >= HALF:
+                record["through_frames"] = 0
+            elif through:
+                record["through_frames"] += 1
+                if record["through_frames"] >= ABSENT_FRAMES:
+                    absent.append(node_id)
+        return absent
+
+    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+        """Number of nodes that are not published, by reason."""
+        nodes, records = graph.nodes, self._records
+        ids = [i for i in nodes.ids[~nodes.confirmed].tolist() if i not in self._lost]
+        missed = records.are_missed([records.owner(i) for i in ids], self._min_existence)
+        reasons = {
+            "seen too little": len(ids) - int(missed.sum()),
+            "missed by the detector": int(missed.sum()),
+            "absent from its position": len(self._lost),
+        }
+        return {reason: count for reason, count in reasons.items() if count}
+
+    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+        """Publish the nodes that are likely to be objects, and hide the others."""
+        probabilities = self._records.existence([self._records.owner(i) for i in node_ids])
+        for node_id in graph.set_existence(node_ids, probabilities, self._min_existence):
+            # A new node that is the object of a lost node takes the id of the lost node.
+            lost_id = self._lost.match(graph, node_id)
+            if lost_id is not None:
+                self._lost.remove(lost_id)
+                self._move(graph, lost_id, node_id)
+
+    def _forget(self, graph: SceneGraph, stamp_ns: int) -> None:
+        """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
         nodes = graph.nodes
-        oldest_ns = stamp_ns - self._expire_ns
-        old = nodes.ids[~nodes.confirmed & (nodes.last_seen_ns < oldest_ns)].tolist()
-        for node_id in old:
-            if node_id not in self._lost and node_id not in self._hidden:
+        old = ~nodes.confirmed & (nodes.existence < FORGOTTEN)
+        old &= nodes.last_seen_ns < stamp_ns - FORGOTTEN_NS
+        for node_id in nodes.ids[old].tolist():
+            if node_id not in self._lost:
                 graph.remove_node(node_id)
                 self._records.remove(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
 
-    def _hide_doubtful(
-        self, graph: SceneGraph, local: LocalGraph, missed: list[int], visibilities: Int64
-    ) -> None:
-        """Hide confirmed nodes that the detector misses too often."""
-        records = self._records
-        doubtful = records.existence.add_misses(
-            missed,
-            visibilities[missed],
-            graph.nodes.means[records.rows(graph, missed)],
-            local.T_world_camera[:3, 3],
-            local.stamp_ns,
-        )
-        for owner in doubtful:
-            node_id = records.owners.node(owner)
-            if graph.nodes.confirmed[graph.nodes.row(node_id)]:
-                graph.set_confirmed(node_id, False)
-                self._hidden.add(node_id)
-
     def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
         """Remove an absent node from its position; its id may continue elsewhere, now or later."""
         self._records.remove(node_id)
-        self._hidden.discard(node_id)
-        if not graph.nodes.confirmed[graph.nodes.row(node_id)]:
+        row = graph.nodes.row(node_id)
+        if not graph.nodes.confirmed[row]:
             graph.remove_node(node_id)
             return
-        graph.set_confirmed(node_id, False)
+        graph.set_existence([node_id], graph.nodes.existence[[row]], np.inf)
         moved_id = moved_object(graph, node_id)
         if moved_id is None:
             self._lost.add(node_id, stamp_ns)

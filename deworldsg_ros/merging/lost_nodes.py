@@ -25,13 +25,23 @@ class LostNodes:
     def __contains__(self, node_id: object) -> bool:
         return node_id in self._lost_ns
 
+    def __len__(self) -> int:
+        return len(self._lost_ns)
+
     def add(self, node_id: int, stamp_ns: int) -> None:
         """Add a node whose object is absent."""
         self._lost_ns[node_id] = stamp_ns
 
     def match(self, graph: SceneGraph, node_id: int) -> int | None:
         """The lost node that is the same object as a new node; None if there is not exactly one."""
-        similar = [lost_id for lost_id in self._lost_ns if _are_similar(graph, lost_id, node_id)]
+        nodes = graph.nodes
+        first_ns = nodes.first_seen_ns[nodes.row(node_id)]
+        similar = [
+            lost_id
+            for lost_id in self._lost_ns
+            if nodes.last_seen_ns[nodes.row(lost_id)] < first_ns
+            and _are_similar(graph, lost_id, node_id)
+        ]
         return similar[0] if len(similar) == 1 else None
 
     def remove(self, node_id: int) -> None:

@@ -103,12 +103,6 @@ def one_to_one(scores: Float64) -> list[int]:
     return matched
 
 
-def warm_up() -> None:
-    """Compile the kernel, or load it from the cache."""
-    item = (np.zeros((1, 3)), np.eye(3)[None], np.ones((1, 1)))
-    _match_scores(item, item, np.zeros(1, np.int64), np.ones((1, 1)), np.ones((1, 1)), 0.5, 1.0)
-
-
 @kernel
 def _solve(covariance: Float64, d0: float, d1: float, d2: float) -> tuple[float, float]:
     """|Σ| and dᵀΣ⁻¹d by the LDLᵀ pivots of a covariance."""

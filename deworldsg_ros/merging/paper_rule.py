@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.nearest import (
@@ -43,16 +41,16 @@ class PaperMerging:
         add_relations(graph, local, node_ids)
         return node_ids
 
+    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+        """None: every node is published."""
+        return {}
+
     def memory(self) -> Memory:
         """Empty: the rule has no state besides the graph."""
         return {}
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """Does nothing: the rule has no state besides the graph."""
-
-    def pose_correction(self) -> Float64:
-        """See `Merging.pose_correction`."""
-        return np.eye(4)
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Does nothing: the rule has no state besides the graph."""

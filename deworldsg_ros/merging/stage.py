@@ -32,6 +32,10 @@ class Merging(Protocol):
         """
         ...
 
+    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+        """Number of nodes that are not published, by reason, in words."""
+        ...
+
     def memory(self) -> Memory:
         """The state besides the graph, as arrays by name, for `restore`."""
         ...
@@ -48,15 +52,19 @@ class Merging(Protocol):
         """
         ...
 
-    def pose_correction(self) -> Float64:
-        """(4, 4) from the world of the newest poses to the graph's: drift that is corrected."""
-        ...
-
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Update the state of nodes that a pose-graph correction (4, 4) moved in the graph."""
         ...
 
 
-def build_merging(config: MergingConfig) -> Merging:
-    """The configured association rule."""
-    return SurfaceMerging(config) if config.association == "surface" else PaperMerging(config)
+def build_merging(config: MergingConfig, min_existence: float) -> Merging:
+    """The configured association rule.
+
+    Args:
+        config: of the stage.
+        min_existence: the surface rule publishes a node if it is an object with at least this
+            probability. The paper's rule publishes all nodes.
+    """
+    if config.association == "paper":
+        return PaperMerging(config)
+    return SurfaceMerging(config, min_existence)

@@ -11,20 +11,19 @@ import numpy as np
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.cell_kernels import CellSets
-from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
-from deworldsg_ros.merging.coverage import coverage
+from deworldsg_ros.merging.common import Memory, add_relations, check_fits
 from deworldsg_ros.merging.life_cycle import LifeCycle
-from deworldsg_ros.merging.limits import LifeCycleLimits
-from deworldsg_ros.merging.matching import match
-from deworldsg_ros.merging.matching import warm_up as warm_up_matching
+from deworldsg_ros.merging.matching import Matches, match
 from deworldsg_ros.merging.node_records import NodeRecords
+from deworldsg_ros.merging.views import View, see
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.camera import Intrinsics, invert_pose
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0
+SPARE = Vocabulary(("a", "b"), ("on",))
 
 
 class SurfaceMerging:
@@ -32,20 +31,23 @@ class SurfaceMerging:
 
     Args:
         config: thresholds.
-        limits: of the life cycle of a node; only tests change them.
+        min_existence: a node is published if it is an object with at least this probability.
     """
 
-    def __init__(self, config: MergingConfig, limits: LifeCycleLimits = LifeCycleLimits()) -> None:
+    def __init__(self, config: MergingConfig, min_existence: float = 0.5) -> None:
         self._config = config
-        self._records = NodeRecords(config.confirm_observations, limits)
-        self._life_cycle = LifeCycle(self._records, limits)
+        self._records = NodeRecords()
+        self._life_cycle = LifeCycle(self._records, min_existence)
 
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
-        self._records.warm_up()
-        self._records.drift.warm_up()
-        warm_up_matching()
-        warm_up_graph()
+        spare, graph = SurfaceMerging(self._config), SceneGraph(SPARE, "world", even_gaussians=True)
+        for stamp_ns in range(1, 4):
+            spare.merge(graph, _spare_frame(stamp_ns))
+        graph.node_states(1)
+        spare.hidden(graph)
+        spare._records.remove(1)
+        graph.merge_nodes(1, 2)
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
@@ -53,37 +55,20 @@ class SurfaceMerging:
         Two objects of one frame never become one node, even if both overlap the same node.
         """
         check_fits(graph, local)
-        records = self._records
-        local = records.drift.align(local)
-        cells = records.map.cells_of(local.surface_points_world)
-        owners, on_nodes, of_nodes = records.map.overlaps(cells)
-        rows = np.array(records.rows(graph, owners), np.int64)
-        T_camera_world = invert_pose(local.T_world_camera)
-        covered = coverage(
-            graph.nodes, rows, local.instance_ids, T_camera_world, local.depth_grid, of_nodes
-        )
-        matches = match(
-            local,
-            graph.nodes,
-            rows,
-            owners,
-            on_nodes,
-            covered,
-            self._config.overlap_threshold,
-            records.map.cell_m,
-        )
-        matched_owners = [owners[column] if column >= 0 else -1 for column in matches.columns]
-        node_ids = self._fuse(graph, local, cells, matched_owners)
-        object_owners = [records.owners.of(node_id) for node_id in node_ids]
-        records.joint.add_frame(object_owners, matches, local.scores, local.T_world_camera[:3, 3])
-        self._life_cycle.merge_parts(graph)
-        node_ids = [graph.resolve(node_id) for node_id in node_ids]
-        self._life_cycle.observe_depth(graph, local, node_ids)
-        self._life_cycle.expire(graph, local.stamp_ns)
+        cells = self._records.map.cells_of(local.surface_points_world)
+        view = see(graph.nodes, local)
+        matches = self._associate(graph, local, cells, view)
+        node_ids = self._update(graph, local, cells, matches)
+        node_ids = self._merge_parts(graph, local, matches, node_ids)
+        self._life_cycle.observe(graph, local, view, node_ids)
         node_ids = [graph.resolve(node_id) for node_id in node_ids]
         graph.remember_frame(local.stamp_ns, node_ids)
         add_relations(graph, local, node_ids)
         return node_ids
+
+    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+        """See `Merging.hidden`."""
+        return self._life_cycle.hidden(graph)
 
     def memory(self) -> Memory:
         """See `Merging.memory`."""
@@ -93,15 +78,72 @@ class SurfaceMerging:
         """See `Merging.restore`."""
         self._records.restore(graph, memory)
 
-    def pose_correction(self) -> Float64:
-        """See `Merging.pose_correction`."""
-        return self._records.drift.T_graph_poses
-
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
         self._records.apply_correction(graph, node_ids, T_correction)
 
-    def _judge(
+    def _associate(
+        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, view: View
+    ) -> Matches:
+        """Match the objects with the nodes whose surfaces they meet."""
+        records = self._records
+        owners, on_nodes, covered = records.map.overlaps(cells)
+        column_of = {node_id: column for column, node_id in enumerate(view.ids.tolist())}
+        for column, node_id in enumerate(records.rows["node_id"][owners].tolist()):
+            # If the frame shows enough of a node, its visible part counts, and not the whole node.
+            shown = column_of.get(node_id)
+            if shown is not None and not np.isnan(view.covered[:, shown]).any():
+                covered[:, column] = view.covered[:, shown]
+        return match(
+            local,
+            graph.nodes,
+            np.array(records.graph_rows(graph, owners), np.int64),
+            owners,
+            on_nodes,
+            covered,
+            self._config.overlap_threshold,
+            records.map.cell_m,
+        )
+
+    def _update(
+        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, matches: Matches
+    ) -> list[int]:
+        """Fuse each object into the node that it matched, or add a node; returns the node ids."""
+        records, weights = self._records, local.pixel_counts / PIXELS_PER_WEIGHT
+        owners = [matches.owners[column] if column >= 0 else -1 for column in matches.columns]
+        known = [row for row, owner in enumerate(owners) if owner >= 0]
+        known_owners = [owners[row] for row in known]
+        known_ids = [records.node(owner) for owner in known_owners]
+        graph.observe_each(
+            known_ids,
+            local.means_world[known],
+            local.covariances_world[known],
+            local.class_probabilities[known],
+            local.stamp_ns,
+            [local.surface_points_world[row] for row in known],
+            weights[known],
+        )
+        classes = records.name(known_owners, local.class_probabilities[known], local.stamp_ns)
+        graph.set_classes(known_ids, classes)
+        for row, owner in enumerate(owners):
+            if owner < 0:
+                classes = local.class_probabilities[row]
+                node_id = graph.add_node(
+                    local.means_world[row],
+                    local.covariances_world[row],
+                    classes,
+                    local.stamp_ns,
+                    local.surface_points_world[row],
+                    float(weights[row]),
+                    confirmed=False,
+                )
+                owners[row] = records.add(node_id, classes, local.stamp_ns)
+        records.map.add(owners, cells)
+        node_ids = [records.node(owner) for owner in owners]
+        self._judge_cells(graph, local, cells, owners, node_ids)
+        return node_ids
+
+    def _judge_cells(
         self,
         graph: SceneGraph,
         local: LocalGraph,
@@ -120,44 +162,45 @@ class SurfaceMerging:
             rows = [graph.nodes.row(node_id) for node_id in node_ids]
             graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, rows))
 
-    def _fuse(
-        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, owners: list[int]
+    def _merge_parts(
+        self, graph: SceneGraph, local: LocalGraph, matches: Matches, node_ids: list[int]
     ) -> list[int]:
-        """Fuse each object into the node of its owner, or create a tentative node (owner -1)."""
-        weights = local.pixel_counts / PIXELS_PER_WEIGHT
-        surfaces = local.surface_points_world
+        """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records
-        known = [row for row, owner in enumerate(owners) if owner >= 0]
-        node_ids = [records.owners.node(owner) if owner >= 0 else 0 for owner in owners]
-        graph.observe_each(
-            [node_ids[row] for row in known],
-            local.means_world[known],
-            local.covariances_world[known],
-            local.class_probabilities[known],
-            local.stamp_ns,
-            [surfaces[row] for row in known],
-            weights[known],
-        )
-        owners = owners.copy()
-        for row, node_id in enumerate(node_ids):
-            if not node_id:
-                node_ids[row] = graph.add_node(
-                    local.means_world[row],
-                    local.covariances_world[row],
-                    local.class_probabilities[row],
-                    local.stamp_ns,
-                    surfaces[row],
-                    float(weights[row]),
-                    confirmed=False,
-                )
-                owners[row] = records.owners.add(node_ids[row])
-        records.map.add(owners, cells)
-        self._judge(graph, local, cells, owners, node_ids)
-        records.existence.add_detections(
-            owners,
-            local.means_world,
-            local.scores,
-            local.T_world_camera[:3, 3],
-            local.stamp_ns,
-        )
-        return [self._life_cycle.confirm(graph, node_id) for node_id in node_ids]
+        owners = [records.owner(node_id) for node_id in node_ids]
+        records.joint.add_frame(owners, matches, local.scores, local.T_world_camera[:3, 3])
+        while (pair := records.joint.next_merge()) is not None:
+            a_id, b_id = (records.node(owner) for owner in pair)
+            kept_id = graph.merge_nodes(a_id, b_id)
+            records.merge(graph, kept_id, b_id if kept_id == a_id else a_id)
+        return [graph.resolve(node_id) for node_id in node_ids]
+
+
+def _spare_frame(stamp_ns: int) -> LocalGraph:
+    """Two objects before a camera, of which the third frame shows one in another place."""
+    shift_m = 0.1 * (stamp_ns == 3)
+    points = tuple(
+        (np.random.default_rng(0).random((50, 3)) * 0.2 + (x_m, 0.0, 1.0)).astype(np.float32)
+        for x_m in (-0.3, 0.1 + shift_m)
+    )
+    instances = np.repeat(np.arange(3, dtype=np.uint16), 20)[None].repeat(60, axis=0)
+    camera = Intrinsics(300.0, 300.0, 240.0, 240.0, 480, 480)
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id="world",
+        width=480,
+        height=480,
+        T_world_camera=np.eye(4),
+        vocabulary=SPARE,
+        instance_ids=np.array([1, 2]),
+        boxes_xyxy=np.zeros((2, 4)),
+        class_probabilities=np.full((2, 2), 0.5),
+        scores=np.ones(2),
+        means_world=np.array([cloud.mean(axis=0) for cloud in points], np.float64),
+        covariances_world=np.stack([0.01 * np.eye(3)] * 2),
+        depths_m=np.ones(2),
+        pixel_counts=np.array([50, 50]),
+        surface_points_world=points,
+        relations=Relations.none(1),
+        depth_grid=DepthGrid(np.full((60, 60), 1100, np.uint16), 8, camera, instances),
+    )

@@ -13,10 +13,8 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from deworldsg_ros.files import write_atomically
-from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import check_map_writable, read_map, write_map
-from deworldsg_ros.merging.stage import build_merging
-from deworldsg_ros.relations import pair_geometry
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.qos import reliable
@@ -41,8 +39,7 @@ class GraphNode(StageNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
-        build_merging(self.parameters.merging).warm_up()
-        pair_geometry.warm_up()
+        warm_up(self.parameters)
         # None until a map or the first local graph gives the world frame and the vocabulary.
         self._builder: GraphBuilder | None = None
         map_path = self.parameters.node.map_path
@@ -192,6 +189,7 @@ class GraphNode(StageNode):
         snapshot = self._builder.snapshot()
         return {
             "nodes": str(len(snapshot.nodes)),
+            **{f"hidden, {why}": str(count) for why, count in self._builder.hidden.items()},
             "edges": str(len(snapshot.edges)),
             "sequence": str(snapshot.sequence),
             "evidence waiting": str(len(self._pending)),

@@ -62,7 +62,6 @@ class EdgeBeliefs:
             graph,
             load_physics_model(),
             geometry=relations.world_model != "none",
-            tentative=config.output.include_tentative,
         )
         self._has_predictions = relations.world_model == "physics"
         self._paper_beliefs = PaperBeliefs(relations, graph, self._top_k)

@@ -49,7 +49,7 @@ class GraphView(Protocol):
         ...
 
     def node(self, node_id: int) -> NodeView | None:
-        """A confirmed node; None if it is tentative."""
+        """A published node; None if it is hidden."""
         ...
 
     def visual_entropy_nats(self, a_id: int, b_id: int) -> float:
@@ -126,7 +126,7 @@ class PublishedGraph:
         self._last_sequence = update.sequence
         for removed in update.removed_nodes:
             self._successors[removed.id] = removed.merged_into or 0
-        # A node that becomes tentative is published as removed. It may return under the same id.
+        # A node that is hidden is published as removed. It may return under the same id.
         for node in update.nodes:
             self._successors.pop(node.id, None)
         for association in update.associations:

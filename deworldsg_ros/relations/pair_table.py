@@ -63,9 +63,7 @@ class PairTable(Columns):
     frames: Float64
     counts: Float64
 
-    def __init__(
-        self, graph: SceneGraph, model: PhysicsModel, *, geometry: bool, tentative: bool
-    ) -> None:
+    def __init__(self, graph: SceneGraph, model: PhysicsModel, *, geometry: bool) -> None:
         super().__init__(
             {
                 "nodes": (np.int64, (2,)),
@@ -84,7 +82,6 @@ class PairTable(Columns):
         self._graph = graph
         self._model = model
         self._geometry = geometry
-        self._tentative = tentative
         self._inputs = PairInputs(graph.vocabulary.classes)
         self._relation_of = relation_of_predicates(graph.vocabulary.predicates)
         self._R_up_world = np.eye(3)
@@ -97,7 +94,7 @@ class PairTable(Columns):
             up_world: (3,) direction that points up in the world frame; it is used in `UP_STEP`s.
         """
         nodes, shapes = self._graph.nodes, self.shapes
-        included = np.flatnonzero(nodes.confirmed | self._tentative)
+        included = np.flatnonzero(nodes.confirmed)
         ids = nodes.ids[included].tolist()
         for node_id in set(shapes.ids.tolist()).difference(ids):
             self._forget(node_id)

@@ -46,7 +46,7 @@ def diff(
     known_edges = {(edge.subject, edge.object): edge for edge in previous.edges}
     node_ids = {node.id for node in current.nodes}
     pairs = {(edge.subject, edge.object) for edge in current.edges}
-    # A live node that became tentative is removed from the snapshot.
+    # A live node that was hidden is removed from the snapshot.
     left: dict[int, int | None] = dict.fromkeys(known_nodes.keys() - node_ids)
     left.update(removed or {})
     return wire.SceneGraphUpdateMessage(

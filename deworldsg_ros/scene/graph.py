@@ -200,16 +200,12 @@ class SceneGraph(NodeStore):
         pair = (self.resolve(subject_id), self.resolve(object_id))
         return None if 0 in pair or pair[0] == pair[1] else pair
 
-    def node_states(
-        self, top_k: int, tentative: bool = False, with_points: bool = False
-    ) -> dict[int, wire.NodeState]:
-        """Messages of the confirmed nodes, or of all, by ascending id.
+    def node_states(self, top_k: int, with_points: bool = False) -> dict[int, wire.NodeState]:
+        """Messages of the confirmed nodes by ascending id.
 
         Messages of nodes that did not change are the same objects as before.
         """
-        return self._states.states(
-            self.nodes, self.vocabulary.classes, top_k, tentative, with_points
-        )
+        return self._states.states(self.nodes, self.vocabulary.classes, top_k, with_points)
 
     def _remove(self, node_id: int, successor: int) -> None:
         self.nodes.remove(node_id)

@@ -124,7 +124,7 @@ def _state(arrays: Arrays) -> GraphState:
     return GraphState(
         vocabulary=Vocabulary(tuple(header["classes"]), tuple(header["predicates"])),
         frame_id=header["frame_id"],
-        nodes={name: arrays[name] for name in SAVED_COLUMNS},
+        nodes={name: _column(arrays, name) for name in SAVED_COLUMNS},
         surfaces=_split(arrays["surface_points"], arrays["surface_point_counts"]),
         edges=_edges(arrays),
         votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
@@ -135,6 +135,12 @@ def _state(arrays: Arrays) -> GraphState:
         # Files of earlier releases do not have it.
         even_gaussians=header.get("even_gaussians", False),
     )
+
+
+def _column(arrays: Arrays, name: str) -> NDArray[Any]:
+    if name == "existence" and name not in arrays:  # files of older releases
+        return np.full(len(arrays["ids"]), -1.0)
+    return arrays[name]
 
 
 def _edges(arrays: Arrays) -> dict[Pair, EdgeEvidence]:

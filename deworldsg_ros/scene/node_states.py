@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
@@ -31,13 +32,12 @@ class NodeStateCache:
         nodes: NodeTable,
         classes: tuple[str, ...],
         top_k: int,
-        tentative: bool,
         with_points: bool,
     ) -> dict[int, wire.NodeState]:
-        """Messages by ascending id of the confirmed nodes, or with `tentative` of all."""
+        """Messages by ascending id of the confirmed nodes."""
         known = self._known.setdefault((top_k, with_points), {})
         states = {}
-        rows = np.flatnonzero(nodes.confirmed | tentative)
+        rows = np.flatnonzero(nodes.confirmed)
         rows = rows[np.argsort(nodes.ids[rows])]
         ids, revisions = nodes.ids[rows].tolist(), nodes.revisions[rows].tolist()
         for row, node_id, revision in zip(rows.tolist(), ids, revisions):
@@ -80,6 +80,7 @@ def _state(
         covariance_m2=covariance.ravel().tolist(),
         observations=int(nodes.observations[row]),
         confirmed=bool(nodes.confirmed[row]),
+        existence=float(existence) if (existence := nodes.existence[row]) >= 0 else UNSET,
         first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
         last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
         surface_points_m=points.tolist() if with_points else [],

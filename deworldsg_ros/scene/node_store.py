@@ -69,7 +69,7 @@ class NodeStore:
             stamp_ns: time of the observation.
             surface_points_world: (k, 3) float32 points of its surface, metres.
             weight: w of Eq. 7.
-            confirmed: false for a tentative node.
+            confirmed: false for a hidden node.
 
         Raises:
             ValueError: if the covariance is not positive definite.
@@ -82,7 +82,7 @@ class NodeStore:
         except ValueError:
             nodes.remove(node_id)
             raise
-        nodes.confirmed[row] = confirmed
+        nodes.confirmed[row], nodes.existence[row] = confirmed, -1.0
         nodes.set_surface(row, surface_points_world)
         nodes.first_seen_ns[row] = nodes.last_seen_ns[row] = stamp_ns
         self._changed([row])
@@ -144,12 +144,34 @@ class NodeStore:
         self.nodes.drop_points(rows, dropped)
         self._changed([row for row, some in zip(rows, dropped) if some.any()])
 
-    def set_confirmed(self, node_id: int, confirmed: bool) -> None:
-        """Make a live node confirmed or tentative."""
-        row = self.nodes.row(node_id)
-        if self.nodes.confirmed[row] != confirmed:
-            self.nodes.confirmed[row] = confirmed
-            self._changed([row])
+    def set_classes(self, node_ids: Sequence[int], class_probabilities: Float64) -> None:
+        """Replace the class distributions of n live nodes, (n, C)."""
+        rows = [self.nodes.row(node_id) for node_id in node_ids]
+        self.nodes.class_probabilities[rows] = class_probabilities
+        self._changed(rows)
+
+    def set_existence(
+        self, node_ids: Sequence[int], existence: Float64, minimum: float
+    ) -> list[int]:
+        """Set the probabilities (n,) that n live nodes are objects, to two decimals.
+
+        Args:
+            node_ids: n ids.
+            existence: (n,) probabilities.
+            minimum: a node is confirmed if it has at least this probability.
+
+        Returns:
+            The ids of the nodes that were not confirmed before, and are now.
+        """
+        nodes = self.nodes
+        rows = np.array([nodes.row(node_id) for node_id in node_ids], np.int64)
+        existence = np.round(existence, 2)
+        confirmed = existence >= minimum
+        differs = (nodes.existence[rows] != existence) | (nodes.confirmed[rows] != confirmed)
+        new: list[int] = nodes.ids[rows[confirmed & ~nodes.confirmed[rows]]].tolist()
+        nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed
+        self._changed(rows[differs].tolist())
+        return new
 
     def move_node(self, node_id: int, T_correction: Float64) -> None:
         """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""

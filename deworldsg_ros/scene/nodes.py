@@ -25,6 +25,7 @@ SAVED_COLUMNS = (
     "weights",
     "observations",
     "confirmed",
+    "existence",
     "first_seen_ns",
     "last_seen_ns",
     "revisions",
@@ -66,11 +67,12 @@ class NodeTable(Columns):
         weights: (n,) float64, w of Eq. 7: number of observations, or a rule's own weight.
         observations: (n,) int64, frames in which it was observed; class distributions average
             with these.
-        confirmed: (n,) bool; false = tentative.
+        confirmed: (n,) bool, whether it is published; false = hidden.
         log_determinants: (n,) float64, of the covariances.
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
         revisions: (n,) int64, graph revision at which the node last changed.
+        existence: (n,) float64, probability that it is an object; -1 = not estimated.
         surface_hashes: (n, K) uint64, and
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
         surface_counts: (n,) int64 points; see `surface`.
@@ -82,6 +84,7 @@ class NodeTable(Columns):
     weights: Float64
     observations: Int64
     confirmed: Bool
+    existence: Float64
     log_determinants: Float64
     eigenvalue_bounds: Float64
     first_seen_ns: Int64
@@ -100,6 +103,7 @@ class NodeTable(Columns):
                 "weights": (np.float64, ()),
                 "observations": (np.int64, ()),
                 "confirmed": (np.bool_, ()),
+                "existence": (np.float64, ()),
                 "log_determinants": (np.float64, ()),
                 "eigenvalue_bounds": (np.float64, ()),
                 "first_seen_ns": (np.int64, ()),
@@ -180,6 +184,7 @@ class NodeTable(Columns):
             ),
         )
         self.confirmed[row] |= self.confirmed[other]
+        self.existence[row] = max(self.existence[row], self.existence[other])
 
     def take_over(self, row: int, other: int) -> None:
         """Give a row the Gaussian, surface and state of another one.
@@ -187,16 +192,11 @@ class NodeTable(Columns):
         Class distributions average with the numbers of observations, which add up.
         """
         counts = self.observations[[row, other]]
-        self.put(
-            row,
-            self.means[other].copy(),
-            self.covariances[other].copy(),
-            counts @ self.class_probabilities[[row, other]] / counts.sum(),
-            float(self.weights[other]),
-            int(counts.sum()),
-        )
+        classes = counts @ self.class_probabilities[[row, other]] / counts.sum()
+        gaussian = self.means[other].copy(), self.covariances[other].copy()
+        self.put(row, *gaussian, classes, float(self.weights[other]), int(counts.sum()))
         self.set_surface(row, self.surface(other))
-        self.confirmed[row] = self.confirmed[other]
+        self.confirmed[row], self.existence[row] = self.confirmed[other], self.existence[other]
         self.last_seen_ns[row] = self.last_seen_ns[other]
 
     def move(self, row: int, T: Float64) -> None:
@@ -244,7 +244,7 @@ class NodeTable(Columns):
                 int(columns["observations"][index]),
             )
             self.set_surface(row, surfaces[index])
-            for name in ("confirmed", "first_seen_ns", "last_seen_ns", "revisions"):
+            for name in ("confirmed", "existence", "first_seen_ns", "last_seen_ns", "revisions"):
                 getattr(self, name)[row] = columns[name][index]
 
     def _add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:

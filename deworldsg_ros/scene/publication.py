@@ -18,7 +18,6 @@ class Publication:
         edge_states: the messages of the edges between nodes, in order; unchanged messages are the
             same objects.
         top_k: number of labels of each node.
-        include_tentative: whether tentative nodes are published.
         include_surface_points: whether snapshots and updates contain surface points.
     """
 
@@ -28,13 +27,11 @@ class Publication:
         edge_states: Callable[[Collection[int]], list[wire.EdgeState]],
         *,
         top_k: int,
-        include_tentative: bool,
         include_surface_points: bool,
     ) -> None:
         self._graph = graph
         self._edge_states = edge_states
         self._top_k = top_k
-        self._include_tentative = include_tentative
         self._include_surface_points = include_surface_points
         # Frames to come may be older than the newest one of a map.
         self._stamp_ns = int(graph.nodes.last_seen_ns.max(initial=0))
@@ -69,7 +66,7 @@ class Publication:
 
     def _message(self, sequence: int, with_points: bool) -> wire.SceneGraphMessage:
         graph = self._graph
-        nodes = graph.node_states(self._top_k, self._include_tentative, with_points)
+        nodes = graph.node_states(self._top_k, with_points)
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=wire.stamp_from_ns(self._stamp_ns),

@@ -172,8 +172,13 @@ class NodeState(msgspec.Struct, frozen=True):
     first_seen: Stamp
     last_seen: Stamp
     confirmed: Annotated[
-        bool, msgspec.Meta(description="false = tentative: not enough evidence yet")
+        bool,
+        msgspec.Meta(description="false = hidden: its existence is below output.min_existence"),
     ] = True
+    existence: Annotated[
+        Union[Probability, msgspec.UnsetType],
+        msgspec.Meta(description="probability that this is an object; absent = not estimated"),
+    ] = msgspec.UNSET
     surface_points_m: list[Vector3] = []
     entropy_nats: Annotated[
         Union[float, None],

@@ -19,12 +19,12 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import shade
 from deworldsg_ros.view.geometry import SIGMAS
 from deworldsg_ros.view.picture_text import (
-    CONFIRMED_FROM,
     CURVATURE,
     draw_frame,
     draw_labels,
     draw_predicates,
     edge_alpha,
+    is_sure,
 )
 from deworldsg_ros.view.top_view import BACKGROUND, DPI, FAINT, Drawing, drawing_of
 
@@ -80,13 +80,13 @@ def _draw_path(drawing: Drawing) -> None:
 
 
 def _draw_ellipses(drawing: Drawing) -> None:
-    """Ellipses of the nodes, higher objects on top; tentative ones paler."""
+    """Ellipses of the nodes, higher objects on top; unsure ones paler."""
     view, nodes, axes = drawing.view, drawing.graph.nodes, drawing.axes
     for order, row in enumerate(np.argsort(view.heights)):
         variances, directions = np.linalg.eigh(view.covariances[row])
         width, height = 2 * SIGMAS * np.sqrt(np.maximum(variances[::-1], 1e-8))
         angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
-        alpha = 1.0 if nodes[row].observations >= CONFIRMED_FROM else 0.45
+        alpha = 1.0 if is_sure(nodes[row]) else 0.45
         fill = drawing.colours[nodes[row].label]
         rim = shade(fill, 0.8)
         zorder = 3 + order / (len(nodes) + 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
@@ -18,8 +19,8 @@ from deworldsg_ros.view.top_view import BACKGROUND, FAINT, INK, Drawing
 
 # More labels leave no free space on a page.
 MOST_LABELS = 90
-# As `merging.confirm_observations`: nodes with fewer are pale and have a small label.
-CONFIRMED_FROM = 3
+# Nodes that are objects with a smaller probability are pale and have a small label.
+SURE_FROM = 0.75
 # Of matplotlib's arc3 arrows: enough to separate an edge from its opposite.
 CURVATURE = 0.16
 HALO = [patheffects.withStroke(linewidth=2.6, foreground=BACKGROUND)]
@@ -154,8 +155,13 @@ def _frame_px(axes: Axes) -> Float64:
     return np.array([extent.x0 + 4, extent.y0 + 4, extent.x1 - 4, extent.y1 - 4])
 
 
+def is_sure(node: wire.NodeState) -> bool:
+    """Whether a node is an object for sure, or its existence is not estimated."""
+    return node.existence is msgspec.UNSET or node.existence >= SURE_FROM
+
+
 def _label_style(node: wire.NodeState, label_count: int) -> dict[str, Any]:
-    if node.observations < CONFIRMED_FROM:
+    if not is_sure(node):
         return {"fontsize": 7.0, "alpha": 0.75}
     return {"fontsize": 9.0 if label_count <= 40 else 8.0, "fontweight": "bold"}
 

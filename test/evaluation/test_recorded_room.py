@@ -79,8 +79,9 @@ def test_true_boxes_of_a_recording_get_the_masks_of_the_segmenter(tmp_path: Path
     assert result.exit_code == 0, result.output
     values = json.loads((tmp_path / "n.json").read_text())
     assert values["front_end"] == "boxes jitter 2"
-    assert values["measures"]["found"] >= 4
-    assert values["measures"]["wrong_class"] == 0
+    # Three views far apart: one look is enough, and one node's centre is in its neighbour's box.
+    assert values["measures"]["found"] >= 20
+    assert values["measures"]["wrong_class"] <= 1
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,7 @@ def test_the_pose_table(root: Path, tmp_path: Path) -> None:
 
 
 def test_the_tables_of_hard_input_and_of_switches(root: Path, tmp_path: Path) -> None:
-    for table, name in (("hard", "default-jitter"), ("switches", "confirmed-label")):
+    for table, name in (("hard", "default-jitter"), ("switches", "hidden-label")):
         result = evaluate(
             *(root, table, "--workers", 1, "--checkpoints", 0, "--max-frames", 2),
             *("--out", tmp_path / table, "--json", tmp_path / "t.json"),

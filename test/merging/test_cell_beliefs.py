@@ -116,7 +116,7 @@ def test_a_node_that_the_frame_does_not_detect_keeps_its_surface() -> None:
 
 def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
     masks = [TRUE_M, WIDE_M, WIDE_M, TRUE_M, WIDE_M, TRUE_M, TRUE_M, WIDE_M, TRUE_M]
-    config = Config(merging=MergingConfig(confirm_observations=1))
+    config = Config()
     frames = [view(stamp, half_m, TRUE_M) for stamp, half_m in enumerate(masks, start=1)]
     for stop in (3, 5, 7):
         whole = GraphBuilder(config, VOCABULARY, "world")
@@ -131,17 +131,21 @@ def test_a_map_continues_the_evidence(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(one, other)
 
 
-def test_a_map_of_version_0_2_0_starts_without_evidence(tmp_path: Path) -> None:
-    config = Config(merging=MergingConfig(confirm_observations=1))
+def test_a_map_of_an_older_release_starts_without_evidence(tmp_path: Path) -> None:
+    config = Config()
     whole = GraphBuilder(config, VOCABULARY, "world")
     for stamp in range(1, 4):
         whole.integrate(view(stamp, TRUE_M))
     path = tmp_path / "room.map"
     write_map(whole, path)
     arrays = graph_io.read(path)
-    del arrays["merging.scores"]
+    for name in ("scores", "records", "looks", "last_ns"):
+        del arrays[f"merging.{name}"]
+    del arrays["existence"]
     graph_io.write(path, arrays)
-    assert read_map(config, path).integrate(view(4, TRUE_M)) == [1]
+    again = read_map(config, path)
+    assert again.integrate(view(4, TRUE_M)) == [1]
+    assert again.full().nodes[0].existence > 0.5
 
 
 class PlainScores:

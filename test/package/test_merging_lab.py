@@ -84,7 +84,7 @@ def test_a_row_is_printed_and_written_for_each_capture(
     assert "room_0.flip.every2: exists" in capsys.readouterr().out
     lab.replay.main(
         [str(folder), "--only", "*.clean*", "--missed", "--json", str(numbers), "--settings"]
-        + ["merging.confirm_observations=4"]
+        + ["output.min_existence=0.9"]
     )
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].split()[:5] == ["room_0.clean.every2", "3", "3", "0", "0"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.merging import set_confirmed
 from support.room_nodes import (
     VOCABULARY,
     Thing,
@@ -62,7 +63,6 @@ def beliefs_of(builder: GraphBuilder, of: Config) -> dict[tuple[int, int], np.nd
         builder.graph,
         load_physics_model(),
         geometry=relations.world_model != "none",
-        tentative=False,
     )
     pairs.refresh(builder.up.up_world())
     prior = (
@@ -400,7 +400,7 @@ def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:
     """A phantom under the cup would otherwise carry half of it."""
     phantom = {**DESK, "phantom": thing("book", 0.3, 0.1, 0.71, 0.3, 0.3, 0.03)}
     builder, ids = room(phantom, config())
-    builder.graph.set_confirmed(ids["phantom"], False)
+    set_confirmed(builder.graph, ids["phantom"], False)
     alone, _ = room(DESK, config())
     assert builder.full().edges == alone.full().edges
 

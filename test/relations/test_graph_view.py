@@ -6,6 +6,7 @@ import math
 
 import msgspec
 import pytest
+from support.merging import set_confirmed
 from support.scripted import PAPER, VOCABULARY, Scripted, frame
 
 from deworldsg_ros.config import RelationsConfig
@@ -64,7 +65,7 @@ def test_a_tentative_node_has_an_id_and_no_view():
     (builder, update, _, stamp_ns), *_ = running()
     published = PublishedGraph()
     published.apply(msgspec.structs.replace(update, nodes=update.nodes[:2]))
-    builder.graph.set_confirmed(3, False)
+    set_confirmed(builder.graph, 3, False)
     for view in (published, LiveGraph(builder.graph)):
         assert view.nodes_of_frame(stamp_ns) == [1, 2, 3]
         assert view.node(3) is None and view.node(2) is not None

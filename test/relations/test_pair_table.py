@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
+from support.merging import set_confirmed
 from support.room_nodes import (
     VOCABULARY,
     add_node,
@@ -58,8 +59,8 @@ THINGS = [
 ]
 
 
-def table_of(graph: SceneGraph, geometry: bool = True, tentative: bool = False) -> PairTable:
-    return PairTable(graph, load_physics_model(), geometry=geometry, tentative=tentative)
+def table_of(graph: SceneGraph, geometry: bool = True) -> PairTable:
+    return PairTable(graph, load_physics_model(), geometry=geometry)
 
 
 Pairs = dict[tuple[int, int], dict[str, np.ndarray]]
@@ -98,7 +99,7 @@ def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
     if kind == "add" or len(ids) < 4:
         parts = THINGS[rng.integers(len(THINGS))]
         node_id = add_node(builder, parts, rng, frames=1)
-        graph.set_confirmed(node_id, bool(rng.integers(3)))
+        set_confirmed(graph, node_id, bool(rng.integers(3)))
         return
     one, other = rng.choice(ids, 2, replace=False).tolist()
     if kind == "votes":
@@ -109,7 +110,7 @@ def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
         points = surface(parts, rng, int(rng.integers(0, 60)))
         graph.observe(one, np.zeros(3), np.eye(3), classes, 5, points)
     elif kind == "confirm":
-        graph.set_confirmed(one, bool(rng.integers(2)))
+        set_confirmed(graph, one, bool(rng.integers(2)))
     elif kind == "merge":
         graph.merge_nodes(one, other)
     elif kind == "remove":
@@ -122,15 +123,13 @@ def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
         graph.take_over(*sorted((one, other)))
 
 
-@pytest.mark.parametrize(("geometry", "tentative"), [(True, False), (True, True), (False, False)])
+@pytest.mark.parametrize("geometry", [True, False])
 @settings(max_examples=10, deadline=None)
 @given(seed=seeds)
-def test_a_table_that_follows_equals_one_made_anew(
-    geometry: bool, tentative: bool, seed: int
-) -> None:
+def test_a_table_that_follows_equals_one_made_anew(geometry: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     builder, _ = room({str(index): item for index, item in enumerate(THINGS[:4])}, seed=seed)
-    followed = table_of(builder.graph, geometry, tentative)
+    followed = table_of(builder.graph, geometry)
     up = Z
     for step in range(25):
         change(builder, rng)
@@ -139,7 +138,7 @@ def test_a_table_that_follows_equals_one_made_anew(
         if rng.random() < 0.1:
             up = rng.normal(0, 0.1, 3) + Z
         followed.refresh(up)
-        fresh = table_of(builder.graph, geometry, tentative)
+        fresh = table_of(builder.graph, geometry)
         fresh.refresh(up)
         assert_equal(pairs_of(followed), pairs_of(fresh))
         assert followed.floor_m == fresh.floor_m
@@ -218,24 +217,21 @@ def test_votes_are_those_of_the_graph_in_both_directions() -> None:
     assert followed.counts.shape == (1, 2, NONE)
 
 
-def test_tentative_nodes_take_part_only_on_request() -> None:
+def test_hidden_nodes_take_no_part() -> None:
     builder, ids = room({"cup": THINGS[2], "table": THINGS[0], "chair": THINGS[1]})
     graph = builder.graph
-    graph.set_confirmed(ids["cup"], False)
+    set_confirmed(graph, ids["cup"], False)
     graph.add_votes(ids["cup"], ids["chair"], None)
     graph.add_votes(ids["table"], ids["chair"], None)
-    followed, all_nodes = table_of(graph), table_of(graph, tentative=True)
-    all_nodes.refresh(Z)
-    assert {tuple(pair) for pair in all_nodes.nodes.tolist()} == {(1, 2), (1, 3), (2, 3)}
     followed = table_of(graph)
     followed.refresh(Z)
     assert followed.nodes.tolist() == [[ids["table"], ids["chair"]]]
     assert sorted(followed.shapes.ids) == [ids["table"], ids["chair"]]
-    graph.set_confirmed(ids["cup"], True)
+    set_confirmed(graph, ids["cup"], True)
     followed.refresh(Z)
-    assert_equal(pairs_of(followed), pairs_of(all_nodes))
+    assert {tuple(pair) for pair in followed.nodes.tolist()} == {(1, 2), (1, 3), (2, 3)}
     assert followed.frames[followed.row(key(ids["cup"], ids["chair"]))] == 1
-    graph.set_confirmed(ids["table"], False)
+    set_confirmed(graph, ids["table"], False)
     followed.refresh(Z)
     assert {tuple(pair) for pair in followed.nodes.tolist()} == {(ids["cup"], ids["chair"])}
 
@@ -384,4 +380,4 @@ def test_pairs_have_different_keys() -> None:
 
 def test_the_defaults_use_geometry_and_confirmed_nodes() -> None:
     config = Config()
-    assert config.relations.world_model == "physics" and not config.output.include_tentative
+    assert config.relations.world_model == "physics"

@@ -24,8 +24,8 @@ TOLERANCE_M = {"paper": 1e-9, "surface": 1e-3}
 
 def config(association: str) -> Config:
     return Config(
-        merging=MergingConfig(association=association, confirm_observations=1),
-        output=OutputConfig(include_tentative=True),
+        merging=MergingConfig(association=association),
+        output=OutputConfig(min_existence=0.0),
     )
 
 

@@ -14,8 +14,8 @@ from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.replica import GraphReplica
 
 
-def snapshot_of(graph: SceneGraph, sequence: int, tentative: bool = True):
-    nodes = graph.node_states(2, tentative, with_points=True)
+def snapshot_of(graph: SceneGraph, sequence: int):
+    nodes = graph.node_states(2, with_points=True)
     edges = []
     for subject, object_ in sorted(graph.edges):
         evidence = graph.edges[subject, object_]
@@ -42,13 +42,12 @@ def snapshot_of(graph: SceneGraph, sequence: int, tentative: bool = True):
 def test_a_replica_that_missed_nothing_is_the_graph(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=3)
-    tentative = bool(rng.integers(2))
     previous = empty_scene_graph("world")
     from_start, joined_late = GraphReplica(), GraphReplica()
     known: set[int] = set()
     for sequence in range(1, 12):
         edit_at_random(graph, rng, int(rng.integers(0, 8)))
-        current = snapshot_of(graph, sequence, tentative)
+        current = snapshot_of(graph, sequence)
         update = diff(previous, current, graph.take_removals())
         sent = wire.decode(wire.encode(update), wire.SceneGraphUpdateMessage)
         assert sent == update
@@ -60,8 +59,8 @@ def test_a_replica_that_missed_nothing_is_the_graph(seed: int) -> None:
             assert joined_late.message() == current
         assert from_start.message() == current
         # An update tells nothing that was known, and every node that went.
-        assert not {(n.id, n.observations, n.confirmed) for n in update.nodes} & {
-            (n.id, n.observations, n.confirmed) for n in previous.nodes
+        assert not {(n.id, n.observations, n.existence) for n in update.nodes} & {
+            (n.id, n.observations, n.existence) for n in previous.nodes
         }
         now = {node.id for node in current.nodes}
         assert known - now <= {node.id for node in update.removed_nodes}

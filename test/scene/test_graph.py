@@ -13,6 +13,7 @@ from support.merging import (
     random_classes,
     random_covariances,
     seeds,
+    set_confirmed,
 )
 
 from deworldsg_ros.scene import graph_io, wire
@@ -216,18 +217,12 @@ def test_unchanged_nodes_keep_their_message() -> None:
     assert third[3] is first[3]
 
 
-def test_tentative_nodes_are_published_only_on_request() -> None:
+def test_hidden_nodes_have_no_message() -> None:
     graph = graph_of(1)
     for x in (5.0, 9.0):
         graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
     assert list(graph.node_states(2)) == [1]
-    published = graph.node_states(2, tentative=True)
-    assert [(node.id, node.confirmed) for node in published.values()] == [
-        (1, True),
-        (2, False),
-        (3, False),
-    ]
-    graph.set_confirmed(3, True)
+    set_confirmed(graph, 3, True)
     assert list(graph.node_states(2)) == [1, 3]
     assert graph.node_states(2)[3].confirmed
     assert graph.merge_nodes(2, 3) == 2  # a confirmed node stays confirmed

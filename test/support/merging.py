@@ -15,6 +15,11 @@ seeds = st.integers(0, 2**32 - 1)
 EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "votes", "frame"]
 
 
+def set_confirmed(graph: SceneGraph, node_id: int, confirmed: bool) -> None:
+    """Publish a node, or hide it."""
+    graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
+
+
 def random_covariances(
     rng: np.random.Generator, count: int, thinnest_m: float = 1e-3, largest_m: float = 1.0
 ) -> NDArray[np.float64]:
@@ -130,7 +135,7 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
         elif action == "observe":
             graph.observe(int(rng.choice(live)), *gaussian, stamp_ns, points)
         elif action == "confirm":
-            graph.set_confirmed(int(rng.choice(live)), True)
+            set_confirmed(graph, int(rng.choice(live)), True)
         elif action == "merge":
             graph.merge_nodes(*rng.choice(live, 2, replace=False).tolist())
         elif action == "remove" and rng.random() < 0.5:

@@ -270,7 +270,7 @@ def existence_beliefs(
     stated = [
         (float(existence), node)
         for node in nodes
-        if (existence := getattr(node, "existence", None)) is not None
+        if isinstance(existence := getattr(node, "existence", None), float)
     ]
     low, high = reference.boxes_min - BOX_MARGIN_M, reference.boxes_max + BOX_MARGIN_M
     free = np.ones(len(reference), bool)

@@ -118,7 +118,7 @@ HARD = (
 SWITCHES = (
     ("default", "default", ()),
     ("paper", "association of the paper", ("merging.association=paper",)),
-    ("confirmed", "nodes confirmed at once", ("merging.confirm_observations=1",)),
+    ("hidden", "all nodes published", ("output.min_existence=0",)),
     ("mask", "all mask pixels", ("lifting.pixels=mask",)),
     ("belief", "edge belief of the paper", ("relations.edge_belief=paper",)),
 )

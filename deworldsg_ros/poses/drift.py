@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from deworldsg_ros.merging.surfels import JOINT, SurfelMap, about_camera, difference
+from deworldsg_ros.poses.surfels import JOINT, SurfelMap, about_camera, difference
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph

@@ -1,0 +1,180 @@
+"""What a frame shows of the nodes of the graph, before it is merged.
+
+The surface points of the nodes are projected into the depth image of the frame. A point is present
+if the image shows a surface there, and seen through if the image shows something behind it. A point
+that is present may lie in the mask of an object.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
+from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.nodes import NodeTable
+
+# A point is seen through if the measured depth is larger than its own by THROUGH_M and
+# THROUGH_FRACTION of its depth. This is well above the noise of depth cameras and poses, and above
+# the step of the depth grid at an edge.
+THROUGH_M = 0.08
+THROUGH_FRACTION = 0.03
+# A node is judged only if this many of its points are visible, and this fraction of them.
+MIN_VISIBLE_POINTS = 6
+MIN_VISIBLE_FRACTION = 0.5
+# This fraction of the visible points decides: seen through, or present.
+DECISIVE_FRACTION = 0.7
+# A node is in full view if this fraction of its points is in the image, and not in view if less
+# than MIN_IN_VIEW_FRACTION is visible.
+FULL_VIEW_FRACTION = 0.9
+MIN_IN_VIEW_FRACTION = 0.25
+# How much of a present node is visible: less than a quarter, a quarter, half, or all of it.
+VISIBILITIES = NOT_VISIBLE, QUARTER, HALF, FULL = range(4)
+# Depth cameras measure nothing nearer than this.
+NEAR_M = 0.1
+# Surface points of a node that are compared with the image: the first in the order of their
+# hashes, which are a sample.
+SAMPLED_POINTS = 48
+# A node is compared if a ball of this many standard deviations around its mean may be in view.
+BALL_DEVIATIONS = 3.0
+
+# T_camera_world; depth in millimetres and instances, both (h, w); fx, fy, cx and cy of these images
+# in their own pixels. As in `cell_beliefs`.
+_Frame = tuple[Float64, UInt16, UInt16, tuple[float, float, float, float]]
+
+
+@dataclass(frozen=True)
+class View:
+    """The m nodes of which a frame with n objects shows something.
+
+    Attributes:
+        ids: (m,) int64, ids of the nodes.
+        visibilities: (m,) int64, how much of each is visible and present, of `VISIBILITIES`.
+        through: (m,) bool, whether the frame sees through most of it.
+        covered: (n, m) float64, the fraction of its present points in the mask of each object; NaN
+            if too few are present, or without instances.
+    """
+
+    ids: Int64
+    visibilities: Int64
+    through: Bool
+    covered: Float64
+
+
+def see(nodes: NodeTable, local: LocalGraph) -> View:
+    """What a frame shows of the nodes; nothing without a depth grid."""
+    grid = local.depth_grid
+    if grid is None:
+        none = np.zeros(0, np.int64)
+        return View(none, none, none.astype(bool), np.zeros((len(local), 0)))
+    camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
+    instances = np.zeros_like(grid.depth_mm) if grid.instances is None else grid.instances
+    frame = (
+        invert_pose(local.T_world_camera),
+        grid.depth_mm,
+        instances,
+        (camera.fx * per_px, camera.fy * per_px, camera.cx * per_px, camera.cy * per_px),
+    )
+    rows = _in_view(nodes.means, nodes.eigenvalue_bounds, frame)
+    visibilities, through, covered = _see(
+        nodes.surface_points_world, nodes.surface_counts, rows, local.instance_ids, frame
+    )
+    if grid.instances is None:
+        covered[:] = np.nan
+    return View(nodes.ids[rows], visibilities, through, covered)
+
+
+@kernel
+def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@kernel
+def _in_view(means: Float64, eigenvalue_bounds: Float64, frame: _Frame) -> Int64:
+    """Rows of the nodes that are not wholly behind the camera or beyond one side of the image."""
+    T, depth_mm, _, (fx, fy, cx, cy) = frame
+    right, below = cx - depth_mm.shape[1], cy - depth_mm.shape[0]
+    rows = np.empty(len(means), np.int64)
+    count = 0
+    for row in range(len(means)):
+        radius = BALL_DEVIATIONS * math.sqrt(eigenvalue_bounds[row])
+        x, y, z = _in_camera(T, means[row, 0], means[row, 1], means[row, 2])
+        beyond = (
+            z < NEAR_M - radius
+            or fx * x + cx * z < -radius * math.hypot(fx, cx)
+            or fx * x + right * z > radius * math.hypot(fx, right)
+            or fy * y + cy * z < -radius * math.hypot(fy, cy)
+            or fy * y + below * z > radius * math.hypot(fy, below)
+        )
+        rows[count] = row
+        count += int(not beyond)
+    return rows[:count]
+
+
+@kernel
+def _see(
+    points: Float32, counts: Int64, rows: Int64, values: Int64, frame: _Frame
+) -> tuple[Int64, Bool, Float64]:
+    """The arrays of a `View` of some rows; values (n,) are those of the objects in the image."""
+    visibilities = np.full(len(rows), NOT_VISIBLE)
+    through = np.zeros(len(rows), np.bool_)
+    covered = np.full((len(values), len(rows)), np.nan)
+    object_of = np.full(max(values.max() if len(values) else 0, 0) + 1, -1, np.int64)
+    for index in range(len(values)):
+        object_of[values[index]] = index
+    hits = np.empty(len(values), np.int64)
+    for column in range(len(rows)):
+        count = min(counts[rows[column]], SAMPLED_POINTS)
+        hits[:] = 0
+        behind, present, inside = _compare(points[rows[column]], count, object_of, hits, frame)
+        if present >= MIN_VISIBLE_POINTS:
+            covered[:, column] = hits / present
+        visible = behind + present
+        if visible < MIN_VISIBLE_POINTS or visible < MIN_IN_VIEW_FRACTION * count:
+            continue
+        half = visible >= MIN_VISIBLE_FRACTION * count
+        if present >= DECISIVE_FRACTION * visible:
+            visibilities[column] = QUARTER
+            if half:
+                visibilities[column] = FULL if inside >= FULL_VIEW_FRACTION * count else HALF
+        through[column] = half and behind >= DECISIVE_FRACTION * visible
+    return visibilities, through, covered
+
+
+@kernel
+def _compare(
+    points: Float32, count: int, object_of: Int64, hits: Int64, frame: _Frame
+) -> tuple[int, int, int]:
+    """Number of points that are seen through, present, and in the image; counts those in masks."""
+    T, depth_mm, instances, (fx, fy, cx, cy) = frame
+    height, width = depth_mm.shape
+    behind = present = inside = 0
+    for index in range(count):
+        x, y, z = points[index]
+        right, down, ahead = _in_camera(T, np.float64(x), np.float64(y), np.float64(z))
+        if ahead < NEAR_M:
+            continue
+        u, v = fx * right / ahead + cx, fy * down / ahead + cy
+        if u < 0.0 or v < 0.0 or u >= width or v >= height:
+            continue
+        inside += 1
+        measured_m = depth_mm[int(v), int(u)] * 0.001
+        if measured_m == 0.0:
+            continue
+        tolerance_m = THROUGH_M + THROUGH_FRACTION * ahead
+        if measured_m > ahead + tolerance_m:
+            behind += 1
+        elif measured_m > ahead - tolerance_m:
+            present += 1
+            value = instances[int(v), int(u)]
+            if value < len(object_of) and object_of[value] >= 0:
+                hits[object_of[value]] += 1
+    return behind, present, inside

@@ -1,0 +1,112 @@
+"""What a frame shows of nodes: visibility, points seen through, and coverage by masks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from support.gaussians import moments
+from support.merging import seeds
+from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
+
+from deworldsg_ros.merging.views import FULL, HALF, NOT_VISIBLE, QUARTER, SAMPLED_POINTS, View, see
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
+from deworldsg_ros.scene.nodes import NodeTable
+
+BOARD = slab((0, 0, 1), (0.8, 0.8, 0.004))
+LEFT = slab((-0.2, 0, 1), (0.3, 0.3, 0.004))
+
+
+def table_of(*surfaces: np.ndarray, capacity: int = 512) -> NodeTable:
+    nodes = NodeTable(1, capacity)
+    for index, points in enumerate(surfaces):
+        row = nodes.append(index + 1)
+        mean, covariance = moments(points, 1e-6) if len(points) else (np.zeros(3), np.eye(3))
+        nodes.put(row, mean, covariance, np.ones(1), 1.0, 1)
+        nodes.set_surface(row, points.astype(np.float32))
+    return nodes
+
+
+def view_of(points: np.ndarray, background_m: float = WALL_M) -> tuple[bool, int]:
+    """Whether a wall's frame sees through a node of these points, and how much is visible."""
+    local = frame(1, depth_grid=depth_grid(background_m=background_m))
+    view = see(table_of(points, capacity=SAMPLED_POINTS), local)
+    if not len(view.ids):
+        return False, NOT_VISIBLE
+    return bool(view.through[0]), int(view.visibilities[0])
+
+
+@pytest.mark.parametrize(
+    ("z_m", "through", "visibility"),
+    [(0.7, True, NOT_VISIBLE), (1.0, False, FULL), (1.5, False, NOT_VISIBLE)],
+)
+def test_points_before_on_and_behind_the_measured_depth(z_m, through, visibility) -> None:
+    points = np.stack([np.linspace(-0.2, 0.2, 10), np.zeros(10), np.full(10, z_m)], axis=1)
+    assert view_of(points) == (through, visibility)
+    assert view_of(points[:0]) == (False, NOT_VISIBLE)
+
+
+@pytest.mark.parametrize(
+    ("left_m", "visibility"), [(-1.0, FULL), (-1.7, HALF), (-2.4, QUARTER), (-2.8, NOT_VISIBLE)]
+)
+def test_visibility_of_a_node_cut_by_the_image_border(left_m, visibility) -> None:
+    # The image ends at 1.07 m to the left.
+    x_m = np.linspace(left_m, left_m + 2, 40)
+    points = np.stack([x_m, np.zeros(40), np.full(40, WALL_M)], axis=1)
+    assert view_of(points) == (False, visibility)
+    # Nearer to the camera, the image ends sooner.
+    assert view_of(points, background_m=3.0) == (visibility in (HALF, FULL), NOT_VISIBLE)
+
+
+@given(seeds)
+@settings(max_examples=100)
+def test_a_node_is_seen_through_if_half_of_it_is_in_the_image(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform((-3.5, -2.6, -0.5), (3.5, 2.6, 3.0))
+    # A part of it is elsewhere, so that its centre is not on it.
+    apart = rng.random((40, 1)) < 0.45
+    points = centre + rng.uniform(-0.2, 0.2, (40, 3)) + apart * rng.uniform(-6, 6, 3)
+    points = points.astype(np.float32)
+    x, y, z = points.astype(np.float64).T
+    inside = z >= 0.1
+    z = np.where(inside, z, 1.0)
+    inside &= (np.abs(300 * x / z + 319.5 - 320) < 320) & (np.abs(300 * y / z + 239.5 - 240) < 240)
+    through, _ = view_of(points, background_m=60.0)
+    assert through == bool(inside.sum() >= 20)
+
+
+def halves() -> DepthGrid:
+    """A wall at 1 m, its left half in the first mask and its right half in the second."""
+    instances = np.repeat(np.uint16([[1, 2]]), 40, axis=1).repeat(60, axis=0)
+    return replace(depth_grid(), instances=instances)
+
+
+def of_two_masks(grid: DepthGrid | None, *surfaces: np.ndarray) -> View:
+    local: LocalGraph = frame(1, (LEFT, CUP), (BOARD, CUP), depth_grid=grid)
+    return see(table_of(*surfaces), local)
+
+
+def test_the_masks_share_a_node_by_its_present_points() -> None:
+    covered = of_two_masks(halves(), BOARD, LEFT).covered
+    assert covered[:, 0] == pytest.approx([0.5, 0.5], abs=0.2)
+    assert covered[:, 1].tolist() == [1.0, 0.0]
+
+
+def test_hidden_points_and_points_out_of_view_are_not_covered() -> None:
+    behind, beyond = LEFT + np.float32([0.3, 0, 1.0]), LEFT - np.float32([3.0, 0, 0])
+    covered = of_two_masks(halves(), np.concatenate((LEFT, behind, beyond))).covered
+    assert covered[:, 0].tolist() == [1.0, 0.0]
+
+
+def test_the_coverage_of_a_hidden_node_is_unknown() -> None:
+    hidden = slab((0, 0, 2), (0.5, 0.5, 0.004))
+    assert np.isnan(of_two_masks(halves(), hidden).covered).all()
+    assert np.isnan(of_two_masks(replace(halves(), instances=None), BOARD).covered).all()
+    assert of_two_masks(None, BOARD).covered.shape == (2, 0)
+
+
+def test_only_nodes_that_may_be_in_view_are_compared() -> None:
+    elsewhere = BOARD - np.float32([50.0, 0, 0])
+    assert of_two_masks(halves(), elsewhere, BOARD).ids.tolist() == [2]
