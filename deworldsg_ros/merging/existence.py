@@ -7,13 +7,18 @@ frames in which the node is hidden or out of view do not count.
 
 The log odds of existence are a sum:
 
-    OFFSET + SCORE ln(s / (1 - s)) + LOOKS ln(D) - MISSES ln(1 + M) - MOMENT ln(1 + R)
+    prior + SCORE ln(s / (1 - s)) + LOOKS ln(D) - MISSES ln(1 + M) - MOMENT ln(1 + R)
 
 s is the best detection score, and D the sum of the detected fractions of all looks. M is the
 evidence of the misses: the sum of -(1 - fraction) ln(1 - rate), where `rate` is the fraction of
 looks that detect an object of which as much is visible; it is learned. R is the part of M since the
 last detection; it counts only if all detections lie within MOMENT_NS: a reflection or a shadow
-lasts for a moment. The weights are fitted by logistic regression (tools/merging_lab).
+lasts for a moment. The prior is learned, too: where many nodes turned out to be errors, a new one
+is less probable (`prior`).
+
+The weights started from a logistic regression on recorded and embedded detections of one rendered
+room and the shipped recording, and were rounded so that a score above 0.5 and a moment in sight
+count the same for all detectors. docs/dev/notebook.md has the calibration.
 """
 
 from __future__ import annotations
@@ -29,6 +34,10 @@ from deworldsg_ros.merging.views import VISIBILITIES
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
 OFFSET, SCORE, LOOKS, MISSES, MOMENT = 0.2, 1.5, 1.2, 0.35, 1.2
+FATES = 0.4
+# The fate of a node is known from this probability on, or below one minus it after a clear miss.
+# At first, as many objects as errors are known.
+SETTLED, CLEAR_MISS, PRIOR_FATES = 0.9, 1.0, 10
 MIN_SCORE, MAX_SCORE = 0.02, 0.5
 LOOK_RAD = math.radians(2.0)
 LOOK_NS = 500_000_000
@@ -64,12 +73,37 @@ FIELDS: list[Any] = [
     ("look_weight", np.float64),
     # Looks since the last detection, by visibility.
     ("pending", np.float64, len(VISIBILITIES)),
+    # Whether its fate is known: it is an object, or an error.
+    ("is_settled", np.bool_),
 ]
 
 
 def first_counts() -> Float64:
     """Looks at objects, and those that detected them, by visibility: (len(VISIBILITIES), 2)."""
     return np.full((len(VISIBILITIES), 2), (PRIOR_LOOKS, PRIOR_LOOKS / 2))
+
+
+def first_fates() -> Int64:
+    """Number of errors, and of objects, among the nodes whose fate is known: (2,)."""
+    return np.array([PRIOR_FATES, PRIOR_FATES])
+
+
+def prior(fates: Int64) -> float:
+    """Log odds that a new node is an object: higher where few nodes turned out to be errors."""
+    return OFFSET + FATES * math.log(fates[1] / fates[0])
+
+
+def settle(records: NDArray[Any], fates: Int64, owners: list[int], known: Float64) -> None:
+    """Count the nodes (n) of which the probability (n,) now says what they are.
+
+    A node is an error only after a clear miss: a new node of a fast camera is improbable, too.
+    """
+    for owner, probability in zip(owners, known.tolist()):
+        record = records[owner]
+        is_error = probability < 1.0 - SETTLED and record["missed_since"] > CLEAR_MISS
+        if not record["is_settled"] and (probability > SETTLED or is_error):
+            record["is_settled"] = True
+            fates[int(not is_error)] += 1
 
 
 def frame_weight(step_ns: int | None) -> float:
@@ -134,7 +168,7 @@ def observe(
         record.visibility = max(record.visibility, visibilities[index])
         if scores[index] > 0.0:
             # After a clear miss, a node of a moment starts again: it may be an error that returns.
-            if record.missed_since > 1.0 and record.last_ns - record.first_ns < MOMENT_NS:
+            if record.missed_since > CLEAR_MISS and record.last_ns - record.first_ns < MOMENT_NS:
                 record.first_ns = stamp_ns
             record.detected += weight
             record.missed_since = 0.0
@@ -177,28 +211,30 @@ def _look(record: Any, counts: Float64) -> tuple[float, float]:
 
 
 @kernel
-def probabilities(records: NDArray[Any], counts: Float64, owners: Int64) -> Float64:
-    """Probability (n,) that each of n nodes is an object."""
+def probabilities(records: NDArray[Any], counts: Float64, owners: Int64, prior: float) -> Float64:
+    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`."""
     result = np.empty(len(owners))
     for index in range(len(owners)):
-        result[index] = _probability(records[owners[index]], counts, True)
+        result[index] = _probability(records[owners[index]], counts, prior, True)
     return result
 
 
 @kernel
-def are_missed(records: NDArray[Any], counts: Float64, owners: Int64, minimum: float) -> Bool:
+def are_missed(
+    records: NDArray[Any], counts: Float64, owners: Int64, prior: float, minimum: float
+) -> Bool:
     """Whether (n,) only the misses make the probability of each of n nodes less than a minimum."""
     result = np.empty(len(owners), np.bool_)
     for index in range(len(owners)):
-        result[index] = _probability(records[owners[index]], counts, False) >= minimum
+        result[index] = _probability(records[owners[index]], counts, prior, False) >= minimum
     return result
 
 
 @kernel
-def _probability(record: Any, counts: Float64, with_misses: bool) -> float:
+def _probability(record: Any, counts: Float64, prior: float, with_misses: bool) -> float:
     found, missed = _look(record, counts)
     score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
-    log_odds = OFFSET + SCORE * math.log(score / (1.0 - score))
+    log_odds = prior + SCORE * math.log(score / (1.0 - score))
     log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
     if with_misses:
         log_odds -= MISSES * math.log1p(record.missed + missed)

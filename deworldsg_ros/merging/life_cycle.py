@@ -6,6 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
+from deworldsg_ros.merging import existence
 from deworldsg_ros.merging.lost_nodes import LostNodes, moved_object
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
@@ -103,7 +104,10 @@ class LifeCycle:
 
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
-        probabilities = self._records.existence([self._records.owner(i) for i in node_ids])
+        records = self._records
+        owners = [records.owner(node_id) for node_id in node_ids]
+        probabilities = records.existence(owners)
+        existence.settle(records.rows, records.fates, owners, probabilities)
         for node_id in graph.set_existence(node_ids, probabilities, self._min_existence):
             # A new node that is the object of a lost node takes the id of the lost node.
             lost_id = self._lost.match(graph, node_id)

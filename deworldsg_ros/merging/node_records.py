@@ -31,6 +31,7 @@ class NodeRecords:
     Attributes:
         rows: (capacity,) of `RECORD`; ``node_id`` is 0 in rows that are free.
         looks: looks at objects and those that detected them (`existence.first_counts`).
+        fates: errors and objects among the nodes so far (`existence.first_fates`).
         last_ns: stamp of the newest frame; 0 = none.
         map: cells of the surfaces, by owner.
         joint: evidence that two owners are one object.
@@ -39,6 +40,7 @@ class NodeRecords:
     def __init__(self) -> None:
         self.rows: NDArray[np.void] = np.zeros(64, RECORD)
         self.looks = existence.first_counts()
+        self.fates = existence.first_fates()
         self.last_ns = 0
         self.map = VoxelMap()
         self.joint = JointEvidence()
@@ -110,11 +112,13 @@ class NodeRecords:
 
     def existence(self, owners: list[int]) -> Float64:
         """Probability (n,) that each of n owners is an object."""
-        return existence.probabilities(self.rows, self.looks, np.array(owners, np.int64))
+        prior = existence.prior(self.fates)
+        return existence.probabilities(self.rows, self.looks, np.array(owners, np.int64), prior)
 
     def are_missed(self, owners: list[int], minimum: float) -> Bool:
         """Whether (n,) only misses make the existence of each of n owners less than a minimum."""
-        return existence.are_missed(self.rows, self.looks, np.array(owners, np.int64), minimum)
+        prior, indices = existence.prior(self.fates), np.array(owners, np.int64)
+        return existence.are_missed(self.rows, self.looks, indices, prior, minimum)
 
     def remove(self, node_id: int) -> CellSets:
         """Drop everything of a node; returns its cells, as one set."""
@@ -152,6 +156,7 @@ class NodeRecords:
             "cell_m": np.array(self.map.cell_m),
             "records": self.rows[owners],
             "looks": self.looks,
+            "fates": self.fates,
             "last_ns": np.array(self.last_ns),
             "blocks": np.concatenate([np.zeros(0, np.int64), *(cells.blocks for cells in sets)]),
             "masks": np.concatenate([np.zeros(0, np.uint64), *(cells.masks for cells in sets)]),
@@ -176,6 +181,7 @@ class NodeRecords:
         owners = [owner_of[node_id] for node_id in records["node_id"][kept].tolist()]
         self.rows[owners] = records[kept]
         self.looks[:] = memory["looks"]
+        self.fates[:] = memory["fates"]
         self.last_ns = int(memory["last_ns"])
         counts = memory["block_counts"]
         stops = np.cumsum(counts)

@@ -139,7 +139,7 @@ def test_a_map_of_an_older_release_starts_without_evidence(tmp_path: Path) -> No
     path = tmp_path / "room.map"
     write_map(whole, path)
     arrays = graph_io.read(path)
-    for name in ("scores", "records", "looks", "last_ns"):
+    for name in ("scores", "records", "looks", "fates", "last_ns"):
         del arrays[f"merging.{name}"]
     del arrays["existence"]
     graph_io.write(path, arrays)

@@ -254,6 +254,24 @@ def test_at_a_high_detection_rate_a_miss_counts_for_more() -> None:
     assert beliefs[0] < beliefs[1] - 0.03
 
 
+def test_where_new_nodes_turn_out_to_be_errors_a_new_one_is_less_probable() -> None:
+    beliefs = []
+    for fates in ([10, 60], [60, 10]):
+        records = records_of(1)
+        records.fates[:] = fates
+        look(records, 0, around(0), 0, 0.5)
+        beliefs.append(records.existence([0])[0])
+    assert beliefs[0] > beliefs[1] + 0.2
+
+
+def test_the_fate_of_a_node_is_counted_once_and_only_after_a_clear_miss() -> None:
+    records = records_of(3)
+    records.rows["missed_since"][:3] = 0.0, 2.0, 0.0
+    for _ in range(2):
+        existence.settle(records.rows, records.fates, [0, 1, 2], np.array([0.95, 0.05, 0.05]))
+        assert records.fates.tolist() == [11, 11]
+
+
 @pytest.mark.parametrize("behind_s", [0, 10**6])
 def test_restored_records_continue_if_the_clock_is_behind(behind_s: int) -> None:
     records = records_of(1)
