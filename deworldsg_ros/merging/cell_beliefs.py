@@ -11,8 +11,8 @@ import numpy as np
 
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, TableArrays
-from deworldsg_ros.merging.views import NEAR_M
-from deworldsg_ros.scene.arrays import Float64, Int8, Int64, UInt16, UInt64
+from deworldsg_ros.merging.views import NEAR_M, FrameArrays
+from deworldsg_ros.scene.arrays import Float64, Int8, Int64, UInt64
 
 # A cell is rejected if less than 60 % of the frames that saw it say that it is the owner's. With
 # 50 %, more of a bleeding mask stays; with 67 %, more of the true surface is lost if masks are cut
@@ -25,10 +25,6 @@ MAX_SCORE = 120
 # SHOWN_FRACTION of it: the distance of a cell's corner from its centre, and the noise of cameras.
 SHOWN_M = 0.03
 SHOWN_FRACTION = 0.01
-
-# A frame: T_camera_world (4, 4); depth in millimetres and instances, both (h, w); and fx, fy, cx
-# and cy of these images in their own pixels.
-FrameArrays = tuple[Float64, UInt16, UInt16, tuple[float, float, float, float]]
 
 
 @kernel

@@ -15,7 +15,7 @@ import numpy as np
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
 
 # A point is seen through if the measured depth is larger than its own by THROUGH_M and
@@ -42,14 +42,14 @@ SAMPLED_POINTS = 48
 # A node is compared if a ball of this many standard deviations around its mean may be in view.
 BALL_DEVIATIONS = 3.0
 
-# T_camera_world; depth in millimetres and instances, both (h, w); fx, fy, cx and cy of these images
-# in their own pixels. As in `cell_beliefs`.
-_Frame = tuple[Float64, UInt16, UInt16, tuple[float, float, float, float]]
+# A frame: T_camera_world (4, 4); depth in millimetres and instances, both (h, w); and fx, fy, cx
+# and cy of these images in their own pixels.
+FrameArrays = tuple[Float64, UInt16, UInt16, tuple[float, float, float, float]]
 
 
 @dataclass(frozen=True)
 class View:
-    """The m nodes of which a frame with n objects shows something.
+    """The m nodes that a frame with n objects may show.
 
     Attributes:
         ids: (m,) int64, ids of the nodes.
@@ -71,14 +71,7 @@ def see(nodes: NodeTable, local: LocalGraph) -> View:
     if grid is None:
         none = np.zeros(0, np.int64)
         return View(none, none, none.astype(bool), np.zeros((len(local), 0)))
-    camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
-    instances = np.zeros_like(grid.depth_mm) if grid.instances is None else grid.instances
-    frame = (
-        invert_pose(local.T_world_camera),
-        grid.depth_mm,
-        instances,
-        (camera.fx * per_px, camera.fy * per_px, camera.cx * per_px, camera.cy * per_px),
-    )
+    frame = frame_arrays(invert_pose(local.T_world_camera), grid)
     rows = _in_view(nodes.means, nodes.eigenvalue_bounds, frame)
     visibilities, through, covered = _see(
         nodes.surface_points_world, nodes.surface_counts, rows, local.instance_ids, frame
@@ -86,6 +79,14 @@ def see(nodes: NodeTable, local: LocalGraph) -> View:
     if grid.instances is None:
         covered[:] = np.nan
     return View(nodes.ids[rows], visibilities, through, covered)
+
+
+def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
+    """The arrays of a frame for kernels; without instances, no pixel shows an object."""
+    camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
+    instances = np.zeros_like(grid.depth_mm) if grid.instances is None else grid.instances
+    intrinsics = camera.fx * per_px, camera.fy * per_px, camera.cx * per_px, camera.cy * per_px
+    return T_camera_world, grid.depth_mm, instances, intrinsics
 
 
 @kernel
@@ -98,7 +99,7 @@ def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, 
 
 
 @kernel
-def _in_view(means: Float64, eigenvalue_bounds: Float64, frame: _Frame) -> Int64:
+def _in_view(means: Float64, eigenvalue_bounds: Float64, frame: FrameArrays) -> Int64:
     """Rows of the nodes that are not wholly behind the camera or beyond one side of the image."""
     T, depth_mm, _, (fx, fy, cx, cy) = frame
     right, below = cx - depth_mm.shape[1], cy - depth_mm.shape[0]
@@ -121,7 +122,7 @@ def _in_view(means: Float64, eigenvalue_bounds: Float64, frame: _Frame) -> Int64
 
 @kernel
 def _see(
-    points: Float32, counts: Int64, rows: Int64, values: Int64, frame: _Frame
+    points: Float32, counts: Int64, rows: Int64, values: Int64, frame: FrameArrays
 ) -> tuple[Int64, Bool, Float64]:
     """The arrays of a `View` of some rows; values (n,) are those of the objects in the image."""
     visibilities = np.full(len(rows), NOT_VISIBLE)
@@ -151,7 +152,7 @@ def _see(
 
 @kernel
 def _compare(
-    points: Float32, count: int, object_of: Int64, hits: Int64, frame: _Frame
+    points: Float32, count: int, object_of: Int64, hits: Int64, frame: FrameArrays
 ) -> tuple[int, int, int]:
     """Number of points that are seen through, present, and in the image; counts those in masks."""
     T, depth_mm, instances, (fx, fy, cx, cy) = frame

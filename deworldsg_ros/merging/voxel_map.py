@@ -14,6 +14,7 @@ import numpy as np
 
 from deworldsg_ros.merging import cell_beliefs, cell_kernels
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets
+from deworldsg_ros.merging.views import frame_arrays
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
@@ -127,10 +128,7 @@ class VoxelMap:
             return CellSets(*no_cells, np.zeros(len(owners) + 1, np.int64))
         owner_array = np.array(owners, np.int64)
         cell_kernels.mark(self._table[:], owner_array, sets[:])
-        camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
-        fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-        grid_camera = fx * per_px, fy * per_px, cx * per_px, cy * per_px
-        frame = T_camera_world, grid.depth_mm, grid.instances, grid_camera
+        frame = frame_arrays(T_camera_world, grid)
         changed = cell_beliefs.judge(
             self._table[:], self._firsts, owner_array, values, frame, self.cell_m
         )
