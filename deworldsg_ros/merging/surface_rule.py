@@ -177,7 +177,7 @@ class SurfaceMerging:
 
 
 def _spare_frame(stamp_ns: int) -> LocalGraph:
-    """Two objects before a camera, of which the third frame shows one in another place."""
+    """A frame of two objects, to compile the kernels. In the third frame, one object has moved."""
     shift_m = 0.1 * (stamp_ns == 3)
     points = tuple(
         (np.random.default_rng(0).random((50, 3)) * 0.2 + (x_m, 0.0, 1.0)).astype(np.float32)

@@ -99,8 +99,8 @@ def build_probed(
         )
     if config.edge_belief == "paper" and probe.card.inputs != "clip":
         logger.warning(
-            "probe %s is told which object is the subject (inputs '%s'); the paper's probe sees "
-            "the clip only",
+            "probe %s gets '%s'. The paper's probe gets the clip only: these are not the paper's "
+            "results. For those, use a probe trained with --inputs clip",
             config.probe_path,
             probe.card.inputs,
         )
