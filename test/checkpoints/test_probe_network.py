@@ -196,7 +196,7 @@ def test_a_probe_that_knows_the_subject_is_told_beside_the_papers_rule(tmp_path,
     assert warnings_of(tmp_path / "a", caplog, {}, **boxes) == []
     assert warnings_of(tmp_path / "b", caplog, {}, "paper") == []
     (told,) = warnings_of(tmp_path / "c", caplog, {}, "paper", **boxes)
-    assert "the paper's probe sees the clip only" in told
+    assert "The paper's probe gets the clip only" in told
 
 
 @pytest.mark.parametrize(
