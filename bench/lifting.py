@@ -8,7 +8,6 @@ The times are processor times. Both must find the same number of inliers.
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import time
 from pathlib import Path
@@ -21,12 +20,19 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 from support.reference_lifting import reference_lift  # noqa: E402
 
+from bench.figures import Figure, Paired, Setup, in_turn  # noqa: E402
 from deworldsg_ros.config import LiftingConfig  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402
 from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
-from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary  # noqa: E402
+from deworldsg_ros.scene.frame_graph import (  # noqa: E402
+    FrameGraph,
+    LocalGraph,
+    Relations,
+    Vocabulary,
+)
 
 HEIGHT, WIDTH, OBJECTS = 480, 640, 12
+REFERENCE = "lifting without optimisation (test/support/reference_lifting.py)"
 
 
 def make_frame(kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -52,16 +58,8 @@ def make_frame(kind: str) -> tuple[np.ndarray, np.ndarray]:
     return instances, depth.astype(np.float32)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("rounds", type=int, nargs="?", default=31, help="number of measurements")
-    rounds = parser.parse_args().rounds
-    cv2.setNumThreads(1)
-    config = LiftingConfig()
-    lifting = Lifting(config)
-    start = time.process_time()
-    lifting.warm_up()
-    print(f"warm-up {time.process_time() - start:.2f} s")
+def compare(lifting: Lifting, kind: str, rounds: int) -> tuple[Paired, int]:
+    """Lifting and its reference in turn, on a kind of frame; and the number of mask pixels."""
     intrinsics = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)
     graph = FrameGraph(
         0,
@@ -74,25 +72,58 @@ def main() -> None:
         np.ones(OBJECTS),
         Relations.none(0),
     )
+    instances, depth_m = make_frame(kind)
+
+    def lift() -> LocalGraph:
+        return lifting.lift(graph, instances, depth_m, intrinsics, np.eye(4), "world")
+
+    def lift_plainly() -> list:
+        return reference_lift(
+            instances, depth_m, intrinsics, np.eye(4), LiftingConfig(), OBJECTS, fast_median=True
+        )
+
+    assert [int(r.inliers.sum()) for r in lift_plainly()] == lift().pixel_counts.tolist()
+    return in_turn(lift, lift_plainly, rounds), int((instances > 0).sum())
+
+
+def figures(setup: Setup) -> list[Figure]:
+    """Figures of `python -m bench`."""
+    cv2.setNumThreads(1)
+    lifting = Lifting(LiftingConfig())
+    lifting.warm_up()
+    found = []
     for kind in ("smooth", "millimetres", "two layers"):
-        instances, depth_m = make_frame(kind)
-        kernel_ms, reference_ms = [], []
-        for _ in range(rounds):
-            start = time.process_time()
-            local = lifting.lift(graph, instances, depth_m, intrinsics, np.eye(4), "world")
-            middle = time.process_time()
-            reference = reference_lift(
-                instances, depth_m, intrinsics, np.eye(4), config, OBJECTS, fast_median=True
+        paired, pixels = compare(lifting, kind, 3 if setup.quick else 31)
+        found.append(
+            Figure(
+                f"lifting_{kind.replace(' ', '_')}",
+                paired.ours_ms,
+                "ms",
+                target=2.5,
+                reference=REFERENCE,
+                reference_value=paired.reference_ms,
+                ratio=paired.ratio,
+                ratio_target=14,
+                note=f"a frame of {OBJECTS} masks, {pixels} mask pixels, processor time",
             )
-            end = time.process_time()
-            kernel_ms.append(1e3 * (middle - start))
-            reference_ms.append(1e3 * (end - middle))
-        assert [int(r.inliers.sum()) for r in reference] == local.pixel_counts.tolist()
-        ratio = statistics.median(r / k for r, k in zip(reference_ms, kernel_ms))
+        )
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rounds", type=int, nargs="?", default=31, help="number of measurements")
+    rounds = parser.parse_args().rounds
+    cv2.setNumThreads(1)
+    lifting = Lifting(LiftingConfig())
+    start = time.process_time()
+    lifting.warm_up()
+    print(f"warm-up {time.process_time() - start:.2f} s")
+    for kind in ("smooth", "millimetres", "two layers"):
+        paired, pixels = compare(lifting, kind, rounds)
         print(
-            f"{kind:12} {int((instances > 0).sum())} mask pixels, {len(local)} objects: "
-            f"{statistics.median(kernel_ms):.2f} ms; reference "
-            f"{statistics.median(reference_ms):.1f} ms; ratio {ratio:.1f}"
+            f"{kind:12} {pixels} mask pixels, {OBJECTS} objects: {paired.ours_ms:.2f} ms; "
+            f"reference {paired.reference_ms:.1f} ms; ratio {paired.ratio:.1f}"
         )
 
 

@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 
 from support.reference_merging import class_distance, may_merge
 
+from bench.figures import Figure, Paired, Setup, in_turn
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging import build_merging
 from deworldsg_ros.merging.nearest import bhattacharyya_bound, nearest_row, observed, warm_up
@@ -173,19 +174,48 @@ def milliseconds(call: Callable[[], object]) -> float:
     return (time.thread_time() - start) * 1e3
 
 
-def bench_search(count: int, rounds: int) -> None:
+def compare_searches(count: int, rounds: int) -> Paired:
+    """Both searches in turn, in graphs of `count` nodes."""
     world = World(count)
     graph = graph_of(world)
-    kernel, linalg = [], []
-    for local in frames_of(world, rounds):
+    frames = frames_of(world, rounds)
+    for local in frames:
         assert search_with_kernel(graph, local) == search_with_linalg(graph, local)
-        kernel.append(milliseconds(lambda frame=local: search_with_kernel(graph, frame)))
-        linalg.append(milliseconds(lambda frame=local: search_with_linalg(graph, frame)))
-    ratio = statistics.median(slow / fast for slow, fast in zip(linalg, kernel))
+    ours, reference = iter(frames), iter(frames)
+    return in_turn(
+        lambda: search_with_kernel(graph, next(ours)),
+        lambda: search_with_linalg(graph, next(reference)),
+        rounds,
+        time.thread_time,
+    )
+
+
+def search_figures(setup: Setup) -> list[Figure]:
+    """Figures of `python -m bench`: the search of the paper's rule."""
+    warm_up()
+    found = []
+    for count, rounds in ((100, 5),) if setup.quick else ((100, 200), (1000, 40)):
+        paired = compare_searches(count, rounds)
+        found.append(
+            Figure(
+                f"search_{count}_nodes",
+                paired.ours_ms,
+                "ms",
+                reference="np.linalg over all nodes (scene/gaussian.py)",
+                reference_value=paired.reference_ms,
+                ratio=paired.ratio,
+                note=f"Eq. 5 and 6 for {LOCAL_NODES} objects, processor time of one thread",
+            )
+        )
+    return found
+
+
+def bench_search(count: int, rounds: int) -> None:
+    paired = compare_searches(count, rounds)
     print(
         f"search of {LOCAL_NODES} objects in {count} nodes: "
-        f"kernel {statistics.median(kernel):7.3f} ms, "
-        f"np.linalg {statistics.median(linalg):8.2f} ms, ratio {ratio:6.0f}"
+        f"kernel {paired.ours_ms:7.3f} ms, "
+        f"np.linalg {paired.reference_ms:8.2f} ms, ratio {paired.ratio:6.0f}"
     )
 
 

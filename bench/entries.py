@@ -1,0 +1,46 @@
+"""The benchmarks of `python -m bench`. A new one is a function and a line here.
+
+A benchmark is a function of a `Setup` that returns its figures. Each runs in a process of its own:
+it may set threads, measure memory and crash.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from bench.figures import Figure, Setup
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One benchmark.
+
+    Attributes:
+        name: on the command line.
+        function: ``module:function``; the module is imported in the process of the benchmark.
+        limit_s: it is ended after this time.
+        takes_s: about how long it runs on two cores.
+    """
+
+    name: str
+    function: str
+    limit_s: float
+    takes_s: float
+
+    def run(self, setup: Setup) -> list[Figure]:
+        """Run it in this process."""
+        module, _, name = self.function.partition(":")
+        function: Callable[[Setup], list[Figure]] = getattr(importlib.import_module(module), name)
+        return function(setup)
+
+
+# The sum of the limits is no bound: all of them together take less than ten minutes.
+ENTRIES = {
+    entry.name: entry
+    for entry in (
+        Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=15),
+        Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=15),
+    )
+}

@@ -1,0 +1,69 @@
+"""`python -m bench`: each benchmark has a process of its own, and may fail alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.__main__ import main, run_all
+from bench.entries import ENTRIES, Entry
+from bench.figures import Figure, Setup, in_turn
+
+# The quickest, without data.
+QUICK = ("lifting", "merging_search")
+
+
+def test_the_quickest_benchmarks_write_their_figures(tmp_path, monkeypatch, capsys) -> None:  # type: ignore[no-untyped-def]
+    out = tmp_path / "figures.json"
+    monkeypatch.setattr(sys, "argv", ["bench", "--quick", "--json", str(out), "--only", *QUICK])
+    with pytest.raises(SystemExit) as end:
+        main()
+    report = json.loads(out.read_text())
+    assert end.value.code == 0, capsys.readouterr().out
+    assert set(report["benchmarks"]) == set(QUICK)
+    assert report["cores"] >= 1 and report["date"] and report["machine"]
+    assert {figure["benchmark"] for figure in report["figures"]} == set(QUICK)
+    for figure in report["figures"]:
+        assert figure["value"] > 0 and figure["unit"] == "ms"
+        assert figure["reference"] and figure["ratio"] > 1
+    names = [figure["name"] for figure in report["figures"]]
+    assert len(set(names)) == len(names)
+
+
+def test_a_benchmark_that_fails_leaves_the_others_their_figures(monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    failing = Entry("failing", "bench.entries:NO_SUCH_FUNCTION", limit_s=60, takes_s=1)
+    slow = Entry("slow", "time:sleep", limit_s=0.01, takes_s=1)
+    report = run_all([failing, slow, ENTRIES["lifting"]], Setup(quick=True))
+    assert "KeyError: 'failing'" in report["benchmarks"]["failing"]["error"]
+    assert report["benchmarks"]["slow"]["error"] == "ended after 0.01 s"
+    assert {figure["benchmark"] for figure in report["figures"]} == {"lifting"}
+
+
+def test_every_entry_names_a_function_of_a_setup(root_dir: Path) -> None:
+    for entry in ENTRIES.values():
+        module, _, name = entry.function.partition(":")
+        function = getattr(importlib.import_module(module), name)
+        assert list(inspect.signature(function).parameters) == ["setup"], entry
+    assert sum(entry.takes_s for entry in ENTRIES.values()) < 600
+
+
+def test_a_figure_reaches_its_target_or_not() -> None:
+    figure = Figure("time", 3.0, "ms", target=2.5)
+    assert figure.reached is False
+    assert dataclasses.replace(figure, target=3.0).reached is True
+    assert dataclasses.replace(figure, more_is_better=True).reached is True
+    assert dataclasses.replace(figure, target=None).reached is None
+    assert dataclasses.replace(figure, target=3.0, ratio=2.0, ratio_target=2.5).reached is False
+
+
+def test_two_calls_in_turn_are_compared_pair_by_pair() -> None:
+    # A clock that gives each call its time: ours 1 and 3 s, the reference 2 and 12 s.
+    ticks = iter([0.0, 1.0, 3.0, 10.0, 13.0, 25.0])
+    paired = in_turn(lambda: None, lambda: None, 2, lambda: next(ticks))
+    assert (paired.ours_ms, paired.reference_ms, paired.ratio) == (2000.0, 7000.0, 3.0)
