@@ -1,0 +1,385 @@
+"""Readers of files: maps, configuration, bags, data sets, trajectories, PLY, predictions, cards."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from support.evaluation import (
+    CLASSES,
+    PREDICATES,
+    segment,
+    write_dataset,
+    write_ply,
+    write_predictions,
+)
+from support.merging import VOCABULARY, random_local_graphs
+from support.recordings import (
+    CAMERA,
+    WORLD,
+    camera_items,
+    depth_mm,
+    encoded,
+    pose,
+    rgb_pixels,
+    stamp_ns,
+    transform,
+    write_bag,
+    write_seven_scenes,
+)
+from support.sequences import write_ground_truth, write_room, write_sequence
+from support.surfaces import CHAIR, CUP, TABLE, frame, slab
+from support.view import make_edge, make_graph, make_node
+
+from deworldsg_ros.checkpoints import card, headers, probe_card
+from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig, to_mapping, to_yaml
+from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import read_map, write_map
+from deworldsg_ros.poses.trajectory import read_trajectory, write_tum
+from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.recordings.folders.instances import read_instances
+from deworldsg_ros.recordings.folders.ply import read_vertices
+from deworldsg_ros.recordings.folders.rooms import read_ground_truth
+from deworldsg_ros.recordings.messages import TF_MESSAGE
+from deworldsg_ros.recordings.recording import open_recording
+from deworldsg_ros.scene import graph_file, wire
+from fuzz.target import Target
+
+# --- hypothesis: whole documents -------------------------------------------------------------
+
+_TEXT = st.text(max_size=12) | st.sampled_from(["$\\foo$", "__PLOTLY__", "[/foo]", "../x", "\x00"])
+_NUMBERS = st.integers() | st.floats() | st.sampled_from([10**40, 2**63, -(2**63) - 1])
+_JSON: st.SearchStrategy[Any] = st.recursive(
+    st.none() | st.booleans() | _NUMBERS | _TEXT,
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(_TEXT, inner, max_size=5),
+    max_leaves=20,
+)
+
+
+def _encoded(value: Any) -> bytes:
+    return json.dumps(value).encode()
+
+
+JSON_DOCUMENTS = _JSON.map(_encoded)
+
+
+@st.composite
+def _configurations(draw: st.DrawFn) -> bytes:
+    """Sections and options that exist, with any values."""
+    mapping = to_mapping(Config())
+    chosen: dict[str, Any] = {}
+    for _ in range(draw(st.integers(1, 4))):
+        section = draw(st.sampled_from(sorted(mapping)))
+        field = draw(st.sampled_from(sorted(mapping[section])) | _TEXT)
+        chosen.setdefault(section, {})[field] = draw(_JSON)
+    return _encoded(draw(st.sampled_from([chosen, {"/**": {"ros__parameters": chosen}}])))
+
+
+@st.composite
+def _settings(draw: st.DrawFn) -> bytes:
+    mapping = to_mapping(Config())
+    section = draw(st.sampled_from(sorted(mapping)))
+    field = draw(st.sampled_from(sorted(mapping[section])))
+    value = draw(_TEXT | _JSON.map(lambda value: json.dumps(value)))
+    return f"{section}.{field}={value}".encode(errors="replace")
+
+
+# --- maps ------------------------------------------------------------------------------------
+
+
+def _map_config(association: str) -> Config:
+    merging = MergingConfig(association=association)  # type: ignore[arg-type]
+    return Config(merging=merging, output=OutputConfig(min_existence=0.0))
+
+
+def _frames() -> list[Any]:
+    table, mug = slab((0, 0.7, 1), (0.4, 0.04, 0.3)), slab((0.1, 0.77, 1), (0.08, 0.1, 0.08))
+    chair = slab((0.9, 0.25, 1), (0.3, 0.4, 0.3))
+    few = [(points[:150], kind) for points, kind in ((table, TABLE), (mug, CUP), (chair, CHAIR))]
+    return [frame(stamp, *few) for stamp in range(1, 7)]
+
+
+def _write_map(association: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        builder = GraphBuilder(_map_config(association), VOCABULARY, "world")
+        frames = _frames()
+        if association == "paper":
+            frames = random_local_graphs(np.random.default_rng(3), 20)
+        for local in frames:
+            builder.integrate(local)
+        write_map(builder, folder / "room.map")
+
+    return write
+
+
+def _read_map(association: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        """Continue as graph_node does: publish, merge frames, publish, save."""
+        builder = read_map(_map_config(association), folder / "room.map")
+        builder.update()
+        _check_graph(builder.full())
+        if builder.graph.vocabulary == VOCABULARY and builder.graph.frame_id == "world":
+            newest = int(builder.graph.nodes.last_seen_ns.max(initial=0))
+            for local in _frames()[:3]:
+                stamp = max(newest, 0) + local.stamp_ns
+                builder.integrate(dataclasses.replace(local, stamp_ns=stamp))
+            builder.update()
+            _check_graph(builder.full())
+        write_map(builder, folder.parent / f"{folder.name}.again")
+        read_map(_map_config(association), folder.parent / f"{folder.name}.again")
+
+    return read
+
+
+def _check_graph(message: wire.SceneGraphMessage) -> None:
+    """What every reader of /scene_graph relies on."""
+    text = wire.encode(message)
+    assert "null" not in text.replace('"null"', ""), "a number is no number"
+    wire.decode(text, wire.SceneGraphMessage)
+    ids = [node.id for node in message.nodes]
+    assert len(set(ids)) == len(ids) and min(ids, default=1) >= 1
+    assert {end for edge in message.edges for end in (edge.subject, edge.object)} <= set(ids)
+
+
+# --- recordings ------------------------------------------------------------------------------
+
+
+def _read_recording(folder: Path) -> None:
+    source = next(path for path in sorted(folder.iterdir()) if path.name != "ReplicaSSG")
+    if source.name == "data":
+        source = source / "room_0"
+    recording = open_recording(source)
+    try:
+        for item in recording.frames():
+            assert np.isfinite(item.T_world_camera).all()
+            read_instances(recording.source, item.stamp_ns)
+    finally:
+        recording.close()
+    read_ground_truth(source)
+
+
+def _bag(storage: str, with_tf: bool = False) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        items = camera_items(3, compressed=not with_tf, with_pose=not with_tf)
+        if with_tf:
+            items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
+            moving = [
+                ("/tf", TF_MESSAGE, stamp_ns(i), transform(stamp_ns(i), WORLD, CAMERA, pose(i)))
+                for i in range(3)
+            ]
+            items = sorted([*items, *moving], key=lambda item: item[2])
+        write_bag(folder / "bag", items, storage)
+
+    return write
+
+
+def _write_tum(folder: Path) -> None:
+    sequence = folder / "rgbd_dataset_freiburg1_xyz"
+    sequence.mkdir()
+    rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for index in range(2):
+        stamp = f"{1 + index * 0.1:.4f}"
+        for name, pixels in (("rgb", rgb_pixels(index)), ("depth", depth_mm(index))):
+            (sequence / name).mkdir(exist_ok=True)
+            (sequence / name / f"{stamp}.png").write_bytes(encoded(pixels))
+            rows[name].append(f"{stamp} {name}/{stamp}.png")
+        rows["groundtruth"].append(f"{stamp} 0.{index} 0 1 0 0 0 1")
+    for name, lines in rows.items():
+        (sequence / f"{name}.txt").write_text("# made by a test\n" + "\n".join(lines) + "\n")
+
+
+def _write_rio(folder: Path) -> None:
+    write_sequence(folder / "scan", 2)
+
+
+def _write_rooms(folder: Path) -> None:
+    write_room(folder, 2)
+    write_ground_truth(folder / "data" / "room_0")
+
+
+def _write_replica(folder: Path) -> None:
+    write_dataset(folder, {"room_0": ([("chair", 1)], [])})
+    write_sequence(folder / "data" / "room_0", 2)
+
+
+def _write_annotations(layout: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
+        write_dataset(folder, scans, layout=layout)
+
+    return write
+
+
+def _read_annotations(layout: str) -> Callable[[Path], None]:
+    def read(folder: Path) -> None:
+        annotations = Annotations(folder, layout)
+        annotations.scans("test")
+        for scan in ("a", "b"):
+            annotations.scan(scan)
+            annotations.points(scan)
+
+    return read
+
+
+# --- other files -----------------------------------------------------------------------------
+
+
+def _write_trajectory(folder: Path) -> None:
+    write_tum(folder / "poses.txt", [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)])
+
+
+def _read_trajectory(folder: Path) -> None:
+    found = read_trajectory(folder / "poses.txt")
+    assert len(found) and np.isfinite(found.T_world_cameras).all()
+    found.at(stamp_ns(1) + 5, 1, 1, 10**8)
+
+
+def _write_kitti(folder: Path) -> None:
+    np.savetxt(folder / "poses.txt", [pose(i)[:3].ravel() for i in range(4)], "%.9g")
+
+
+def _write_pose_files(folder: Path) -> None:
+    for index in range(2):
+        np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
+
+
+def _ply(form: str) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        points = np.random.default_rng(0).random((5, 3))
+        write_ply(folder / "points.ply", points, np.arange(5), form)
+
+    return write
+
+
+def _read_ply(folder: Path) -> None:
+    columns = read_vertices(folder / "points.ply", ("x", "y", "z", "objectId"))
+    assert len({len(column) for column in columns.values()}) == 1
+
+
+def _prediction() -> ScanPrediction:
+    return ScanPrediction(
+        (segment(1, 3), segment(2, 3)),
+        np.array([[0.1, 0.8, 0.1], [0.2, 0.2, 0.6]]),
+        np.array([[0, 1]]),
+        np.array([[0.7, 0.2, 0.1]]),
+    )
+
+
+def _write_predictions(folder: Path) -> None:
+    predictions = {"a": _prediction(), "b": ScanPrediction.empty(3, 3)}
+    write_predictions(folder / "predictions.json", predictions, len(CLASSES), len(PREDICATES))
+
+
+def _write_pickle(protocol: int) -> Callable[[Path], None]:
+    def write(folder: Path) -> None:
+        item = _prediction()
+        graph = {
+            "pcd": [points.astype(np.float32) for points in item.points_world],
+            "cls": [scores.astype(np.float32) for scores in item.class_scores],
+            "edge_index": item.edges.T,
+            "edge_cls": item.edge_scores.astype(np.float32),
+        }
+        (folder / "predictions.pkl").write_bytes(pickle.dumps({"a": graph}, protocol))
+
+    return write
+
+
+def _read_predictions(folder: Path) -> None:
+    path = next(folder.iterdir())
+    for prediction in read_predictions(path).values():
+        assert len(prediction.class_scores) == len(prediction)
+        assert len(prediction.edges) == len(prediction.edge_scores)
+
+
+def _write_card(folder: Path) -> None:
+    made = card.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
+    card.write_card(folder / card.CARD_FILE, made)
+
+
+def _write_probe_card(folder: Path) -> None:
+    identity = probe_card.BackboneIdentity("vjepa2", 48, 32, 4)
+    made = probe_card.ProbeCard(
+        identity, ("on", "near"), training={"groups_by_part": {"train": []}}
+    )
+    probe_card.write_card(folder, made)
+
+
+def _read_probe_card(folder: Path) -> None:
+    found = probe_card.read_card(folder)
+    assert found.seen_groups is not None and found.input_dim > 0
+    str(found.backbone)
+
+
+def _write_headers(folder: Path) -> None:
+    entries = {
+        name: {"dtype": "F32", "shape": [2, 2], "data_offsets": [0, 16]} for name in ("a", "b")
+    }
+    text = json.dumps(entries).encode()
+    (folder / "model.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
+
+
+def _write_graph(folder: Path) -> None:
+    nodes = [make_node(1, "cup", points=[(0, 0, 0)]), make_node(2, "table", (0.3, 0, 0))]
+    graph_file.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
+
+
+TARGETS: list[Target] = [
+    Target("map_surface", _write_map("surface"), _read_map("surface"), weight=3),
+    Target("map_paper", _write_map("paper"), _read_map("paper"), weight=2),
+    Target(
+        "config_yaml",
+        lambda folder: (folder / "config.yaml").write_text(to_yaml(Config())),
+        lambda folder: effective_config(folder / "config.yaml"),
+        documents=_configurations(),
+        weight=2,
+    ),
+    Target(
+        "set_option",
+        lambda folder: (folder / "set.txt").write_text("output.rate_hz=2.5"),
+        lambda folder: effective_config(
+            None, [(folder / "set.txt").read_bytes().decode(errors="surrogateescape")]
+        ),
+        documents=_settings(),
+    ),
+    Target("bag_mcap", _bag("mcap"), _read_recording, weight=2),
+    Target("bag_sqlite", _bag("sqlite3"), _read_recording, weight=2),
+    Target("bag_tf", _bag("mcap", with_tf=True), _read_recording),
+    Target("tum", _write_tum, _read_recording),
+    Target(
+        "seven_scenes", lambda folder: write_seven_scenes(folder / "seq-01", 2), _read_recording
+    ),
+    Target("scan_3rscan", _write_rio, _read_recording),
+    Target("scan_replica", _write_replica, _read_recording),
+    Target("scan_rooms", _write_rooms, _read_recording),
+    Target("annotations_replica", _write_annotations("replica"), _read_annotations("replica")),
+    Target("annotations_3rscan", _write_annotations("3rscan"), _read_annotations("3rscan")),
+    Target("trajectory_tum", _write_trajectory, _read_trajectory),
+    Target("trajectory_kitti", _write_kitti, _read_trajectory),
+    Target("trajectory_folder", _write_pose_files, lambda folder: read_trajectory(folder)),
+    Target("ply_ascii", _ply("ascii"), _read_ply),
+    Target("ply_binary", _ply("binary_little_endian"), _read_ply),
+    Target("predictions_json", _write_predictions, _read_predictions, documents=JSON_DOCUMENTS),
+    Target("predictions_pickle_2", _write_pickle(2), _read_predictions),
+    Target("predictions_pickle_5", _write_pickle(5), _read_predictions),
+    Target(
+        "checkpoint_card",
+        _write_card,
+        lambda folder: card.read_card(folder / card.CARD_FILE),
+        documents=JSON_DOCUMENTS,
+    ),
+    Target("probe_card", _write_probe_card, _read_probe_card, documents=JSON_DOCUMENTS),
+    Target(
+        "safetensors",
+        _write_headers,
+        lambda folder: headers.read_headers(folder / "model.safetensors"),
+    ),
+    Target("scene_graph", _write_graph, graph_file.read_graph, documents=JSON_DOCUMENTS),
+]

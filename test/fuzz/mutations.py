@@ -1,0 +1,304 @@
+"""Damage to good files: bytes, words, trees, arrays, images and tables, by the kind of the file."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import sqlite3
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+Mutation = Callable[[bytes, random.Random], bytes]
+
+# Numbers that a format allows in its text and few programs expect.
+NUMBERS = (
+    "0", "-0", "-1", "1e400", "-1e400", "1e9999999", "1e308", "1e-320", "nan", "inf", "-inf",
+    "NaN", "Infinity", "2147483648", "-2147483649", "9223372036854775808", "1" + "0" * 40,
+    "1" * 5000, "0x10", "1_000", "1e", "\u0663", "true", "null", "1000000000000",
+)  # fmt: skip
+WORDS = (
+    "", "x", "$\\foo$", "__PLOTLY__", "[/foo]", "[bold]", "\x00", "\x1b[31m", "../x",
+    "../../etc/passwd", "/etc/passwd", "/dev/zero", "\ud800", "\u202e", "<script>alert(1)</script>",
+    "'; DROP TABLE", "~", "%s", "{0}", "a" * 10_000, "é" * 300, "\n", "\u2028", "on", "yes",
+    "C:\\x",
+)  # fmt: skip
+INTEGERS = (0, 1, -1, 2**31 - 1, 2**31, -(2**31), 2**32 - 1, 2**63 - 1, -(2**63), 10**12)
+FLOATS = (0.0, -0.0, -1.0, 1e-320, 1e30, 1e308, -1e308, np.inf, -np.inf, np.nan, 2.0, 1e19)
+VALUES: tuple[Any, ...] = (
+    None, True, [], {}, [[]], "x", *WORDS[:10], *INTEGERS, *FLOATS, 10**40, [0] * 300,
+)  # fmt: skip
+
+
+def mutate(name: str, content: bytes, rng: random.Random) -> bytes:
+    """Damaged content of a file; its name says which kind of file it is."""
+    kinds = BY_SUFFIX.get(Path(name).suffix.lower(), (words,))
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        mutation = rng.choice((raw_bytes, *kinds, *kinds, *kinds))
+        try:
+            content = mutation(content, rng)
+        except Exception:  # the last mutation left nothing of this kind to damage
+            content = raw_bytes(content, rng)
+    return content
+
+
+def raw_bytes(content: bytes, rng: random.Random) -> bytes:
+    """Flip, overwrite, cut, repeat or insert bytes."""
+    data = bytearray(content)
+    at = rng.randrange(len(data) + 1)
+    kind = rng.randrange(7)
+    if kind == 0 and data:
+        data[at - 1] ^= 1 << rng.randrange(8)
+    elif kind == 1:
+        width = rng.choice("bhiq")
+        value = rng.choice(INTEGERS) & (256 ** struct.calcsize(width) - 1)
+        order = rng.choice(("little", "big"))
+        data[at : at + struct.calcsize(width)] = value.to_bytes(struct.calcsize(width), order)
+    elif kind == 2:
+        del data[at:]
+    elif kind == 3:
+        del data[at : at + rng.randrange(1, 64)]
+    elif kind == 4:
+        data[at:at] = data[at : at + rng.randrange(1, 4096)] * rng.choice((1, 2, 10))
+    elif kind == 5:
+        data[at:at] = rng.randbytes(rng.randrange(1, 16))
+    else:
+        opening = rng.choice((b"[", b"{", b"(", b"[{", b'{"a":', b"- ", b"\xff", b"\n", b"\x00"))
+        data[at:at] = opening * rng.choice((1, 10, 5000, 100_000))
+    return bytes(data)
+
+
+def words(content: bytes, rng: random.Random) -> bytes:
+    """Replace, drop or repeat words and lines of a text."""
+    lines = content.split(b"\n")
+    row = rng.randrange(len(lines))
+    parts = lines[row].split(b" ")
+    column = rng.randrange(len(parts))
+    kind = rng.randrange(6)
+    if kind < 3:
+        parts[column] = rng.choice((*NUMBERS, *WORDS)).encode(errors="surrogatepass")
+    elif kind == 3:
+        del parts[column]
+    elif kind == 4:
+        parts[column:column] = [parts[column]] * rng.choice((1, 3, 1000))
+    lines[row] = b" ".join(parts)
+    if kind == 5:
+        other = rng.randrange(len(lines))
+        lines[row], lines[other] = lines[other], lines[row]
+        if rng.randrange(2):
+            del lines[row]
+    return b"\n".join(lines)
+
+
+def json_tree(content: bytes, rng: random.Random) -> bytes:
+    """Damage values of a JSON document."""
+    return json.dumps(_tree(json.loads(content), rng)).encode(errors="surrogatepass")
+
+
+def yaml_tree(content: bytes, rng: random.Random) -> bytes:
+    """Damage values of a YAML document, or use YAML's own ways to grow one."""
+    if rng.randrange(8) == 0:
+        levels = rng.choice((3, 9, 12))
+        rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+        rows += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels)]
+        return (
+            content + "\n".join(["", *rows, "b: &b [*b]"][: rng.choice((-1, levels + 2))]).encode()
+        )
+    return yaml.safe_dump(_tree(yaml.safe_load(content), rng), allow_unicode=True).encode(
+        errors="surrogatepass"
+    )
+
+
+def _tree(tree: Any, rng: random.Random) -> Any:
+    places: list[tuple[Any, Any]] = []
+    pending = [tree]
+    while pending:
+        node = pending.pop()
+        keys = (
+            node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+        )
+        for key in list(keys):
+            places.append((node, key))
+            pending.append(node[key])
+    if not places:
+        return rng.choice(VALUES)
+    node, key = rng.choice(places)
+    kind = rng.randrange(6)
+    if kind == 0:
+        del node[key]
+    elif kind == 1 and isinstance(node, dict):
+        node[rng.choice(WORDS)] = rng.choice((node[key], *VALUES))
+    elif kind == 1:
+        node[key:key] = [node[key]] * rng.choice((1, 2, 50))
+    elif kind == 2:
+        other, place = rng.choice(places)
+        node[key] = json.loads(json.dumps(other[place]))
+    elif kind == 3:
+        deep: Any = node[key]
+        for _ in range(rng.choice((1, 3, 60, 400))):
+            deep = [deep]
+        node[key] = deep
+    else:
+        node[key] = rng.choice(VALUES)
+    return tree
+
+
+def _keys(node: Any) -> Any:
+    return node if isinstance(node, dict) else range(len(node) if isinstance(node, list) else 0)
+
+
+def arrays(content: bytes, rng: random.Random) -> bytes:
+    """Damage the arrays of an .npz file; its checksums are right again."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = {info.filename: archive.read(info) for info in archive.infolist()}
+    name = rng.choice(list(entries))
+    kind = rng.randrange(9)
+    compression = zipfile.ZIP_STORED
+    if kind == 0:
+        del entries[name]
+    elif kind == 1:
+        entries[rng.choice((*WORDS[1:5], "../x.npy", name + "x"))] = entries[name]
+    elif kind == 2:
+        entries[name] = raw_bytes(entries[name], rng)
+    elif kind == 3:
+        compression = rng.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
+        entries[name] += bytes(rng.choice((0, 1 << 24)))
+    else:
+        array = _array(np.load(io.BytesIO(entries[name]), allow_pickle=False), rng)
+        packed = io.BytesIO()
+        np.save(packed, array, allow_pickle=False)
+        entries[name] = packed.getvalue()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", compression) as archive:
+        for entry, data in entries.items():
+            archive.writestr(zipfile.ZipInfo(entry), data, compression)
+    return packed.getvalue()
+
+
+def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    if array.dtype == np.uint8 and array.ndim == 1 and array.tobytes()[:1] in (b"{", b"["):
+        damaged = rng.choice((json_tree, words))(array.tobytes(), rng)
+        return np.frombuffer(damaged, np.uint8)
+    kind = rng.randrange(9)
+    if kind == 0:
+        return array.astype(rng.choice(("i1", "i4", "f4", "f8", "u8", "?", "c16", "U3")))
+    if kind == 1:
+        return array[: rng.randrange(len(array) + 1)] if array.ndim else array.reshape(1)
+    if kind == 2:
+        return np.concatenate([np.atleast_1d(array)] * 2)
+    if kind == 3:
+        return array.reshape(array.shape[::-1]) if array.ndim > 1 else array[None]
+    array = array.copy()
+    if array.dtype.names and kind < 8:
+        field = rng.choice(array.dtype.names)
+        array[field] = _values(array[field], rng)
+        return array
+    return _values(array, rng)
+
+
+def _values(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """Put hostile numbers, or numbers of other places, into an array."""
+    if not array.size:
+        return np.zeros((1, *array.shape[1:]), array.dtype)
+    flat = array.ravel().copy()
+    for _ in range(rng.choice((1, 1, 3))):
+        at = rng.randrange(flat.size)
+        if rng.randrange(3) == 0:
+            flat[at] = flat[rng.randrange(flat.size)]
+        elif flat.dtype.kind == "f":
+            flat[at] = rng.choice(FLOATS)
+        elif flat.dtype.kind in "iu":
+            limits = np.iinfo(flat.dtype)
+            small = int(flat[at]) + rng.choice((-1, 1, 2))
+            flat[at] = min(max(rng.choice((*INTEGERS, small, small)), limits.min), limits.max)
+        else:
+            flat[at] = flat.dtype.type(rng.randrange(2))
+    if rng.randrange(8) == 0:
+        flat[:] = flat[rng.randrange(flat.size)]
+    return flat.reshape(array.shape)
+
+
+def png(content: bytes, rng: random.Random) -> bytes:
+    """Damage the chunks of a PNG; their checksums are right again."""
+    chunks = []
+    at = 8
+    while at + 12 <= len(content):
+        (length,) = struct.unpack_from(">I", content, at)
+        chunks.append([content[at + 4 : at + 8], content[at + 8 : at + 8 + length]])
+        at += length + 12
+    chunk = rng.choice(chunks)
+    if chunk[0] == b"IHDR" and rng.randrange(2):
+        sides = (0, 1, 7, 4000, 65535, 1 << 20, 2**31 - 1)
+        chunk[1] = struct.pack(">II", rng.choice(sides), rng.choice(sides)) + chunk[1][8:]
+    elif chunk[0] == b"IDAT" and rng.randrange(2):
+        chunk[1] = zlib.compress(bytes(rng.choice((0, 10, 1 << 25))))
+    else:
+        chunk[1] = raw_bytes(chunk[1], rng)
+    if rng.randrange(4) == 0:
+        rng.shuffle(chunks)
+    packed = content[:8]
+    for kind, data in chunks:
+        packed += struct.pack(">I", len(data)) + kind + data
+        packed += struct.pack(">I", zlib.crc32(kind + data))
+    return packed
+
+
+def table(content: bytes, rng: random.Random) -> bytes:
+    """Damage the rows of an SQLite file."""
+    with tempfile.NamedTemporaryFile(suffix=".db3") as file:
+        Path(file.name).write_bytes(content)
+        database = sqlite3.connect(file.name)
+        names = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        name = rng.choice(names)[0]
+        columns = [row[1] for row in database.execute(f"PRAGMA table_info({name})")]
+        column = rng.choice(columns)
+        value = rng.choice((*INTEGERS[:-2], *FLOATS, *WORDS[:10], None, rng.randbytes(5)))
+        (count,) = database.execute(f"SELECT count(*) FROM {name}").fetchone()
+        at = rng.randrange(max(count, 1))
+        if column == "data" and rng.randrange(2):
+            row = database.execute(f"SELECT rowid, data FROM {name} LIMIT 1 OFFSET {at}").fetchone()
+            database.execute(
+                f"UPDATE {name} SET data = ? WHERE rowid = ?",
+                (raw_bytes(bytes(row[1]), rng), row[0]),
+            )
+        elif rng.randrange(8) == 0:
+            database.execute(f"ALTER TABLE {name} RENAME COLUMN {column} TO other")
+        else:
+            database.execute(
+                f"UPDATE {name} SET {column} = ? WHERE rowid IN "
+                f"(SELECT rowid FROM {name} LIMIT 1 OFFSET {at})",
+                (value,),
+            )
+        database.commit()
+        database.close()
+        return Path(file.name).read_bytes()
+
+
+def pgm(content: bytes, rng: random.Random) -> bytes:
+    """Damage the header of a PGM image."""
+    head, rest = content[:40], content[40:]
+    return words(head, rng) + rest
+
+
+BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
+    ".map": (arrays,),
+    ".npz": (arrays,),
+    ".json": (json_tree, json_tree, words),
+    ".jsonl": (words,),
+    ".yaml": (yaml_tree, words),
+    ".png": (png,),
+    ".jpg": (raw_bytes,),
+    ".pgm": (pgm,),
+    ".db3": (table,),
+    ".mcap": (raw_bytes,),
+    ".pkl": (raw_bytes,),
+    ".safetensors": (raw_bytes, words),
+}
