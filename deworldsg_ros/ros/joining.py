@@ -104,7 +104,7 @@ class JoiningNode(StageNode, Generic[Out]):
             self._worker.stop()
         super().close()
 
-    def _overrun(self) -> None:
+    def _overrun(self, _: Any) -> None:
         self.drop(
             "overrun",
             f"the node processes fewer frames than arrive: dropped the oldest of "

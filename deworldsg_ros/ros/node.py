@@ -142,26 +142,44 @@ class StageNode(Node):
         return subscription
 
     def listen_json(
-        self, topic: str, kind: type[wire.M], callback: Callable[[wire.M], None], depth: int
+        self,
+        topic: str,
+        kind: type[wire.M],
+        callback: Callable[[wire.M], None],
+        depth: int,
+        submit: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
-        """Subscribe to JSON messages of one type."""
+        """Subscribe to JSON messages of one type.
+
+        Args:
+            topic: name of the topic.
+            kind: type of the messages.
+            callback: called with each message.
+            depth: messages that DDS keeps.
+            submit: queues a call for another thread, which then decodes the message. A message that
+                the queue drops thus costs nothing.
+        """
 
         def received(message: Any) -> None:
             self.health.received(topic)
-            callback(wire.decode(message.data, kind))
+            if submit is None:
+                callback(wire.decode(message.data, kind))
+            else:
+                submit(lambda: callback(wire.decode(message.data, kind)))
 
         self.create_subscription(String, topic, self.guarded(received), reliable(depth))
 
-    def json_publisher(
-        self, topic: str, depth: int, *, latched: bool = False
-    ) -> Callable[[wire.Message], None]:
+    def json_publisher(self, topic: str, depth: int) -> Callable[[wire.Message], None]:
         """A function that publishes JSON messages on a topic."""
+        publish = self.text_publisher(topic, depth)
+        return lambda message: publish(wire.encode(message))
+
+    def text_publisher(
+        self, topic: str, depth: int, *, latched: bool = False
+    ) -> Callable[[str], None]:
+        """A function that publishes texts on a topic."""
         publisher = self.create_publisher(String, topic, reliable(depth, latched=latched))
-
-        def publish(message: wire.Message) -> None:
-            publisher.publish(String(data=wire.encode(message)))
-
-        return publish
+        return lambda text: publisher.publish(String(data=text))
 
     def _check_publishers(self) -> None:
         for subscription in self._subscriptions_to_check:

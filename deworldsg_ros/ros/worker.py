@@ -17,15 +17,24 @@ class Worker(Generic[T]):
         name: thread name.
         work: must not raise.
         size: items that may wait.
-        on_overrun: called when a new item replaces the oldest.
+        on_overrun: called with the oldest item when a new one replaces it.
+        after: called after each item, and again when the seconds that it returned have passed;
+            None = only after the next item. It must not raise.
     """
 
     def __init__(
-        self, name: str, work: Callable[[T], None], *, size: int, on_overrun: Callable[[], None]
+        self,
+        name: str,
+        work: Callable[[T], None],
+        *,
+        size: int,
+        on_overrun: Callable[[T], None],
+        after: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._work = work
         self._size = size
         self._on_overrun = on_overrun
+        self._after = after
         self._items: deque[T] = deque()
         self._changed = threading.Condition()
         self._stopping = False
@@ -41,15 +50,14 @@ class Worker(Generic[T]):
 
     def submit(self, item: T) -> None:
         """Queue an item; does not block."""
-        overrun = False
+        lost: list[T] = []
         with self._changed:
             if len(self._items) >= self._size:
-                self._items.popleft()
-                overrun = True
+                lost.append(self._items.popleft())
             self._items.append(item)
             self._changed.notify_all()
-        if overrun:
-            self._on_overrun()
+        for oldest in lost:
+            self._on_overrun(oldest)
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until nothing is queued or processed; False on timeout."""
@@ -66,13 +74,16 @@ class Worker(Generic[T]):
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        wait_s: float | None = None
         while True:
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._items or self._stopping)
+                self._changed.wait_for(lambda: self._items or self._stopping, wait_s)
                 if self._stopping:
                     return
-                item = self._items.popleft()
+                items = [self._items.popleft()] if self._items else []
                 self._busy = True
-            self._work(item)
+            for item in items:
+                self._work(item)
+            wait_s = self._after()

@@ -247,7 +247,7 @@ def test_evidence_waits_for_its_frame(graph: Bench) -> None:
     works(graph, lambda: send_graph(graph))
     drops = dict(graph.node.health.drops)
     graph.send(deworldsg__relation_evidence=evidence(graph.stamp_ns + STEP_NS))
-    graph.expect(lambda: len(graph.node._pending) == 1, "the evidence to wait")
+    graph.expect(lambda: len(graph.node.graph._pending) == 1, "the evidence to wait")
     works(graph, lambda: send_graph(graph))
-    assert len(graph.node._pending) == 0
+    assert len(graph.node.graph._pending) == 0
     assert graph.node.health.drops == drops

@@ -69,13 +69,13 @@ def test_a_worker_keeps_the_order_and_drops_the_oldest() -> None:
         assert begin.wait(10)
         done.append(item)
 
-    worker: Worker[int] = Worker("test", work, size=3, on_overrun=lambda: overruns.append(1))
+    worker: Worker[int] = Worker("test", work, size=3, on_overrun=overruns.append)
     worker.submit(0)
     while worker.waiting:  # taken by the thread
         threading.Event().wait(0.001)
     for item in range(1, 6):
         worker.submit(item)
-    assert (worker.waiting, len(overruns)) == (3, 2)
+    assert (worker.waiting, overruns) == (3, [1, 2])
     assert not worker.wait_idle(0.0)
     begin.set()
     assert worker.wait_idle(10)
@@ -83,10 +83,28 @@ def test_a_worker_keeps_the_order_and_drops_the_oldest() -> None:
     assert worker.stop(10)
 
 
+def test_a_worker_calls_again_after_the_time_that_was_asked_for() -> None:
+    calls, enough = [], threading.Event()
+
+    def after() -> float | None:
+        calls.append(len(calls))
+        if len(calls) < 3:
+            return 0.01
+        enough.set()
+        return None
+
+    worker: Worker[int] = Worker("test", print, size=1, on_overrun=print, after=after)
+    worker.submit(0)
+    assert enough.wait(10)
+    assert worker.wait_idle(10)
+    assert len(calls) == 3
+    assert worker.stop(10)
+
+
 def test_a_worker_stops_with_items_in_its_queue() -> None:
     begin, done = threading.Event(), []
     worker: Worker[int] = Worker(
-        "test", lambda item: (begin.wait(10), done.append(item)), size=9, on_overrun=lambda: None
+        "test", lambda item: (begin.wait(10), done.append(item)), size=9, on_overrun=print
     )
     for item in range(5):
         worker.submit(item)

@@ -160,7 +160,7 @@ class Bench:
     def products(self) -> int:
         """A number that grows with every processed frame."""
         if isinstance(self.node, GraphNode):  # the merging rule decides whether it publishes
-            return self.node._newest_ns
+            return self.node.graph.newest_ns
         return self.node.health.products
 
     def expect(self, condition: Callable[[], bool], what: str) -> None:

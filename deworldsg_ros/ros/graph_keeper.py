@@ -1,0 +1,247 @@
+"""The global graph of a node, in a thread of its own: merged, published, saved.
+
+Diagnostics and signals are served by the executor's thread, so they do not wait for the graph.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from geometry_msgs.msg import PoseStamped
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from deworldsg_ros.graph_builder import GraphBuilder, warm_up
+from deworldsg_ros.ros.graph_files import GraphFiles
+from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.ros.update_times import UpdateTimes
+from deworldsg_ros.ros.whole_graph import MakeMarkers, WholeGraph
+from deworldsg_ros.ros.worker import Worker
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+from deworldsg_ros.streams.pending import PendingEvidence
+from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
+
+CORRECTION_TOPIC = "deworldsg/pose_correction"
+# Local graphs and evidence that may wait: a second of both at 30 Hz. A graph takes milliseconds a
+# frame, so they wait only while kernels are compiled or a file is written.
+QUEUE_JOBS = 60
+
+
+class _Job(NamedTuple):
+    """A call for the graph's thread, when it was submitted, and the call if it is dropped."""
+
+    run: Callable[[], None]
+    submitted_s: float
+    dropped: Callable[[], None]
+
+
+class GraphKeeper:
+    """Owns the `GraphBuilder` of a node; only its own thread uses it.
+
+    Args:
+        node: publishes the graph, and counts.
+        markers: the markers of a snapshot (`view.markers`).
+        on_update: called with each update, in the graph's thread.
+
+    Attributes:
+        newest_ns: stamp of the newest merged frame; 0 = none.
+
+    Raises:
+        ConfigurationError: for a map file that cannot be read or written.
+    """
+
+    def __init__(
+        self,
+        node: StageNode,
+        markers: MakeMarkers,
+        on_update: Callable[[wire.SceneGraphUpdateMessage], None] = lambda update: None,
+    ) -> None:
+        self._node = node
+        self._parameters = node.parameters
+        self._on_update = on_update
+        warm_up(node.parameters)
+        self._pending = PendingEvidence()
+        self.newest_ns = 0
+        self._corrections = self._corrected_nodes = 0
+        self._values: dict[str, str] = {}
+        self._times = UpdateTimes(self._parameters.output.rate_hz)
+        self._running_s = 0.0  # when the job that runs now was submitted
+        self._publish_update = node.json_publisher("/scene_graph/updates", 50)
+        self._whole = WholeGraph(node, markers)
+        self._files = GraphFiles(node.parameters)
+        # None until a map or the first local graph gives the world frame and the vocabulary.
+        self._builder = self._files.continued_map()
+        self._worker = Worker(
+            "graph", self._run, size=QUEUE_JOBS, on_overrun=_drop, after=self._publish
+        )
+        if self._builder is not None:
+            self._announce(self._builder)
+        node.create_service(Trigger, "~/save", self._save)
+        node.create_subscription(
+            PoseStamped, CORRECTION_TOPIC, node.guarded(self._receive_correction), reliable(10)
+        )
+
+    def submit(self, job: Callable[[], None], dropped: Callable[[], None] | None = None) -> None:
+        """Call a function in the graph's thread, after the earlier ones; does not block.
+
+        Args:
+            job: may raise RefusedInput.
+            dropped: called instead if too many wait; default: count an overrun.
+        """
+        self._worker.submit(_Job(job, time.monotonic(), dropped or self._count_overrun))
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until all jobs are done; False on timeout."""
+        return self._worker.wait_idle(timeout_s)
+
+    def close(self) -> None:
+        """End the threads, then write the map file."""
+        ended = self._worker.stop()
+        self._whole.close()
+        if self._files.map_path is None:
+            return
+        written, message = False, f"{self._files.map_path}: not written, the graph is busy"
+        if ended:
+            written, message = self._files.save_map(self._builder)
+        log = self._node.get_logger()
+        log.info(message) if written else log.warning(message)
+
+    def values(self) -> dict[str, str]:
+        """The size of the graph, for /diagnostics."""
+        if not self._values:
+            return {}
+        return {
+            **self._values,
+            "queue": str(self._worker.waiting),
+            "evidence waiting": str(len(self._pending)),
+            "pose corrections": str(self._corrections),
+            "nodes moved by corrections": str(self._corrected_nodes),
+        }
+
+    def _announce(self, builder: GraphBuilder) -> None:
+        """Report a continued map, and publish it."""
+        graph = builder.graph
+        self._node.get_logger().info(
+            f"continuing map {self._files.map_path}: {len(graph)} nodes in frame '{graph.frame_id}'"
+        )
+        now_s = time.monotonic()
+        self.submit(lambda: self._times.changed(now_s, now_s))
+
+    # The methods below run in the graph's thread.
+
+    def integrate(self, local: LocalGraph) -> None:
+        """Merge a local graph, and the evidence that waited for it."""
+        if self._builder is None:
+            self._builder = GraphBuilder(self._parameters, local.vocabulary, local.frame_id)
+        self._builder.integrate(local)
+        self.newest_ns = local.stamp_ns
+        self._times.changed(self._running_s, time.monotonic())
+        for evidence in self._pending.take(local.stamp_ns):
+            with self._node.refusing():
+                self._builder.add_evidence(evidence)
+
+    def add_evidence(self, evidence: RelationEvidence) -> None:
+        """Add evidence; keep it if its local graph has not arrived."""
+        if self._builder is None or evidence.stamp_ns > self.newest_ns:
+            self._pending.add(evidence)
+            return
+        self._builder.add_evidence(evidence)
+        self._times.changed(self._running_s, time.monotonic(), can_wait=True)
+
+    def _correct(self, message: Any) -> None:
+        """Move the nodes first observed at the stamp or later; the pose is the rigid transform."""
+        T_correction, frame_id = pose_from_message(message)
+        if self._builder is None:
+            raise RefusedInput(
+                "no_graph", "pose correction before the first local graph: no node to correct"
+            )
+        if frame_id != self._builder.graph.frame_id:
+            raise RefusedInput(
+                "wrong_frame",
+                f"pose correction is in frame '{frame_id}', expected "
+                f"'{self._builder.graph.frame_id}'",
+            )
+        moved = self._builder.apply_correction(T_correction, stamp_ns_of(message))
+        self._corrections += 1
+        self._corrected_nodes += len(moved)
+        self._times.changed(self._running_s, time.monotonic())
+
+    def _run(self, job: _Job) -> None:
+        self._running_s = job.submitted_s
+        with self._node.refusing():
+            job.run()
+
+    def _publish(self) -> float | None:
+        """Publish what is due; returns the seconds until something else is."""
+        if self._times.wait_s(time.monotonic()) == 0.0:
+            with self._node.refusing():
+                self._publish_changes()
+        if self._whole.wait_s(time.monotonic()) == 0.0:
+            with self._node.refusing():
+                self._publish_whole()
+        now_s = time.monotonic()
+        waits = (self._times.wait_s(now_s), self._whole.wait_s(now_s))
+        return min((wait_s for wait_s in waits if wait_s is not None), default=None)
+
+    def _publish_changes(self) -> None:
+        changed_s = self._times.published(time.monotonic())
+        assert self._builder is not None
+        update = self._builder.update()
+        if update is None:
+            return
+        self._publish_update(update)
+        self._node.health.published(time.monotonic() - changed_s)
+        self._whole.changed()
+        self._on_update(update)
+
+    def _publish_whole(self) -> None:
+        assert self._builder is not None
+        snapshot = self._builder.snapshot()
+        self._whole.publish(snapshot, time.monotonic())
+        self._values = {
+            "nodes": str(len(snapshot.nodes)),
+            **{f"hidden, {why}": str(count) for why, count in self._builder.hidden.items()},
+            "edges": str(len(snapshot.edges)),
+            "sequence": str(snapshot.sequence),
+        }
+
+    # The methods below run in the executor's thread.
+
+    async def _save(self, request: Any, response: Any) -> Any:
+        """Answer ~/save when the graph's thread has written the files."""
+        done = Future()
+
+        def save() -> None:
+            result = (False, "refused: see /diagnostics")
+            try:
+                result = self._files.save(self._builder)
+            finally:
+                done.set_result(result)
+                self._wake()
+
+        self.submit(save, lambda: done.set_result((False, "too many messages wait: try again")))
+        response.success, response.message = await done
+        return response
+
+    def _wake(self) -> None:
+        if self._node.executor is not None:
+            self._node.executor.wake()
+
+    def _receive_correction(self, message: Any) -> None:
+        self._node.health.received(CORRECTION_TOPIC)
+        self.submit(lambda: self._correct(message))
+
+    def _count_overrun(self) -> None:
+        self._node.drop(
+            "overrun",
+            f"the graph processes fewer messages than arrive: dropped the oldest of {QUEUE_JOBS}",
+        )
+
+
+def _drop(job: _Job) -> None:
+    job.dropped()
