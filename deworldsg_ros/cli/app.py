@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from deworldsg_ros import __version__
+from deworldsg_ros.cli import ask, probe
 from deworldsg_ros.cli import models as models_command
-from deworldsg_ros.cli import probe
 from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
 from deworldsg_ros.recordings.bags.topics import TopicChoice
@@ -328,6 +328,9 @@ for parent, function, summary in (
     (evaluation, evaluate.score, "Score predictions or scene graphs of earlier runs."),
     (evaluation, evaluate.run, "Run the pipeline on every scan and score its graphs."),
     (evaluation, evaluate.table, "Compare methods or configurations in a table."),
+    (app, ask.query, "Ask a scene graph in words."),
+    (app, ask.goal, "Print a pose from which an object is in view."),
+    (app, ask.explain, "Explain an object, a relation or a class."),
     (app, probe.train_probe, "Train the probe of a world model."),
     (app, probe.import_probe, "Make the published probe ready for use."),
 ):

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.predicates import PREDICATES, plain
 
 # Relations of an ordered pair. The first five are the columns of the physical model.
 ON, IN, ATTACHED, AGAINST, ABOVE, UNDER, NEAR, NONE = range(8)
@@ -37,30 +38,16 @@ RELATIONS_OF_STATE: Int64 = np.array(
     np.int64,
 )
 
-# Predicates of each relation. The first one in the vocabulary names it if no frame named another.
-PREDICATES: tuple[tuple[str, ...], ...] = (
-    (
-        "on", "standing on", "supported by", "sitting on", "lying on", "laying on", "parked on",
-        "on back of",
-    ),
-    ("in", "inside", "standing in", "lying in", "hanging in"),
-    ("attached to", "hanging on", "hanging from", "mounted on", "build in", "built in"),
-    ("against", "leaning against", "connected to"),
-    ("above", "over"),
-    ("under", "below"),
-    ("near", "next to", "beside", "close by", "with"),
-)  # fmt: skip
-
 
 def relation_of_predicates(predicates: Sequence[str]) -> Int64:
     """Relation of each predicate name, (R,) int64; -1 = it names no physical relation."""
     of_name = {name: index for index, names in enumerate(PREDICATES) for name in names}
-    return np.array([of_name.get(_plain(name), -1) for name in predicates], np.int64)
+    return np.array([of_name.get(plain(name), -1) for name in predicates], np.int64)
 
 
 def canonical_predicates(predicates: Sequence[str]) -> Int64:
     """Index of the predicate that names each relation but NONE, (7,) int64; -1 = there is none."""
-    known = {_plain(name): index for index, name in reversed(list(enumerate(predicates)))}
+    known = {plain(name): index for index, name in reversed(list(enumerate(predicates)))}
     chosen = [[known[name] for name in names if name in known] for names in PREDICATES]
     return np.array([indices[0] if indices else -1 for indices in chosen], np.int64)
 
@@ -78,7 +65,3 @@ def states_of_relations(relations: Float64) -> Float64:
     states = np.zeros((relations.shape[1], STATE_COUNT))
     states[:, 1::2], states[:, 2::2] = relations[0], relations[1]
     return states
-
-
-def _plain(name: str) -> str:
-    return name.lower().replace("_", " ")

@@ -17,13 +17,13 @@ def write_graph(folder: Path, graph: wire.SceneGraphMessage) -> Path:
     return path
 
 
-def read_graph(folder: Path) -> wire.SceneGraphMessage:
-    """Read ``folder/scene_graph.json``.
+def read_graph(path: Path) -> wire.SceneGraphMessage:
+    """Read a scene graph: a file, or ``scene_graph.json`` of a folder.
 
     Raises:
         RefusedInput: ``unreadable_graph``, or the reason for which `wire.decode` refuses it.
     """
-    path = folder / GRAPH_FILE
+    path = path / GRAPH_FILE if path.is_dir() else path
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -160,6 +160,19 @@ class Belief(msgspec.Struct, frozen=True):
     probability: Probability
 
 
+class GravityBox(msgspec.Struct, frozen=True):
+    """A box around an object with one axis along `up`; points far from the others are left out."""
+
+    center_m: Vector3
+    size_m: Annotated[
+        Vector3, msgspec.Meta(description="along the axes of the box; the third one is up")
+    ]
+    orientation_xyzw: Annotated[
+        list[float],
+        msgspec.Meta(min_length=4, max_length=4, description="axes of the box to world, unit"),
+    ]
+
+
 class NodeState(msgspec.Struct, frozen=True):
     """One object of the global graph."""
 
@@ -187,6 +200,31 @@ class NodeState(msgspec.Struct, frozen=True):
             "null = not available"
         ),
     ] = None
+    remainder: Annotated[
+        Union[Probability, msgspec.UnsetType],
+        msgspec.Meta(description="probability of all classes that are not listed"),
+    ] = msgspec.UNSET
+    box: Annotated[
+        Union[GravityBox, msgspec.UnsetType],
+        msgspec.Meta(description="absent = without surface points"),
+    ] = msgspec.UNSET
+    surface_mm: Annotated[
+        Union[bytes, msgspec.UnsetType],
+        msgspec.Meta(
+            description="points of the surface relative to mean_m: x y z of each, int16 "
+            "little-endian, millimetres, base64; replaces surface_points_m"
+        ),
+    ] = msgspec.UNSET
+
+
+class HiddenNode(msgspec.Struct, frozen=True):
+    """An object that was detected and is not in the graph, with the reason."""
+
+    label: str
+    mean_m: Vector3
+    existence: Probability
+    observations: Annotated[int, msgspec.Meta(ge=1)]
+    reason: str
 
 
 Provenance = Literal["visual", "prior", "fused"]
@@ -220,6 +258,16 @@ class EdgeState(msgspec.Struct, frozen=True):
         float, msgspec.Meta(ge=0.0, description="of the visual distribution (uniform if none)")
     ]
     observations: Annotated[int, msgspec.Meta(ge=0, description="frames with visual evidence")]
+    remainder: Annotated[
+        Union[Probability, msgspec.UnsetType],
+        msgspec.Meta(description="probability of all predicates that are not listed"),
+    ] = msgspec.UNSET
+
+
+Up = Annotated[
+    Union[Vector3, msgspec.UnsetType],
+    msgspec.Meta(description="unit vector against gravity in the world frame"),
+]
 
 
 class SceneGraphMessage(Message, kw_only=True):
@@ -228,6 +276,11 @@ class SceneGraphMessage(Message, kw_only=True):
     sequence: NonNegative
     nodes: list[NodeState]
     edges: list[EdgeState]
+    up: Up = msgspec.UNSET
+    hidden: Annotated[
+        Union[list[HiddenNode], msgspec.UnsetType],
+        msgspec.Meta(description="in saved files only"),
+    ] = msgspec.UNSET
 
 
 class RemovedNode(msgspec.Struct, frozen=True):
@@ -263,6 +316,7 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     nodes: list[NodeState]
     edges: list[EdgeState]
     associations: list[Association]
+    up: Up = msgspec.UNSET
 
 
 MESSAGES: dict[str, type[Message]] = {

@@ -1,0 +1,146 @@
+"""`deworldsg query`, `goal` and `explain`: ask a scene graph."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from deworldsg_ros.client.asking import ask
+from deworldsg_ros.client.content import Which
+from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.objects import odds_of
+from deworldsg_ros.client.patterns import Answers
+
+# typer evaluates these annotations at run time.
+Words = Annotated[
+    list[str],
+    typer.Argument(metavar="[FILE] WORDS", help="graph (file, or folder of a run), then the words"),
+]
+Live = Annotated[bool, typer.Option("--live", help="ask the running graph_node instead of a file")]
+Namespace = Annotated[
+    str, typer.Option("--namespace", help="of the robot, with --live, e.g. /robot_1")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="print JSON for programs")]
+
+
+def query(
+    words: Words, live: Live = False, namespace: Namespace = "", as_json: AsJson = False
+) -> None:
+    """Ask a graph in words: "cup on dining table", "chair within 1 m of table".
+
+    Every answer has its probability, its evidence, and "not sure" below odds of 2 : 1.
+    """
+    with _opened(words, live, namespace) as (graph, rest):
+        answers = ask(graph, " ".join(rest))
+        if as_json:
+            print_json(answers.to_dict())
+        else:
+            _print_answers(answers, graph.frame_id, Console())
+
+
+def goal(
+    words: Words,
+    distance: Annotated[
+        float, typer.Option("--distance", help="from the box of the object, metres")
+    ] = 1.0,
+    live: Live = False,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Print a pose from which an object is in view, as a PoseStamped.
+
+    The words are the id of an object or its class.
+    """
+    with _opened(words, live, namespace) as (graph, rest):
+        found = graph.goal_near(_which(rest), distance)
+        if as_json:
+            print_json(found.to_dict())
+            return
+        x, y, z = found.position_m
+        Console(highlight=False, soft_wrap=True).print(
+            f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found.frame_id}', facing "
+            f"{escape(found.target.name)} ({found.target.probability:.0%}"
+            f"{'' if found.target.is_sure else ', not sure'}); quaternion xyzw "
+            + " ".join(f"{value:.4f}" for value in found.orientation_xyzw)
+            + f"\n{found.distance_m:.2f} m from it; next object {found.clearance_m:.2f} m away; "
+            f"it extends {found.along_std_m:.2f} m (1σ) along, {found.across_std_m:.2f} m across "
+            "the view"
+            + ("" if found.in_known_area else "\nnot sure: the pose is outside of all objects")
+            + (f"\nnot sure: {found.blocked_by.name} may hide it" if found.blocked_by else "")
+        )
+
+
+def explain(
+    words: Words, live: Live = False, namespace: Namespace = "", as_json: AsJson = False
+) -> None:
+    """Explain why an object, a pair of objects or a class is in the graph, or is not.
+
+    The words are an id, two ids, or a class.
+    """
+    with _opened(words, live, namespace) as (graph, rest):
+        if len(rest) == 2 and all(word.isdigit() for word in rest):
+            found = graph.explain((int(rest[0]), int(rest[1])))
+        else:
+            found = graph.explain(_which(rest))
+        if as_json:
+            print_json({"subject": found.subject, "lines": list(found.lines), **found.values})
+        else:
+            typer.echo(str(found))
+
+
+def print_json(content: Any) -> None:
+    """Print a JSON document."""
+    typer.echo(json.dumps(content, indent=2, ensure_ascii=False))
+
+
+@contextmanager
+def _opened(words: list[str], live: bool, namespace: str) -> Iterator[tuple[SceneGraph, list[str]]]:
+    """The graph that the arguments name, and the rest of the words."""
+    if live:
+        from deworldsg_ros.client import SceneGraphClient
+
+        with SceneGraphClient(namespace) as client:
+            yield client.graph, words
+        return
+    if len(words) < 2:
+        raise ClientError(f"'{' '.join(words)}': expected a graph and a question, or --live")
+    yield SceneGraph.load(Path(words[0])), words[1:]
+
+
+def _which(words: list[str]) -> Which:
+    text = " ".join(words).removeprefix("#")
+    return int(text) if text.isdigit() else text
+
+
+def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
+    table = Table(box=box.SIMPLE, caption=f"positions in frame {frame_id!r}")
+    table.add_column("object", no_wrap=True)
+    table.add_column("x, y, z (m)", no_wrap=True)
+    table.add_column("size (cm)", no_wrap=True)
+    table.add_column("p", justify="right", no_wrap=True)
+    table.add_column("odds", justify="right", no_wrap=True)
+    table.add_column("evidence")
+    for answer in answers.found:
+        item = answer.item
+        table.add_row(
+            escape(item.name),
+            " ".join(f"{value:.2f}" for value in item.position_m),
+            " × ".join(f"{100 * value:.0f}" for value in item.size_m),
+            f"{answer.probability:.0%}",
+            odds_of(answer.probability),
+            ("" if answer.is_sure else "[yellow]not sure:[/] ") + escape(answer.evidence),
+        )
+    if answers.found:
+        console.print(table)
+    for note in answers.notes:
+        console.print(escape(note), highlight=False, soft_wrap=True)

@@ -1,0 +1,166 @@
+"""What differs between two graphs: of one session by id, of two sessions by place and class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from deworldsg_ros.client.objects import SceneObject
+
+# An object moved if its box centre did by this much: twice the error of a measured extent.
+MOVED_M = 0.08
+# Objects of two sessions are one object if their centres are within this distance, or within half
+# of the longer side of the larger box.
+SAME_PLACE_M = 0.3
+# An object of the same class farther away than that has moved, up to this distance.
+REACH_M = 3.0
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """An object before and after.
+
+    Attributes:
+        before, after: the object in the two graphs.
+        distance_m: of the centres.
+    """
+
+    before: SceneObject
+    after: SceneObject
+
+    @property
+    def distance_m(self) -> float:
+        """Distance of the centres of the boxes."""
+        return float(np.linalg.norm(np.subtract(self.after.position_m, self.before.position_m)))
+
+
+@dataclass(frozen=True)
+class Changes:
+    """The difference of two graphs.
+
+    Attributes:
+        added, gone: objects of the second, and of the first graph only.
+        moved, relabelled: objects of both; one may be in both lists.
+        same: number of objects that did neither.
+    """
+
+    added: tuple[SceneObject, ...]
+    gone: tuple[SceneObject, ...]
+    moved: tuple[Pairing, ...]
+    relabelled: tuple[Pairing, ...]
+    same: int
+
+    def __bool__(self) -> bool:
+        return bool(self.added or self.gone or self.moved or self.relabelled)
+
+    @property
+    def lines(self) -> list[str]:
+        """One sentence for each change."""
+        found = [f"added {item.name}{_not_sure(item)} at {_place(item)}" for item in self.added]
+        found += [f"gone {item.name}{_not_sure(item)} from {_place(item)}" for item in self.gone]
+        found += [
+            f"moved {pair.after.name} by {pair.distance_m:.2f} m to {_place(pair.after)}"
+            for pair in self.moved
+        ]
+        found += [
+            f"relabelled {pair.before.name} as {pair.after.name}{_not_sure(pair.after)}"
+            for pair in self.relabelled
+        ]
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "added": [item.to_dict() for item in self.added],
+            "gone": [item.to_dict() for item in self.gone],
+            "moved": [
+                {
+                    "before": pair.before.to_dict(),
+                    "after": pair.after.to_dict(),
+                    "distance_m": round(pair.distance_m, 3),
+                }
+                for pair in self.moved
+            ],
+            "relabelled": [
+                {"before": pair.before.to_dict(), "after": pair.after.to_dict()}
+                for pair in self.relabelled
+            ],
+            "same": self.same,
+        }
+
+
+def changes_by_id(before: Mapping[int, SceneObject], after: Mapping[int, SceneObject]) -> Changes:
+    """The changes between two graphs of one session; objects by id."""
+    pairs = [Pairing(before[i], after[i]) for i in after if i in before]
+    return _changes(
+        [after[i] for i in after if i not in before],
+        [before[i] for i in before if i not in after],
+        pairs,
+    )
+
+
+def changes_by_place(before: Iterable[SceneObject], after: Iterable[SceneObject]) -> Changes:
+    """The changes between graphs of two sessions in one world frame.
+
+    Objects at one place are one object, whatever they are called. Of the rest, objects of one class
+    in reach are one object that moved.
+    """
+    first, second = list(before), list(after)
+    pairs = matched(first, second, _place_cost)
+    first = _without(first, (pair.before for pair in pairs))
+    second = _without(second, (pair.after for pair in pairs))
+    moved = matched(first, second, _move_cost)
+    return _changes(
+        _without(second, (pair.after for pair in moved)),
+        _without(first, (pair.before for pair in moved)),
+        [*pairs, *moved],
+    )
+
+
+def matched(before: list[SceneObject], after: list[SceneObject], cost: Any) -> list[Pairing]:
+    """The assignment of least total cost; pairs of infinite cost are left out."""
+    if not before or not after:
+        return []
+    costs = np.array([[cost(a, b) for b in after] for a in before])
+    finite = np.where(np.isfinite(costs), costs, 1e6)
+    rows, columns = linear_sum_assignment(finite)
+    return [Pairing(before[r], after[c]) for r, c in zip(rows, columns) if costs[r, c] < np.inf]
+
+
+def _place_cost(a: SceneObject, b: SceneObject) -> float:
+    distance = float(np.linalg.norm(np.subtract(a.position_m, b.position_m)))
+    reach = max(SAME_PLACE_M, max(*a.size_m, *b.size_m) / 2)
+    # Different classes at one place are rarer than noise of the place.
+    if a.label != b.label:
+        reach, distance = reach / 2, distance + reach / 2
+        return distance if distance <= 2 * reach else np.inf
+    return distance if distance <= reach else np.inf
+
+
+def _move_cost(a: SceneObject, b: SceneObject) -> float:
+    distance = float(np.linalg.norm(np.subtract(a.position_m, b.position_m)))
+    return distance if a.label == b.label and distance <= REACH_M else np.inf
+
+
+def _changes(added: list[SceneObject], gone: list[SceneObject], pairs: list[Pairing]) -> Changes:
+    moved = [pair for pair in pairs if pair.distance_m > MOVED_M]
+    relabelled = [pair for pair in pairs if pair.before.label != pair.after.label]
+    same = sum(pair not in moved and pair not in relabelled for pair in pairs)
+    return Changes(tuple(added), tuple(gone), tuple(moved), tuple(relabelled), same)
+
+
+def _without(items: list[SceneObject], taken: Iterable[SceneObject]) -> list[SceneObject]:
+    ids = {item.id for item in taken}
+    return [item for item in items if item.id not in ids]
+
+
+def _place(item: SceneObject) -> str:
+    return " ".join(f"{value:.2f}" for value in item.position_m)
+
+
+def _not_sure(item: SceneObject) -> str:
+    return "" if item.is_sure else " (not sure)"

@@ -1,0 +1,144 @@
+"""Why an object or a relation is in the graph, or is not, in short sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from deworldsg_ros.client.boxes import gap_m, horizontal_gap_m, vertical_gap_m
+from deworldsg_ros.client.objects import (
+    HiddenObject,
+    Relation,
+    SceneObject,
+    odds_of,
+)
+from deworldsg_ros.client.words import is_class
+
+# Two boxes are in contact below this gap: the error of a measured extent.
+CONTACT_M = 0.04
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The reasons of an answer.
+
+    Attributes:
+        subject: what is explained.
+        lines: one sentence each.
+        values: the same as plain values for JSON.
+    """
+
+    subject: str
+    lines: tuple[str, ...]
+    values: dict[str, Any]
+
+    def __str__(self) -> str:
+        return "\n".join([self.subject, *(f"  {line}" for line in self.lines)])
+
+
+def explain_object(item: SceneObject, relations: Sequence[Relation]) -> Explanation:
+    """Why an object is in the graph and has its name.
+
+    Args:
+        item: the object.
+        relations: all relations of the object.
+    """
+    frames, seconds = item.observations, (item.last_seen_ns - item.first_seen_ns) / 1e9
+    lines = [f"detected in {frames} frames over {seconds:.1f} s"]
+    if item.existence is not None:
+        lines.append(f"exists with {item.existence:.0%} ({odds_of(item.existence)})")
+    names = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])
+    lines.append(f"class: {names}; all others {item.other_classes:.0%}")
+    if not item.is_sure:
+        lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
+    looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"
+    size = " x ".join(f"{100 * side:.0f}" for side in item.size_m)
+    lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")
+    lines += [f"{relation.text}: {relation.probability:.0%}" for relation in relations[:5]]
+    values = {**item.to_dict(), "relations": [relation.to_dict() for relation in relations]}
+    return Explanation(item.name, tuple(lines), values)
+
+
+def explain_relation(relation: Relation) -> Explanation:
+    """Why a relation is in the graph: frames, sources, and the geometry of the two boxes."""
+    geometry = pair_geometry(relation.subject, relation.object)
+    lines = [
+        f"holds with {relation.probability:.0%} ({odds_of(relation.probability)})"
+        + ("" if relation.is_sure else ": not sure"),
+        f"evidence: {relation.evidence}",
+        f"no relation at all: {relation.unrelated:.0%}",
+        geometry_line(geometry),
+    ]
+    others = [item for item in relation.predicates if item.label != relation.predicate]
+    likely = [item for item in others if item.probability >= 0.01]
+    if likely:
+        names = ", ".join(f"{item.label} {item.probability:.0%}" for item in likely[:3])
+        lines.append(f"other predicates: {names}")
+    return Explanation(relation.text, tuple(lines), {**relation.to_dict(), **geometry})
+
+
+def explain_absence(
+    asked: str, hidden: Sequence[HiddenObject] | None, objects: Sequence[SceneObject]
+) -> Explanation:
+    """Why there is no object of a class.
+
+    Args:
+        asked: the class.
+        hidden: objects that were detected and are not in the graph; None = not known.
+        objects: all objects of the graph.
+    """
+    lines = []
+    possible = sorted(
+        (item for item in objects if item.probability_of(asked) >= 0.01),
+        key=lambda item: -item.probability_of(asked),
+    )
+    for item in possible[:5]:
+        lines.append(f"{item.name} may be one: {item.probability_of(asked):.0%}")
+    found = [item for item in hidden or () if is_class(asked, item.label)]
+    for hidden_item in found:
+        place = " ".join(f"{value:.2f}" for value in hidden_item.position_m)
+        lines.append(
+            f"hidden at {place}: {hidden_item.reason}; detected in {hidden_item.observations} "
+            f"frames, exists with {hidden_item.existence:.0%}"
+        )
+    if hidden is None:
+        lines.append("hidden objects: not in this message; a saved file lists them")
+    elif not found:
+        lines.append("no hidden object of this class: it was never detected, or long ago")
+    values = {
+        "label": asked,
+        "candidates": {item.id: round(item.probability_of(asked), 3) for item in possible},
+        "hidden": [item.to_dict() for item in found],
+    }
+    return Explanation(f"no object of class '{asked}'", tuple(lines), values)
+
+
+def explain_no_relation(a: SceneObject, b: SceneObject) -> Explanation:
+    """Why there is no relation between two objects."""
+    geometry = pair_geometry(a, b)
+    lines = (
+        "no predicate is probable enough to be published in either direction",
+        geometry_line(geometry),
+    )
+    return Explanation(f"{a.name} and {b.name}", lines, geometry)
+
+
+def pair_geometry(a: SceneObject, b: SceneObject) -> dict[str, Any]:
+    """Gaps of two boxes in metres, and whether they are in contact."""
+    gap = gap_m(a.footprint, b.footprint)
+    return {
+        "gap_m": round(gap, 3),
+        "horizontal_gap_m": round(horizontal_gap_m(a.footprint, b.footprint), 3),
+        "bottom_above_top_m": round(vertical_gap_m(a.footprint, b.footprint), 3),
+        "contact": gap <= CONTACT_M,
+    }
+
+
+def geometry_line(geometry: dict[str, Any]) -> str:
+    """The geometry of a pair as a sentence."""
+    contact = "in contact" if geometry["contact"] else "not in contact"
+    return (
+        f"boxes: {contact}, gap {100 * geometry['gap_m']:.0f} cm; the bottom of the first is "
+        f"{100 * geometry['bottom_above_top_m']:.0f} cm above the top of the second"
+    )

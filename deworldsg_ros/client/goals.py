@@ -1,0 +1,293 @@
+"""Where to stand to look at an object, as far as the graph knows what is in the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from deworldsg_ros.client.boxes import Footprint, point_gaps_m, polygon_gap_m
+from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.client.objects import Point, SceneObject
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.scene.extent import horizontal_axes
+
+# Directions around an object that are tried.
+DIRECTIONS = 72
+# Half the width of a robot, and its height. A box above the robot is not in its way.
+ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.3, 1.5
+# The floor is this quantile of the bottoms of all boxes: few objects seem to be below it.
+FLOOR_QUANTILE = 0.05
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A pose on the floor from which an object is in view.
+
+    Attributes:
+        target: the object.
+        position_m: on the floor, world frame.
+        orientation_xyzw: x axis towards the object, z axis up.
+        frame_id: the world frame.
+        stamp_ns: of the graph.
+        distance_m: horizontal distance from the box of the object.
+        clearance_m: gap to the nearest other box that is as low as the robot; infinite without one.
+        seen_share: share of the object's surface points on this side, 0.5 = no difference. The
+            camera was on the side of the visible surface, so this side was free of walls.
+        covariance_m2: covariance (3, 3) of the object's Gaussian.
+        along_std_m, across_std_m: its standard deviation along the view, and horizontally across.
+        bearing_std_rad: angle of `across_std_m` as seen from here.
+        blocked_by: an object that reaches into the line of sight, or None.
+        in_known_area: the pose is between the objects of the graph. Outside, there may be a wall.
+    """
+
+    target: SceneObject
+    position_m: Point
+    orientation_xyzw: tuple[float, float, float, float]
+    frame_id: str
+    stamp_ns: int
+    distance_m: float
+    clearance_m: float
+    seen_share: float
+    covariance_m2: tuple[Point, Point, Point]
+    along_std_m: float
+    across_std_m: float
+    bearing_std_rad: float
+    blocked_by: SceneObject | None
+    in_known_area: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, with the fields of a geometry_msgs/PoseStamped."""
+        position = dict(zip("xyz", (round(value, 3) + 0.0 for value in self.position_m)))
+        turn = dict(zip("xyzw", (round(value, 5) + 0.0 for value in self.orientation_xyzw)))
+        sec, nanosec = divmod(self.stamp_ns, 10**9)
+        return {
+            "header": {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": self.frame_id},
+            "pose": {"position": position, "orientation": turn},
+            "target": {"id": self.target.id, "label": self.target.label},
+            "target_probability": round(self.target.probability, 3),
+            "distance_m": round(self.distance_m, 3),
+            "clearance_m": None if math.isinf(self.clearance_m) else round(self.clearance_m, 3),
+            "seen_share": round(self.seen_share, 2),
+            "along_std_m": round(self.along_std_m, 3),
+            "across_std_m": round(self.across_std_m, 3),
+            "bearing_std_deg": round(math.degrees(self.bearing_std_rad), 1),
+            "blocked_by": None if self.blocked_by is None else self.blocked_by.id,
+            "in_known_area": self.in_known_area,
+        }
+
+    def pose_stamped(self) -> Any:
+        """The pose as geometry_msgs/PoseStamped; needs ROS 2."""
+        from deworldsg_ros.client.ros_messages import pose_stamped
+
+        return pose_stamped(self.position_m, self.orientation_xyzw, self.frame_id, self.stamp_ns)
+
+
+def goal_near(
+    target: SceneObject,
+    others: Iterable[SceneObject],
+    distance: float,
+    stamp_ns: int,
+    *,
+    radius: float = ROBOT_RADIUS_M,
+    towards: Point | None = None,
+) -> Goal:
+    """A pose at a distance from the box of an object, facing it, on a free side.
+
+    Every direction around the object is tried. A direction is free if a disc of the robot's radius
+    touches no other box that is lower than the robot. Of the free ones, the best sees the side of
+    the object whose surface was seen, past no other object that hides it, is between the objects of
+    the graph, and is nearest to `towards`. Only objects of the graph are known: a wall that is no
+    object is not.
+
+    Args:
+        target: to look at.
+        others: the other objects of the graph; the target itself is skipped.
+        distance: horizontal distance from its box, metres.
+        stamp_ns: of the graph.
+        radius: of the robot, metres.
+        towards: preferred position, e.g. where the robot is.
+
+    Raises:
+        ClientError: if the distance is not positive, or no direction is free.
+    """
+    if not (math.isfinite(distance) and distance > 0):
+        raise ClientError(f"distance {distance}: expected a positive number of metres")
+    obstacles = [item for item in others if item.id != target.id]
+    floor = floor_m([target, *obstacles])
+    low = [item for item in obstacles if item.footprint.low < floor + ROBOT_HEIGHT_M]
+    area = _hull(np.concatenate([item.footprint.corners for item in [target, *obstacles]]))
+    boxes = np.array([item.footprint.corners for item in low]).reshape(-1, 4, 2)
+    best: tuple[float, Goal] | None = None
+    for ray in _rays():
+        spot = _spot(target.footprint, ray, distance)
+        clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - radius
+        if clearance <= 0.0:
+            continue
+        blocker = _blocker(target, obstacles, spot)
+        known = bool(point_gaps_m(spot, area[None])[0] == 0.0)
+        goal = _goal(target, ray, spot, floor, stamp_ns, clearance, blocker, known)
+        score = _score(goal, towards)
+        if best is None or score > best[0] + 1e-9:
+            best = (score, goal)
+    if best is None:
+        raise ClientError(
+            f"no free side of {target.name} at {distance:g} m: other objects are within "
+            f"{radius:g} m of every pose; try another distance"
+        )
+    return best[1]
+
+
+def _score(goal: Goal, towards: Point | None) -> float:
+    """The better, the higher: the order of importance is that of the numbers, chosen by hand."""
+    score = 1.0 * goal.in_known_area - 0.5 * (goal.blocked_by is not None) + goal.seen_share
+    score += 0.2 * min(goal.clearance_m, 1.0)
+    if towards is not None:
+        score -= 0.1 * float(np.linalg.norm(np.subtract(goal.position_m, towards)))
+    return score
+
+
+def free_direction(
+    of: SceneObject, others: Iterable[SceneObject], towards: Point | None, room: float
+) -> Point:
+    """The horizontal direction (unit vector, world) in which there is room beside an object.
+
+    Args:
+        of: the object.
+        others: the other objects; those wholly above or below it are not in the way.
+        towards: the nearest free direction to this point is chosen; None = the one with the
+            largest gap.
+        room: free length beside the box, metres, in the width of the box seen from there.
+
+    Raises:
+        ClientError: if there is no room on any side.
+    """
+    own = of.footprint
+    level = [
+        item
+        for item in others
+        if item.id != of.id and item.footprint.high > own.low and item.footprint.low < own.high
+    ]
+    wish = None if towards is None else _plan(towards, of.up) - own.center
+    best: tuple[float, Float64] | None = None
+    for ray in _rays():
+        lane = _lane(own, ray, room)
+        gap = min((polygon_gap_m(lane, item.footprint.corners) for item in level), default=1e3)
+        if gap <= 0.0:
+            continue
+        score = gap if wish is None else float(ray @ wish)
+        if best is None or score > best[0] + 1e-9:
+            best = (score, ray)
+    if best is None:
+        raise ClientError(f"{of.name} has no free side with {room:g} m of room")
+    x, y, z = (best[1] @ horizontal_axes(of.up)[:2] + 0.0).tolist()
+    return x, y, z
+
+
+def floor_m(items: Sequence[SceneObject]) -> float:
+    """Height of the floor: that of the lowest objects."""
+    return float(np.quantile([item.footprint.low for item in items], FLOOR_QUANTILE))
+
+
+def _goal(
+    target: SceneObject,
+    ray: Float64,
+    spot: Float64,
+    floor: float,
+    stamp_ns: int,
+    clearance: float,
+    blocker: SceneObject | None,
+    known: bool,
+) -> Goal:
+    axes = horizontal_axes(target.up)
+    position = np.array([*spot, floor]) @ axes
+    forward, left = np.array([*-ray, 0.0]) @ axes, np.array([ray[1], -ray[0], 0.0]) @ axes
+    turn = quaternion_from_rotation(np.stack([forward, left, axes[2]], axis=1)).tolist()
+    covariance = np.array(target.covariance_m2)
+    along, across = (math.sqrt(max(float(v @ covariance @ v), 0.0)) for v in (forward, left))
+    view_m = float(np.linalg.norm(spot - target.footprint.center))
+    x, y, z = position.tolist()
+    return Goal(
+        target=target,
+        position_m=(x, y, z),
+        orientation_xyzw=(turn[0], turn[1], turn[2], turn[3]),
+        frame_id=target.frame_id,
+        stamp_ns=stamp_ns,
+        distance_m=float(point_gaps_m(spot, target.footprint.corners[None])[0]),
+        clearance_m=clearance,
+        seen_share=_seen_share(target, ray),
+        covariance_m2=target.covariance_m2,
+        along_std_m=along,
+        across_std_m=across,
+        bearing_std_rad=math.atan2(across, view_m),
+        blocked_by=blocker,
+        in_known_area=known,
+    )
+
+
+def _rays() -> Float64:
+    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def _plan(point: Point, up: Point) -> Float64:
+    return np.asarray(horizontal_axes(up)[:2] @ np.array(point))
+
+
+def _spot(box: Footprint, ray: Float64, distance: float) -> Float64:
+    """The point (2,) in a direction from the centre of a box at a distance from the box."""
+    low, high = 0.0, distance + float(np.ptp(box.corners, axis=0).sum())
+    for _ in range(20):  # the gap grows along the ray; 20 halvings give micrometres
+        middle = (low + high) / 2
+        if point_gaps_m(box.center + middle * ray, box.corners[None])[0] < distance:
+            low = middle
+        else:
+            high = middle
+    return np.asarray(box.center + high * ray)
+
+
+def _hull(points: Float64) -> Float64:
+    """The corners (k, 2) of the convex hull of points (n, 2), n >= 3 not on one line."""
+    return np.asarray(points[ConvexHull(points).vertices])
+
+
+def _blocker(
+    target: SceneObject, obstacles: Iterable[SceneObject], spot: Float64
+) -> SceneObject | None:
+    """An object between a spot and the target that is higher than the target's centre."""
+    own = target.footprint
+    height = (own.low + own.high) / 2
+    line = np.array([spot, own.center])
+    for item in obstacles:
+        box = item.footprint
+        if box.high <= height or box.low >= height:
+            continue
+        around = point_gaps_m(own.center, box.corners[None])[0] == 0.0
+        if not around and polygon_gap_m(line, box.corners) == 0.0:
+            return item
+    return None
+
+
+def _seen_share(target: SceneObject, ray: Float64) -> float:
+    """Share of the surface points that are on the side of a direction, seen from the centre."""
+    points = target.surface_m
+    if not len(points):
+        return 0.5
+    sides = (points @ horizontal_axes(target.up)[:2].T - target.footprint.center) @ ray
+    return float((sides > 0).mean())
+
+
+def _lane(box: Footprint, ray: Float64, room: float) -> Float64:
+    """The free rectangle (4, 2) that is wanted beside a box, as wide as the box."""
+    across = np.array([-ray[1], ray[0]])
+    offsets = box.corners - box.center
+    start, width = float((offsets @ ray).max()) + 1e-3, float((offsets @ across).max())
+    near, far = box.center + start * ray, box.center + (start + room) * ray
+    return np.array(
+        [near - width * across, far - width * across, far + width * across, near + width * across]
+    )

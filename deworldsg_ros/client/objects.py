@@ -1,0 +1,316 @@
+"""The answers of the client: objects, relations and hidden objects, as frozen values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from deworldsg_ros.client.boxes import Footprint, footprint
+from deworldsg_ros.client.words import is_class, predicate_names
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.extent import box_of, surface_points
+from deworldsg_ros.scene.predicates import plain
+
+Point = tuple[float, float, float]
+
+# An answer is sure from odds of two to one. Chosen, not measured.
+SURE = 2 / 3
+
+
+def odds_of(probability: float) -> str:
+    """A probability as odds, in words: 0.75 is "3 : 1", 0.25 is "1 : 3"."""
+    if probability >= 1.0 - 1e-9:
+        return "certain"
+    if probability <= 1e-9:
+        return "none"
+    odds = probability / (1.0 - probability)
+    ratio = max(odds, 1.0 / odds)
+    number = f"{ratio:.0f}" if ratio >= 9.95 else f"{ratio:.2g}"
+    return f"{number} : 1" if odds >= 1 else f"1 : {number}"
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """One object of the graph.
+
+    Attributes:
+        id: stable, never reused within one graph.
+        label: most probable class.
+        classes: probabilities of the classes that the message lists, the best first.
+        other_classes: probability of all classes that it does not list.
+        existence: probability that this is an object at all; None = not estimated.
+        position_m: centre of the box, world frame, metres.
+        size_m: of the box along its axes; the third axis is up.
+        orientation_xyzw: axes of the box to world.
+        box_source: ``surface``, or ``gaussian`` if the message has no surface: then the box is the
+            one of a uniform body with the object's covariance.
+        mean_m, covariance_m2: the Gaussian of the visible surface, world frame.
+        observations: number of frames that detected the object.
+        first_seen_ns, last_seen_ns: stamps of the first and the last of these frames.
+        entropy_nats: of the whole class distribution; None = not available.
+        frame_id: the world frame.
+        up: unit vector against gravity.
+        state: the message of the object.
+    """
+
+    id: int
+    label: str
+    classes: tuple[wire.Belief, ...]
+    other_classes: float
+    existence: float | None
+    position_m: Point
+    size_m: Point
+    orientation_xyzw: tuple[float, float, float, float]
+    box_source: str
+    mean_m: Point
+    covariance_m2: tuple[Point, Point, Point]
+    observations: int
+    first_seen_ns: int
+    last_seen_ns: int
+    entropy_nats: float | None
+    frame_id: str
+    up: Point
+    state: wire.NodeState = field(repr=False, compare=False)
+
+    @property
+    def name(self) -> str:
+        """Label and id, for people: ``cup #13``."""
+        return f"{self.label} #{self.id}"
+
+    @property
+    def probability(self) -> float:
+        """Probability that this is an object, and of the class `label`."""
+        return self.probability_of(self.label)
+
+    def probability_of(self, label: str) -> float:
+        """Probability that this is an object of a class; "table" includes "dining table"."""
+        share = sum(belief.probability for belief in self.classes if is_class(label, belief.label))
+        return min(share, 1.0) * (1.0 if self.existence is None else self.existence)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether `probability` is at least `SURE`."""
+        return self.probability >= SURE
+
+    @property
+    def height_m(self) -> float:
+        """Height of the centre of the box above the origin of the world frame."""
+        return float(np.dot(self.position_m, self.up))
+
+    @cached_property
+    def surface_m(self) -> Float64:
+        """The sampled surface points (n, 3), world frame, metres; n may be 0."""
+        return surface_points(self.state)
+
+    @cached_property
+    def footprint(self) -> Footprint:
+        """The box seen from above."""
+        return footprint(self.position_m, self.size_m, self.orientation_xyzw, self.up)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; times in seconds."""
+        return {
+            "id": self.id,
+            "label": self.label,
+            "probability": round(self.probability, 3),
+            "sure": self.is_sure,
+            "classes": {belief.label: round(belief.probability, 3) for belief in self.classes},
+            "other_classes": round(self.other_classes, 3),
+            "existence": self.existence,
+            "position_m": _rounded(self.position_m),
+            "size_m": _rounded(self.size_m),
+            "orientation_xyzw": _rounded(self.orientation_xyzw, 4),
+            "box_source": self.box_source,
+            "frame_id": self.frame_id,
+            "observations": self.observations,
+            "first_seen_s": self.first_seen_ns / 1e9,
+            "last_seen_s": self.last_seen_ns / 1e9,
+        }
+
+
+@dataclass(frozen=True)
+class Relation:
+    """A directed relation between two objects, as it was asked for.
+
+    Attributes:
+        subject, object: the two objects.
+        predicate: as asked, or the most probable one.
+        probability: that the predicate holds, given that both objects exist.
+        predicates: probabilities of the predicates that the message lists, the best first.
+        other_predicates: probability of all predicates that it does not list.
+        provenance: ``visual`` (frames), ``prior`` (world model) or ``fused`` (both).
+        observations: number of frames with visual evidence.
+        entropy_nats: of the visual distribution.
+    """
+
+    subject: SceneObject
+    predicate: str
+    object: SceneObject
+    probability: float
+    predicates: tuple[wire.Belief, ...]
+    other_predicates: float
+    provenance: str
+    observations: int
+    entropy_nats: float
+
+    @property
+    def unrelated(self) -> float:
+        """Probability that no predicate holds."""
+        known = sum(belief.probability for belief in self.predicates) + self.other_predicates
+        return min(max(1.0 - known, 0.0), 1.0)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether `probability` is at least `SURE`."""
+        return self.probability >= SURE
+
+    @property
+    def text(self) -> str:
+        """For people: ``cup #13 on dining table #5``."""
+        return f"{self.subject.name} {self.predicate} {self.object.name}"
+
+    @property
+    def evidence(self) -> str:
+        """Where the probability comes from, in words."""
+        source = {
+            "visual": "seen",
+            "prior": "judged by the world model, not seen",
+            "fused": "seen, and judged by the world model",
+        }[self.provenance]
+        frames = f" in {self.observations} frames" if self.observations else ""
+        return source + (frames if self.provenance != "prior" else "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "subject": {"id": self.subject.id, "label": self.subject.label},
+            "predicate": self.predicate,
+            "object": {"id": self.object.id, "label": self.object.label},
+            "probability": round(self.probability, 3),
+            "sure": self.is_sure,
+            "predicates": {item.label: round(item.probability, 3) for item in self.predicates},
+            "other_predicates": round(self.other_predicates, 3),
+            "unrelated": round(self.unrelated, 3),
+            "provenance": self.provenance,
+            "observations": self.observations,
+        }
+
+
+@dataclass(frozen=True)
+class HiddenObject:
+    """Something that was detected and is not in the graph.
+
+    Attributes:
+        label: most probable class.
+        position_m: mean of its surface, world frame.
+        existence: probability that it is an object.
+        observations: number of frames that detected it.
+        reason: why it is hidden, in words.
+    """
+
+    label: str
+    position_m: Point
+    existence: float
+    observations: int
+    reason: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "label": self.label,
+            "position_m": _rounded(self.position_m),
+            "existence": self.existence,
+            "observations": self.observations,
+            "reason": self.reason,
+        }
+
+
+def scene_object(node: wire.NodeState, frame_id: str, up: Point) -> SceneObject:
+    """The object of a message of any version."""
+    box, source = _box(node, up)
+    listed = sum(belief.probability for belief in node.classes)
+    rest = node.remainder if isinstance(node.remainder, float) else max(1.0 - listed, 0.0)
+    rows = np.array(node.covariance_m2, np.float64).reshape(3, 3).tolist()
+    return SceneObject(
+        id=node.id,
+        label=node.label,
+        classes=tuple(node.classes),
+        other_classes=rest,
+        existence=node.existence if isinstance(node.existence, (int, float)) else None,
+        position_m=_point(box.center_m),
+        size_m=_point(box.size_m),
+        orientation_xyzw=(
+            box.orientation_xyzw[0],
+            box.orientation_xyzw[1],
+            box.orientation_xyzw[2],
+            box.orientation_xyzw[3],
+        ),
+        box_source=source,
+        mean_m=_point(node.mean_m),
+        covariance_m2=(_point(rows[0]), _point(rows[1]), _point(rows[2])),
+        observations=node.observations,
+        first_seen_ns=wire.ns_from_stamp(node.first_seen),
+        last_seen_ns=wire.ns_from_stamp(node.last_seen),
+        entropy_nats=node.entropy_nats,
+        frame_id=frame_id,
+        up=up,
+        state=node,
+    )
+
+
+def relation(
+    edge: wire.EdgeState, subject: SceneObject, object_: SceneObject, asked: str | None
+) -> Relation:
+    """The relation of a message, for a predicate that was asked, or for the most probable one."""
+    predicate, probability = edge.predicate, edge.probability
+    if asked is not None:
+        names = predicate_names(asked)
+        found = [item for item in edge.predicates if plain(item.label) in names]
+        predicate = found[0].label if found else asked
+        probability = min(sum(item.probability for item in found), 1.0)
+    rest = edge.remainder if isinstance(edge.remainder, float) else 0.0
+    return Relation(
+        subject=subject,
+        predicate=predicate,
+        object=object_,
+        probability=probability,
+        predicates=tuple(edge.predicates),
+        other_predicates=rest,
+        provenance=edge.provenance,
+        observations=edge.observations,
+        entropy_nats=edge.entropy_nats,
+    )
+
+
+def hidden_object(node: wire.HiddenNode) -> HiddenObject:
+    """The hidden object of a message."""
+    return HiddenObject(
+        node.label, _point(node.mean_m), node.existence, node.observations, node.reason
+    )
+
+
+def _box(node: wire.NodeState, up: Point) -> tuple[wire.GravityBox, str]:
+    """The box of a message, else one from its surface points, else from its Gaussian."""
+    if isinstance(node.box, wire.GravityBox):
+        return node.box, "surface"
+    points = surface_points(node)
+    if len(points):
+        return box_of(points, up), "surface"
+    # A uniform body of width w has the variance w² / 12. Eight corners have that of w² / 4.
+    values, axes = np.linalg.eigh(np.array(node.covariance_m2).reshape(3, 3))
+    half = axes * np.sqrt(3 * np.maximum(values, 0.0))
+    signs = np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T
+    return box_of(np.array(node.mean_m) + signs @ half.T, up), "gaussian"
+
+
+def _point(values: Any) -> Point:
+    x, y, z = values
+    return float(x), float(y), float(z)
+
+
+def _rounded(values: tuple[float, ...], decimals: int = 3) -> list[float]:
+    return [round(value, decimals) + 0.0 for value in values]

@@ -1,0 +1,22 @@
+"""Answers as ROS messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from std_msgs.msg import Header
+
+
+def pose_stamped(
+    position_m: Sequence[float], orientation_xyzw: Sequence[float], frame_id: str, stamp_ns: int
+) -> PoseStamped:
+    """A pose as a message, e.g. for Nav2."""
+    sec, nanosec = divmod(stamp_ns, 10**9)
+    x, y, z = position_m
+    qx, qy, qz, qw = orientation_xyzw
+    return PoseStamped(
+        header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=frame_id),
+        pose=Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw)),
+    )
