@@ -5,18 +5,21 @@ It contains the graph, the state of merging, the priors of class pairs, and the 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.files import check_writable
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
-from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.parsing import parse_json
+from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
 from deworldsg_ros.scene import graph_io
+from deworldsg_ros.scene.array_checks import checked
+from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
@@ -30,7 +33,7 @@ def write_map(builder: GraphBuilder, path: Path) -> None:
     Raises:
         ConfigurationError: if it cannot be written; an older file is then still there.
     """
-    prior = np.frombuffer(json.dumps(builder.prior.to_state()).encode(), np.uint8)
+    prior = np.frombuffer(msgspec.json.encode(builder.prior.to_state()), np.uint8)
     memory = {_MERGING + name: values for name, values in builder.merging.memory().items()}
     arrays = graph_io.to_arrays(builder.graph.state())
     with _writing(path):
@@ -40,14 +43,15 @@ def write_map(builder: GraphBuilder, path: Path) -> None:
 def read_map(config: Config, path: Path) -> GraphBuilder:
     """Continue with the graph of a map; the first `GraphBuilder.update` contains all of it.
 
-    Hidden nodes are dropped: they are not published.
+    Hidden nodes are dropped: they are not published. Everything in the file is checked here, before
+    a kernel gets it: types, lengths, ranges and ids (`graph_checks`, `memory_checks`).
 
     Raises:
-        ConfigurationError: if the file is no map.
+        ConfigurationError: if the file is no map; names the array, the value and what was expected.
     """
     try:
         return _read(config, path)
-    except (RefusedInput, KeyError, TypeError, ValueError, IndexError) as error:
+    except (RefusedInput, ValueError, MemoryError) as error:
         reason = graph_io.reason_of(error).removeprefix(f"graph file {path}: ")
         raise ConfigurationError(f"map {path} cannot be used: {reason}") from error
 
@@ -55,8 +59,7 @@ def read_map(config: Config, path: Path) -> GraphBuilder:
 def _read(config: Config, path: Path) -> GraphBuilder:
     arrays = graph_io.read(path)
     graph = graph_io.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
-    prior = ClassPairPrior.from_state(json.loads(arrays["prior"].tobytes()))
-    _check_prior(prior, graph.vocabulary)
+    prior = _prior(arrays, graph.vocabulary)
     for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
         graph.remove_node(node_id)
     graph.take_removals()
@@ -72,14 +75,17 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     return builder
 
 
-def _check_prior(prior: ClassPairPrior, vocabulary: Vocabulary) -> None:
-    seen = prior.class_count, prior.predicate_count
+def _prior(arrays: Arrays, vocabulary: Vocabulary) -> ClassPairPrior:
+    content = checked(arrays, "prior", np.uint8, None).tobytes()
+    state = parse_json(content, PriorState)
+    seen = state.class_count, state.predicate_count
     expected = len(vocabulary.classes), len(vocabulary.predicates)
     if seen != expected:
         raise ValueError(
             f"its priors are of {seen[0]} classes and {seen[1]} predicates: expected the graph's "
             f"{expected[0]} and {expected[1]}"
         )
+    return ClassPairPrior.from_state(state)
 
 
 def check_map_writable(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import msgspec
@@ -187,7 +186,7 @@ def test_priors_of_another_vocabulary_are_refused(tmp_path):
     path = saved(builder_of(), tmp_path)
     arrays = graph_io.read(path)
     prior = ClassPairPrior(2, 5).to_state()
-    arrays["prior"] = np.frombuffer(json.dumps(prior).encode(), np.uint8)
+    arrays["prior"] = np.frombuffer(msgspec.json.encode(prior), np.uint8)
     graph_io.write(path, arrays)
     with pytest.raises(ConfigurationError, match="priors are of 2 classes and 5 predicates: expec"):
         read_map(Config(), path)

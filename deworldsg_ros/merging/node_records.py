@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from deworldsg_ros.merging import existence, names
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.joint import JointEvidence
+from deworldsg_ros.merging.memory_checks import check_memory
 from deworldsg_ros.merging.voxel_map import VoxelMap
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.graph import SceneGraph
@@ -147,22 +149,19 @@ class NodeRecords:
         self.map.add_scores(kept, cells.blocks, scores)
 
     def memory(self) -> Memory:
-        """The records as arrays by name, for `restore`."""
-        owners = self.owners
-        sets = [self.map.cells(owner) for owner in owners]
+        """The records as arrays by name, for `restore`; equal records give equal arrays."""
+        owners = [self._owners[node_id] for node_id in sorted(self._owners)]
         balances = self.joint.balances
-        pairs = [[*map(self.node, pair), balance] for pair, balance in balances.items()]
+        pairs = [[*sorted(map(self.node, pair)), balance] for pair, balance in balances.items()]
         return {
             "cell_m": np.array(self.map.cell_m),
-            "records": self.rows[owners],
+            # Without the padding between fields, which is memory of the process.
+            "records": repack_fields(self.rows[owners]),
             "looks": self.looks,
             "fates": self.fates,
             "last_ns": np.array(self.last_ns),
-            "blocks": np.concatenate([np.zeros(0, np.int64), *(cells.blocks for cells in sets)]),
-            "masks": np.concatenate([np.zeros(0, np.uint64), *(cells.masks for cells in sets)]),
-            "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
-            "scores": np.concatenate([np.zeros((0, 64), np.int8), *map(self.map.scores, owners)]),
-            "joint": np.array(pairs, np.int64).reshape(-1, 3),
+            **_cells(self.map, owners),
+            "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
@@ -176,7 +175,8 @@ class NodeRecords:
         if "records" not in memory or memory["cell_m"] != self.map.cell_m:
             self._rebuild(graph, list(owner_of.values()))
             return
-        records = memory["records"]
+        check_memory(memory, RECORD, len(graph.vocabulary.classes))
+        records = memory["records"].astype(RECORD)
         kept = [row for row, node_id in enumerate(records["node_id"]) if node_id in owner_of]
         owners = [owner_of[node_id] for node_id in records["node_id"][kept].tolist()]
         self.rows[owners] = records[kept]
@@ -224,3 +224,18 @@ class NodeRecords:
             cells = self.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
             self.map.remove(owner)
             self.map.add([owner], cells)
+
+
+def _cells(map_: VoxelMap, owners: list[int]) -> Memory:
+    """The cells and scores of owners as arrays by name; the blocks of each ascend."""
+    sets = [map_.cells(owner) for owner in owners]
+    orders = [np.argsort(cells.blocks) for cells in sets]
+    blocks = [cells.blocks[order] for cells, order in zip(sets, orders)]
+    masks = [cells.masks[order] for cells, order in zip(sets, orders)]
+    scores = [map_.scores(owner)[order] for owner, order in zip(owners, orders)]
+    return {
+        "blocks": np.concatenate([np.zeros(0, np.int64), *blocks]),
+        "masks": np.concatenate([np.zeros(0, np.uint64), *masks]),
+        "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
+        "scores": np.concatenate([np.zeros((0, 64), np.int8), *scores]),
+    }

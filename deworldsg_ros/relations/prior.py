@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -11,6 +12,26 @@ from deworldsg_ros.scene.errors import RefusedInput
 
 # Distributions of a float32 network sum to one within this.
 SUM_TOLERANCE = 1e-3
+
+
+Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+
+
+class PriorState(msgspec.Struct, frozen=True):
+    """A prior as plain values.
+
+    Attributes:
+        class_count, predicate_count: of the prior.
+        class_pairs: subject and object class of each pair that has a prior.
+        counts: number of its predictions.
+        sums: sum of its predictions.
+    """
+
+    class_count: Index
+    predicate_count: Index
+    class_pairs: list[tuple[Index, Index]]
+    counts: list[Annotated[int, msgspec.Meta(ge=1, le=2**52)]]
+    sums: list[list[float]]
 
 
 class ClassPairPrior:
@@ -71,29 +92,30 @@ class ClassPairPrior:
         priors[has_prior] = self._sums[known] / self._counts[known, None]
         return priors, has_prior
 
-    def to_state(self) -> dict[str, Any]:
+    def to_state(self) -> PriorState:
         """Plain values from which `from_state` makes an equal prior."""
         pairs = np.argwhere(self._rows >= 0)
         rows = self._rows[pairs[:, 0], pairs[:, 1]]
-        return {
-            "class_count": self.class_count,
-            "predicate_count": self.predicate_count,
-            "class_pairs": pairs.tolist(),
-            "counts": self._counts[rows].tolist(),
-            "sums": self._sums[rows].tolist(),
-        }
+        return PriorState(
+            self.class_count,
+            self.predicate_count,
+            [(first, second) for first, second in pairs.tolist()],
+            self._counts[rows].tolist(),
+            self._sums[rows].tolist(),
+        )
 
     @classmethod
-    def from_state(cls, state: dict[str, Any]) -> ClassPairPrior:
+    def from_state(cls, state: PriorState) -> ClassPairPrior:
         """The prior of saved plain values.
 
         Raises:
             ValueError: if they do not fit together.
         """
-        prior = cls(state["class_count"], state["predicate_count"])
-        pairs = np.array(state["class_pairs"], np.int64).reshape(-1, 2)
-        counts = np.array(state["counts"], np.int64)
-        sums = np.array(state["sums"], np.float64).reshape(-1, prior.predicate_count)
+        prior = cls(state.class_count, state.predicate_count)
+        pairs = np.array(state.class_pairs, np.int64).reshape(-1, 2)
+        counts = np.array(state.counts, np.int64)
+        # Rows of another length than R are no array.
+        sums = np.array(state.sums, np.float64).reshape(-1, prior.predicate_count)
         if not len(pairs) == len(counts) == len(sums) == len(np.unique(pairs, axis=0)):
             raise ValueError(
                 f"saved prior: {len(pairs)} class pairs, {len(counts)} counts and {len(sums)} "

@@ -6,7 +6,6 @@ The graph that is read continues exactly as the one that was written.
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,17 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.parsing import parse_json
+from deworldsg_ros.scene.array_checks import checked
+from deworldsg_ros.scene.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.graph import GraphState, SceneGraph
+from deworldsg_ros.scene.graph_checks import Header, check_arrays, check_header
 from deworldsg_ros.scene.node_ids import IdState
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
 from deworldsg_ros.scene.votes import PairVotes
-
-Arrays = dict[str, NDArray[Any]]
 
 # A reader of version N reads N - 1 too.
 FORMAT_VERSION = 1
@@ -118,23 +118,29 @@ def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> SceneGrap
 
 
 def _state(arrays: Arrays) -> GraphState:
-    header = json.loads(arrays["header"].tobytes())
-    if header.get("version", 0) > FORMAT_VERSION:
-        raise ValueError(f"version {header['version']}: expected {FORMAT_VERSION} or older")
+    header = _header(arrays)
+    check_arrays(arrays, header)
     return GraphState(
-        vocabulary=Vocabulary(tuple(header["classes"]), tuple(header["predicates"])),
-        frame_id=header["frame_id"],
+        vocabulary=Vocabulary(tuple(header.classes), tuple(header.predicates)),
+        frame_id=header.frame_id,
         nodes={name: _column(arrays, name) for name in SAVED_COLUMNS},
         surfaces=_split(arrays["surface_points"], arrays["surface_point_counts"]),
         edges=_edges(arrays),
         votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
-        ids=_ids(arrays, int(header["next_id"])),
-        revision=int(header["revision"]),
-        surface_point_capacity=header["surface_point_capacity"],
-        remembered_frames=header["remembered_frames"],
-        # Files of earlier releases do not have it.
-        even_gaussians=header.get("even_gaussians", False),
+        ids=_ids(arrays, header.next_id),
+        revision=header.revision,
+        surface_point_capacity=header.surface_point_capacity,
+        remembered_frames=header.remembered_frames,
+        even_gaussians=header.even_gaussians,
     )
+
+
+def _header(arrays: Arrays) -> Header:
+    header = parse_json(checked(arrays, "header", np.uint8, None).tobytes(), Header)
+    if header.version > FORMAT_VERSION:
+        raise ValueError(f"version {header.version}: expected {FORMAT_VERSION} or older")
+    check_header(header)
+    return header
 
 
 def _column(arrays: Arrays, name: str) -> NDArray[Any]:
@@ -183,21 +189,14 @@ def _split(flat: NDArray[Any], counts: Int64) -> list[NDArray[Any]]:
 
 def write(path: str | Path, arrays: Arrays) -> None:
     """Write arrays as .npz; the file appears complete or not at all."""
-    write_atomically(
-        Path(path),
-        lambda file: np.savez(file, **arrays),  # type: ignore[arg-type]  # names of its options
-    )
+    write_arrays(Path(path), arrays)
 
 
 def read(path: str | Path) -> Arrays:
-    """Read arrays; RefusedInput ``invalid_graph_file`` if the file is no .npz."""
+    """Read arrays; RefusedInput ``invalid_graph_file`` if the file is no .npz, or damaged."""
     try:
-        with Path(path).open("rb") as file:
-            if not zipfile.is_zipfile(file):
-                raise ValueError("not an .npz archive; expected a saved graph or map")
-        with np.load(Path(path), allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError) as error:
+        return read_arrays(Path(path))
+    except (OSError, ValueError, MemoryError) as error:
         raise RefusedInput(
             "invalid_graph_file", f"graph file {path}: {reason_of(error)}"
         ) from error
@@ -207,4 +206,4 @@ def reason_of(error: Exception) -> str:
     """A readable reason, also for exceptions whose text is only a name."""
     if isinstance(error, KeyError):
         return f"there is no {error} in it"
-    return getattr(error, "strerror", None) or str(error)
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__

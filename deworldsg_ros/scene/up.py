@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from deworldsg_ros.scene.array_checks import holds, within
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 
 AXES = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
+
+MAX_POSES = 2**52
 
 # Hand-held cameras roll less than this. A world axis is vertical if the image rows are orthogonal
 # to it within this angle and it points up in the image.
@@ -49,8 +52,15 @@ class UpEstimator:
 
     def restore(self, state: Float64) -> None:
         """Continue from a state; ValueError if it is none."""
-        if state.shape != (13,) or not np.isfinite(state).all() or state[0] < 0:
-            raise ValueError(f"state of the up direction has shape {state.shape}: expected (13,)")
+        if state.shape != (13,) or state.dtype != np.float64:
+            raise ValueError(
+                f"state of the up direction has shape {state.shape} of {state.dtype}: expected "
+                "(13,) of float64"
+            )
+        # The other numbers are sums of products of unit vectors, one for each pose.
+        holds("state of the up direction", 0 <= state[0] <= MAX_POSES, "0 to 2^52 poses")
+        most = state[0] * (1 + 1e-6)
+        within("state of the up direction", state[1:], -most, most)
         self._count = int(state[0])
         self._rows = state[1:10].reshape(3, 3).copy()
         self._image_up = state[10:].copy()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
-
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.relations import mean_of
 
-from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
 from deworldsg_ros.scene.errors import RefusedInput
 
 CLASSES, PREDICATES = 4, 3
@@ -25,7 +24,7 @@ def random_predictions(count, seed):
 def counts_of(prior: ClassPairPrior) -> dict[tuple[int, int], int]:
     """Number of predictions of each class pair that has some."""
     state = prior.to_state()
-    return dict(zip(map(tuple, state["class_pairs"]), state["counts"]))
+    return dict(zip(map(tuple, state.class_pairs), state.counts))
 
 
 def every_class_pair():
@@ -93,7 +92,8 @@ def test_saved_and_loaded_it_is_the_same_and_goes_on():
     classes, predictions = random_predictions(30, 5)
     prior = ClassPairPrior(CLASSES, PREDICATES)
     prior.update(classes, predictions)
-    loaded = ClassPairPrior.from_state(json.loads(json.dumps(prior.to_state())))
+    saved = msgspec.json.encode(prior.to_state())
+    loaded = ClassPairPrior.from_state(msgspec.json.decode(saved, type=PriorState))
     for _ in range(2):
         pairs = every_class_pair()
         assert (loaded.lookup(pairs)[0] == prior.lookup(pairs)[0]).all()
@@ -133,7 +133,7 @@ def test_refuses_a_saved_state_that_does_not_fit(change):
     prior = ClassPairPrior(CLASSES, PREDICATES)
     prior.update(np.array([[0, 1]]), np.array([[0.2, 0.3, 0.5]]))
     with pytest.raises(ValueError):
-        ClassPairPrior.from_state({**prior.to_state(), **change})
+        ClassPairPrior.from_state(msgspec.structs.replace(prior.to_state(), **change))
 
 
 def test_sums_that_differ_from_one_by_float32_rounding_are_normalised():

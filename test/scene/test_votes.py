@@ -183,7 +183,7 @@ def test_the_votes_of_a_graph_follow_its_nodes() -> None:
 
 def test_a_file_keeps_the_votes(tmp_path: Path) -> None:
     graph = graph_of(4)
-    graph.add_votes(3, 1, np.arange(6.0).reshape(2, 3))
+    graph.add_votes(3, 1, np.arange(6.0).reshape(2, 3) / 6)
     graph.add_votes(1, 2, None)
     graph.add_votes(4, 2, np.ones((2, 3)))
     graph.add_votes(1, 3, None)

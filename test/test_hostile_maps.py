@@ -1,0 +1,301 @@
+"""A map is data from outside: whatever it contains, it is refused with one error or is whole."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from support.merging import VOCABULARY
+from support.surfaces import CHAIR, CUP, TABLE, frame, slab
+
+from deworldsg_ros.config import Config, OutputConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import read_map, write_map
+from deworldsg_ros.scene import graph_io
+from deworldsg_ros.scene.array_file import read_arrays
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+
+CONFIG = Config(output=OutputConfig(min_existence=0.0))
+OBJECTS = [
+    (slab((0, 0.7, 1), (0.5, 0.04, 0.4))[:200], TABLE),
+    (slab((0.1, 0.77, 1), (0.08, 0.1, 0.08)), CUP),
+    (slab((0.9, 0.25, 1), (0.4, 0.5, 0.4))[:200], CHAIR),
+]
+
+Arrays = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of three nodes, with edges, votes and all of the memory of the surface rule."""
+    builder = GraphBuilder(CONFIG, VOCABULARY, "world")
+    for stamp in range(1, 6):
+        builder.integrate(frame(stamp, *OBJECTS))
+    builder.graph.add_visual(1, 2, np.ones(3), 10**8)
+    builder.graph.add_visual(3, 2, np.ones(3), 10**8)
+    path = tmp_path_factory.mktemp("map") / "good.map"
+    write_map(builder, path)
+    assert len(read_map(CONFIG, path).graph) == 3
+    return path
+
+
+def changed(name: str, change: Callable[[Any], Any]) -> Callable[[Arrays], Arrays]:
+    return lambda arrays: {**arrays, name: change(arrays[name].copy())}
+
+
+def put(place: Any, value: Any) -> Callable[[Any], Any]:
+    """Overwrite a part of an array."""
+
+    def change(array: Any) -> Any:
+        array[place] = value
+        return array
+
+    return change
+
+
+def field(name: str, place: Any, value: Any) -> Callable[[Arrays], Arrays]:
+    """Overwrite a field of the records."""
+
+    def change(array: Any) -> Any:
+        array[name][place] = value
+        return array
+
+    return changed("merging.records", change)
+
+
+def header(**values: Any) -> Callable[[Arrays], Arrays]:
+    def change(array: Any) -> Any:
+        content = {**msgspec.json.decode(array.tobytes()), **values}
+        return np.frombuffer(msgspec.json.encode(content), np.uint8)
+
+    return changed("header", change)
+
+
+ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
+    # Each of these ended the process, or hung it, before maps were checked.
+    "blocks are shorter than their counts": changed("merging.blocks", lambda a: a[:-5]),
+    "counts of 2^31": changed("merging.block_counts", put(0, 2**31)),
+    "counts of 2^62, whose sum overflows to the right one": changed(
+        "merging.block_counts", lambda a: a + np.array([2**62, 2**62, 2**63 - 1])[: len(a)]
+    ),
+    "negative counts": changed("merging.block_counts", lambda a: a + np.array([-9999, 9999, 0])),
+    "masks are shorter": changed("merging.masks", lambda a: a[:-1]),
+    "scores are shorter": changed("merging.scores", lambda a: a[:-1]),
+    "blocks as int8": changed("merging.blocks", lambda a: a.astype(np.int8)),
+    "masks as float64": changed("merging.masks", lambda a: a.astype(np.float64)),
+    "all ids 0": changed("ids", lambda a: a * 0),
+    "successors in a circle": lambda arrays: {
+        **header(next_id=99)(arrays),
+        "successors": np.array([[10, 11], [11, 12], [12, 10], [13, 10]]),
+    },
+    "an id succeeds itself": lambda arrays: {
+        **header(next_id=99)(arrays),
+        "successors": np.array([[10, 10]]),
+    },
+    "a label beyond the classes": field("labels", (0, 0), 4),
+    "a visibility beyond the table": field("visibility", 0, 9),
+    # Each of these was believed.
+    "a mean of NaN": changed("means", put((0, 0), np.nan)),
+    "an infinite mean": changed("means", put((1, 2), np.inf)),
+    "a covariance of 1e300": changed("covariances", lambda a: a * 1e300),
+    "a covariance that is not symmetric": changed("covariances", put((0, 0, 1), 9.0)),
+    "a covariance that is not positive": changed("covariances", lambda a: -a),
+    "negative probabilities": changed("class_probabilities", put(0, [-1.0, 2.0, 0.0, 0.0])),
+    "probabilities that sum to 2": changed("class_probabilities", put(0, 0.5)),
+    "duplicate ids": changed("ids", put(1, 1)),
+    "next_id below an id": header(next_id=2),
+    "a revision below that of a node": header(revision=0),
+    "existence of 7": changed("existence", put(0, 7.0)),
+    "no observations": changed("observations", put(0, 0)),
+    "a weight of 0": changed("weights", put(0, 0.0)),
+    "first seen after last seen": changed("first_seen_ns", put(0, 10**18)),
+    "a stamp beyond 32-bit seconds": changed("last_seen_ns", put(0, 2**62)),
+    "points of NaN": changed("surface_points", put((0, 0), np.nan)),
+    "points without a node": changed("surface_point_counts", put(0, 0)),
+    "an edge to no node": changed("edge_pairs", put((0, 1), 77)),
+    "an edge of a node with itself": changed("edge_pairs", put((0, 1), 1)),
+    "the same edge twice": changed("edge_pairs", lambda a: a * 0 + a[0]),
+    "edge logits of infinity": changed("edge_visual_logits", put((0, 0), np.inf)),
+    "negative frames of an edge": changed("edge_counts", put((0, 0), -1)),
+    "votes of NaN": changed("vote_counts", lambda a: a * np.nan if len(a) else np.ones((1, 2, 3))),
+    "more votes than frames": changed("vote_known", lambda a: a + [[0, 0, 1]]),
+    "a live node that was removed": lambda arrays: {**arrays, "successors": np.array([[1, 0]])},
+    "a joint pair of one node": changed("merging.joint", put((0, 1), 1)),
+    "two records of one node": field("node_id", 1, 1),
+    "a record with a score of NaN": field("best_score", 0, np.nan),
+    "a record without a name": field("labels", 0, -1),
+    "a record whose name has no probability": field("joint", 0, 0.0),
+    "more detections than frames": field("detected", 0, 1e6),
+    "looks that are all detections": changed("merging.looks", lambda a: a * 0 + 5.0),
+    "no fates": changed("merging.fates", lambda a: a * 0),
+    "a block twice": changed("merging.blocks", lambda a: a * 0 + a[0]),
+    "a block beyond space": changed("merging.blocks", put(0, -1)),
+    "an empty mask": changed("merging.masks", put(0, 0)),
+    "scores of -128": changed("merging.scores", put((0, 0), -128)),
+    "an up direction of 1e300": changed("up", lambda a: a + 1e300),
+    "priors that are no JSON": changed("prior", lambda a: a[:-3]),
+    "priors nested without end": lambda arrays: {
+        **arrays,
+        "prior": np.frombuffer(b"[" * 100_000, np.uint8),
+    },
+    "a header of a list": changed("header", lambda a: np.frombuffer(b"[]", np.uint8)),
+    "10^9 surface points a node": header(surface_point_capacity=10**9),
+    "10^12 remembered frames": header(remembered_frames=10**12),
+    "classes twice": header(classes=["a", "a", "b", "c"]),
+    "a version of text": header(version="1"),
+    "no means": lambda arrays: {k: v for k, v in arrays.items() if k != "means"},
+    "no fates in it": lambda arrays: {k: v for k, v in arrays.items() if k != "merging.fates"},
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_hostile_map_is_refused(good: Path, tmp_path: Path, attack: str) -> None:
+    path = tmp_path / "bad.map"
+    graph_io.write(path, ATTACKS[attack](graph_io.read(good)))
+    with pytest.raises(ConfigurationError, match=r"map .*bad\.map cannot be used: \w+"):
+        read_map(CONFIG, path)
+
+
+def test_an_error_names_the_array_the_value_and_the_expectation(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.map"
+    graph_io.write(path, ATTACKS["existence of 7"](graph_io.read(good)))
+    with pytest.raises(ConfigurationError, match="existence contains 7.0: expected 0 to 1"):
+        read_map(CONFIG, path)
+    graph_io.write(path, ATTACKS["blocks as int8"](graph_io.read(good)))
+    with pytest.raises(ConfigurationError, match="blocks is int8 .*: expected int64 of shape"):
+        read_map(CONFIG, path)
+
+
+def repacked(path: Path, target: Path, change: Callable[[str, bytes], bytes], kind: int) -> Path:
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(target, "w", kind) as copy:
+        for member in archive.infolist():
+            copy.writestr(member.filename, change(member.filename, archive.read(member)))
+    return target
+
+
+def test_a_small_file_does_not_unpack_to_a_large_one(good: Path, tmp_path: Path) -> None:
+    packed = io.BytesIO()
+    np.save(packed, np.zeros(1 << 27, np.uint8))
+    huge = packed.getvalue()
+    for kind in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        target = tmp_path / f"{kind}.map"
+        repacked(good, target, lambda n, c: huge if n.startswith("ids") else c, kind)
+        assert target.stat().st_size < 10**6
+        with pytest.raises(ConfigurationError, match="its arrays are compressed"):
+            read_map(CONFIG, target)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"{'descr': '<i8', 'fortran_order': False, 'shape': (4611686018427387904,), }",
+        b"{'descr': '|O', 'fortran_order': False, 'shape': (3,), }",
+        b"{'descr': '<U9', 'fortran_order': False, 'shape': (3,), }",
+        b"{'descr': '<i8', 'fortran_order': False, 'shape': (" + b"1, " * 60 + b"), }",
+        b"(" * 9000,
+        b"-" * 9000,
+        b"'" + b"\n" * 10,
+        b"\xff" * 30,
+    ],
+)
+def test_headers_of_arrays_are_not_evaluated(good: Path, tmp_path: Path, head: bytes) -> None:
+    head += b"\n"
+    array = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(24)
+    target = repacked(
+        good,
+        tmp_path / "bad.map",
+        lambda name, content: array if name == "ids.npy" else content,
+        zipfile.ZIP_STORED,
+    )
+    with pytest.raises(ConfigurationError, match="cannot be used: array "):
+        read_map(CONFIG, target)
+
+
+def test_a_flipped_bit_is_noticed(good: Path, tmp_path: Path) -> None:
+    content = bytearray(good.read_bytes())
+    at = content.index(graph_io.read(good)["means"].tobytes())
+    content[at + 3] ^= 1
+    (tmp_path / "bad.map").write_bytes(content)
+    with pytest.raises(ConfigurationError, match="Bad CRC-32"):
+        read_map(CONFIG, tmp_path / "bad.map")
+
+
+def test_pipes_devices_and_folders_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.map")
+    for path in (tmp_path / "pipe.map", Path("/dev/zero"), tmp_path):
+        with pytest.raises(ConfigurationError, match="expected a"):
+            read_map(CONFIG, path)
+    with pytest.raises(ConfigurationError, match="No such file"):
+        read_map(CONFIG, tmp_path / "absent.map")
+
+
+def test_the_arrays_of_a_map_are_those_that_numpy_reads(good: Path) -> None:
+    arrays = read_arrays(good)
+    with np.load(good, allow_pickle=False) as archive:
+        assert sorted(archive.files) == sorted(arrays)
+        for name in archive.files:
+            np.testing.assert_array_equal(arrays[name], archive[name], err_msg=name)
+            assert arrays[name].flags.writeable, "kernels are compiled for writable arrays"
+
+
+def test_a_map_of_the_first_release_is_read(good: Path, tmp_path: Path) -> None:
+    # Its records have padding between the fields.
+    arrays = graph_io.read(good)
+    packed = arrays["merging.records"]
+    aligned = np.dtype([(name, packed.dtype[name]) for name in packed.dtype.names], align=True)
+    assert aligned.itemsize > packed.dtype.itemsize
+    path = tmp_path / "old.map"
+    graph_io.write(path, {**arrays, "merging.records": packed.astype(aligned)})
+    write_map(read_map(CONFIG, path), tmp_path / "again.map")
+    write_map(read_map(CONFIG, good), tmp_path / "new.map")
+    assert (tmp_path / "again.map").read_bytes() == (tmp_path / "new.map").read_bytes()
+
+
+def test_loading_and_saving_a_map_changes_no_byte(good: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.map"
+    write_map(read_map(CONFIG, good), again)
+    assert again.read_bytes() == good.read_bytes()
+
+
+PROGRAM = """
+import sys, numpy as np
+from pathlib import Path
+from test_hostile_maps import CONFIG, OBJECTS, VOCABULARY, GraphBuilder, frame, write_map
+np.full(1 << 20, 0xAB, np.uint8)  # other content in freed memory
+builder = GraphBuilder(CONFIG, VOCABULARY, "world")
+for stamp in range(1, 5):
+    builder.integrate(frame(stamp, *OBJECTS))
+write_map(builder, Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.slow
+def test_equal_graphs_give_equal_bytes_in_any_process(tmp_path: Path) -> None:
+    folder = Path(__file__).parent
+    maps = []
+    for seed in ("0", "1", "random"):
+        target = tmp_path / f"{seed}.map"
+        path = os.pathsep.join((str(folder), str(folder.parent)))
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path}
+        environment |= {"NUMBA_NUM_THREADS": "1"} if seed == "0" else {}
+        command = [sys.executable, "-c", PROGRAM, str(target)]
+        subprocess.run(command, env=environment, check=True, timeout=100)
+        maps.append(target.read_bytes())
+    assert maps[0] == maps[1] == maps[2]
+
+
+def test_a_saved_graph_is_checked_as_well(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.npz"
+    graph_io.write(path, ATTACKS["duplicate ids"](graph_io.read(good)))
+    with pytest.raises(RefusedInput, match="ids contains a value twice") as refused:
+        graph_io.load(path)
+    assert refused.value.reason == "invalid_graph_file"
