@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.files import check_writable
+from deworldsg_ros.files import FileLock, check_writable
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
@@ -28,16 +29,88 @@ _MERGING = "merging."
 
 
 def write_map(builder: GraphBuilder, path: Path) -> None:
-    """Write a map.
+    """Write a map; the map before it stays as `previous_of`.
 
     Raises:
-        ConfigurationError: if it cannot be written; an older file is then still there.
+        ConfigurationError: if it cannot be written, or another process writes it; an older file is
+            then still there.
     """
+    write_state(copy_state(builder), path)
+
+
+def copy_state(builder: GraphBuilder) -> Arrays:
+    """The content of a map, by name; the builder can go on while it is written."""
     prior = np.frombuffer(msgspec.json.encode(builder.prior.to_state()), np.uint8)
-    memory = {_MERGING + name: values for name, values in builder.merging.memory().items()}
+    memory = {_MERGING + name: np.array(v) for name, v in builder.merging.memory().items()}
     arrays = graph_io.to_arrays(builder.graph.state())
+    return {**arrays, **memory, "prior": prior, "up": np.array(builder.up.state())}
+
+
+def write_state(state: Arrays, path: Path) -> None:
+    """Write the result of `copy_state`; as `write_map`."""
+    with _writing(path), FileLock.unless_held(path):
+        graph_io.write(path, state, previous=previous_of(path))
+
+
+def previous_of(path: Path) -> Path:
+    """Path of the generation before the map `path`."""
+    return path.with_name(f"{path.name}.previous")
+
+
+def claim_map(path: Path) -> FileLock:
+    """Make a map's folder, and take the right to write the map until `FileLock.release`.
+
+    Raises:
+        ConfigurationError: if the map could not be written there, or another process has the right.
+    """
     with _writing(path):
-        graph_io.write(path, {**arrays, **memory, "prior": prior, "up": builder.up.state()})
+        check_writable(path)
+        return FileLock(path)
+
+
+@dataclass(frozen=True)
+class Continued:
+    """A graph that continues from a map.
+
+    Attributes:
+        builder: the graph.
+        message: the path and the size of the map, and why it is not the newest.
+        newest: False if the newest map is broken, and this is the one before it.
+    """
+
+    builder: GraphBuilder
+    message: str
+    newest: bool
+
+
+def continue_map(config: Config, path: Path) -> Continued | None:
+    """Continue with the newest generation of a map that is whole; the caller has claimed it.
+
+    Returns:
+        None if there is no map yet.
+
+    Raises:
+        ConfigurationError: if the file is no map, and there is none before it.
+    """
+    previous = previous_of(path)
+    if not path.exists() and not previous.exists():
+        return None
+    try:
+        builder = read_map(config, path)
+    except ConfigurationError as error:
+        if not previous.exists():
+            raise
+        builder = read_map(config, previous)
+        if path.exists():
+            # The next write must not put it in place of the generation that is whole.
+            path.replace(path.with_name(f"{path.name}.broken"))
+        message = f"{error}. Continuing the map before it, {previous}: {_size(builder)}"
+        return Continued(builder, message, newest=False)
+    return Continued(builder, f"continuing map {path}: {_size(builder)}", newest=True)
+
+
+def _size(builder: GraphBuilder) -> str:
+    return f"{len(builder.graph)} nodes in frame '{builder.graph.frame_id}'"
 
 
 def read_map(config: Config, path: Path) -> GraphBuilder:
@@ -86,12 +159,6 @@ def _prior(arrays: Arrays, vocabulary: Vocabulary) -> ClassPairPrior:
             f"{expected[0]} and {expected[1]}"
         )
     return ClassPairPrior.from_state(state)
-
-
-def check_map_writable(path: Path) -> None:
-    """Make a map's folder; raises ConfigurationError if the map could not be written there."""
-    with _writing(path):
-        check_writable(path)
 
 
 @contextmanager

@@ -2,25 +2,35 @@
 
 from __future__ import annotations
 
+import os
 import stat
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.killing import full_disk, killed, moments_s, names
 
-from deworldsg_ros.files import check_writable, write_atomically
+from deworldsg_ros.files import (
+    PARTIAL,
+    PREFIX,
+    READY,
+    FileLock,
+    check_writable,
+    remove_left_overs,
+    temporary_folder,
+    together,
+    write_atomically,
+)
 
 
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-@pytest.mark.parametrize("content", [b"", b"new", lambda file: file.write(b"new")])
+@pytest.mark.parametrize("content", [b"", b"new", "new", lambda file: file.write(b"new")])
 def test_the_file_is_replaced_and_nothing_else_stays(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_bytes(b"old")
     write_atomically(path, content)
-    assert path.read_bytes() == (content if isinstance(content, bytes) else b"new")
+    assert path.read_bytes() == (b"" if content == b"" else b"new")
     assert names(tmp_path) == ["a.json"]
 
 
@@ -59,3 +69,161 @@ def test_a_folder_that_cannot_be_made_is_reported_before_writing(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(OSError):
         check_writable(tmp_path / "file" / "a.map")
+    with pytest.raises(IsADirectoryError):
+        check_writable(tmp_path / "maps")
+
+
+def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "a.map"
+    link.symlink_to(tmp_path / "disk" / "a.map")
+    write_atomically(link, b"1")
+    write_atomically(link, b"2")
+    assert link.is_symlink() and (tmp_path / "disk" / "a.map").read_bytes() == b"2"
+    assert names(tmp_path / "disk") == ["a.map"]
+
+
+def test_a_pipe_is_written_and_not_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    read: list[bytes] = []
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
+    reader.start()
+    write_atomically(pipe, b"graph")
+    reader.join(5)
+    assert read == [b"graph"] and names(tmp_path) == ["pipe"]
+
+
+def test_the_file_before_stays_under_its_name(tmp_path):
+    path, previous = tmp_path / "a.map", tmp_path / "a.map.previous"
+    for content in (b"1", b"2", b"3"):
+        write_atomically(path, content, previous=previous)
+    assert (path.read_bytes(), previous.read_bytes()) == (b"3", b"2")
+
+
+@pytest.mark.parametrize("size", [0, 1, 4095, 8192, 99_999])
+def test_a_full_disk_keeps_the_old_file(tmp_path, size):
+    path = tmp_path / "a.json"
+    path.write_bytes(b"old")
+    with full_disk(size), pytest.raises(OSError, match="File too large"):
+        write_atomically(path, bytes(100_000), previous=tmp_path / "before")
+    assert path.read_bytes() == b"old" and names(tmp_path) == ["a.json"]
+
+
+@pytest.mark.parametrize("size", [0, 10, 5000])
+def test_a_full_disk_keeps_the_old_run(tmp_path, size):
+    (tmp_path / "theirs").write_text("theirs")
+    write_run(tmp_path, 1)
+    before = {name: (tmp_path / name).read_bytes() for name in names(tmp_path)}
+    with full_disk(size), pytest.raises(OSError):
+        write_run(tmp_path, 2)
+    assert {name: (tmp_path / name).read_bytes() for name in names(tmp_path)} == before
+
+
+FILES = ("config.yaml", "graph.json", "graph.png", "run.json")
+
+
+def write_run(folder: Path, run: int) -> None:
+    """Files of one run, each with its number and complete by its length; odd runs lack one."""
+    with together(folder, FILES) as staged:
+        for name in FILES[run % 2 :]:
+            (staged / name).write_bytes(b"%05d" % run * 2000)
+
+
+def run_in(folder: Path) -> set[bytes]:
+    """Numbers of the runs whose files are in a folder."""
+    present = [folder / name for name in FILES if (folder / name).exists()]
+    contents = [path.read_bytes() for path in present]
+    assert all(content == content[:5] * 2000 for content in contents)
+    return {content[:5] for content in contents}
+
+
+def test_files_of_two_runs_are_never_side_by_side(tmp_path):
+    (tmp_path / "theirs").write_text("theirs")
+    for run in (2, 3, 4):
+        write_run(tmp_path, run)
+        assert names(tmp_path) == sorted(["theirs", *FILES[run % 2 :]])
+        assert run_in(tmp_path) == {b"%05d" % run}
+
+
+def test_an_error_in_a_run_keeps_the_run_before(tmp_path):
+    write_run(tmp_path, 1)
+    with pytest.raises(KeyboardInterrupt), together(tmp_path, FILES) as staged:
+        (staged / "run.json").write_text("new")
+        raise KeyboardInterrupt
+    assert run_in(tmp_path) == {b"00001"} and names(tmp_path) == [*FILES[1:]]
+
+
+def test_a_name_that_is_a_folder_is_refused_at_the_start(tmp_path):
+    (tmp_path / "run.json").mkdir()
+    with pytest.raises(IsADirectoryError), together(tmp_path, FILES):
+        pytest.fail("the run has begun")
+
+
+def test_a_kill_at_any_moment_leaves_whole_files_of_one_run(tmp_path):
+    write_run(tmp_path, 1)
+    for kill, moment_s in enumerate(moments_s(50, 0.02)):
+        runs = iter(range(100 * kill, 100_000))
+        killed(lambda runs=runs: write_run(tmp_path, next(runs)), 0.005 + moment_s)
+        assert len(run_in(tmp_path)) <= 1
+        remove_left_overs(tmp_path)
+        assert len(run_in(tmp_path)) == 1 and set(names(tmp_path)) <= set(FILES)
+
+
+def test_a_kill_between_two_renames_is_completed_by_the_next_run(tmp_path):
+    write_run(tmp_path, 2)
+    # As it is left: complete, one file is in place, one is to be removed.
+    ready = tmp_path / f"{PREFIX}x{READY}"
+    (ready / "config.yaml").mkdir(parents=True)
+    (tmp_path / "graph.png").unlink()
+    (tmp_path / "graph.json").write_bytes(b"00003" * 2000)
+    for name in ("graph.png", "run.json"):
+        (ready / name).write_bytes(b"00003" * 2000)
+    remove_left_overs(tmp_path)
+    assert run_in(tmp_path) == {b"00003"} and names(tmp_path) == [*FILES[1:]]
+
+
+def test_what_a_living_process_writes_is_no_left_over(tmp_path):
+    (tmp_path / f"{PREFIX}dead{PARTIAL}").write_text("half")
+    (tmp_path / f"{PREFIX}dead2{PARTIAL}").mkdir()
+    with temporary_folder(tmp_path) as folder:
+        (folder / "a").write_text("a")
+        write_atomically(tmp_path / "b", b"b")
+        assert names(tmp_path) == sorted([folder.name, "b"])
+        assert (folder / "a").exists()
+    assert names(tmp_path) == ["b"]
+
+
+def test_a_lock_is_held_once_and_a_dead_process_holds_none(tmp_path):
+    path = tmp_path / "a.map"
+    message = f"process {os.getpid()} writes it; end that"
+    with (
+        FileLock(path),
+        FileLock.unless_held(path),
+        pytest.raises(BlockingIOError, match=message),
+    ):
+        FileLock(path)
+    assert names(tmp_path) == []
+    killed(lambda: FileLock(path) and threading.Event().wait(), 0.1)
+    assert names(tmp_path) == [".a.map.lock"]
+    with FileLock(path):
+        pass
+    assert names(tmp_path) == []
+
+
+def test_only_one_of_many_gets_the_lock(tmp_path):
+    inside = most = 0
+    guard = threading.Lock()
+
+    def take(_: int) -> None:
+        nonlocal inside, most
+        with suppress(BlockingIOError), FileLock(tmp_path / "a.map"):
+            with guard:
+                inside += 1
+                most = max(most, inside)
+            with guard:
+                inside -= 1
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(take, range(400)))
+    assert most == 1 and names(tmp_path) == []

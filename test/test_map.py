@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+import os
+import signal
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from support.killing import full_disk, killed, moments_s, names
 from support.merging import VOCABULARY, random_local_graphs
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import check_map_writable, read_map, write_map
+from deworldsg_ros.map_file import claim_map, continue_map, previous_of, read_map, write_map
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -193,11 +198,103 @@ def test_priors_of_another_vocabulary_are_refused(tmp_path):
 
 
 def test_an_unwritable_map_is_refused_at_the_start(tmp_path):
-    check_map_writable(tmp_path / "maps" / "room.map")
-    assert list((tmp_path / "maps").iterdir()) == []
+    claim_map(tmp_path / "maps" / "room.map").release()
+    assert names(tmp_path / "maps") == []
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match=r"map .*room\.map cannot be written: \w+"):
-        check_map_writable(tmp_path / "file" / "room.map")
+        claim_map(tmp_path / "file" / "room.map")
+
+
+def seen(times: int) -> GraphBuilder:
+    builder = builder_of()
+    for stamp in range(1, 1 + times):
+        builder.integrate(frame(stamp, (WHOLE, TABLE)))
+    return builder
+
+
+def test_a_second_writer_of_a_map_is_refused_in_words(tmp_path):
+    path = tmp_path / "room.map"
+    with claim_map(path):
+        write_map(seen(4), path)  # of the same process
+        if os.fork() == 0:  # pragma: no cover
+            code = 1
+            with suppress(ConfigurationError):
+                write_map(seen(5), path)
+                code = 0
+            os._exit(code)
+        assert os.waitstatus_to_exitcode(os.wait()[1]) == 1
+        with pytest.raises(
+            ConfigurationError, match=r"map .*room\.map cannot be written: process "
+        ):
+            claim_map(path)
+    write_map(seen(5), path)
+    assert names(tmp_path) == ["room.map", "room.map.previous"]
+
+
+def test_a_broken_map_falls_back_to_the_one_before_and_says_so(tmp_path):
+    path = tmp_path / "room.map"
+    assert continue_map(Config(), path) is None
+    write_map(seen(4), path)
+    write_map(seen(6), path)
+    path.write_bytes(path.read_bytes()[:1000])
+    continued = continue_map(Config(), path)
+    assert continued is not None and not continued.newest
+    assert continued.builder.graph.nodes.observations.tolist() == [4]
+    for words in (f"map {path} cannot be used: ", "Continuing the map before it"):
+        assert words in continued.message
+    # The broken one is kept aside: the next write must not put it behind the whole one.
+    write_map(continued.builder, path)
+    assert names(tmp_path) == ["room.map", "room.map.broken", "room.map.previous"]
+    for generation in (path, previous_of(path)):
+        assert read_map(Config(), generation).graph.nodes.observations.tolist() == [4]
+    path.write_bytes(b"")
+    previous_of(path).write_bytes(b"")
+    with pytest.raises(ConfigurationError, match="cannot be used"):
+        continue_map(Config(), path)
+
+
+@pytest.mark.parametrize("size", [100, 5000])
+def test_a_full_disk_keeps_the_map(tmp_path, size):
+    path = tmp_path / "room.map"
+    write_map(seen(4), path)
+    before = path.read_bytes()
+    with full_disk(size), pytest.raises(ConfigurationError, match=r"cannot be written: File too"):
+        write_map(seen(5), path)
+    assert path.read_bytes() == before and names(tmp_path) == ["room.map"]
+
+
+def test_a_kill_at_any_moment_leaves_a_whole_map(tmp_path):
+    path = tmp_path / "room.map"
+    builders = [seen(4), seen(5)]
+    write_map(builders[0], path)
+    for moment_s in moments_s(50, 0.03):
+        turns = itertools.cycle(builders)
+        killed(lambda turns=turns: write_map(next(turns), path), 0.005 + moment_s)
+        assert read_map(Config(), path).graph.nodes.observations.tolist()[0] in (4, 5)
+        write_map(builders[0], path)
+        assert names(tmp_path) == ["room.map", "room.map.previous"]
+
+
+def test_two_processes_save_one_map_while_a_third_reads_it(tmp_path):
+    path = tmp_path / "room.map"
+    write_map(seen(4), path)
+    writers = []
+    for times in (4, 5):
+        builder = seen(times)
+        writers.append(os.fork())
+        if writers[-1] == 0:  # pragma: no cover
+            while True:
+                with suppress(ConfigurationError):
+                    write_map(builder, path)
+    try:
+        found = set()
+        for _ in range(100):
+            found.add(read_map(Config(), path).graph.nodes.observations.tolist()[0])
+    finally:
+        for pid in writers:
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+    assert found == {4, 5}
 
 
 def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
@@ -225,6 +322,7 @@ def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
     graph = read_map(config, tmp_path / "maps" / "room.map").graph
     assert graph.nodes.ids.tolist() == [1]
     assert graph.nodes.observations.tolist() >= [2]
-    (tmp_path / "maps" / "room.map").write_text("no map")
+    for path in (tmp_path / "maps").iterdir():
+        path.write_text("no map")
     with pytest.raises(ConfigurationError, match=r"map .*room\.map"):
         Bench(GraphNode, topics, **options)

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Union
 import msgspec
 
 from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
@@ -54,7 +55,7 @@ def read_card(path: Union[Path, None]) -> CheckpointCard:
 
 def write_card(path: Path, card: CheckpointCard) -> None:
     """Write a card as indented JSON."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
 
 
 def graph_predicates(config: PerceptionConfig) -> Union[tuple[str, ...], None]:

@@ -11,7 +11,8 @@ from typing import Any
 
 import msgspec
 import torch
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import save
 from transformers import RTDetrConfig, RTDetrResNetConfig, RTDetrV2Config
 
 from deworldsg_ros.checkpoints.architectures import DETECTORS, HEAD_FILE
@@ -31,6 +32,7 @@ from deworldsg_ros.checkpoints.fross_names import (
     published_name,
 )
 from deworldsg_ros.checkpoints.loading import check_names, read_tensors
+from deworldsg_ros.files import together, write_atomically
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import (
     REPLICA_SSG_PREDICATES,
@@ -357,11 +359,12 @@ def _write(out: Path, model: Any, network: EgtrNetwork, card: CheckpointCard) ->
         "image_std": list(IMAGENET_STD),
     }
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        model.save_pretrained(out)
-        save_file({k: v.contiguous() for k, v in network.state_dict().items()}, out / HEAD_FILE)
-        text = json.dumps(preprocessing, indent=2) + "\n"
-        (out / "preprocessor_config.json").write_text(text, encoding="utf-8")
-        write_card(out / CARD_FILE, card)
-    except OSError as error:
+        with together(out, ()) as staged:
+            model.save_pretrained(staged)
+            state = {k: v.contiguous() for k, v in network.state_dict().items()}
+            write_atomically(staged / HEAD_FILE, save(state))
+            text = json.dumps(preprocessing, indent=2) + "\n"
+            write_atomically(staged / "preprocessor_config.json", text)
+            write_card(staged / CARD_FILE, card)
+    except (OSError, SafetensorError) as error:
         raise ConfigurationError(f"cannot write {out}: {error}") from error

@@ -121,7 +121,7 @@ class Hub:
                     )
             report(f"{file.name}: {file.size / 1e6:.1f} MB, {'was there' if known else 'verified'}")
             sums.append(f"{sha256(path)}  {file.name}\n")
-        write_atomically(folder / SUMS_FILE, "".join(sums).encode())
+        write_atomically(folder / SUMS_FILE, "".join(sums))
 
     def _download(self, model: RemoteModel, file: RemoteFile, folder: Path) -> None:
         try:

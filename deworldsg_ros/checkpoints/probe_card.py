@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -152,7 +153,7 @@ def read_card(folder: Path) -> ProbeCard:
 def write_card(folder: Path, card: ProbeCard) -> None:
     """Write `config.json` of a probe's folder."""
     path = folder / CARD_FILE
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")
 
 
 def relative_box_pair(

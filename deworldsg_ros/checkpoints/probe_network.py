@@ -9,12 +9,21 @@ from pathlib import Path
 import numpy as np
 import safetensors
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from deworldsg_ros.checkpoints.loading import check_names
-from deworldsg_ros.checkpoints.probe_card import WEIGHTS_FILE, ProbeCard, read_card, write_card
+from deworldsg_ros.checkpoints.probe_card import (
+    CARD_FILE,
+    WEIGHTS_FILE,
+    ProbeCard,
+    read_card,
+    write_card,
+)
+from deworldsg_ros.files import together, write_atomically
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
+
+PROBE_FILES = (WEIGHTS_FILE, CARD_FILE)
 
 
 def build_network(card: ProbeCard) -> torch.nn.Sequential:
@@ -71,10 +80,15 @@ def probe_inputs(card: ProbeCard, features: Float32, boxes: Float32) -> Float32:
 
 
 def save_probe(folder: Path, probe: Probe) -> None:
-    """Write a probe's folder; the card is last, so that a folder with a card is complete."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write a probe's folder, complete or not at all; raises OSError."""
+    with together(folder, PROBE_FILES) as staged:
+        write_probe(staged, probe)
+
+
+def write_probe(folder: Path, probe: Probe) -> None:
+    """Write a probe's files into a folder that exists; raises OSError."""
     state = {name: value.contiguous() for name, value in probe.network.state_dict().items()}
-    save_file(state, folder / WEIGHTS_FILE)
+    write_atomically(folder / WEIGHTS_FILE, save(state))
     write_card(folder, probe.card)
 
 

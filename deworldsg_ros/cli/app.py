@@ -149,6 +149,13 @@ def _reporting_errors() -> Iterator[None]:
         console = Console(stderr=True, highlight=False, soft_wrap=True)
         console.print(f"[bold red]error:[/] {escape(str(error))}")
         raise typer.Exit(EXIT_USAGE) from error
+    except OSError as error:
+        # Of a file that could not be written: a full disk, a read-only place.
+        Console(stderr=True, highlight=False, soft_wrap=True).print(
+            f"[bold red]error:[/] {escape(f'{error.filename}: ' if error.filename else '')}"
+            f"{escape(error.strerror or str(error))}"
+        )
+        raise typer.Exit(EXIT_USAGE) from error
     except KeyboardInterrupt as interrupt:
         Console(stderr=True).print("interrupted")
         raise typer.Exit(EXIT_INTERRUPTED) from interrupt

@@ -94,18 +94,17 @@ def run_demo(
     require_checkpoints(config.perception, config.relations)
     # Opened first, so that a problem of the recording is reported before any process starts.
     recording = _check_recording(path or _shipped(), config, options)
-    outputs.prepare_folder(out, config)
-    (out / GRAPH_FILE).unlink(missing_ok=True)
-    started_s = time.perf_counter()
-    with one_interrupt(), ending(console) as processes:
-        _start(processes, recording, out, options)
-        *nodes, replay = processes
-        finished = ReplayProgress(replay, nodes, recording.frames, console).follow()
-    wall_s = time.perf_counter() - started_s
-    graph = read_graph(out)
-    poses = [np.array(values).reshape(4, 4) for values in finished.poses]
-    outputs.show_graph(out, graph, console, poses, config.inputs.world_up)
-    _write_report(out, recording, graph, finished, wall_s)
+    with outputs.writing(out, config) as staged:
+        started_s = time.perf_counter()
+        with one_interrupt(), ending(console) as processes:
+            _start(processes, recording, staged, out / "logs", options)
+            *nodes, replay = processes
+            finished = ReplayProgress(replay, nodes, recording.frames, console).follow()
+        wall_s = time.perf_counter() - started_s
+        graph = read_graph(staged)
+        poses = [np.array(values).reshape(4, 4) for values in finished.poses]
+        outputs.show_graph(staged, graph, console, poses, config.inputs.world_up)
+        _write_report(staged, recording, graph, finished, wall_s)
     _print_summary(out, finished, console)
 
 
@@ -170,10 +169,13 @@ def _check_recording(path: Path, config: Config, options: DemoOptions) -> _Recor
 
 
 def _start(
-    processes: list[LoggedProcess], recording: _Recording, out: Path, options: DemoOptions
+    processes: list[LoggedProcess],
+    recording: _Recording,
+    out: Path,
+    logs: Path,
+    options: DemoOptions,
 ) -> None:
     """Append the processes of the nodes, then that of replay_node."""
-    logs = out / "logs"
     logs.mkdir(exist_ok=True)
     environment = dds_environment()
     common = ["--ros-args", "--params-file", str((out / outputs.CONFIG_FILE).absolute())]

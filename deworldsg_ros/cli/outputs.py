@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 from rich.console import Console
 
 from deworldsg_ros.config import Config, to_yaml
+from deworldsg_ros.files import check_writable, together, write_atomically
 from deworldsg_ros.ros.health import UNMATCHED_PREFIX
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
@@ -22,20 +24,42 @@ PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
 CONFIG_FILE = "config.yaml"
 REPORT_FILE = "run.json"
+RESULTS = (CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE)
 # Rows of each printed table, to fit a screen; the page shows everything.
 MOST_ROWS = 25
 # Printed losses of a recording; run.json has all.
 MOST_LOSSES = 5
 
 
-def prepare_folder(out: Path, config: Config) -> None:
-    """Create the folder and save the effective configuration; raises ConfigurationError."""
+def check_folder(out: Path) -> None:
+    """Create the folder and test that it can be written; raises ConfigurationError."""
+    with _refusing(out):
+        check_writable(out / CONFIG_FILE)
+
+
+@contextmanager
+def writing(out: Path, config: Config) -> Iterator[Path]:
+    """A folder for the results, with the effective configuration.
+
+    All results are put into `out` at the end, together. After an error or a kill, the results of
+    the run before are still there.
+
+    Raises:
+        ConfigurationError: if something cannot be written.
+    """
+    with _refusing(out), together(out, RESULTS) as staged:
+        write_atomically(staged / CONFIG_FILE, to_yaml(config))
+        yield staged
+
+
+@contextmanager
+def _refusing(out: Path) -> Iterator[None]:
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / CONFIG_FILE).write_text(to_yaml(config), encoding="utf-8")
+        yield
     except OSError as error:
+        reason = error.strerror or str(error)
         raise ConfigurationError(
-            f"--out {out}: cannot be written ({error.strerror}); give a writable folder"
+            f"--out {out}: cannot be written ({reason}); give a writable folder"
         ) from error
 
 
@@ -73,7 +97,7 @@ def show_graph(
 def write_report(out: Path, report: Mapping[str, Any]) -> None:
     """Write run.json."""
     text = json.dumps(report, indent=2, ensure_ascii=False)
-    (out / REPORT_FILE).write_text(text + "\n", encoding="utf-8")
+    write_atomically(out / REPORT_FILE, text + "\n")
 
 
 def print_files(console: Console, out: Path) -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from deworldsg_ros import __version__
@@ -20,7 +22,7 @@ from deworldsg_ros.cli.progress import frame_progress, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import warm_up
-from deworldsg_ros.map_file import check_map_writable, read_map, write_map
+from deworldsg_ros.map_file import claim_map, continue_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
@@ -98,6 +100,12 @@ class _Processed:
 
 def run_recording(options: RunOptions, console: Console) -> None:
     """Run, write the results and print a summary; raises DeWorldSGError."""
+    # The map is ours from reading to writing: what another process adds to it would be lost.
+    with claim_map(options.map_path) if options.map_path else nullcontext():
+        _run(options, console)
+
+
+def _run(options: RunOptions, console: Console) -> None:
     config = effective_config(options.config_path, options.settings)
     if options.poses.odometry and not HAS_ODOMETRY:
         console.print(f"[yellow]warning:[/] {WITHOUT_ODOMETRY}", highlight=False, soft_wrap=True)
@@ -110,7 +118,7 @@ def run_recording(options: RunOptions, console: Console) -> None:
     )
     try:
         recording = Recording(choose_poses(source, options.poses, config), config.inputs)
-        outputs.prepare_folder(options.out, config)
+        outputs.check_folder(options.out)
         pipeline = _build_pipeline(config, options.map_path, console)
         processed = _process(recording, pipeline, options, console)
     finally:
@@ -121,28 +129,27 @@ def run_recording(options: RunOptions, console: Console) -> None:
         raise RecordingError(
             f"recording {options.recording}: not one frame could be used; see the reasons above"
         )
-    graph = pipeline.graph()
-    _write_results(options, pipeline, graph, processed, console)
     dropped = pipeline.relations.counters().dropped
     failed = {reason: dropped[reason] for reason in FAILURES if reason in dropped}
     if failed:
         drops["world model"] = failed
-    outputs.write_report(options.out, _report(recording, pipeline, graph, processed, drops))
+    _write_results(options, recording, pipeline, processed, drops, console)
     outputs.print_drops(console, recording.losses, drops, recording.reasons)
     _print_summary(options, pipeline, processed, console)
 
 
 def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
     """A pipeline with its models loaded, and with the map's graph if the map file exists."""
-    if map_path is not None:
-        check_map_writable(map_path)
     with working(console, LOADING):
         pipeline = Pipeline(config)
         pipeline.lifting.warm_up()
         warm_up(config)
-    if map_path is not None and map_path.exists():
-        pipeline.go_on_with(read_map(config, map_path))
-        console.print(f"loaded the map {map_path}", highlight=False, soft_wrap=True)
+    if map_path is not None:
+        continued = continue_map(config, map_path)
+        if continued is not None:
+            pipeline.go_on_with(continued.builder)
+            warning = "" if continued.newest else "[yellow]warning:[/] "
+            console.print(warning + escape(continued.message), highlight=False, soft_wrap=True)
     return pipeline
 
 
@@ -195,20 +202,25 @@ def _node_count(pipeline: Pipeline) -> str:
 
 def _write_results(
     options: RunOptions,
+    recording: Recording,
     pipeline: Pipeline,
-    graph: wire.SceneGraphMessage,
     processed: _Processed,
+    drops: dict[str, dict[str, int]],
     console: Console,
 ) -> None:
-    """Write the graph, its views, the trajectory and the map; print the graph's tables."""
+    """Write the graph, its views, the report, the trajectory and the map; print the tables."""
+    graph = pipeline.graph()
     T_world_cameras = list(processed.poses.values())
-    write_graph(options.out, graph)
-    world_up = pipeline.config.inputs.world_up
-    outputs.show_graph(options.out, graph, console, T_world_cameras, world_up)
-    if options.trajectory_out is not None:
-        write_tum(options.trajectory_out, list(processed.poses), T_world_cameras)
-    if options.map_path is not None and pipeline.builder is not None:
-        write_map(pipeline.builder, options.map_path)
+    with outputs.writing(options.out, pipeline.config) as staged:
+        write_graph(staged, graph)
+        world_up = pipeline.config.inputs.world_up
+        outputs.show_graph(staged, graph, console, T_world_cameras, world_up)
+        outputs.write_report(staged, _report(recording, pipeline, graph, processed, drops))
+        # Last: each of these two is in place at once, and must not be if the results failed.
+        if options.trajectory_out is not None:
+            write_tum(options.trajectory_out, list(processed.poses), T_world_cameras)
+        if options.map_path is not None and pipeline.builder is not None:
+            write_map(pipeline.builder, options.map_path)
 
 
 def _report(

@@ -34,13 +34,14 @@ from deworldsg_ros.evaluation.protocol.labels import translate
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.files import together, write_atomically
 from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.graph_file import write_graph
+from deworldsg_ros.scene.graph_file import GRAPH_FILE, write_graph
 from deworldsg_ros.timing import device_name, total_ms
 
 logger = logging.getLogger(__name__)
@@ -269,9 +270,9 @@ def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:
 def _write(task: ScanTask, graph: wire.SceneGraphMessage, measures: Measures) -> None:
     folder = task.out / task.scan
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CONFIG_FILE).write_text(to_yaml(task.config), encoding="utf-8")
-        write_graph(folder, graph)
-        write_edge_list(folder / EDGES_FILE, measures.edges, measures.relations)
+        with together(folder, (CONFIG_FILE, GRAPH_FILE, EDGES_FILE)) as staged:
+            write_atomically(staged / CONFIG_FILE, to_yaml(task.config))
+            write_graph(staged, graph)
+            write_edge_list(staged / EDGES_FILE, measures.edges, measures.relations)
     except OSError as error:
         raise EvaluationError(f"--out {task.out}: cannot be written ({error.strerror})") from error

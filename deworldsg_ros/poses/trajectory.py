@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
     check_pose,
@@ -123,7 +124,7 @@ def write_tum(path: Path, stamps_ns: Sequence[int], T_world_cameras: Sequence[Fl
         seconds, rest = divmod(stamp_ns, 10**9)
         rows.append(" ".join([f"{seconds}.{rest:09d}", *(f"{value:.9g}" for value in numbers)]))
     try:
-        path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+        write_atomically(path, "\n".join(rows) + "\n")
     except OSError as error:
         raise TrajectoryError(f"trajectory {path}: cannot be written ({error.strerror})") from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 
+from deworldsg_ros.files import check_writable, together
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import (
     COMPRESSED_IMAGE,
@@ -57,14 +57,17 @@ def write_mcap(messages: Iterable[RawRoleMessage], path: Path) -> int:
         RecordingError: as `check_output`, or if there are no messages.
     """
     check_output(path)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".deworldsg-") as folder:
-        bag = Path(folder) / "bag"
-        count = _write(iter(messages), bag)
-        if not count:
-            raise RecordingError(
-                f"output {path}: the recording has no messages; expected at least one"
-            )
-        shutil.move(bag / "bag.mcap", path)
+    try:
+        with together(path.parent, ()) as staged:
+            count = _write(iter(messages), staged / "bag")
+            if not count:
+                raise RecordingError(
+                    f"output {path}: the recording has no messages; expected at least one"
+                )
+            (staged / "bag" / "bag.mcap").rename(staged / path.name)
+            shutil.rmtree(staged / "bag")
+    except OSError as error:
+        raise RecordingError(f"output {path}: cannot be written ({error.strerror})") from error
     return count
 
 
@@ -78,6 +81,10 @@ def check_output(path: Path) -> None:
         raise RecordingError(
             f"output {path}: the folder {path.parent} does not exist; create it first"
         )
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise RecordingError(f"output {path}: cannot be written ({error.strerror})") from error
 
 
 def _write(messages: Iterator[RawRoleMessage], bag: Path) -> int:

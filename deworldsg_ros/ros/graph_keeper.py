@@ -14,6 +14,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
+from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.graph_files import GraphFiles
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
@@ -75,12 +76,13 @@ class GraphKeeper:
         self._whole = WholeGraph(node, markers)
         self._files = GraphFiles(node.parameters)
         # None until a map or the first local graph gives the world frame and the vocabulary.
-        self._builder = self._files.continued_map()
+        continued = self._files.continued_map()
+        self._builder = None if continued is None else continued.builder
         self._worker = Worker(
             "graph", self._run, size=QUEUE_JOBS, on_overrun=_drop, after=self._publish
         )
-        if self._builder is not None:
-            self._announce(self._builder)
+        if continued is not None:
+            self._announce(continued)
         node.create_service(Trigger, "~/save", self._save)
         node.create_subscription(
             PoseStamped, CORRECTION_TOPIC, node.guarded(self._receive_correction), reliable(10)
@@ -110,6 +112,7 @@ class GraphKeeper:
             written, message = self._files.save_map(self._builder)
         log = self._node.get_logger()
         log.info(message) if written else log.warning(message)
+        self._files.close()
 
     def values(self) -> dict[str, str]:
         """The size of the graph, for /diagnostics."""
@@ -123,12 +126,10 @@ class GraphKeeper:
             "nodes moved by corrections": str(self._corrected_nodes),
         }
 
-    def _announce(self, builder: GraphBuilder) -> None:
+    def _announce(self, continued: Continued) -> None:
         """Report a continued map, and publish it."""
-        graph = builder.graph
-        self._node.get_logger().info(
-            f"continuing map {self._files.map_path}: {len(graph)} nodes in frame '{graph.frame_id}'"
-        )
+        log = self._node.get_logger()
+        log.info(continued.message) if continued.newest else log.warning(continued.message)
         now_s = time.monotonic()
         self.submit(lambda: self._times.changed(now_s, now_s))
 

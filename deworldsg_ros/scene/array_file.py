@@ -36,11 +36,12 @@ _NUMBER = re.compile(r"[|<][bif]\d{1,2}|[|<]u\d{1,2}")
 _FIELD = re.compile(r"\('(\w*)', '([^']*)'(?:, \(([\d, ]*)\))?\)")
 
 
-def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays; the file appears complete or not at all. OSError if it cannot be written."""
+def write_arrays(path: Path, arrays: Arrays, *, previous: Path | None = None) -> None:
+    """Write arrays; as `write_atomically`."""
     write_atomically(
         path,
         lambda file: np.savez(file, **arrays),  # type: ignore[arg-type]  # names of its options
+        previous=previous,
     )
 
 

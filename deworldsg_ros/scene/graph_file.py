@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -13,7 +14,7 @@ GRAPH_FILE = "scene_graph.json"
 def write_graph(folder: Path, graph: wire.SceneGraphMessage) -> Path:
     """Write ``folder/scene_graph.json``; returns its path. Raises OSError."""
     path = folder / GRAPH_FILE
-    path.write_text(wire.encode(graph), encoding="utf-8")
+    write_atomically(path, wire.encode(graph))
     return path
 
 

@@ -187,9 +187,9 @@ def _split(flat: NDArray[Any], counts: Int64) -> list[NDArray[Any]]:
     return np.split(flat, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
-def write(path: str | Path, arrays: Arrays) -> None:
-    """Write arrays as .npz; the file appears complete or not at all."""
-    write_arrays(Path(path), arrays)
+def write(path: str | Path, arrays: Arrays, *, previous: Path | None = None) -> None:
+    """Write arrays as .npz; as `write_atomically`."""
+    write_arrays(Path(path), arrays, previous=previous)
 
 
 def read(path: str | Path) -> Arrays:

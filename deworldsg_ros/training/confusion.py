@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Int64
 
 # Size of the picture per predicate, and of the margin for the names.
@@ -41,4 +42,4 @@ def write_confusion(path: Path, confusion: Int64, names: Sequence[str]) -> None:
     for row, column in np.argwhere(counts).tolist():
         colour = "white" if fractions[row, column] > 0.5 else "black"
         axes.text(column, row, str(counts[row, column]), ha="center", va="center", color=colour)
-    figure.savefig(path, format="png")
+    write_atomically(path, lambda file: figure.savefig(file, format="png"))

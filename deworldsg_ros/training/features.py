@@ -29,7 +29,7 @@ class FeatureCache:
     def __init__(self, root: Path, description: str) -> None:
         self.folder = root / _digest(description)
         self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / "description.txt").write_text(description + "\n")
+        write_atomically(self.folder / "description.txt", description + "\n")
         self._features: dict[str, Float32] = {}
         self._unsaved: list[str] = []
         for path in sorted(self.folder.glob("*.npz")):

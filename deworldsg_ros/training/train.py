@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from deworldsg_ros.checkpoints.probe_card import BOX_INPUTS, ProbeCard
-from deworldsg_ros.checkpoints.probe_network import Probe, probe_inputs, save_probe
+from deworldsg_ros.checkpoints.probe_network import PROBE_FILES, Probe, probe_inputs, write_probe
+from deworldsg_ros.files import together, write_atomically
 from deworldsg_ros.relations.probing.backbone import FrozenBackbone
 from deworldsg_ros.scene.arrays import Float32, Int64
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -136,7 +137,7 @@ def _split(clips: Sequence[LabelledClip], options: TrainingOptions) -> Split:
 def _save(
     out: Path, fit: Fit, scores: dict[str, Scores], training: dict[str, Any]
 ) -> dict[str, Any]:
-    """Write metrics, confusion picture and, at the end, the probe; returns the metrics."""
+    """Write metrics, confusion picture and the probe, together; returns the metrics."""
     card = msgspec.structs.replace(fit.probe.card, training=training)
     metrics = {
         **{name: _metrics(found, card.predicates) for name, found in scores.items()},
@@ -144,10 +145,11 @@ def _save(
         "train_losses": fit.train_losses,
         "validation_losses": fit.validation_losses,
     }
-    out.mkdir(parents=True, exist_ok=True)
-    (out / METRICS_FILE).write_bytes(msgspec.json.format(msgspec.json.encode(metrics), indent=1))
-    write_confusion(out / CONFUSION_FILE, scores["held_out"].confusion, card.predicates)
-    save_probe(out, Probe(card, fit.probe.network))
+    with together(out, (METRICS_FILE, CONFUSION_FILE, *PROBE_FILES)) as staged:
+        content = msgspec.json.format(msgspec.json.encode(metrics), indent=1)
+        write_atomically(staged / METRICS_FILE, content)
+        write_confusion(staged / CONFUSION_FILE, scores["held_out"].confusion, card.predicates)
+        write_probe(staged, Probe(card, fit.probe.network))
     return metrics
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from plotly.offline import get_plotlyjs
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import class_colours
@@ -42,6 +43,7 @@ def write(
 
     Raises:
         ValueError: for an up direction of zero length.
+        OSError: if the page cannot be written.
     """
     axes_of_view = view_axes(up_world)
     figure = figure_of(graph, axes_of_view, camera_path_world)
@@ -55,7 +57,7 @@ def write(
         "__PLOTLY__": get_plotlyjs(),
     }.items():
         html = html.replace(name, text, 1)
-    Path(path).write_text(html, encoding="utf-8")
+    write_atomically(Path(path), html)
 
 
 def _script_safe(text: str) -> str:

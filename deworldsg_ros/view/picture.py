@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Ellipse, FancyArrowPatch
 
+from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.view.colours import shade
@@ -49,6 +50,7 @@ def draw(
 
     Raises:
         ValueError: for an up direction of zero length.
+        OSError: if the picture cannot be written.
     """
     drawing = drawing_of(graph, up_world, camera_path_world)
     _draw_points(drawing)
@@ -57,7 +59,10 @@ def draw(
     _draw_arrows(drawing)
     draw_predicates(drawing, draw_labels(drawing))
     draw_frame(drawing)
-    drawing.figure.savefig(path, dpi=DPI, facecolor=BACKGROUND)
+    write_atomically(
+        Path(path),
+        lambda file: drawing.figure.savefig(file, format="png", dpi=DPI, facecolor=BACKGROUND),
+    )
 
 
 def _draw_points(drawing: Drawing) -> None:

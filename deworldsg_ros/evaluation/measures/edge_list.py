@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 from deworldsg_ros.evaluation.measures.edge_measures import JudgedEdge
+from deworldsg_ros.files import write_csv
 
 EDGES_FILE = "edges.csv"
 HEADER = (
@@ -41,10 +41,7 @@ def write_edge_list(
     lines = [(verdict(edge), edge) for edge in edges if edge not in missed]
     lines += [("missed", item) for item in missed]
     lines.sort(key=lambda line: (VERDICTS.index(line[0]), -line[1].probability))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(HEADER)
-        writer.writerows([name, *_cells(edge)] for name, edge in lines)
+    write_csv(path, [HEADER, *([name, *_cells(edge)] for name, edge in lines)])
 
 
 def verdict(edge: JudgedEdge) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
+from deworldsg_ros.files import write_csv
 
 # The columns of the paper's tables.
 LATEX_COLUMNS = (
@@ -23,24 +23,22 @@ _LATEX_SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"}
 def write_rows(path: Path, rows: Mapping[str, Mapping[str, float]], heading: str) -> None:
     """Write one CSV line per row, one column per number; undefined numbers stay empty."""
     columns = list(dict.fromkeys(name for row in rows.values() for name in row))
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([heading, *columns])
-        for name, row in rows.items():
-            writer.writerow([name, *(_cell(row.get(column, math.nan)) for column in columns)])
+    lines = [
+        [name, *(_cell(row.get(column, math.nan)) for column in columns)]
+        for name, row in rows.items()
+    ]
+    write_csv(path, [[heading, *columns], *lines])
 
 
 def write_classes(path: Path, result: ProtocolResult) -> None:
     """Write a CSV file of the recall of each class and predicate."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["kind", "class", "items", "right", "recall"])
-        for kind, counts in (
-            ("object", result.object_classes),
-            ("predicate", result.predicate_classes),
-        ):
-            for name, count in counts.items():
-                writer.writerow([kind, name, count.total, count.hits, _cell(count.recall)])
+    kinds = {"object": result.object_classes, "predicate": result.predicate_classes}
+    lines = [
+        [kind, name, count.total, count.hits, _cell(count.recall)]
+        for kind, counts in kinds.items()
+        for name, count in counts.items()
+    ]
+    write_csv(path, [["kind", "class", "items", "right", "recall"], *lines])
 
 
 def latex_rows(methods: Mapping[str, Mapping[str, float]]) -> str:

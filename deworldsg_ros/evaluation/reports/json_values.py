@@ -14,6 +14,7 @@ from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult, ScanResult
 from deworldsg_ros.evaluation.reports.evaluation import Evaluation
 from deworldsg_ros.evaluation.runner import ScanOutcome
+from deworldsg_ros.files import write_atomically
 
 
 def protocol_values(result: ProtocolResult) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
     text = json.dumps(finite_or_none(values), indent=2, ensure_ascii=False, allow_nan=False)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n", encoding="utf-8")
+        write_atomically(path, text + "\n")
     except OSError as error:
         raise EvaluationError(f"--json {path} cannot be written ({error.strerror})") from error
 

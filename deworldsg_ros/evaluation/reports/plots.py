@@ -19,6 +19,7 @@ from deworldsg_ros.evaluation.measures.calibration import (
 from deworldsg_ros.evaluation.protocol.scoring import Count
 from deworldsg_ros.evaluation.reports.csv_latex import class_items
 from deworldsg_ros.evaluation.runner import Checkpoint
+from deworldsg_ros.files import write_atomically
 
 DPI = 130
 RIGHT, ALL = "#2f6f8f", "#d5dde3"
@@ -141,4 +142,6 @@ def _figure(width_in: float, height_in: float) -> tuple[Figure, Axes]:
 
 def _save(figure: Figure, path: Path) -> None:
     # Without date and version: equal results give equal bytes.
-    figure.savefig(path, metadata={"Software": None})
+    write_atomically(
+        path, lambda file: figure.savefig(file, format="png", metadata={"Software": None})
+    )

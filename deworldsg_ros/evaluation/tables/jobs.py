@@ -88,7 +88,7 @@ def run_job(job: Job) -> JobResult:
         return JobResult(job.row, task.scan, None, str(error))
     except Exception as error:  # a failed scan must not stop the others
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / ERROR_FILE).write_text(traceback.format_exc(), encoding="utf-8")
+        write_atomically(folder / ERROR_FILE, traceback.format_exc())
         failure = f"{type(error).__name__}: {error} (traceback in {folder / ERROR_FILE})"
         return JobResult(job.row, task.scan, None, failure)
     return JobResult(job.row, task.scan, outcome)

@@ -21,6 +21,7 @@ from deworldsg_ros.evaluation.tables.paper_numbers import (
     RUNTIME_MS,
     printed_rows,
 )
+from deworldsg_ros.files import together, write_atomically
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 CSV_FILE, LATEX_FILE = "table.csv", "table.tex"
@@ -149,7 +150,6 @@ def total_ms(times_ms: Mapping[str, float]) -> float:
 def write_table(out: Path, rows: Sequence[RowResult]) -> list[Path]:
     """Write a CSV file with every number and a file of LaTeX rows; raises EvaluationError."""
     try:
-        out.mkdir(parents=True, exist_ok=True)
         lines = {
             row.title + (" (printed)" if row.printed else ""): {
                 **row.numbers,
@@ -157,8 +157,9 @@ def write_table(out: Path, rows: Sequence[RowResult]) -> list[Path]:
             }
             for row in rows
         }
-        csv_latex.write_rows(out / CSV_FILE, lines, "method")
-        (out / LATEX_FILE).write_text(csv_latex.latex_rows(lines), encoding="utf-8")
+        with together(out, (CSV_FILE, LATEX_FILE)) as staged:
+            csv_latex.write_rows(staged / CSV_FILE, lines, "method")
+            write_atomically(staged / LATEX_FILE, csv_latex.latex_rows(lines))
     except OSError as error:
         raise EvaluationError(f"--out {out}: cannot be written ({error.strerror})") from error
     return [out / CSV_FILE, out / LATEX_FILE]
