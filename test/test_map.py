@@ -297,6 +297,33 @@ def test_two_processes_save_one_map_while_a_third_reads_it(tmp_path):
     assert found == {4, 5}
 
 
+def test_a_killed_node_has_its_last_checkpoint(tmp_path):
+    rclpy = pytest.importorskip("rclpy")
+    from std_msgs.msg import String
+    from support.nodes_bench import Bench, works
+    from support.nodes_bench import local_graph as message_of
+
+    from deworldsg_ros.nodes.graph_node import GraphNode
+
+    path = tmp_path / "room.map"
+    values = {"map_path": str(path), "map_period_s": 0.2, "output.min_existence": 0.0}
+    values |= {"merging.association": "paper"}
+    overrides = [rclpy.parameter.Parameter(name, value=value) for name, value in values.items()]
+    at = Bench(GraphNode, {"deworldsg/local_graph": String}, parameter_overrides=overrides)
+    try:
+        works(at, lambda: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
+        at.expect(path.exists, "a checkpoint")
+        config = msgspec.convert({"merging": {"association": "paper"}}, Config)
+        assert read_map(config, path).graph.nodes.ids.tolist() == [1]
+        # What cannot be written is counted and named, and the node works on.
+        with full_disk(100):
+            works(at, lambda: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
+            at.expect(lambda: at.node.health.drops.get("map_not_written"), "the refusal")
+        assert read_map(config, path).graph.nodes.ids.tolist() == [1]
+    finally:
+        at.close()
+
+
 def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
     rclpy = pytest.importorskip("rclpy")
     from std_msgs.msg import String

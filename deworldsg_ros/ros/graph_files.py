@@ -6,36 +6,36 @@ from pathlib import Path
 
 from deworldsg_ros.files import write_atomically
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import Continued, claim_map, continue_map, write_map
-from deworldsg_ros.ros.options import Parameters
+from deworldsg_ros.map_file import Continued
+from deworldsg_ros.ros.map_keeper import MapKeeper
+from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.errors import ConfigurationError
 
 
 class GraphFiles:
-    """Reads and writes the files that the parameters name; no other process may write the map.
+    """Reads and writes the files that the parameters name.
+
+    Args:
+        node: for its parameters, the log and the counts.
+
+    Attributes:
+        map: None without a map.
 
     Raises:
         ConfigurationError: if the map file cannot be written.
     """
 
-    def __init__(self, parameters: Parameters) -> None:
-        self._parameters = parameters
-        self._save_path = Path(parameters.node.save_path).absolute()
-        map_path = parameters.node.map_path
-        self.map_path = Path(map_path).absolute() if map_path else None
-        self._lock = None if self.map_path is None else claim_map(self.map_path)
+    def __init__(self, node: StageNode) -> None:
+        self._node = node
+        options = node.parameters.node
+        self._save_path = Path(options.save_path).absolute()
+        self.map: MapKeeper | None = None
+        if options.map_path:
+            self.map = MapKeeper(node, Path(options.map_path).absolute(), options.map_period_s)
 
     def continued_map(self) -> Continued | None:
         """The graph of the map file, if there is one; raises ConfigurationError if it has none."""
-        if self.map_path is None:
-            return None
-        return continue_map(self._parameters, self.map_path)
-
-    def close(self) -> None:
-        """Let other processes write the map."""
-        if self._lock is not None:
-            self._lock.release()
+        return None if self.map is None else self.map.continued(self._node.parameters)
 
     def save(self, builder: GraphBuilder | None) -> tuple[bool, str]:
         """Write the whole graph, with surface points, as JSON; and the map file.
@@ -52,17 +52,32 @@ class GraphFiles:
         except OSError as error:
             return False, f"{self._save_path}: {error}"
         said = f"{self._save_path}: {len(message.nodes)} nodes, {len(message.edges)} edges"
-        if self.map_path is None:
+        if self.map is None:
             return True, said
-        saved, about_map = self.save_map(builder)
+        saved, about_map = self.map.save(builder)
         return saved, f"{said}; {about_map}"
 
-    def save_map(self, builder: GraphBuilder | None) -> tuple[bool, str]:
-        """Write the map file; returns as `save`."""
-        if self.map_path is None or builder is None:
-            return False, "no map written: no local graph has arrived"
-        try:
-            write_map(builder, self.map_path)
-        except ConfigurationError as error:
-            return False, str(error)
-        return True, f"map {self.map_path}: {builder.confirmed} nodes"
+    def changed(self) -> None:
+        """Note that the graph differs from the last checkpoint of the map."""
+        if self.map is not None:
+            self.map.changed()
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until the next checkpoint is due, 0 = now; None = there is none."""
+        return None if self.map is None else self.map.wait_s(now_s)
+
+    def checkpoint(self, builder: GraphBuilder | None) -> None:
+        """Copy the graph, and write the map in the background."""
+        if self.map is not None and builder is not None:
+            self.map.checkpoint(builder)
+
+    def close(self, builder: GraphBuilder | None, *, busy: bool) -> None:
+        """Write the map, unless its graph is busy, and log it."""
+        if self.map is None:
+            return
+        written, message = False, f"map {self.map.path}: not written, the graph is busy"
+        if not busy:
+            written, message = self.map.save(builder)
+        self.map.close()
+        log = self._node.get_logger()
+        log.info(message) if written else log.warning(message)

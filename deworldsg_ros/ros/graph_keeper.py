@@ -74,7 +74,7 @@ class GraphKeeper:
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher("/scene_graph/updates", 50)
         self._whole = WholeGraph(node, markers)
-        self._files = GraphFiles(node.parameters)
+        self._files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.
         continued = self._files.continued_map()
         self._builder = None if continued is None else continued.builder
@@ -105,14 +105,7 @@ class GraphKeeper:
         """End the threads, then write the map file."""
         ended = self._worker.stop()
         self._whole.close()
-        if self._files.map_path is None:
-            return
-        written, message = False, f"{self._files.map_path}: not written, the graph is busy"
-        if ended:
-            written, message = self._files.save_map(self._builder)
-        log = self._node.get_logger()
-        log.info(message) if written else log.warning(message)
-        self._files.close()
+        self._files.close(self._builder, busy=not ended)
 
     def values(self) -> dict[str, str]:
         """The size of the graph, for /diagnostics."""
@@ -185,8 +178,12 @@ class GraphKeeper:
         if self._whole.wait_s(time.monotonic()) == 0.0:
             with self._node.refusing():
                 self._publish_whole()
+        if self._files.wait_s(time.monotonic()) == 0.0:
+            with self._node.refusing():
+                self._files.checkpoint(self._builder)
         now_s = time.monotonic()
-        waits = (self._times.wait_s(now_s), self._whole.wait_s(now_s))
+        parts = (self._times, self._whole, self._files)
+        waits = (part.wait_s(now_s) for part in parts)
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 
     def _publish_changes(self) -> None:
@@ -198,6 +195,7 @@ class GraphKeeper:
         self._publish_update(update)
         self._node.health.published(time.monotonic() - changed_s)
         self._whole.changed()
+        self._files.changed()
         self._on_update(update)
 
     def _publish_whole(self) -> None:

@@ -20,6 +20,14 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "empty = no map. Poses must be in the map's world frame"
         ),
     ] = ""
+    map_period_s: Annotated[
+        float,
+        option(
+            "seconds between two checkpoints of the map while the graph changes: a node that is "
+            "killed loses no more; 0 = none",
+            ge=0,
+        ),
+    ] = 10.0
 
 
 class Parameters(Config, frozen=True, forbid_unknown_fields=True):

@@ -43,6 +43,9 @@ REASONS: dict[str, str] = {
     "nan_features": "The world model computed NaN or infinity for a clip. The clip gives no "
     "prediction. Run it on the CPU (`perception.device: cpu`), and report it with "
     "`deworldsg models inspect`.",
+    # Files
+    "map_not_written": "A checkpoint of the map could not be written; the file holds the one "
+    "before. Make room on the disk, or take another `map_path`.",
     # Joining
     "no_depth": "No depth image is within `inputs.slop_s` of the RGB image. Check the rate and "
     "the stamps of the depth images.",

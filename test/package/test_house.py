@@ -13,7 +13,7 @@ import pytest
 from deworldsg_ros.config import Config
 from deworldsg_ros.ros.options import NodeOptions, ReplayOptions
 
-MAX_OPTIONS = 55
+MAX_OPTIONS = 56
 MAX_FUNCTION_LINES = 60
 MAX_CLASS_LINES = 200
 MAX_NESTING = 4
