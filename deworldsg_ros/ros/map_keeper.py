@@ -17,8 +17,8 @@ from deworldsg_ros.map_file import (
 )
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.worker import Worker
+from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.graph_io import Arrays
 
 # Longest time in which a disk may take a checkpoint, before the map itself is written.
 SLOW_DISK_S = 20.0
