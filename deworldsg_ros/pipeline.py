@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ParamSpec, Protocol
 
+from deworldsg_ros.ahead import apply_ahead, read_ahead
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
+from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.relations.graph_view import LiveGraph
@@ -21,8 +26,13 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.timing import timed, watch
 
+P = ParamSpec("P")
+
 # Methods of perception that are timed, with the names of their times.
 PERCEPTION_PARTS = {"detect": "detection", "segment": "masks", "relate": "relation_inference"}
+# Frames that are read before their detector runs. One is enough to keep the threads busy if all
+# frames take equally long; more only need memory.
+FRAMES_READ_AHEAD = 2
 
 
 @dataclass(frozen=True)
@@ -54,20 +64,26 @@ class Pipeline:
     Args:
         config: the whole configuration.
         perceiver: replaces the configured perception, e.g. by recorded detections.
+        overlapped: whether `process_all` detects frames at the same time, where the detector can.
 
     Attributes:
         builder: keeps the global graph; None before the first frame, which gives the world frame.
         drops: number of dropped inputs and objects, by reason.
-        times_s: seconds of each frame in each stage, and in each part of perception.
+        times_s: seconds of each frame in each stage, in each part of perception, and to
+            read it (only `process_all`).
     """
 
-    def __init__(self, config: Config, perceiver: Perceiver | None = None) -> None:
+    def __init__(
+        self, config: Config, perceiver: Perceiver | None = None, *, overlapped: bool = False
+    ) -> None:
         self.config = config
         require_checkpoints(config.perception if perceiver is None else None, config.relations)
         world_model = build_world_model(config.relations, config.perception.device)
         self.perception: Perceiver
         if perceiver is None:
-            perception = build_perception(config.perception, world_up=config.inputs.world_up)
+            perception = build_perception(
+                config.perception, world_up=config.inputs.world_up, overlapped=overlapped
+            )
             require_predicates(world_model, perception.vocabulary.predicates)
             self.perception = perception
         else:  # recorded detections have their vocabulary in each frame
@@ -77,7 +93,7 @@ class Pipeline:
         self.builder: GraphBuilder | None = None
         self.drops: Counter[str] = Counter()
         self.times_s: dict[str, list[float]] = {
-            name: [] for name in ("perception", "lifting", "merging", "relations")
+            name: [] for name in ("reading", "perception", "lifting", "merging", "relations")
         }
         watch_parts(self.perception, self.times_s)
 
@@ -94,6 +110,46 @@ class Pipeline:
         """
         with timed(self.times_s["perception"]):
             perceived = self.perception.perceive(frame)
+        return self._add(frame, perceived)
+
+    def process_all(
+        self, frames: Iterable[RgbdFrame]
+    ) -> Generator[tuple[RgbdFrame, FrameResult | RefusedInput], None, None]:
+        """Process frames in order; each with its result, or with the reason why it was refused.
+
+        The graph is the same as with `process`, but stages overlap: a thread reads the frames, and
+        others detect objects in the next frames, while this thread does the rest of a frame. Close
+        the iteration to end the threads.
+
+        Args:
+            frames: read by a thread.
+        """
+        frames = read_ahead(_timed(frames, self.times_s["reading"]), FRAMES_READ_AHEAD)
+        perception = self.perception
+        if not isinstance(perception, Perception) or not perception.detectors:
+            for frame in frames:
+                yield frame, _result_or_refusal(self.process, frame)
+            return
+        for frame, detections in apply_ahead(self._detect, frames, perception.detectors):
+            yield frame, _result_or_refusal(self._process_detected, frame, detections)
+
+    def _detect(self, frame: RgbdFrame) -> tuple[Detections, float]:
+        """The detections of a frame, and the seconds that they took."""
+        assert isinstance(self.perception, Perception)
+        start = time.perf_counter()
+        return self.perception.detect(frame), time.perf_counter() - start
+
+    def _process_detected(
+        self, frame: RgbdFrame, found: Future[tuple[Detections, float]]
+    ) -> FrameResult:
+        assert isinstance(self.perception, Perception)
+        wait([found])
+        start = time.perf_counter()
+        perceived = self.perception.perceive(frame, lambda: found.result()[0])
+        self.times_s["perception"].append(time.perf_counter() - start + found.result()[1])
+        return self._add(frame, perceived)
+
+    def _add(self, frame: RgbdFrame, perceived: Perceived) -> FrameResult:
         with timed(self.times_s["lifting"]):
             local = self.lifting.lift(
                 perceived.frame_graph,
@@ -132,3 +188,21 @@ def watch_parts(perceiver: Perceiver, times_s: dict[str, list[float]]) -> None:
     if isinstance(perceiver, Perception):
         for method, name in PERCEPTION_PARTS.items():
             watch(perceiver, method, times_s.setdefault(name, []))
+
+
+def _timed(frames: Iterable[RgbdFrame], times_s: list[float]) -> Iterator[RgbdFrame]:
+    """The frames; the time to read each is appended."""
+    start = time.perf_counter()
+    for frame in frames:
+        times_s.append(time.perf_counter() - start)
+        yield frame
+        start = time.perf_counter()
+
+
+def _result_or_refusal(
+    process: Callable[P, FrameResult], *args: P.args, **kwargs: P.kwargs
+) -> FrameResult | RefusedInput:
+    try:
+        return process(*args, **kwargs)
+    except RefusedInput as refusal:
+        return refusal

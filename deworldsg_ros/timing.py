@@ -11,8 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-# In processing order. The first three are parts of perception. `relations` is the world model.
-STAGES = ("detection", "masks", "relation_inference", "lifting", "merging", "relations")
+# In processing order. `reading` decodes the images. The next three are parts of perception.
+# `relations` is the world model.
+STAGES = ("reading", "detection", "masks", "relation_inference", "lifting", "merging", "relations")
 
 
 @contextmanager

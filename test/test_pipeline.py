@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
+from support.failing_backend import Backend
 from support.relations import mean_of
 from support.scripted import CONFIGURATIONS, INTRINSICS, PAPER, VOCABULARY, Scripted, frame
 
@@ -20,10 +24,11 @@ from deworldsg_ros.config import (
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.pipeline import PERCEPTION_PARTS, Pipeline
+from deworldsg_ros.pipeline import PERCEPTION_PARTS, FrameResult, Pipeline
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.replica import GraphReplica
@@ -210,3 +215,86 @@ def test_the_paper_differs_from_the_default_in_these_options() -> None:
         ("relations", "edge_belief"),
         ("relations", "world_model"),
     }
+
+
+class Slowest:
+    """A detector whose first frames take longest, and whose third one fails."""
+
+    classes = ("table", "cup")
+    default_score_threshold = 0.5
+
+    def __init__(self) -> None:
+        self.threads: set[threading.Thread] = set()
+
+    def detect(self, rgb, score_threshold):  # type: ignore[no-untyped-def]
+        number = int(rgb[0, 0, 0])
+        self.threads.add(threading.current_thread())
+        time.sleep(0.002 * (5 - number))
+        if number == 2:
+            raise RuntimeError("CUDA out of memory")
+        return Backend().detect(rgb, score_threshold)
+
+
+def overlapped_pipeline(detectors: int) -> tuple[Pipeline, Slowest]:
+    detector, backend = Slowest(), Backend()
+    perception = Perception(detector, backend, backend, PAPER.perception, detectors=detectors)
+    return Pipeline(PAPER, perception), detector
+
+
+def numbered_frames(count: int) -> list[RgbdFrame]:
+    frames = [frame(index) for index in range(count)]
+    return [
+        replace(seen, rgb=np.full_like(seen.rgb, index), depth_m=np.full_like(seen.depth_m, 1.5))
+        for index, seen in enumerate(frames)
+    ]
+
+
+@pytest.mark.parametrize("detectors", [0, 1, 2])
+def test_overlapped_stages_give_the_same_results_in_order(detectors: int, caplog) -> None:  # type: ignore[no-untyped-def]
+    frames = numbered_frames(5)
+    frames.insert(4, frames[1])  # not newer than those before it
+    alone, _ = overlapped_pipeline(0)
+    expected: list[FrameResult | str] = []
+    for seen in frames:
+        try:
+            expected.append(alone.process(seen))
+        except RefusedInput as refusal:
+            expected.append(refusal.reason)
+    together, detector = overlapped_pipeline(detectors)
+    results = list(together.process_all(iter(frames)))
+    assert [seen for seen, _ in results] == frames
+    assert expected[2] == "detector_error" and expected[4] == "out_of_order"
+    for (_, found), wanted in zip(results, expected):
+        if isinstance(found, RefusedInput):
+            assert found.reason == wanted
+        else:
+            assert isinstance(wanted, FrameResult)
+            assert found.node_ids == wanted.node_ids
+            np.testing.assert_array_equal(found.local.means_world, wanted.local.means_world)
+    assert together.graph() == alone.graph()
+    assert together.drops == alone.drops
+    assert len(detector.threads) <= max(1, detectors)
+    assert (threading.current_thread() in detector.threads) == (detectors == 0)
+    for part in ("reading", "perception", "lifting", "merging", "relations"):
+        assert len(together.times_s[part]) == {"reading": 6, "perception": 5, "lifting": 5}.get(
+            part, 4
+        )
+    # The time of perception includes that of its detector, wherever that ran.
+    assert sum(together.times_s["perception"]) > sum(together.times_s["masks"]) + 0.002 * 9
+
+
+def test_frames_are_not_read_far_ahead_and_reading_ends_with_the_run() -> None:
+    read: list[int] = []
+
+    def frames() -> Iterator[RgbdFrame]:
+        for index, seen in enumerate(numbered_frames(30)):
+            read.append(index)
+            yield seen
+
+    pipeline, _ = overlapped_pipeline(2)
+    results = pipeline.process_all(frames())
+    next(results)
+    results.close()
+    time.sleep(0.05)
+    assert len(read) < 12
+    assert not [thread for thread in threading.enumerate() if "_ahead" in thread.name]

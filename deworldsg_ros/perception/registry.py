@@ -6,9 +6,12 @@ and slow to import.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeVar
+
+import msgspec
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
@@ -81,6 +84,9 @@ DETECTORS: dict[str, Callable[[PerceptionConfig], Detector]] = {
     "nanodet": _nanodet,
     "rtdetr": _rtdetr,
 }
+# Torch has one setting of its threads for the thread that sets it, and a GPU takes one frame after
+# the other anyway.
+THREAD_SAFE_DETECTORS = {"nanodet"}
 SEGMENTERS: dict[str, Callable[[PerceptionConfig], Segmenter]] = {
     "rgbd": _rgbd,
     "sam2": _sam2,
@@ -95,7 +101,11 @@ RELATION_HEADS: dict[str, Callable[[PerceptionConfig, Detector], RelationHead]] 
 
 
 def build_perception(
-    config: PerceptionConfig, *, world_up: str = "auto", detector: Detector | None = None
+    config: PerceptionConfig,
+    *,
+    world_up: str = "auto",
+    detector: Detector | None = None,
+    overlapped: bool = False,
 ) -> Perception:
     """Perception with the backends that `config` names.
 
@@ -103,6 +113,9 @@ def build_perception(
         config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y.
         detector: replaces the configured detector.
+        overlapped: whether the detector shall take several frames at the same time, with one
+            thread for each; if it can. It needs less processor time for each frame, but a single
+            frame takes longer.
 
     Raises:
         ConfigurationError: an unknown backend or axis, or a checkpoint that cannot be used.
@@ -111,9 +124,16 @@ def build_perception(
     make_detector = _choose("perception.detector", config.detector, DETECTORS)
     make_segmenter = _choose("perception.segmenter", config.segmenter, SEGMENTERS)
     make_head = _choose("perception.relation_head", config.relation_head, RELATION_HEADS)
-    detector = make_detector(config) if detector is None else detector
+    detectors = 0
+    if overlapped and detector is None and config.detector in THREAD_SAFE_DETECTORS:
+        detectors = config.threads or len(os.sched_getaffinity(0))
+        detector = make_detector(msgspec.structs.replace(config, threads=1))
+    elif detector is None:
+        detector = make_detector(config)
     head = make_head(config, detector)
-    return Perception(detector, make_segmenter(config), head, config, world_up=world_up)
+    return Perception(
+        detector, make_segmenter(config), head, config, world_up=world_up, detectors=detectors
+    )
 
 
 @contextmanager

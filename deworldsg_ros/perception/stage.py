@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -68,6 +69,8 @@ class Perception:
         detector, segmenter, relation_head: the backends.
         config: the section `perception`.
         world_up: axis of the world frame that points up: auto, z, y or -y (`UpEstimator`).
+        detectors: frames that `detect` can take at the same time, in other threads than that of
+            `perceive`; 0 = it runs in the thread of `perceive` alone.
 
     Attributes:
         vocabulary: classes of the detector and predicates of the relation head.
@@ -82,7 +85,9 @@ class Perception:
         config: PerceptionConfig,
         *,
         world_up: str = "auto",
+        detectors: int = 0,
     ) -> None:
+        self.detectors = detectors
         self._detector = detector
         self._segmenter = segmenter
         self._relation_head = relation_head
@@ -98,11 +103,17 @@ class Perception:
             else config.score_threshold
         )
 
-    def perceive(self, frame: RgbdFrame) -> Perceived:
+    def perceive(
+        self, frame: RgbdFrame, detect: Callable[[], Detections] | None = None
+    ) -> Perceived:
         """The 2D scene graph and the instance image of `frame`.
 
         A segmenter or relation head that fails does not stop the run: `drops` counts the lost
         objects.
+
+        Args:
+            frame: the frames come in order of time.
+            detect: gives the result of `detect` for the frame, or raises its error; None = now.
 
         Raises:
             RefusedInput: ``detector_error``.
@@ -110,7 +121,7 @@ class Perception:
         intrinsics = frame.intrinsics
         self._up.observe(frame.T_world_camera)
         self._failures = {}
-        found = self.detect(frame)
+        found = self.detect(frame) if detect is None else detect()
         strong = found.scores >= self.score_threshold
         objects, drops = self._select(found.take(strong), intrinsics.width, intrinsics.height)
         weak, _ = self._select(found.take(~strong), intrinsics.width, intrinsics.height)

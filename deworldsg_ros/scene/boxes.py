@@ -14,9 +14,11 @@ def areas(boxes: Float64) -> Float64:
 
 def shared_areas(boxes: Float64, others: Float64) -> Float64:
     """Areas (n, m) that boxes (n, 4) share with others (m, 4)."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    return np.asarray(np.clip(high - low, 0.0, None).prod(axis=2))
+    # One array per side: numpy is several times slower with a last axis of two.
+    x1, y1, x2, y2 = (np.ascontiguousarray(side)[:, None] for side in boxes.T)
+    left, top, right, bottom = np.ascontiguousarray(others.T)
+    width = np.maximum(np.minimum(x2, right) - np.maximum(x1, left), 0.0)
+    return np.asarray(width * np.maximum(np.minimum(y2, bottom) - np.maximum(y1, top), 0.0))
 
 
 def pairwise_iou(boxes: Float64, others: Float64) -> Float64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Int32, UInt8
+from deworldsg_ros.scene.arrays import Float32, Int32, UInt8
 
 # The cost of a cell sums squared differences between it and the pixel. Each of these counts 1:
 # RGB colour, 8 bit; depth, relative to the depth.
@@ -38,50 +38,71 @@ def upsample_labels(
     """
     height, width = depth_m.shape
     rows, columns = labels.shape
-    # The last cells also cover the pixels that the stride leaves over.
-    row_of = np.minimum(np.arange(height) // stride, rows - 1)
-    column_of = np.minimum(np.arange(width) // stride, columns - 1)
-    uniform = _uniform_cells(labels)
     result = np.empty((height, width), np.int32)
-    for y in range(height):
-        for x in range(width):
-            v, u = row_of[y], column_of[x]
-            best = np.float32(np.inf)
-            chosen = labels[v, u]
-            if uniform[v, u]:
-                result[y, x] = chosen
+    for v in range(rows):
+        # The last cells also cover the pixels that the stride leaves over.
+        bottom = height if v == rows - 1 else (v + 1) * stride
+        for u in range(columns):
+            right = width if u == columns - 1 else (u + 1) * stride
+            if _is_uniform(labels, v, u):
+                result[v * stride : bottom, u * stride : right] = labels[v, u]
                 continue
-            z = depth_m[y, x]
-            for dv, du in CANDIDATES:
-                b, a = v + dv, u + du
-                if b < 0 or a < 0 or b >= rows or a >= columns:
-                    continue
-                cost = np.float32(0.0)
-                for k in range(3):
-                    d = np.float32(rgb[y, x, k]) - np.float32(cell_rgb[b, a, k])
-                    cost += d * d
-                cost /= np.float32(COLOUR_STEP * COLOUR_STEP)
-                if z > 0 and z < np.inf and cell_depth[b, a] > 0:
-                    d = (z - cell_depth[b, a]) / (np.float32(DEPTH_STEP) * z)
-                    cost += min(d * d, np.float32(MAX_DEPTH_COST))
-                d = np.float32(y - (b * stride + stride // 2)) / np.float32(stride)
-                e = np.float32(x - (a * stride + stride // 2)) / np.float32(stride)
-                cost += np.float32(DISTANCE_WEIGHT) * (d * d + e * e)
-                if cost < best:
-                    best = cost
-                    chosen = labels[b, a]
-            result[y, x] = chosen
+            for y in range(v * stride, bottom):
+                for x in range(u * stride, right):
+                    result[y, x] = _label_of_pixel(
+                        labels, cell_rgb, cell_depth, rgb[y, x], depth_m[y, x], y, x, v, u, stride
+                    )
     return result
 
 
 @kernel
-def _uniform_cells(labels: Int32) -> Bool:
-    """(h, w) bool: cells whose eight neighbours have the same label."""
+def _is_uniform(labels: Int32, v: int, u: int) -> bool:
+    """Whether all candidates of the pixels of cell (v, u) have one label."""
     rows, columns = labels.shape
-    uniform = np.ones((rows, columns), np.bool_)
-    for v in range(rows):
-        for u in range(columns):
-            for b in range(max(v - 1, 0), min(v + 2, rows)):
-                for a in range(max(u - 1, 0), min(u + 2, columns)):
-                    uniform[v, u] &= labels[b, a] == labels[v, u]
-    return uniform
+    for dv, du in CANDIDATES:
+        b, a = v + dv, u + du
+        if 0 <= b < rows and 0 <= a < columns and labels[b, a] != labels[v, u]:
+            return False
+    return True
+
+
+@kernel
+def _label_of_pixel(
+    labels: Int32,
+    cell_rgb: UInt8,
+    cell_depth: Float32,
+    colour: UInt8,
+    z: float,
+    y: int,
+    x: int,
+    v: int,
+    u: int,
+    stride: int,
+) -> int:
+    """The label of pixel (y, x), of colour (3,) and depth z, in cell (v, u)."""
+    rows, columns = labels.shape
+    depth_step = np.float32(DEPTH_STEP) * z
+    has_depth = z > 0 and z < np.inf
+    best = np.float32(np.inf)
+    chosen = labels[v, u]
+    for dv, du in CANDIDATES:
+        b, a = v + dv, u + du
+        if b < 0 or a < 0 or b >= rows or a >= columns:
+            continue
+        cost = np.float32(0.0)
+        for k in range(3):
+            d = np.float32(colour[k]) - np.float32(cell_rgb[b, a, k])
+            cost += d * d
+        cost /= np.float32(COLOUR_STEP * COLOUR_STEP)
+        if cost >= best:  # the other terms only add to it
+            continue
+        if has_depth and cell_depth[b, a] > 0:
+            d = (z - cell_depth[b, a]) / depth_step
+            cost += min(d * d, np.float32(MAX_DEPTH_COST))
+        d = np.float32(y - (b * stride + stride // 2)) / np.float32(stride)
+        e = np.float32(x - (a * stride + stride // 2)) / np.float32(stride)
+        cost += np.float32(DISTANCE_WEIGHT) * (d * d + e * e)
+        if cost < best:
+            best = cost
+            chosen = labels[b, a]
+    return chosen
