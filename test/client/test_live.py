@@ -1,0 +1,111 @@
+"""The live client over DDS: the first graph, updates, a gap, changes, the end."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+pytest.importorskip("rclpy")
+
+import msgspec
+from std_msgs.msg import String
+from support.nodes import Peer, peer, wait_until
+from support.view import make_edge, make_graph, make_node
+
+from deworldsg_ros.client import ClientError, SceneGraphClient
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.delta import diff
+
+LIMIT_S = 20.0
+
+
+def graph(sequence: int, *labels: str) -> wire.SceneGraphMessage:
+    """A snapshot: objects 1, 2, … in a row, the second one on the first."""
+    nodes = [make_node(i + 1, label, (float(i), 0.0, 0.0)) for i, label in enumerate(labels)]
+    edges = [make_edge(2, 1, "on")] if len(nodes) > 1 else []
+    return msgspec.structs.replace(make_graph(nodes, edges), sequence=sequence)
+
+
+class Robot:
+    """Publishes what graph_node would publish."""
+
+    def __init__(self, me: Peer, namespace: str = "") -> None:
+        self._snapshots = me.node.create_publisher(
+            String, f"{namespace}/scene_graph", reliable(1, latched=True)
+        )
+        self._updates = me.node.create_publisher(
+            String, f"{namespace}/scene_graph/updates", reliable(50)
+        )
+
+    def wait(self, count: int = 1) -> None:
+        wait_until(lambda: self._updates.get_subscription_count() >= count, LIMIT_S, "the client")
+
+    def latch(self, message: wire.SceneGraphMessage) -> None:
+        self._snapshots.publish(String(data=wire.encode(message)))
+
+    def update(self, before: wire.SceneGraphMessage, after: wire.SceneGraphMessage) -> None:
+        self._updates.publish(String(data=wire.encode(diff(before, after))))
+
+    def text(self, text: str) -> None:
+        self._updates.publish(String(data=text))
+
+
+def test_a_client_follows_the_graph_and_closes_a_gap_by_itself() -> None:
+    steps = [graph(i, *["table", "cup", "book", "vase", "bowl"][:i]) for i in range(6)]
+    with peer("robot") as me, SceneGraphClient() as client:
+        robot = Robot(me)
+        seen: list[list[str]] = []
+        threads = set()
+        client.on_change(lambda now, changes: threads.add(threading.get_ident()))
+        client.on_change(lambda now, changes: seen.append(changes.lines))
+        robot.latch(steps[2])
+        first = client.graph
+        assert [item.label for item in first.on("table")] == ["cup"]
+        robot.wait()
+
+        robot.update(steps[2], steps[3])
+        assert len(client.wait(3, LIMIT_S)) == 3
+        assert len(first) == 2  # a graph never changes
+        assert client.gaps == 0
+
+        robot.update(steps[4], steps[5])  # update 4 was lost
+        wait_until(lambda: client.gaps == 1, LIMIT_S, "the gap")
+        robot.latch(steps[5])
+        assert len(client.wait(5, LIMIT_S)) == 5
+
+        robot.text("{}")
+        wait_until(lambda: client.refused == 1, LIMIT_S, "the refusal")
+        assert [line.split(" at")[0] for line in seen[0]] == ["added table #1", "added cup #2"]
+        assert seen[1] == ["added book #3 at 2.00 0.00 0.00"]
+        assert len(seen[2]) == 2
+        assert threads.isdisjoint({threading.get_ident()})
+
+
+def test_two_robots_in_two_namespaces() -> None:
+    with (
+        peer("robots") as me,
+        SceneGraphClient("/robot_1") as one,
+        SceneGraphClient("/robot_2/") as two,
+    ):
+        Robot(me, "/robot_1").latch(graph(1, "cup"))
+        Robot(me, "/robot_2").latch(graph(7, "table", "cup"))
+        assert (len(one.wait(1, LIMIT_S)), len(two.wait(7, LIMIT_S))) == (1, 2)
+
+
+def test_without_a_graph_the_reason_is_told() -> None:
+    with (
+        SceneGraphClient("/nobody") as client,
+        pytest.raises(ClientError, match="no graph on /nobody/scene_graph within 0.1 s"),
+    ):
+        client.wait(timeout_s=0.1)
+
+
+def test_a_client_ends_at_once_and_twice() -> None:
+    client = SceneGraphClient().__enter__()
+    started_s = time.monotonic()
+    client.close()
+    client.close()
+    assert time.monotonic() - started_s < 5.0
