@@ -1,0 +1,443 @@
+"""Time from the stamp of an image to its change on /scene_graph/updates, over DDS.
+
+    python -m bench.latency [--seconds 60] [--rate 30] [--front-end embedded] [--one-process]
+
+Starts the real node processes on this machine and publishes the shipped recording to them: raw
+640x480 images at a fixed rate, forwards and backwards, with the present time as stamps. With the
+front end `recorded`, segmentation_node returns the results that its perception gave before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import pickle
+import struct
+import sys
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from bench.figures import Figure, Setup
+from deworldsg_ros.cli.demo import dds_environment
+from deworldsg_ros.cli.processes import LoggedProcess, end_all
+from deworldsg_ros.config import Config
+from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.recordings.recording import open_recording
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import RgbdFrame
+
+RECORDING = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
+NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
+START_LIMIT_S = 120.0
+# The first seconds, in which nodes find each other and caches fill, are not measured.
+WARM_UP_S = 3.0
+# After the last image: longer than the latency of any frame.
+DRAIN_S = 2.0
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Result:
+    """One run.
+
+    Attributes:
+        latencies_ms: of the frames that reached the graph, from their stamp to their update.
+        published: number of measured frames.
+        updates_per_s: rate of updates while frames were published.
+        diagnostics: last values of each node, by its name.
+        cpu_ms: processor time of each process per published frame.
+        hops_ms: median time from the stamp to each topic in between, by topic.
+    """
+
+    latencies_ms: np.ndarray
+    published: int
+    updates_per_s: float
+    diagnostics: dict[str, dict[str, str]]
+    cpu_ms: dict[str, float]
+    hops_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def lost(self) -> int:
+        """Frames that never reached the graph."""
+        return self.published - len(self.latencies_ms)
+
+    @property
+    def counted(self) -> int:
+        """Frames and messages that the nodes counted as dropped."""
+        return sum(
+            int(count)
+            for values in self.diagnostics.values()
+            for key, count in values.items()
+            if key.startswith("dropped ") and not key.startswith("dropped unmatched")
+        )
+
+    def percentile_ms(self, percent: float) -> float:
+        """Percentile of the latencies; infinite without any."""
+        return (
+            float(np.percentile(self.latencies_ms, percent)) if self.latencies_ms.size else np.inf
+        )
+
+
+class RecordedPerceiver:
+    """Returns what perception gave for an image before; knows images by their pixels."""
+
+    def __init__(self, perceived: dict[int, Perceived]) -> None:
+        self._perceived = perceived
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
+        """The results of the image, with the stamp of this frame."""
+        known = self._perceived[fingerprint(frame.rgb)]
+        graph = replace(known.frame_graph, stamp_ns=frame.stamp_ns)
+        return replace(known, frame_graph=graph)
+
+
+def fingerprint(rgb: np.ndarray) -> int:
+    """A number that differs between images of a recording."""
+    return zlib.crc32(np.ascontiguousarray(rgb[::16]))
+
+
+class Camera:
+    """Publishes frames with new stamps, as serialized messages."""
+
+    def __init__(self, node: Any, frames: Sequence[RgbdFrame]) -> None:
+        from geometry_msgs.msg import PoseStamped
+        from rclpy.serialization import serialize_message
+        from sensor_msgs.msg import CameraInfo, Image
+
+        from deworldsg_ros.ros.qos import reliable
+        from deworldsg_ros.ros.transform_output import put_pose
+        from deworldsg_ros.streams.images import fill_image
+
+        kinds = {
+            "camera/pose": PoseStamped,
+            "rgb/camera_info": CameraInfo,
+            "depth/image_raw": Image,
+            "rgb/image_raw": Image,
+        }
+        self._outputs = [
+            node.create_publisher(kind, topic, reliable(10)) for topic, kind in kinds.items()
+        ]
+        self._frames: list[list[bytes]] = []
+        for frame in frames:
+            pose, info, depth, rgb = (kind() for kind in kinds.values())
+            put_pose(frame.T_world_camera, pose.pose.position, pose.pose.orientation)
+            pose.header.frame_id = frame.frame_id
+            k = frame.intrinsics
+            info.width, info.height = k.width, k.height
+            info.k = [k.fx, 0.0, k.cx, 0.0, k.fy, k.cy, 0.0, 0.0, 1.0]
+            for message in (info, depth, rgb):
+                message.header.frame_id = "camera"
+            fill_image(depth, np.round(1e3 * frame.depth_m).astype(np.uint16), "16UC1")
+            fill_image(rgb, np.ascontiguousarray(frame.rgb), "rgb8")
+            self._frames.append([serialize_message(item) for item in (pose, info, depth, rgb)])
+
+    @property
+    def listeners(self) -> int:
+        """The smallest number of subscribers of depth and RGB."""
+        return min(output.get_subscription_count() for output in self._outputs)
+
+    def publish(self, number: int, stamp_ns: int) -> None:
+        """Publish a frame; numbers beyond the end go back and forth."""
+        period = 2 * len(self._frames) - 2
+        at = number % period
+        # After the CDR header of four bytes, each message begins with its stamp.
+        stamp = struct.pack("<iI", *divmod(stamp_ns, 10**9))
+        for output, data in zip(self._outputs, self._frames[min(at, period - at)]):
+            output.publish(data[:4] + stamp + data[12:])
+
+
+class Listener:
+    """Notes when each message arrives; it is decoded after the run."""
+
+    def __init__(self, node: Any, hops: bool) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+        from std_msgs.msg import String
+
+        from deworldsg_ros.ros.qos import reliable
+
+        self.updates: list[tuple[int, str]] = []
+        self.hops: dict[str, list[tuple[int, str]]] = {}
+        self.diagnostics: dict[str, dict[str, str]] = {}
+        node.create_subscription(
+            String,
+            "/scene_graph/updates",
+            lambda message: self.updates.append((time.time_ns(), message.data)),
+            reliable(1000),
+        )
+        topics = ("frame_graph", "local_graph", "relation_evidence") if hops else ()
+        for topic in topics:
+            noted = self.hops[topic] = []
+            node.create_subscription(
+                String,
+                f"deworldsg/{topic}",
+                lambda message, noted=noted: noted.append((time.time_ns(), message.data)),
+                reliable(1000),
+            )
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._note, 100)
+
+    def _note(self, message: Any) -> None:
+        for status in message.status:
+            values = {item.key: item.value for item in status.values}
+            self.diagnostics[status.name.split(":")[0]] = values
+
+    def latencies_ms(self, stamps_ns: Sequence[int]) -> np.ndarray:
+        """Of these frames, those in an update."""
+        arrived: dict[int, int] = {}
+        for at_ns, text in self.updates:
+            update = wire.decode(text, wire.SceneGraphUpdateMessage)
+            for item in update.associations:
+                arrived.setdefault(wire.ns_from_stamp(item.stamp), at_ns)
+        return 1e-6 * np.array([arrived[s] - s for s in stamps_ns if s in arrived], float)
+
+    def hops_ms(self, first_ns: int) -> dict[str, float]:
+        """Median time to each topic in between."""
+        return {
+            topic: float(
+                np.median(
+                    [
+                        1e-6 * (at_ns - stamp_ns)
+                        for at_ns, text in noted
+                        if (stamp_ns := wire.ns_from_stamp(_stamp(text))) >= first_ns
+                    ]
+                )
+            )
+            for topic, noted in self.hops.items()
+        }
+
+
+class _Stamped(msgspec.Struct):
+    stamp: wire.Stamp
+
+
+def _stamp(text: str) -> wire.Stamp:
+    return msgspec.json.decode(text, type=_Stamped).stamp
+
+
+def record(frames: Sequence[RgbdFrame], path: Path) -> None:
+    """Write what perception gives for frames, for `RecordedPerceiver`."""
+    perception = build_perception(Config().perception)
+    perceived = {fingerprint(frame.rgb): perception.perceive(frame) for frame in frames}
+    path.write_bytes(pickle.dumps(perceived))
+
+
+def run_recorded_node(name: str, path: Path, arguments: list[str]) -> int:
+    """In the process of a node: run it with recorded perception."""
+    import importlib
+
+    module = importlib.import_module(f"deworldsg_ros.nodes.{name}")
+    perceived = pickle.loads(path.read_bytes())
+    module.build_perception = lambda *_, **__: RecordedPerceiver(perceived)
+    return int(module.main([name, *arguments]))
+
+
+@contextmanager
+def _running(
+    nodes: Sequence[str], recorded: Path | None, folder: Path
+) -> Iterator[list[LoggedProcess]]:
+    """The processes of the nodes, once all are ready."""
+    processes: list[LoggedProcess] = []
+    root = str(Path(__file__).resolve().parents[1])
+    paths = [root, str(Path(root) / "test"), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
+    try:
+        for name in nodes:
+            command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}"]
+            if recorded is not None and name in ("segmentation_node", "deworldsg_node"):
+                command = [sys.executable, "-m", "bench.latency", "--node", name, str(recorded)]
+            log = folder / f"{name}.log"
+            processes.append(LoggedProcess(name, command, environment, log))
+        end_s = time.monotonic() + START_LIMIT_S
+        while not all("ready" in process.log.read_text() for process in processes):
+            ended = [process for process in processes if process.exit_code is not None]
+            if ended or time.monotonic() > end_s:
+                failed = (ended or processes)[0]
+                raise RuntimeError(f"{failed.name} did not start:\n{failed.last_lines()}")
+            time.sleep(0.1)
+        yield processes
+    finally:
+        end_all(processes)
+
+
+def _cpu_s(process: LoggedProcess) -> float:
+    fields = Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+
+
+def _play(camera: Camera, rate_hz: float, seconds: float, first: int = 0) -> list[int]:
+    """Publish frames at a rate; returns their stamps."""
+    stamps_ns = []
+    start_s = time.monotonic()
+    for number in range(round(rate_hz * seconds)):
+        due_s = start_s + number / rate_hz
+        while (wait_s := due_s - time.monotonic()) > 0:
+            time.sleep(wait_s)
+        stamps_ns.append(time.time_ns())
+        camera.publish(first + number, stamps_ns[-1])
+    return stamps_ns
+
+
+def measure(
+    seconds: float = 60.0,
+    rate_hz: float = 30.0,
+    *,
+    front_end: str = "recorded",
+    one_process: bool = False,
+    hops: bool = False,
+    max_frames: int | None = None,
+) -> Result:
+    """Run the nodes for some seconds.
+
+    Args:
+        seconds: of measured frames, after `WARM_UP_S` of others.
+        rate_hz: of the camera.
+        front_end: recorded or embedded.
+        one_process: deworldsg_node in place of the four nodes.
+        hops: also note when frames reach the topics in between.
+        max_frames: distinct frames of the recording; None = all.
+    """
+    os.environ.update(dds_environment())
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    frames = list(itertools.islice(open_recording(RECORDING).frames(), max_frames))
+    nodes = ("deworldsg_node",) if one_process else NODES
+    context = rclpy.Context()
+    with tempfile.TemporaryDirectory() as folder:
+        recorded = Path(folder) / "perceived.pickle" if front_end == "recorded" else None
+        if recorded is not None:
+            record(frames, recorded)
+        rclpy.init(context=context)
+        node = rclpy.create_node("latency_bench", context=context)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+        camera, listener = Camera(node, frames), Listener(node, hops)
+        stop = threading.Event()
+
+        def spin() -> None:
+            while not stop.is_set():
+                executor.spin_once(timeout_sec=0.1)
+
+        thread = threading.Thread(target=spin)
+        try:
+            with _running(nodes, recorded, Path(folder)) as processes:
+                thread.start()
+                _wait_for_listeners(camera, 1 if one_process else 2)
+                warm = _play(camera, rate_hz, WARM_UP_S)
+                before_s = {process.name: _cpu_s(process) for process in processes}
+                stamps_ns = _play(camera, rate_hz, seconds, first=len(warm))
+                cpu_s = {
+                    process.name: _cpu_s(process) - before_s[process.name] for process in processes
+                }
+                time.sleep(DRAIN_S)
+        finally:
+            stop.set()
+            if thread.ident is not None:
+                thread.join()
+            executor.shutdown(timeout_sec=1.0)
+            node.destroy_node()
+            rclpy.try_shutdown(context=context)
+    in_time = sum(stamps_ns[0] <= at_ns <= stamps_ns[-1] for at_ns, _ in listener.updates)
+    return Result(
+        latencies_ms=listener.latencies_ms(stamps_ns),
+        published=len(stamps_ns),
+        updates_per_s=in_time / seconds,
+        diagnostics=listener.diagnostics,
+        cpu_ms={name: 1e3 * value / len(stamps_ns) for name, value in cpu_s.items()},
+        hops_ms=listener.hops_ms(stamps_ns[0]),
+    )
+
+
+def _wait_for_listeners(camera: Camera, number: int) -> None:
+    end_s = time.monotonic() + 20.0
+    while camera.listeners < number and time.monotonic() < end_s:
+        time.sleep(0.1)
+    time.sleep(1.0)
+
+
+def figures(setup: Setup) -> list[Figure]:
+    """Latency and losses of the four nodes and of the one process."""
+    seconds = 5.0 if setup.quick else 60.0
+    found: list[Figure] = []
+    cases = (
+        ("recorded", False, 25.0, 60.0),
+        ("embedded", False, 90.0, None),
+        ("embedded", True, None, None),
+    )
+    for front_end, one_process, p50_ms, p95_ms in cases:
+        result = measure(seconds, front_end=front_end, one_process=one_process)
+        name = f"latency_{front_end}_{'one_process' if one_process else 'four_processes'}"
+        note = f"stamp of an image to its update, 30 Hz, {seconds:g} s, raw images over DDS"
+        found += [
+            Figure(f"{name}_p50", result.percentile_ms(50), "ms", target=p50_ms, note=note),
+            Figure(f"{name}_p95", result.percentile_ms(95), "ms", target=p95_ms, note=note),
+            Figure(
+                f"{name}_updates",
+                result.updates_per_s,
+                "updates/s",
+                target=25.0,
+                more_is_better=True,
+            ),
+            Figure(
+                f"{name}_lost",
+                result.lost,
+                "frames",
+                target=0 if front_end == "recorded" else None,
+                note=f"of {result.published}; the nodes counted {result.counted} drops",
+            ),
+        ]
+    return found
+
+
+def show(result: Result) -> None:
+    """Print a result."""
+    percentiles = ", ".join(f"p{p} {result.percentile_ms(p):.1f}" for p in (5, 50, 95, 99, 100))
+    print(f"latency ms: {percentiles}")
+    print(f"frames {result.published}, lost {result.lost}, counted {result.counted}")
+    print(f"updates per second {result.updates_per_s:.1f}")
+    print("processor ms per frame:", {k: round(v, 1) for k, v in result.cpu_ms.items()})
+    if result.hops_ms:
+        print("median ms to:", {k: round(v, 1) for k, v in result.hops_ms.items()})
+    for name, values in sorted(result.diagnostics.items()):
+        chosen = {
+            key: value
+            for key, value in values.items()
+            if key.startswith(("dropped", "latency", "lost", "total"))
+        }
+        print(f"  {name}: {chosen}")
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["--node"]:
+        sys.exit(run_recorded_node(sys.argv[2], Path(sys.argv[3]), sys.argv[4:]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=30.0, help="of the camera, Hz")
+    parser.add_argument("--front-end", choices=("recorded", "embedded"), default="recorded")
+    parser.add_argument("--one-process", action="store_true", help="deworldsg_node")
+    parser.add_argument("--hops", action="store_true", help="also the topics in between")
+    options = parser.parse_args()
+    show(
+        measure(
+            options.seconds,
+            options.rate,
+            front_end=options.front_end,
+            one_process=options.one_process,
+            hops=options.hops,
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
