@@ -47,8 +47,8 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         frames = self._frames = UnposedAssembler(self.parameters.inputs, **self.assembler_options())
         self.join(frames, self._track)
         listen_camera_info(self, self.taking(frames.add_camera_info))
-        listen_depth(self, self.taking(frames.add_depth))
-        listen_rgb(self, self.taking(frames.add_rgb))
+        listen_depth(self, self.taking(frames.add_depth), self.wants_images)
+        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images)
 
     def _track(self, frame: UnposedFrame) -> None:
         if frame.stamp_ns < self._newest_ns:  # a recording was restarted

@@ -49,9 +49,13 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._snapshot_text = ""
         if world_model is not None and config.max_clips_per_s:
             self._watch_graph()
-        frames = self._frames = RelationAssembler(**self.assembler_options())
+        # Only clips need images.
+        with_rgb = world_model is not None
+        frames = RelationAssembler(with_rgb=with_rgb, **self.assembler_options())
+        self._frames = frames
         self.join(frames, self._relate)
-        listen_rgb(self, self.taking(frames.add_rgb))
+        if with_rgb:
+            listen_rgb(self, self.taking(frames.add_rgb))
         self.listen_json(
             "deworldsg/local_graph", wire.LocalGraphMessage, self.taking(self._add_local_graph), 50
         )

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.pacing import Window
-from deworldsg_ros.ros.health import DROPPED, UNMATCHED_PREFIX, counts_in, received_in
+from deworldsg_ros.ros.health import DROPPED, LOST_PREFIX, UNMATCHED_PREFIX, counts_in, received_in
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 
@@ -28,8 +28,9 @@ SEGMENTATION, LIFTING, RELATION, GRAPH, ODOMETRY = (
     "graph_node",
     "odometry_node",
 )
+# relation_node listens to RGB too if its world model reads clips.
 LISTENERS = {
-    Role.RGB: {SEGMENTATION, RELATION},
+    Role.RGB: {SEGMENTATION},
     Role.DEPTH: {SEGMENTATION, LIFTING},
     Role.CAMERA_INFO: {SEGMENTATION, LIFTING},
     Role.POSE: {SEGMENTATION, LIFTING},
@@ -43,9 +44,9 @@ BETWEEN = {
 }
 ODOMETRY_LISTENS_TO = (Role.RGB, Role.DEPTH, Role.CAMERA_INFO)
 POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
-# Enough for one frame in each of the three processing nodes and one between them; fewer than a
-# node's queue holds, so that no frame is dropped.
-WINDOW_FRAMES = 4
+# One frame in segmentation_node, and one that waits for it or is in another node: with more, a slow
+# segmentation_node would drop those that wait too long.
+WINDOW_FRAMES = 2
 # DDS announces each endpoint to each participant separately: endpoints that are seen here may be
 # unknown elsewhere for a moment.
 SETTLE_S = 1.0
@@ -204,9 +205,13 @@ class PipelineMonitor:
             self._progress_s = None
 
     def _drops(self, name: str) -> int:
-        """Frames that a node has dropped; unmatched messages are not frames."""
+        """Frames that a node has dropped; unmatched and lost messages are not frames."""
         drops = counts_in(self.diagnostics.get(name, {}), DROPPED)
-        return sum(n for reason, n in drops.items() if not reason.startswith(UNMATCHED_PREFIX))
+        return sum(
+            n
+            for reason, n in drops.items()
+            if not reason.startswith((UNMATCHED_PREFIX, LOST_PREFIX))
+        )
 
     def _received(self, topic: str) -> int:
         return received_in(self.diagnostics.get(GRAPH, {}), topic)

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Image
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
-from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.camera import RgbdFrame
@@ -25,7 +25,7 @@ class SegmentationNode(JoiningNode[RgbdFrame]):
     """Stage a as a node."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("segmentation_node", "frame graphs", **options)
+        super().__init__("segmentation_node", "frame graphs", max_queue_s=MAX_QUEUE_S, **options)
         inputs = self.parameters.inputs
         perception = self.parameters.perception
         require_checkpoints(perception)
@@ -36,8 +36,8 @@ class SegmentationNode(JoiningNode[RgbdFrame]):
         self.join(frames, self._segment)
         listen_camera_info(self, self.taking(frames.add_camera_info))
         listen_pose(self, frames)
-        listen_depth(self, self.taking(frames.add_depth))
-        listen_rgb(self, self.taking(frames.add_rgb))
+        listen_depth(self, self.taking(frames.add_depth), self.wants_images)
+        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images)
 
     def _segment(self, frame: RgbdFrame) -> None:
         perceived = self._perception.perceive(frame)

@@ -17,6 +17,8 @@ INTERNAL_ERROR = "internal_error"
 # Reasons with this prefix raise no warning: one camera stream is faster than the other, or than the
 # node.
 UNMATCHED_PREFIX = "unmatched_"
+# Reasons with this prefix count messages that the node never had.
+LOST_PREFIX = "lost_"
 DROPPED, LEFT_OUT, RECEIVED = "dropped ", "objects left out ", "received "
 TOTAL = re.compile(r"(\d+) in total")
 

@@ -27,6 +27,9 @@ Taker = Callable[[Any, int], None]
 # Messages that DDS keeps: a third of a second of images at 30 Hz, half a second of poses at 200 Hz.
 IMAGE_DEPTH = 10
 POSE_DEPTH = 100
+# The same for images that a busy node leaves to DDS: the newest, and enough to find the depth image
+# of an RGB image.
+WANTED_DEPTH = 4
 # Without a publisher of poses for this time, poses come from TF.
 TF_AFTER_S = 3.0
 
@@ -47,20 +50,34 @@ def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[So
     return {"raw": raw, "compressed": compressed, "auto": raw + compressed}[transport]
 
 
-def listen_rgb(node: StageNode, take: Taker) -> None:
-    """Subscribe to RGB images."""
+def listen_rgb(node: StageNode, take: Taker, is_wanted: Callable[[], bool] | None = None) -> None:
+    """Subscribe to RGB images; `is_wanted` as in `AutoSubscription`."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("rgb/image_raw")
     sources = image_sources(topic, "/compressed", inputs.transport)
-    node.listen("rgb", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+    _listen_image(node, "rgb", sources, take, is_wanted)
 
 
-def listen_depth(node: StageNode, take: Taker) -> None:
-    """Subscribe to depth images."""
+def listen_depth(node: StageNode, take: Taker, is_wanted: Callable[[], bool] | None = None) -> None:
+    """Subscribe to depth images; `is_wanted` as in `AutoSubscription`."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("depth/image_raw")
     sources = image_sources(topic, "/compressedDepth", inputs.transport)
-    node.listen("depth", sources, _stamped(take), inputs.reliability, IMAGE_DEPTH)
+    _listen_image(node, "depth", sources, take, is_wanted)
+
+
+def _listen_image(
+    node: StageNode,
+    name: str,
+    sources: list[Source],
+    take: Taker,
+    is_wanted: Callable[[], bool] | None,
+) -> None:
+    reliability = node.parameters.inputs.reliability
+    if is_wanted is None:
+        node.listen(name, sources, _stamped(take), reliability, IMAGE_DEPTH)
+    else:
+        node.listen(name, sources, _stamped(take), reliability, WANTED_DEPTH, is_wanted)
 
 
 def listen_camera_info(node: StageNode, take: Taker) -> None:

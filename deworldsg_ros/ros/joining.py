@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
@@ -11,9 +12,15 @@ from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.streams.assembler import Assembler
 from deworldsg_ros.streams.posed import TOPICS
 
-# A third of a second of a 30 Hz camera: a longer queue of a slow node adds latency only. It has to
-# be longer than the window of a replay (4 frames), or a replay would lose frames.
+# A third of a second of a 30 Hz camera: a longer queue of a slow node adds latency only.
 QUEUE_FRAMES = 10
+# A frame of the slowest node waits for at most a frame period at 20 Hz if a newer one waits. Poses
+# that come at 10 Hz complete three frames of a 30 Hz camera at once: a shorter wait would drop some
+# of them although the node keeps up.
+MAX_QUEUE_S = 0.05
+# While a frame waits, others are taken from DDS at the rate of a usual camera. If they come faster,
+# DDS drops the oldest, and nobody receives or decodes them.
+TAKE_PERIOD_S = 1 / 30
 # Poses of a SLAM system come seconds after their image. The streams keep 256 images, which is 8 s
 # at 30 Hz.
 MAX_WAIT_S = 5.0
@@ -27,7 +34,8 @@ class JoiningNode(StageNode, Generic[Out]):
     Args:
         name: node name.
         product: name of the output in /diagnostics.
-        queue_frames: complete frames that may wait for the worker; more drop the oldest.
+        max_queue_s: a complete frame that has waited longer for the worker is dropped if a newer
+            one waits; of more than QUEUE_FRAMES, the oldest is dropped in any case.
         max_wait_s: maximum time a frame waits for depth, camera_info or pose.
         options: arguments of rclpy's Node.
     """
@@ -37,15 +45,15 @@ class JoiningNode(StageNode, Generic[Out]):
         name: str,
         product: str,
         *,
-        queue_frames: int = QUEUE_FRAMES,
+        max_queue_s: float = math.inf,
         max_wait_s: float = MAX_WAIT_S,
         **options: Any,
     ) -> None:
         super().__init__(name, product, **options)
-        self._queue_frames = queue_frames
+        self._max_queue_s = max_queue_s
         self._max_wait_s = max_wait_s
         self._assembler: Assembler[Any, Out] | None = None
-        self._worker: Worker[tuple[Out, float]] | None = None
+        self._worker: Worker[tuple[Callable[[], Out], float]] | None = None
 
     def assembler_options(self) -> dict[str, Any]:
         """Arguments of every assembler: topic names, maximum wait, counter of drops."""
@@ -59,14 +67,19 @@ class JoiningNode(StageNode, Generic[Out]):
         """Call `work` with each frame that the assembler completes; it publishes one product."""
         self._assembler = assembler
 
-        def process(item: tuple[Out, float]) -> None:
-            joined, joined_s = item
+        def process(item: tuple[Callable[[], Out], float]) -> None:
+            decode, joined_s = item
             with self.refusing():
-                work(joined)
+                work(decode())
                 self.health.published(time.monotonic() - joined_s)
 
         self._worker = Worker(
-            self.get_name(), process, size=self._queue_frames, on_overrun=self._overrun
+            self.get_name(),
+            process,
+            size=QUEUE_FRAMES,
+            max_wait_s=self._max_queue_s,
+            on_overrun=self._overrun,
+            after=self._wake,
         )
         # The maximum wait also ends when no message arrives.
         self.every(CHECK_PERIOD_S, self.pump)
@@ -83,8 +96,13 @@ class JoiningNode(StageNode, Generic[Out]):
     def pump(self) -> None:
         """Pass complete frames to the worker."""
         assert self._assembler is not None and self._worker is not None
-        for joined in self._assembler.pop_ready(time.monotonic_ns()):
+        for joined in self._assembler.pop_joined(time.monotonic_ns()):
             self._worker.submit((joined, time.monotonic()))
+
+    def wants_images(self) -> bool:
+        """Whether to take another image from DDS: not while a fresh frame waits for the worker."""
+        submitted_s = 0.0 if self._worker is None else self._worker.youngest_s()
+        return time.monotonic() - submitted_s > TAKE_PERIOD_S
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, in words."""
@@ -104,9 +122,10 @@ class JoiningNode(StageNode, Generic[Out]):
             self._worker.stop()
         super().close()
 
+    def _wake(self) -> None:
+        """Let the executor take images again."""
+        if self.executor is not None:
+            self.executor.wake()
+
     def _overrun(self, _: Any) -> None:
-        self.drop(
-            "overrun",
-            f"the node processes fewer frames than arrive: dropped the oldest of "
-            f"{self._queue_frames}",
-        )
+        self.drop("overrun", "the node processes fewer frames than arrive: dropped the oldest")

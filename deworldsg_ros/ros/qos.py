@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 
@@ -90,6 +91,18 @@ def choose(sources: Sequence[Source], offers: Sequence[Offer], reliability: str)
     return Choice(chosen, reliability == "reliable")
 
 
+class _WantedGroup(MutuallyExclusiveCallbackGroup):
+    """Lets the executor take messages only while they are wanted."""
+
+    def __init__(self, is_wanted: Callable[[], bool]) -> None:
+        super().__init__()
+        self._is_wanted = is_wanted
+
+    def can_execute(self, entity: Any) -> bool:
+        """Whether the executor may take a message."""
+        return self._is_wanted() and bool(super().can_execute(entity))
+
+
 class AutoSubscription:
     """A subscription that is recreated when the publishers change type or reliability.
 
@@ -99,6 +112,8 @@ class AutoSubscription:
         callback: called with each message.
         reliability: auto, reliable or best_effort.
         depth: messages that DDS keeps.
+        is_wanted: whether to take messages now; DDS keeps the newest `depth`.
+        on_lost: called with the number of messages that were published and not taken.
 
     Attributes:
         was_published: whether there has been a publisher.
@@ -112,8 +127,14 @@ class AutoSubscription:
         *,
         reliability: str,
         depth: int = 10,
+        is_wanted: Callable[[], bool] = lambda: True,
+        on_lost: Callable[[int], None] = lambda number: None,
     ) -> None:
         self._node = node
+        self._group = _WantedGroup(is_wanted)
+        self._on_lost = on_lost
+        self._sequence: int | None = None
+        self._publishers = 0
         self._sources = [
             Source(node.resolve_topic_name(item.topic), item.kind, item.type_name)
             for item in sources
@@ -135,6 +156,7 @@ class AutoSubscription:
     def check(self) -> bool:
         """Compare with the publishers; True if the subscription was recreated."""
         offers = self._offers()
+        self._publishers = len(offers)
         self.was_published = self.was_published or bool(offers)
         choice = choose(self._sources, offers, self._reliability)
         # After the last publisher ends, keep the choice: the same publisher is likely to return.
@@ -145,10 +167,12 @@ class AutoSubscription:
         self._subscription = self._node.create_subscription(
             choice.source.kind,
             choice.source.topic,
-            self._callback,
+            self._receive,
             reliable(self._depth) if choice.reliable else best_effort(self._depth),
+            callback_group=self._group,
         )
         self._choice = choice
+        self._sequence = None
         return True
 
     def describe(self) -> str:
@@ -156,6 +180,16 @@ class AutoSubscription:
         assert self._choice is not None
         kind = self._choice.source.type_name
         return f"{self.topic} [{kind}] {'reliable' if self._choice.reliable else 'best effort'}"
+
+    def _receive(self, message: Any, info: dict[str, Any]) -> None:
+        self._count(info["publication_sequence_number"])
+        self._callback(message)
+
+    def _count(self, sequence: int | None) -> None:
+        """Note a message's number. Each publisher counts its own, so gaps tell nothing of two."""
+        before, self._sequence = self._sequence, sequence if self._publishers == 1 else None
+        if before is not None and self._sequence is not None and self._sequence > before + 1:
+            self._on_lost(self._sequence - before - 1)
 
     def _offers(self) -> list[Offer]:
         return [

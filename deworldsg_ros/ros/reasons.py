@@ -60,6 +60,12 @@ REASONS: dict[str, str] = {
     "No action is needed.",
     "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
     "queue. Lower the camera's frame rate, or choose a faster model.",
+    "lost_rgb": "RGB images were overwritten by newer ones before the node took them, or lost on "
+    "the way. If the node is as fast as the camera, use `config/fastdds.xml` in every process.",
+    "lost_depth": "As `lost_rgb`, for depth images.",
+    "lost_instances": "As `lost_rgb`, for instance images.",
+    "lost_camera_info": "As `lost_rgb`, for camera_info.",
+    "lost_pose": "As `lost_rgb`, for poses.",
     "unmatched_rgb": "An RGB image belongs to no local graph, because its frame was dropped "
     "before. See the other reasons.",
     "unmatched_depth": "A depth image belongs to no RGB image or frame graph. This is harmless if "

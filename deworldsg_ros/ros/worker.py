@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -17,7 +19,8 @@ class Worker(Generic[T]):
         name: thread name.
         work: must not raise.
         size: items that may wait.
-        on_overrun: called with the oldest item when a new one replaces it.
+        on_overrun: called with each item that is dropped: the oldest, when a new one replaces it.
+        max_wait_s: an item that has waited longer is dropped if a newer one waits.
         after: called after each item, and again when the seconds that it returned have passed;
             None = only after the next item. It must not raise.
     """
@@ -29,13 +32,15 @@ class Worker(Generic[T]):
         *,
         size: int,
         on_overrun: Callable[[T], None],
+        max_wait_s: float = math.inf,
         after: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._work = work
         self._size = size
         self._on_overrun = on_overrun
         self._after = after
-        self._items: deque[T] = deque()
+        self._max_wait_s = max_wait_s
+        self._items: deque[tuple[T, float]] = deque()  # with the time of `submit`
         self._changed = threading.Condition()
         self._stopping = False
         self._busy = False
@@ -50,14 +55,18 @@ class Worker(Generic[T]):
 
     def submit(self, item: T) -> None:
         """Queue an item; does not block."""
-        lost: list[T] = []
+        now_s = time.monotonic()
         with self._changed:
-            if len(self._items) >= self._size:
-                lost.append(self._items.popleft())
-            self._items.append(item)
+            lost = [self._items.popleft()[0]] if len(self._items) >= self._size else []
+            self._items.append((item, now_s))
             self._changed.notify_all()
         for oldest in lost:
             self._on_overrun(oldest)
+
+    def youngest_s(self) -> float:
+        """When the newest waiting item was submitted, monotonic clock; 0 = none waits."""
+        with self._changed:
+            return self._items[-1][1] if self._items else 0.0
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until nothing is queued or processed; False on timeout."""
@@ -82,8 +91,18 @@ class Worker(Generic[T]):
                 self._changed.wait_for(lambda: self._items or self._stopping, wait_s)
                 if self._stopping:
                     return
-                items = [self._items.popleft()] if self._items else []
+                late, items = self._take()
                 self._busy = True
+            for item in late:
+                self._on_overrun(item)
             for item in items:
                 self._work(item)
             wait_s = self._after()
+
+    def _take(self) -> tuple[list[T], list[T]]:
+        """The waiting items that are too old, and the next one."""
+        late = []
+        end_s = time.monotonic() - self._max_wait_s
+        while len(self._items) > 1 and self._items[0][1] < end_s:
+            late.append(self._items.popleft()[0])
+        return late, [self._items.popleft()[0]] if self._items else []

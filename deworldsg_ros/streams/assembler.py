@@ -56,8 +56,11 @@ class Assembler(ABC, Generic[T, Out]):
         """Whether the output of this item is final: later messages cannot change it."""
 
     @abstractmethod
-    def _build(self, stamp_ns: int, value: T) -> Out:
-        """The output of an item, from the buffered messages; raises RefusedInput."""
+    def _build(self, stamp_ns: int, value: T) -> Callable[[], Out]:
+        """A function that decodes the output of an item; both raise RefusedInput.
+
+        The messages are chosen now; decoding them is left to the function.
+        """
 
     @abstractmethod
     def _forget(self, stamp_ns: int) -> None:
@@ -73,14 +76,20 @@ class Assembler(ABC, Generic[T, Out]):
         self._drop("time_jump", f"stamps went back: {lost} buffered messages are dropped")
 
     def pop_ready(self, now_ns: int | None) -> list[Out]:
-        """Complete outputs in stamp order; an item that waited too long is decided as it is.
+        """Complete outputs in stamp order, decoded; see `pop_joined`."""
+        return self._decoded(self.pop_joined(now_ns))
+
+    def pop_joined(self, now_ns: int | None) -> list[Callable[[], Out]]:
+        """Complete outputs in stamp order, as functions that decode them; they raise RefusedInput.
+
+        An item that waited too long is decided as it is.
 
         Args:
             now_ns: time of any monotonic clock; None = wait without a limit.
         """
         if now_ns is not None:
             self._note_time(now_ns)
-        ready: list[Out] = []
+        ready: list[Callable[[], Out]] = []
         while len(self._leader):
             item = self._leader.first()
             if not (
@@ -94,10 +103,10 @@ class Assembler(ABC, Generic[T, Out]):
 
     def flush(self) -> list[Out]:
         """Decide all waiting items as they are: the streams have ended."""
-        ready: list[Out] = []
+        ready: list[Callable[[], Out]] = []
         while len(self._leader):
             self._decide(ready)
-        return ready
+        return self._decoded(ready)
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing input, in words: silent streams, or streams whose stamps lag behind."""
@@ -136,7 +145,16 @@ class Assembler(ABC, Generic[T, Out]):
             return False
         return now_ns - self._waiting_since_ns.get(stamp_ns, now_ns) >= self._max_wait_ns
 
-    def _decide(self, ready: list[Out]) -> None:
+    def _decoded(self, joined: list[Callable[[], Out]]) -> list[Out]:
+        outputs: list[Out] = []
+        for decode in joined:
+            try:
+                outputs.append(decode())
+            except RefusedInput as refusal:
+                self._drop(refusal.reason, str(refusal))
+        return outputs
+
+    def _decide(self, ready: list[Callable[[], Out]]) -> None:
         item = self._leader.take()
         self._waiting_since_ns.pop(item.stamp_ns, None)
         try:

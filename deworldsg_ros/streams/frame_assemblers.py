@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8, UInt16
@@ -15,6 +17,8 @@ from deworldsg_ros.streams.images import instances_from_message, rgb_from_messag
 from deworldsg_ros.streams.jump_gate import JumpGate
 from deworldsg_ros.streams.posed import TOPICS, PosedAssembler
 from deworldsg_ros.streams.stamped import Stream
+
+NO_IMAGE: UInt8 = np.zeros((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,10 @@ class LiftingFrame:
 
 @dataclass(frozen=True)
 class PairingFrame:
-    """The input of relations for one frame: its local graph and its image, (H, W, 3) uint8 RGB."""
+    """The input of relations for one frame: its local graph and its image, (H, W, 3) uint8 RGB.
+
+    The image is empty if the assembler does not wait for images.
+    """
 
     local: LocalGraph
     rgb: UInt8
@@ -85,15 +92,17 @@ class FrameAssembler(PosedAssembler[Any, RgbdFrame]):
     def _settled(self, stamp_ns: int, value: Any) -> bool:
         return self._posed(stamp_ns)
 
-    def _build(self, stamp_ns: int, value: Any) -> RgbdFrame:
-        # The cheap checks come first: a refused frame is not decoded.
+    def _build(self, stamp_ns: int, value: Any) -> Callable[[], RgbdFrame]:
         intrinsics = self._intrinsics_at(stamp_ns)
         T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
-        depth_m = self._depth_at(stamp_ns)
-        rgb = rgb_from_message(value)
-        frame = RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
+        decode_depth = self._depth_at(stamp_ns)
         self._gate.check(T_world_camera, stamp_ns)
-        return frame
+
+        def decode() -> RgbdFrame:
+            depth_m, rgb = decode_depth(), rgb_from_message(value)
+            return RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, T_world_camera, frame_id)
+
+        return decode
 
 
 class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
@@ -128,12 +137,17 @@ class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
     def _settled(self, stamp_ns: int, value: FrameGraph) -> bool:
         return self._instances.settled(stamp_ns) and self._posed(stamp_ns)
 
-    def _build(self, stamp_ns: int, value: FrameGraph) -> LiftingFrame:
+    def _build(self, stamp_ns: int, value: FrameGraph) -> Callable[[], LiftingFrame]:
         intrinsics = self._intrinsics_at(stamp_ns)
         T_world_camera, frame_id = self._source().at(stamp_ns, self.camera_frame)
-        depth_m = self._depth_at(stamp_ns)
-        instances = instances_from_message(self._instances.exact(stamp_ns))
-        return LiftingFrame(value, instances, depth_m, intrinsics, T_world_camera, frame_id)
+        decode_depth = self._depth_at(stamp_ns)
+        message = self._instances.exact(stamp_ns)
+
+        def decode() -> LiftingFrame:
+            depth_m, instances = decode_depth(), instances_from_message(message)
+            return LiftingFrame(value, instances, depth_m, intrinsics, T_world_camera, frame_id)
+
+        return decode
 
     def _forget(self, stamp_ns: int) -> None:
         super()._forget(stamp_ns)
@@ -141,23 +155,32 @@ class LiftingAssembler(PosedAssembler[FrameGraph, LiftingFrame]):
 
 
 class RelationAssembler(Assembler[LocalGraph, PairingFrame]):
-    """Local graphs with the RGB image of the same stamp."""
+    """Local graphs with the RGB image of the same stamp.
+
+    Args:
+        with_rgb: whether to wait for images; without, the image of each frame is empty.
+        topics, capacity, max_wait_s, on_drop: as `FrameAssembler`.
+    """
 
     def __init__(
         self,
         *,
+        with_rgb: bool = True,
         topics: Mapping[str, str] | None = None,
         capacity: int = 256,
         max_wait_s: float = 2.0,
         on_drop: OnDrop | None = None,
     ) -> None:
         names = {**TOPICS, **(topics or {})}
-        self._rgb: Stream[Any] = Stream("rgb", names["rgb"], capacity)
+        rgb: Stream[Any] = Stream("rgb", names["rgb"], capacity)
+        self._rgb = rgb if with_rgb else None
         leader: Stream[LocalGraph] = Stream("local_graph", names["local_graph"], capacity)
-        super().__init__(leader, [self._rgb], max_wait_s=max_wait_s, on_drop=on_drop)
+        others = [rgb] if with_rgb else []
+        super().__init__(leader, others, max_wait_s=max_wait_s, on_drop=on_drop)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""
+        assert self._rgb is not None
         self._add(self._rgb, stamp_ns, message)
 
     def add_local_graph(self, graph: LocalGraph) -> None:
@@ -165,10 +188,14 @@ class RelationAssembler(Assembler[LocalGraph, PairingFrame]):
         self._add(self._leader, graph.stamp_ns, graph)
 
     def _settled(self, stamp_ns: int, value: LocalGraph) -> bool:
-        return self._rgb.settled(stamp_ns)
+        return self._rgb is None or self._rgb.settled(stamp_ns)
 
-    def _build(self, stamp_ns: int, value: LocalGraph) -> PairingFrame:
-        return PairingFrame(value, rgb_from_message(self._rgb.exact(stamp_ns)))
+    def _build(self, stamp_ns: int, value: LocalGraph) -> Callable[[], PairingFrame]:
+        if self._rgb is None:
+            return lambda: PairingFrame(value, NO_IMAGE)
+        message = self._rgb.exact(stamp_ns)
+        return lambda: PairingFrame(value, rgb_from_message(message))
 
     def _forget(self, stamp_ns: int) -> None:
-        self._drop_unmatched(self._rgb, self._rgb.forget_before(stamp_ns + 1))
+        if self._rgb is not None:
+            self._drop_unmatched(self._rgb, self._rgb.forget_before(stamp_ns + 1))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from deworldsg_ros.config import InputsConfig
@@ -162,8 +163,10 @@ class PosedAssembler(Assembler[T, Out]):
                 current = intrinsics
         return current
 
-    def _depth_at(self, stamp_ns: int) -> Float32:
-        return depth_from_message(
+    def _depth_at(self, stamp_ns: int) -> Callable[[], Float32]:
+        """A function that decodes the depth image nearest to a stamp."""
+        return partial(
+            depth_from_message,
             self._depth.nearest(stamp_ns, self._slop_ns),
             depth_scale_m=self._inputs.depth_scale,
             max_depth_m=self._inputs.max_depth_m,

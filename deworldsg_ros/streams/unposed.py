@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from deworldsg_ros.config import InputsConfig
@@ -54,15 +55,22 @@ class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
     def _settled(self, stamp_ns: int, value: Any) -> bool:
         return bool(self._intrinsics) and self._depth.settled(stamp_ns)
 
-    def _build(self, stamp_ns: int, value: Any) -> UnposedFrame:
-        intrinsics = self._intrinsics_at(stamp_ns)
-        depth_m = self._depth_at(stamp_ns)
-        rgb = rgb_from_message(value)
-        if rgb.shape[:2] != (intrinsics.height, intrinsics.width) or rgb.shape[:2] != depth_m.shape:
-            raise RefusedInput(
-                "grid_mismatch",
-                f"RGB is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x"
-                f"{depth_m.shape[0]}, camera_info {intrinsics.width}x{intrinsics.height}: expected "
-                "one size. Register the depth to the RGB image",
-            )
-        return UnposedFrame(stamp_ns, rgb, depth_m, intrinsics)
+    def _build(self, stamp_ns: int, value: Any) -> Callable[[], UnposedFrame]:
+        return partial(
+            _decode, stamp_ns, value, self._depth_at(stamp_ns), self._intrinsics_at(stamp_ns)
+        )
+
+
+def _decode(
+    stamp_ns: int, message: Any, decode_depth: Callable[[], Float32], intrinsics: Intrinsics
+) -> UnposedFrame:
+    depth_m = decode_depth()
+    rgb = rgb_from_message(message)
+    if rgb.shape[:2] != (intrinsics.height, intrinsics.width) or rgb.shape[:2] != depth_m.shape:
+        raise RefusedInput(
+            "grid_mismatch",
+            f"RGB is {rgb.shape[1]}x{rgb.shape[0]}, depth {depth_m.shape[1]}x"
+            f"{depth_m.shape[0]}, camera_info {intrinsics.width}x{intrinsics.height}: expected "
+            "one size. Register the depth to the RGB image",
+        )
+    return UnposedFrame(stamp_ns, rgb, depth_m, intrinsics)
