@@ -131,6 +131,23 @@ def remove_left_overs(folder: Path) -> None:
                     path.unlink()
 
 
+def confined(folder: Path, name: str | Path) -> Path:
+    """The path of a file that other files name: by a line of an index, or by a link.
+
+    Raises:
+        OSError: the path leaves the folder, by its name or by symbolic links.
+    """
+    path = folder / name
+    try:
+        root, real = os.path.realpath(folder), os.path.realpath(path)
+    except ValueError as error:  # a name with a null byte
+        raise OSError(errno.EINVAL, str(error), str(path)) from error
+    if os.path.commonpath([root, real]) != root:
+        problem = f"it leaves the folder {folder}: copy the file into it"
+        raise PermissionError(errno.EPERM, problem, str(path))
+    return path
+
+
 def check_writable(path: Path) -> None:
     """Make the folder of a file and test that `write_atomically` can write there.
 

@@ -24,7 +24,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.timing import timed, watch
+from deworldsg_ros.timing import Times, timed, watch
 
 P = ParamSpec("P")
 
@@ -92,8 +92,8 @@ class Pipeline:
         self.relations = RelationReasoner(config.relations, world_model)
         self.builder: GraphBuilder | None = None
         self.drops: Counter[str] = Counter()
-        self.times_s: dict[str, list[float]] = {
-            name: [] for name in ("reading", "perception", "lifting", "merging", "relations")
+        self.times_s: dict[str, Times] = {
+            name: Times() for name in ("reading", "perception", "lifting", "merging", "relations")
         }
         watch_parts(self.perception, self.times_s)
 
@@ -183,14 +183,14 @@ class Pipeline:
         return self.builder.full()
 
 
-def watch_parts(perceiver: Perceiver, times_s: dict[str, list[float]]) -> None:
+def watch_parts(perceiver: Perceiver, times_s: dict[str, Times]) -> None:
     """Time the parts of perception from now on; other perceivers have no parts."""
     if isinstance(perceiver, Perception):
         for method, name in PERCEPTION_PARTS.items():
-            watch(perceiver, method, times_s.setdefault(name, []))
+            watch(perceiver, method, times_s.setdefault(name, Times()))
 
 
-def _timed(frames: Iterable[RgbdFrame], times_s: list[float]) -> Iterator[RgbdFrame]:
+def _timed(frames: Iterable[RgbdFrame], times_s: Times) -> Iterator[RgbdFrame]:
     """The frames; the time to read each is appended."""
     start = time.perf_counter()
     for frame in frames:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import platform
 import sys
+import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,29 +18,56 @@ from typing import Any
 STAGES = ("reading", "detection", "masks", "relation_inference", "lifting", "merging", "relations")
 
 
+# Newest durations for median and percentiles: five minutes at 30 Hz, in 80 kB.
+KEPT_TIMES = 10_000
+
+
+class Times:
+    """Durations in seconds: the sum of all, and the newest.
+
+    Attributes:
+        count: number of all durations.
+        total_s: their sum.
+        newest_s: at most KEPT_TIMES.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.total_s = 0.0
+        self.newest_s: deque[float] = deque(maxlen=KEPT_TIMES)
+        self._lock = threading.Lock()  # detectors run in several threads
+
+    def append(self, duration_s: float) -> None:
+        """Add a duration."""
+        with self._lock:
+            self.count += 1
+            self.total_s += duration_s
+            self.newest_s.append(duration_s)
+
+
 @contextmanager
-def timed(times_s: list[float]) -> Iterator[None]:
-    """Append the duration of the block in seconds, unless it raises."""
+def timed(times: Times) -> Iterator[None]:
+    """Add the duration of the block, unless it raises."""
     start = time.perf_counter()
     yield
-    times_s.append(time.perf_counter() - start)
+    times.append(time.perf_counter() - start)
 
 
-def watch(owner: object, method: str, times_s: list[float]) -> None:
+def watch(owner: object, method: str, times: Times) -> None:
     """Time each call of a method of this one object from now on."""
     inner = getattr(owner, method)
 
     @functools.wraps(inner)
     def outer(*args: Any, **kwargs: Any) -> Any:
-        with timed(times_s):
+        with timed(times):
             return inner(*args, **kwargs)
 
     setattr(owner, method, outer)
 
 
-def total_ms(times_s: Mapping[str, Sequence[float]]) -> dict[str, float]:
+def total_ms(times: Mapping[str, Times]) -> dict[str, float]:
     """Total milliseconds of each part that ran."""
-    return {name: 1e3 * sum(times) for name, times in times_s.items() if times}
+    return {name: 1e3 * item.total_s for name, item in times.items() if item.count}
 
 
 def device_name() -> str:

@@ -276,11 +276,11 @@ def test_overlapped_stages_give_the_same_results_in_order(detectors: int, caplog
     assert len(detector.threads) <= max(1, detectors)
     assert (threading.current_thread() in detector.threads) == (detectors == 0)
     for part in ("reading", "perception", "lifting", "merging", "relations"):
-        assert len(together.times_s[part]) == {"reading": 6, "perception": 5, "lifting": 5}.get(
+        assert together.times_s[part].count == {"reading": 6, "perception": 5, "lifting": 5}.get(
             part, 4
         )
     # The time of perception includes that of its detector, wherever that ran.
-    assert sum(together.times_s["perception"]) > sum(together.times_s["masks"]) + 0.002 * 9
+    assert together.times_s["perception"].total_s > together.times_s["masks"].total_s + 0.002 * 9
 
 
 def test_frames_are_not_read_far_ahead_and_reading_ends_with_the_run() -> None:

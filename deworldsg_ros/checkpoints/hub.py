@@ -10,7 +10,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.files import confined, write_atomically
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # Configuration, weights in safetensors (no pickles), preprocessing, licence.
@@ -109,7 +109,7 @@ class Hub:
         """
         sums = []
         for file in model.files:
-            path = folder / file.name
+            path = confined(folder, file.name)
             known = path.is_file() and _matches(path, file.checksum)
             if not known:
                 self._download(model, file, folder)

@@ -38,7 +38,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
-from deworldsg_ros.timing import STAGES, device_name, total_ms
+from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
 
 # Clips that the world model lost.
 FAILURES = ("world_model_error", "nan_features")
@@ -276,22 +276,20 @@ def _print_summary(
         console.print(f"  {options.map_path}  [dim]the map[/]", highlight=False, soft_wrap=True)
 
 
-def _times_ms(times_s: dict[str, list[float]]) -> dict[str, Any]:
+def _times_ms(times_s: dict[str, Times]) -> dict[str, Any]:
     """Mean, median and 95th percentile of each stage, milliseconds per call."""
     return {
         stage: {
-            "mean": round(1e3 * float(np.mean(values)), 3),
-            "median": round(1e3 * float(np.median(values)), 3),
-            "p95": round(1e3 * float(np.percentile(values, 95)), 3),
+            "mean": round(1e3 * item.total_s / item.count, 3),
+            "median": round(1e3 * float(np.median(item.newest_s)), 3),
+            "p95": round(1e3 * float(np.percentile(item.newest_s, 95)), 3),
         }
-        for stage, values in times_s.items()
-        if values
+        for stage, item in times_s.items()
+        if item.count
     }
 
 
-def _print_timings(
-    console: Console, times_s: dict[str, list[float]], frames: int, wall_s: float
-) -> None:
+def _print_timings(console: Console, times_s: dict[str, Times], frames: int, wall_s: float) -> None:
     """Print a table: mean milliseconds per frame, median and 95th percentile per call."""
     times_ms, totals_ms = _times_ms(times_s), total_ms(times_s)
     table = Table(title=f"milliseconds per frame on {device_name()}")

@@ -34,7 +34,7 @@ from deworldsg_ros.evaluation.protocol.labels import translate
 from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
 from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, ScanResult, score_scan
 from deworldsg_ros.evaluation.recorded_room import open_annotations
-from deworldsg_ros.files import together, write_atomically
+from deworldsg_ros.files import confined, together, write_atomically
 from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
@@ -211,9 +211,9 @@ def _evaluate(task: ScanTask, opened: ExitStack) -> ScanOutcome:
         nodes=len(graph.nodes),
         edges=len(graph.edges),
         times_ms={
-            stage: 1e3 * float(np.median(times))
+            stage: 1e3 * float(np.median(times.newest_s))
             for stage, times in pipeline.times_s.items()
-            if times
+            if times.count
         },
         drops=dict(recording.drops + refused + pipeline.drops),
         over_time=over_time,
@@ -268,8 +268,8 @@ def _checkpoint(frames: int, stamp_s: float, result: ScanResult) -> Checkpoint:
 
 
 def _write(task: ScanTask, graph: wire.SceneGraphMessage, measures: Measures) -> None:
-    folder = task.out / task.scan
     try:
+        folder = confined(task.out, task.scan)
         with together(folder, (CONFIG_FILE, GRAPH_FILE, EDGES_FILE)) as staged:
             write_atomically(staged / CONFIG_FILE, to_yaml(task.config))
             write_graph(staged, graph)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
+
+# Removed ids, before those that nobody can ask for are forgotten: kilobytes, and far more than are
+# removed while a frame is remembered.
+PRUNE_ABOVE = 4096
 
 
 @dataclass(frozen=True)
@@ -26,7 +31,7 @@ class IdState:
 class NodeIds:
     """Gives out ids, follows merges, and remembers which node each row of a frame became.
 
-    A removed id costs two integers for the life of the graph.
+    A removed id is forgotten when no remembered frame has it any more.
 
     Args:
         live: contains the ids of the live nodes.
@@ -44,6 +49,7 @@ class NodeIds:
         self._successors = dict(state.successors)
         self._removals = list(state.removals)
         self._frames = dict(state.frames)
+        self._prune_above = PRUNE_ABOVE
 
     @property
     def next_id(self) -> int:
@@ -88,6 +94,18 @@ class NodeIds:
         self._frames[stamp_ns] = tuple(node_ids)
         if len(self._frames) > self._remembered_frames:
             del self._frames[next(iter(self._frames))]
+        if len(self._successors) > self._prune_above:
+            self._prune()
+
+    def _prune(self) -> None:
+        """Forget the removed ids that nobody can ask for."""
+        kept: set[int] = set()
+        for node_id in itertools.chain(self._removals, *self._frames.values()):
+            while node_id in self._successors and node_id not in kept:
+                kept.add(node_id)
+                node_id = self._successors[node_id]
+        self._successors = {old: new for old, new in self._successors.items() if old in kept}
+        self._prune_above = max(PRUNE_ABOVE, 2 * len(kept))
 
     def nodes_of_frame(self, stamp_ns: int) -> list[int] | None:
         """The live node of each row of a frame (0 = removed); None = the frame is forgotten."""

@@ -13,6 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from deworldsg_ros.files import confined
 from deworldsg_ros.relations.clips import Rgb
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -139,7 +140,13 @@ def _read_index(index: Path) -> list[LabelledClip]:
             line = msgspec.json.decode(text, type=_Line)
         except msgspec.MsgspecError as error:
             raise ConfigurationError(f"{index}, line {number}: {error}") from error
-        if not (index.parent / line.clip).is_file():
+        try:
+            path = confined(index.parent, line.clip)
+        except OSError as error:
+            raise ConfigurationError(
+                f"{index}, line {number}: clip '{line.clip}': {error.strerror}"
+            ) from error
+        if not path.is_file():
             raise ConfigurationError(f"{index}, line {number}: there is no clip '{line.clip}'")
         clips.append(_clip(index.parent, line))
     return clips

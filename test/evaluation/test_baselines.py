@@ -351,7 +351,7 @@ def test_a_still_camera_sees_each_object_once(name: str) -> None:
     assert [len(points) for points in prediction.points_world] == [
         len(item.surface_points_m) for item in graph.nodes
     ]
-    assert {stage: len(times) for stage, times in pipeline.times_s.items()} == {
+    assert {stage: times.count for stage, times in pipeline.times_s.items()} == {
         "perception": 4,
         "lifting": 4,
         "merging": 4,

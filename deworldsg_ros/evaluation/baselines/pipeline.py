@@ -16,7 +16,7 @@ from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations
-from deworldsg_ros.timing import timed
+from deworldsg_ros.timing import Times, timed
 
 
 class Baseline(Protocol):
@@ -58,8 +58,8 @@ class BaselinePipeline:
 
     def __init__(self, baseline: Baseline, perceiver: Perceiver) -> None:
         self.drops: Counter[str] = Counter()
-        self.times_s: dict[str, list[float]] = {
-            name: [] for name in ("perception", "lifting", "merging")
+        self.times_s: dict[str, Times] = {
+            name: Times() for name in ("perception", "lifting", "merging")
         }
         watch_parts(perceiver, self.times_s)
         self._baseline = baseline

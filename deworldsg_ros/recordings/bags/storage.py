@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from rosbags.rosbag2 import Reader, ReaderError
 
+from deworldsg_ros.files import confined
 from deworldsg_ros.recordings.bags.salvage_mcap import salvage_mcap
 from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
 from deworldsg_ros.recordings.errors import RecordingError
@@ -59,6 +60,7 @@ class RawBag:
         self.path = path
         self.losses: list[str] = []
         self._reader: Reader | None = None
+        _check_links(path)
         try:
             reader = Reader(path)
             reader.open()
@@ -162,6 +164,16 @@ def storage_files(folder: Path) -> list[Path]:
     )
     bags = {(re.sub(r"_\d+$", "", file.stem), file.suffix) for file in found}
     return found if len(bags) == 1 else []
+
+
+def _check_links(folder: Path) -> None:
+    """Raise RecordingError if a file of a bag is a link to another place."""
+    if folder.is_dir():
+        for file in folder.iterdir():
+            try:
+                confined(folder, file.name)
+            except OSError as error:
+                raise RecordingError(f"recording {file}: {error.strerror}") from error
 
 
 def _one_line(error: BaseException) -> str:

@@ -172,7 +172,9 @@ class Annotations:
         return self.scan_folder(scan) / (ALIGNED_PLY_NAME if aligned else PLY_NAME)
 
     def scan_folder(self, scan: str) -> Path:
-        """Folder of a scan."""
+        """Folder of a scan; raises RecordingError if the id is no name of a folder."""
+        if scan in ("", ".", "..") or "/" in scan or "\0" in scan:
+            raise RecordingError(f"scan '{scan}': expected the name of a folder in data/")
         return self.root / "data" / scan
 
     def ground_truth(self, scan: str) -> dict[str, Any] | None:

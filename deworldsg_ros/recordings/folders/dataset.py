@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.files import confined
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
@@ -104,17 +105,25 @@ class Dataset(ABC):
         """Nothing to close: files are open only while they are read."""
 
 
-def read_file(path: Path) -> bytes:
-    """Content of a file; raises RecordingError if it cannot be read."""
+def read_file(path: Path, folder: Path | None = None) -> bytes:
+    """Content of a file of a data set.
+
+    Args:
+        path: of the file.
+        folder: folder in which it has to lie, with all links followed; None = its own.
+
+    Raises:
+        RecordingError: if it cannot be read, or lies elsewhere.
+    """
     try:
-        return path.read_bytes()
+        return confined(folder or path.parent, path.absolute()).read_bytes()
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file; raises RecordingError."""
-    return decode_image(read_file(path), cv2.IMREAD_COLOR, path).shape[1::-1]
+def image_size(path: Path, folder: Path | None = None) -> tuple[int, int]:
+    """Width and height of an image file; arguments and errors as `read_file`."""
+    return decode_image(read_file(path, folder), cv2.IMREAD_COLOR, path).shape[1::-1]
 
 
 def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from deworldsg_ros.recordings import messages as ros
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset
+from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, read_file
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
@@ -140,8 +140,8 @@ def color_files(folder: Path) -> dict[int, Path]:
 def read_pose(path: Path) -> Float64:
     """The (4, 4) matrix of a pose file; raises RefusedInput ``invalid_pose``."""
     try:
-        T = np.array(path.read_text().split(), np.float64).reshape(4, 4)
-    except (OSError, ValueError) as error:
+        T = np.array(read_file(path).decode().split(), np.float64).reshape(4, 4)
+    except (RecordingError, ValueError) as error:
         raise RefusedInput("invalid_pose", f"{path}: {error}; expected a 4x4 matrix") from error
     check_pose(T)
     # The printed decimals are only nearly a rotation. The message has a quaternion, so use it here.

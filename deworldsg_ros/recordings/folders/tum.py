@@ -66,7 +66,7 @@ class TumRgbd(Dataset):
         self._rgb = _read_index(path / "rgb.txt", 1)
         self._depth = _read_index(path / "depth.txt", 1)
         self._poses = _read_index(path / "groundtruth.txt", 7)
-        size = image_size(path / self._rgb[0].values[0])
+        size = image_size(path / self._rgb[0].values[0], path)
         self.intrinsics = Intrinsics(*(options.intrinsics or self._known_intrinsics()), *size)
         self.frame_count = len(self._rgb)
         self.topics = {
@@ -108,12 +108,14 @@ class TumRgbd(Dataset):
         path = self.path / entry.values[0]
         return [
             ros.camera_info(entry.stamp_ns, CAMERA_FRAME, self.intrinsics),
-            ros.compressed_image(entry.stamp_ns, CAMERA_FRAME, read_file(path), image_format(path)),
+            ros.compressed_image(
+                entry.stamp_ns, CAMERA_FRAME, read_file(path, self.path), image_format(path)
+            ),
         ]
 
     def _depth_messages(self, entry: Entry) -> list[RoleMessage]:
         path = self.path / entry.values[0]
-        units = decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path)
+        units = decode_image(read_file(path, self.path), cv2.IMREAD_UNCHANGED, path)
         if units.dtype != np.uint16 or units.ndim != 2:
             raise RecordingError(f"{path} is {units.dtype}: expected 16-bit grey")
         # 5000 units are one metre. Rounding to millimetres is far below the noise of the sensor.
