@@ -52,6 +52,8 @@ WINDOW_FRAMES = 2
 SETTLE_S = 1.0
 # Longest delay of evidence after the last local graph.
 EVIDENCE_QUIET_S = 3.0
+# Between two looks at which nodes are there; a look takes milliseconds.
+LOOK_PERIOD_S = 1.0
 # Compiling the kernels for the first frame takes minutes on a small machine.
 FIRST_RESULT_S = 300.0
 
@@ -99,6 +101,8 @@ class PipelineMonitor:
         self._refused_frames = 0
         self._complete_since_s: float | None = None
         self._progress_s: float | None = None
+        self._own_pace = False
+        self._looked_s = 0.0
         node.create_subscription(String, "deworldsg/local_graph", self._on_local, reliable(50))
         node.create_subscription(
             String, "deworldsg/relation_evidence", self._on_evidence, reliable(50)
@@ -121,17 +125,36 @@ class PipelineMonitor:
             self._complete_since_s = now_s
         return [] if now_s - self._complete_since_s >= SETTLE_S else ["discovery to settle"]
 
-    def give_up_after(self, stall_s: float, now_s: float) -> None:
-        """Stop waiting for the frames in flight after `stall_s` without a result."""
-        if not self.window.results:
-            stall_s = max(stall_s, FIRST_RESULT_S)
-        if self.silent_for(now_s) > stall_s:
+    def has_to_wait(self, stall_s: float, now_s: float) -> bool:
+        """Whether the next frame waits for results of the frames in flight.
+
+        If a node has gone, or there was no result for `stall_s`, the replay keeps its own pace and
+        waits for nothing, until there is a result again.
+        """
+        if not self.window.is_full:
+            return False
+        if not self._own_pace:
+            stall_s = stall_s if self.window.results else max(stall_s, FIRST_RESULT_S)
+            problem = self._gone(now_s)
+            if self.silent_for(now_s) > stall_s:
+                problem = f"no local graph for {stall_s:g} s"
+            if not problem:
+                return True
+            self._own_pace = True
             self._node.get_logger().warning(
-                f"no local graph for {stall_s:g} s: stopped waiting for {self.window.in_flight} "
-                "frames; the log of each node has the cause"
+                f"{problem}: stopped waiting for {self.window.in_flight} frames, and replaying at "
+                "its own pace until there are results again; the log of each node has the cause"
             )
-            self.window.give_up()
-            self._progress_s = now_s
+        self.window.give_up()
+        return False
+
+    def _gone(self, now_s: float) -> str:
+        """What a node that has ended leaves missing, in words; "" = nothing."""
+        if now_s < self._looked_s + LOOK_PERIOD_S:
+            return ""
+        self._looked_s = now_s
+        missing = self._missing_between()
+        return f"waiting for {missing[0]}" if missing else ""
 
     def silent_for(self, now_s: float) -> float:
         """Seconds since the last progress, or since the first call after it."""
@@ -187,6 +210,7 @@ class PipelineMonitor:
         self.poses.append(local.T_world_camera)
         self._local_graphs += 1
         self._progress_s = None
+        self._own_pace = False
         self.window.add_result(wire.ns_from_stamp(local.stamp))
 
     def _on_evidence(self, message: Any) -> None:

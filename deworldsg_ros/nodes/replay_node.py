@@ -194,8 +194,11 @@ class ReplayNode(Node):
             now_s = time.monotonic()
         self._spin(0.0)
         # The other messages of a frame surround its RGB image, so only the image has to wait.
-        while message.role is Role.RGB and not alone and self._monitor.window.is_full:
-            self._monitor.give_up_after(STALL_S, time.monotonic())
+        while (
+            message.role is Role.RGB
+            and not alone
+            and self._monitor.has_to_wait(STALL_S, time.monotonic())
+        ):
             self._spin(SPIN_PERIOD_S)
             self._emit_progress()
         self._pace.late(time.monotonic() - now_s)

@@ -1,0 +1,92 @@
+"""A replay waits for a pipeline that works, and keeps its own pace without one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
+from std_msgs.msg import String
+from support.nodes_bench import local_graph
+
+from deworldsg_ros.nodes.replay_monitor import (
+    BETWEEN,
+    FIRST_RESULT_S,
+    LISTENERS,
+    WINDOW_FRAMES,
+    PipelineMonitor,
+)
+from deworldsg_ros.scene import wire
+
+STALL_S = 30.0
+
+
+class FakeNode(MagicMock):
+    """Answers discovery: all nodes but `gone`."""
+
+    gone: tuple[str, ...] = ()
+
+    def resolve_topic_name(self, topic):
+        return topic
+
+    def _infos(self, names):
+        return [SimpleNamespace(node_name=name) for name in names if name not in self.gone]
+
+    def get_publishers_info_by_topic(self, topic):
+        return self._infos(BETWEEN[topic][0])
+
+    def get_subscriptions_info_by_topic(self, topic):
+        return self._infos(BETWEEN[topic][1])
+
+
+def monitor_with_full_window(first_ns=1):
+    node = FakeNode()
+    monitor = PipelineMonitor(node, odometry=False)
+    fill(monitor, first_ns)
+    return node, monitor
+
+
+def fill(monitor, first_ns):
+    for stamp_ns in range(first_ns, first_ns + WINDOW_FRAMES):
+        monitor.window.publish(stamp_ns)
+        for role in LISTENERS:
+            monitor.window.passed(role, stamp_ns)
+    assert monitor.window.is_full
+
+
+def result(monitor, stamp_ns):
+    monitor._on_local(String(data=wire.encode(local_graph(stamp_ns))))
+
+
+def test_it_waits_for_nodes_that_work():
+    _, monitor = monitor_with_full_window()
+    assert monitor.has_to_wait(STALL_S, 100.0)
+    assert monitor.has_to_wait(STALL_S, 100.0 + FIRST_RESULT_S)
+    result(monitor, 1)
+    assert not monitor.has_to_wait(STALL_S, 500.0)  # there is room
+
+
+def test_without_results_it_waits_once_and_then_keeps_its_pace_until_there_are_some():
+    node, monitor = monitor_with_full_window()
+    result(monitor, 1)
+    fill(monitor, 10)
+    assert monitor.has_to_wait(STALL_S, 100.0)
+    assert not monitor.has_to_wait(STALL_S, 131.0)
+    for first_ns in (20, 30, 40):
+        fill(monitor, first_ns)
+        assert not monitor.has_to_wait(STALL_S, 131.0 + first_ns / 1000)
+    assert monitor.window.given_up == 5 * WINDOW_FRAMES - 1
+    assert node.get_logger().warning.call_count == 1
+    fill(monitor, 50)
+    result(monitor, 50)
+    fill(monitor, 60)
+    assert monitor.has_to_wait(STALL_S, 140.0)
+
+
+def test_a_node_that_is_gone_is_not_waited_for():
+    node, monitor = monitor_with_full_window()
+    node.gone = ("lifting_node",)
+    assert not monitor.has_to_wait(STALL_S, 100.0)
+    (sentence,) = node.get_logger().warning.call_args.args
+    assert sentence.startswith(
+        "waiting for lifting_node to listen to deworldsg/frame_graph: stopped"
+    )
