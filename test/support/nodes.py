@@ -75,6 +75,11 @@ class NodeProcess:
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log
 
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
     def wait(self, limit_s: float) -> int:
         """Wait for the end of the process; returns its exit code."""
         return self._process.wait(limit_s)
@@ -181,6 +186,10 @@ class Camera:
             limit_s,
             "the nodes to subscribe to the camera",
         )
+
+    def publish(self, message: RawRoleMessage, data: bytes) -> None:
+        """Publish serialized data on the topic of a message."""
+        self._publishers[message.role].publish(data)
 
     def frames(self) -> Iterator[int]:
         """Publish one frame after the other. Yields the stamp of a frame after its messages."""

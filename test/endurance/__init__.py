@@ -1,0 +1,1 @@
+"""Long runs and crashes: `scripts/soak`, `scripts/crash`, and the tests that run a part of them."""

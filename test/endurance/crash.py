@@ -1,0 +1,125 @@
+"""`python -m endurance.crash [KILLS]`: kill -9 of the nodes at random moments of a replay."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.map_file import previous_of, read_map
+from deworldsg_ros.scene.errors import ConfigurationError
+from endurance.rig import NODES, Rig
+
+# A node is restarted at once. The graph has to be updated again within this time after the node is
+# ready, in most cases: on a busy machine a single frame can take longer.
+WHOLE_WITHIN_S = 5.0
+PATIENCE_S = 30.0
+# Importing, compiled kernels from their cache, weights: on a busy machine with two cores.
+START_LIMIT_S = 120.0
+FIRST_GRAPH_S = 60.0
+# Between two kills.
+LONGEST_LIFE_S = 8.0
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What a kill cost.
+
+    Attributes:
+        node: name of the killed node.
+        start_s: from the restart until the node is ready.
+        whole_s: from then until the graph is updated again.
+        problem: what was lost, in words; "" = nothing.
+    """
+
+    node: str
+    start_s: float
+    whole_s: float
+    problem: str = ""
+
+
+def kill_and_restart(rig: Rig, name: str) -> Recovery:
+    """Kill a node, start it again, and wait until the graph is updated."""
+    rig.kill(name)
+    kept = kept_nodes(rig) if name == "graph_node" else {}
+    if name == "graph_node":
+        rig.graph = None
+    started_s = time.monotonic()
+    rig.start(name)
+    process = rig.processes[name]
+    if not rig.run(lambda: "ready" in process.log or not process.alive, START_LIMIT_S):
+        return Recovery(name, START_LIMIT_S, 0.0, "not ready")
+    if not process.alive:
+        return Recovery(name, 0.0, 0.0, f"ended: {process.log[-300:]}")
+    ready_s = time.monotonic()
+    before = rig.updates
+    whole = rig.run(lambda: rig.updates > before and rig.graph is not None, PATIENCE_S)
+    whole_s = time.monotonic() - ready_s
+    problem = "" if whole else f"the graph is not updated in {PATIENCE_S:g} s"
+    if name == "graph_node" and rig.graph is not None:
+        found = {node.id: node.label for node in rig.graph.nodes}
+        lost = sorted(set(kept) - set(found))
+        # A node can be merged into another, or be seen to be gone, before the first whole graph.
+        if len(lost) > 0.1 * len(kept):
+            problem = f"ids {lost} of {len(kept)} are lost"
+    return Recovery(name, ready_s - started_s, whole_s, problem)
+
+
+def kept_nodes(rig: Rig) -> dict[int, int]:
+    """Observations by id of the nodes in the last checkpoint; empty before the first."""
+    if not rig.map_path.exists():
+        return {}
+    try:
+        graph = read_map(Config(), rig.map_path).graph
+    except ConfigurationError:
+        # A kill never breaks it: the test fails by what follows.
+        graph = read_map(Config(), previous_of(rig.map_path)).graph
+    return dict(zip(graph.nodes.ids.tolist(), graph.nodes.observations.tolist()))
+
+
+def crash(kills: int, folder: Path, seed: int = 0) -> list[Recovery]:
+    """Kill nodes at random moments; each node at least once if there are enough kills."""
+    random = np.random.default_rng(seed)
+    rig = Rig(folder)
+    recoveries = []
+    try:
+        rig.start_all()
+        assert rig.run(lambda: rig.graph is not None and len(rig.graph.nodes) > 2, FIRST_GRAPH_S)
+        for kill in range(kills):
+            end_s = time.monotonic() + random.uniform(0.2, LONGEST_LIFE_S)
+            rig.run(lambda end_s=end_s: time.monotonic() > end_s, 2 * LONGEST_LIFE_S)  # type: ignore[misc]
+            name = NODES[-1 - kill % 4] if kill < 4 else str(random.choice(NODES))
+            recoveries.append(kill_and_restart(rig, name))
+            print(recoveries[-1], flush=True)
+        assert not list(folder.glob(".deworldsg-*.ready"))
+    finally:
+        rig.close()
+    return recoveries
+
+
+def main() -> int:
+    """Returns 1 if a kill cost more than it may."""
+    parser = argparse.ArgumentParser(prog="scripts/crash", description=__doc__)
+    parser.add_argument("kills", nargs="?", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        recoveries = crash(options.kills, Path(folder), options.seed)
+    problems = [item for item in recoveries if item.problem]
+    times_s = [item.whole_s for item in recoveries]
+    print(
+        f"{len(recoveries)} kills, {len(problems)} problems; updated again after "
+        f"{np.median(times_s):.1f} s (median), {max(times_s):.1f} s (most); ready after "
+        f"{np.median([item.start_s for item in recoveries]):.1f} s (median)"
+    )
+    return 1 if problems or np.median(times_s) > WHOLE_WITHIN_S else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,149 @@
+"""Four node processes, and a camera that repeats a recording for ever with stamps that grow."""
+
+from __future__ import annotations
+
+import os
+import signal
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from diagnostic_msgs.msg import DiagnosticArray
+from support.nodes import ROOT, Camera, NodeProcess, Peer
+
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.recording import open_source
+from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene import wire
+
+NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
+RECORDING = ROOT / "bags" / "demo_room"
+MAP_PERIOD_S = 1.0
+# Frames that may wait for their results, while there are results at all.
+WINDOW_FRAMES = 3
+SILENCE_S = 1.0
+# In the CDR encoding, the stamp of the header is the first field after the four bytes of its kind.
+STAMP = struct.Struct("<iI")
+STAMP_AT = 4
+
+
+class Rig:
+    """The nodes and their camera.
+
+    Args:
+        folder: for logs, the map and everything the nodes write.
+
+    Attributes:
+        processes: by name.
+        map_path: of graph_node.
+        graph: the newest whole graph; None before the first.
+        updates: number of updates so far.
+        values: newest diagnostics of each node, by its name.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.map_path = folder / "room.map"
+        self.peer = Peer("endurance")
+        self.graph: wire.SceneGraphMessage | None = None
+        self.updates = 0
+        self.values: dict[str, dict[str, str]] = {}
+        self._texts = self.peer.collect("/scene_graph", 1, latched=True)
+        self._update_texts = self.peer.collect("/scene_graph/updates")
+        self.peer.node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_diagnostics, reliable(50)
+        )
+        source = open_source(RECORDING)
+        self._messages = list(source.raw_messages())
+        source.close()
+        self._camera = Camera(self.peer, self._messages)
+        self._first_ns = self._messages[0].stamp_ns
+        self._length_ns = self._messages[-1].stamp_ns - self._first_ns + 10**8
+        self._next = 0
+        self._started_s = self._last_s = 0.0
+        self._results = self.peer.collect("deworldsg/local_graph")
+        self._in_flight = 0
+        self._result_s = 0.0
+        self.processes: dict[str, NodeProcess] = {}
+
+    def start(self, name: str) -> None:
+        """Start a node; does not wait for it."""
+        values = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
+        arguments = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
+        folder = self._folder / str(time.monotonic_ns())
+        folder.mkdir(parents=True)
+        self.processes[name] = NodeProcess(name, folder, "--ros-args", *arguments)
+
+    def start_all(self) -> None:
+        """Start all nodes and wait until they are ready."""
+        for name in NODES:
+            self.start(name)
+        for process in self.processes.values():
+            process.wait_ready()
+        self._camera.wait_for_subscribers()
+        self._started_s = self._last_s = time.monotonic()
+
+    def kill(self, name: str) -> None:
+        """Kill a node as the operating system does: without a word."""
+        process = self.processes[name]
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(10)
+
+    def run(self, until: Callable[[], bool], limit_s: float) -> bool:
+        """Publish frames at their pace until a condition is true; False at the limit."""
+        end_s = time.monotonic() + limit_s
+        while not until():
+            if time.monotonic() > end_s:
+                return False
+            self._publish_due()
+            self.peer.spin_for(0.01)
+            self._read()
+        return True
+
+    def close(self) -> None:
+        """End the nodes."""
+        for process in self.processes.values():
+            process.end()
+        self.peer.close()
+
+    def _publish_due(self) -> None:
+        """Publish what is due. A slow machine gets fewer frames, as with replay_node."""
+        now_s = time.monotonic()
+        if self._in_flight >= WINDOW_FRAMES and now_s - self._result_s < SILENCE_S:
+            self._started_s += now_s - self._last_s  # the clock of the recording stands still
+        self._last_s = now_s
+        while True:
+            round_, index = divmod(self._next, len(self._messages))
+            message = self._messages[index]
+            due_ns = message.stamp_ns - self._first_ns + round_ * self._length_ns
+            if due_ns > (now_s - self._started_s) * 1e9:
+                return
+            self._camera.publish(message, shifted(message, round_ * self._length_ns))
+            self._in_flight += message.role is Role.RGB
+            self._next += 1
+
+    def _read(self) -> None:
+        self.updates += len(self._update_texts)
+        self._update_texts.clear()
+        if self._results:
+            self._results.clear()
+            # A result also ends the frames before it.
+            self._in_flight, self._result_s = 0, time.monotonic()
+        if self._texts:
+            self.graph = wire.decode(self._texts[-1], wire.SceneGraphMessage)
+            self._texts.clear()
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            name = status.name.split(":")[0]
+            self.values[name] = {item.key: item.value for item in status.values}
+
+
+def shifted(message: RawRoleMessage, by_ns: int) -> bytes:
+    """The serialized message with a later stamp."""
+    data = bytearray(message.data)
+    sec, nanosec = divmod(message.stamp_ns + by_ns, 10**9)
+    STAMP.pack_into(data, STAMP_AT, sec, nanosec)
+    return bytes(data)

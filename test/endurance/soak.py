@@ -1,0 +1,213 @@
+"""`python -m endurance.soak [MINUTES]`: memory and times of long runs.
+
+Three parts: the nodes with an endless replay; the graph under a camera that stands still; the graph
+of a robot that goes through many rooms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from support.merging import VOCABULARY
+from support.surfaces import CHAIR, CUP, TABLE, frame, slab
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from endurance.rig import NODES, Rig
+
+# Models, kernels, buffers and the graph of the room are there after this time.
+SETTLE_S = 120.0
+SAMPLE_PERIOD_S = 1.0
+MAX_SLOPE_MB_PER_H = 1.0
+# A slope over less time is noise: one allocation of 0.2 MB in ten minutes is more than the limit.
+LEAST_SLOPE_S = 1800.0
+# Of the last tenth of the frames, by that of the first, after the graph is complete.
+MAX_SLOWER = 1.5
+ROOM_FRAMES = 8
+# Of the graph, for its clients: three a second at 30 Hz.
+FRAMES_PER_UPDATE = 10
+ROOM_DISTANCE_M = 20.0
+
+
+@dataclass
+class Series:
+    """Memory of a process over time: seconds, and megabytes."""
+
+    times_s: list[float] = field(default_factory=list)
+    rss_mb: list[float] = field(default_factory=list)
+
+    def add(self, time_s: float, rss_mb: float) -> None:
+        """Add a sample."""
+        self.times_s.append(time_s)
+        self.rss_mb.append(rss_mb)
+
+    def settled(self, settle_s: float) -> Series:
+        """The samples after a time."""
+        first = int(np.searchsorted(self.times_s, settle_s))
+        return Series(self.times_s[first:], self.rss_mb[first:])
+
+    def slope_mb_per_h(self) -> float:
+        """Median slope between samples that are half of the time apart (as Theil and Sen)."""
+        half = len(self.times_s) // 2
+        times_s, rss_mb = np.array(self.times_s), np.array(self.rss_mb)
+        if half < 1:
+            return 0.0
+        later, earlier = slice(half, 2 * half), slice(0, half)
+        slopes = (rss_mb[later] - rss_mb[earlier]) / (times_s[later] - times_s[earlier])
+        return float(3600 * np.median(slopes))
+
+
+@dataclass(frozen=True)
+class Times:
+    """Milliseconds per frame of the first and the last tenth, and the growth of the memory."""
+
+    name: str
+    frames: int
+    first_ms: float
+    last_ms: float
+    grown_mb: float
+
+    @property
+    def slower(self) -> float:
+        """How much slower the last frames are."""
+        return self.last_ms / self.first_ms
+
+
+def rss_mb(pid: int | str = "self") -> float:
+    """Resident memory of a process."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def replay(minutes: float, folder: Path) -> tuple[dict[str, Series], Series]:
+    """Memory of each node during an endless replay, and latency of graph_node as a series."""
+    rig = Rig(folder)
+    memory = {name: Series() for name in NODES}
+    latencies = Series()
+    try:
+        rig.start_all()
+        started_s = time.monotonic()
+        while (now_s := time.monotonic() - started_s) < 60 * minutes:
+            for name, process in rig.processes.items():
+                assert process.alive, process.log[-500:]
+                memory[name].add(now_s, rss_mb(process.pid))
+            latency_ms = rig.values.get("graph_node", {}).get("latency mean ms")
+            if latency_ms is not None:
+                latencies.add(now_s, float(latency_ms))
+            next_s = time.monotonic() + SAMPLE_PERIOD_S
+            rig.run(lambda next_s=next_s: time.monotonic() > next_s, 10)  # type: ignore[misc]
+    finally:
+        rig.close()
+    return memory, latencies
+
+
+def room(offset_m: float) -> list[tuple[np.ndarray, int]]:
+    """Objects of a room: a table, a mug on it and a chair."""
+    shapes = [
+        ((0.0, 0.0, 1.0), (1.2, 0.8, 0.04), TABLE),
+        ((0.2, 0.1, 0.95), (0.08, 0.08, 0.08), CUP),
+        ((1.2, 0.0, 1.0), (0.4, 0.5, 0.4), CHAIR),
+    ]
+    shift = np.array([offset_m, 0.0, 0.0], np.float32)
+    return [(slab(centre, size) + shift, kind) for centre, size, kind in shapes]
+
+
+def still(count: int) -> Iterator[LocalGraph]:
+    """Frames of a camera that stands still."""
+    objects = room(0.0)
+    for stamp in range(1, count + 1):
+        yield frame(stamp, *objects)
+
+
+def rooms(count: int) -> Iterator[LocalGraph]:
+    """Frames of a camera that goes from room to room."""
+    stamp = 0
+    for number in range(count):
+        T_world_camera = np.eye(4)
+        T_world_camera[0, 3] = ROOM_DISTANCE_M * number
+        objects = room(ROOM_DISTANCE_M * number)
+        for _ in range(ROOM_FRAMES):
+            stamp += 1
+            yield frame(stamp, *objects, T_world_camera=T_world_camera)
+
+
+def merge(name: str, frames: Iterator[LocalGraph], settle: int) -> Times:
+    """Merge frames and make updates of the graph; `settle` frames are not measured."""
+    builder = GraphBuilder(Config(), VOCABULARY, "world")
+    times_ms = []
+    before_mb = 0.0
+    for index, local in enumerate(frames):
+        if index == settle:
+            before_mb = rss_mb()
+        started_s = time.thread_time()
+        builder.integrate(local)
+        if index % FRAMES_PER_UPDATE == 0:
+            builder.update()
+        times_ms.append(1e3 * (time.thread_time() - started_s))
+    measured = np.array(times_ms[settle:])
+    tenth = max(1, len(measured) // 10)
+    return Times(
+        name,
+        len(measured),
+        float(np.median(measured[:tenth])),
+        float(np.median(measured[-tenth:])),
+        rss_mb() - before_mb,
+    )
+
+
+def main() -> int:
+    """Returns 1 if the memory or the times grow."""
+    parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__.splitlines()[0])
+    parser.add_argument("minutes", nargs="?", type=float, default=60.0, help="of replay; 0 = none")
+    parser.add_argument("--frames", type=int, default=100_000, help="of the still camera")
+    parser.add_argument("--rooms", type=int, default=300)
+    options = parser.parse_args()
+    problems = []
+    parts: list[Callable[[], Times]] = [
+        lambda: merge("still camera", still(options.frames), settle=1000),
+        lambda: merge("rooms", rooms(options.rooms), settle=10 * ROOM_FRAMES),
+    ]
+    for part in parts:
+        times = part()
+        print(
+            f"{times.name}: {times.frames} frames, {times.first_ms:.2f} ms a frame at first, "
+            f"{times.last_ms:.2f} ms at the end; memory grew by {times.grown_mb:.1f} MB",
+            flush=True,
+        )
+        if times.slower > MAX_SLOWER:
+            problems.append(f"{times.name}: {times.slower:.1f} times slower")
+    if options.minutes:
+        with tempfile.TemporaryDirectory() as folder:
+            memory, latencies = replay(options.minutes, Path(folder))
+        settle_s = min(SETTLE_S, 20 * options.minutes)
+        for name, series in memory.items():
+            settled = series.settled(settle_s)
+            slope = settled.slope_mb_per_h()
+            print(f"{name}: {settled.rss_mb[-1]:.0f} MB, {slope:+.2f} MB an hour")
+            if 60 * options.minutes >= LEAST_SLOPE_S and slope > MAX_SLOPE_MB_PER_H:
+                problems.append(f"{name} grows by {slope:.2f} MB an hour")
+        settled = latencies.settled(settle_s)
+        third = max(1, len(settled.rss_mb) // 3)
+        first_ms, last_ms = (
+            np.median(settled.rss_mb[part]) for part in (slice(third), slice(-third, None))
+        )
+        print(f"graph_node: latency {first_ms:.1f} ms at first, {last_ms:.1f} ms at the end")
+        if last_ms > MAX_SLOWER * first_ms + 1.0:
+            problems.append("the latency of graph_node grows")
+    for problem in problems:
+        print("problem:", problem)
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
