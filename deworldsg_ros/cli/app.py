@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import ask, exchange, probe
+from deworldsg_ros.cli import ask, exchange, mcp, probe
 from deworldsg_ros.cli import models as models_command
 from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
@@ -338,6 +338,7 @@ for parent, function, summary in (
     (app, ask.query, "Ask a scene graph in words."),
     (app, ask.goal, "Print a pose from which an object is in view."),
     (app, ask.explain, "Explain an object, a relation or a class."),
+    (app, mcp.mcp, "Serve a scene graph to an LLM agent (MCP)."),
     (app, exchange.export, "Write a scene graph in another format."),
     (app, exchange.diff, "List what differs between two scene graphs."),
     (app, exchange.merge, "Merge two scene graphs into one."),

@@ -1,0 +1,112 @@
+"""The MCP server, asked by the package's own client in a process of its own; and its tools."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import typer.testing
+from support.cli import COMMAND, ROOT
+
+from deworldsg_ros.cli.app import app
+from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client.tools import GraphTools, WatchedFile
+from deworldsg_ros.scene import wire
+
+TOOLS = {
+    "list_objects", "list_relations", "find", "get_object_context", "what_changed", "goal_near",
+}  # fmt: skip
+
+
+def test_an_agent_asks_over_stdio(demo_out: Path) -> None:
+    mcp = pytest.importorskip("mcp")
+    if not hasattr(mcp, "Client"):
+        pytest.skip("mcp is older than version 2")
+    server = mcp.StdioServerParameters(
+        command=COMMAND[0],
+        args=[*COMMAND[1:], "mcp", str(demo_out)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])},
+    )
+
+    async def talk() -> None:
+        async with mcp.Client(server) as client:
+
+            async def ask(name: str, **arguments: Any) -> dict[str, Any]:
+                result = await client.call_tool(name, arguments)
+                assert not result.is_error, result.content
+                return json.loads(result.content[0].text)
+
+            listed = (await client.list_tools()).tools
+            assert {tool.name for tool in listed} == TOOLS
+            assert all("Args:" in (tool.description or "") for tool in listed)
+            cups = await ask("list_objects", label="cup")
+            assert [item["id"] for item in cups["objects"]] == [13, 40]
+            found = await ask("find", question="cup on dining table")
+            assert found["answers"][0]["object"]["label"] == "cup"
+            assert found["answers"][0]["sure"] is True
+            related = await ask("list_relations", subject="13", predicate="on")
+            assert related["relations"][0]["text"] == "cup #13 on dining table #5"
+            context = await ask("get_object_context", object="cup")
+            assert "exists with" in context["explanation"]
+            goal = await ask("goal_near", object="13", distance_m=0.8)
+            assert goal["distance_m"] == pytest.approx(0.8)
+            changed = await ask("what_changed", seconds_ago=5.0)
+            assert "starts when this server started" in changed["note"]
+            refused = await client.call_tool("goal_near", {"object": "elephant"})
+            assert refused.is_error
+            assert "no object of class 'elephant'" in refused.content[0].text
+
+    asyncio.run(asyncio.wait_for(talk(), 90))
+
+
+def test_changes_are_told_from_the_first_question_on(room: SceneGraph) -> None:
+    later = msgspec.structs.replace(
+        room.message,
+        nodes=room.message.nodes[1:],
+        stamp=wire.stamp_from_ns(room.stamp_ns + 10**10),
+    )
+    graphs = [room, SceneGraph(later)]
+    tools = GraphTools(lambda: graphs[0])
+    assert tools.list_objects(limit=3)["count"] == 34
+    del graphs[0]
+    changed = tools.what_changed(10.0)
+    assert "note" not in changed
+    assert [item["label"] for item in changed["gone"]] == ["bottle"]
+    assert tools.what_changed(1.0)["compared_with_s"] == room.stamp_ns / 1e9
+    assert "note" in tools.what_changed(1000.0)
+
+
+def test_empty_and_unknown_arguments(room: SceneGraph) -> None:
+    tools = GraphTools(lambda: room)
+    assert "never detected" in str(tools.get_object_context("elephant")) or "hidden" in str(
+        tools.get_object_context("elephant")
+    )
+    with pytest.raises(ClientError, match="expected an id or a class"):
+        tools.goal_near(" ")
+    assert tools.list_relations(limit=0)["relations"] == []
+
+
+def test_a_file_is_read_again_when_it_changes(demo_out: Path, room: SceneGraph) -> None:
+    watched = WatchedFile(demo_out)
+    first = watched()
+    assert watched() is first
+    path = demo_out / "scene_graph.json"
+    path.write_text("{ half")
+    assert watched() is first
+    path.write_text(wire.encode(msgspec.structs.replace(room.message, nodes=[], edges=[])))
+    assert len(watched()) == 0
+    path.unlink()
+    assert len(watched()) == 0
+
+
+def test_what_to_serve_has_to_be_said(demo_out: Path) -> None:
+    for arguments in (["mcp"], ["mcp", str(demo_out), "--live"]):
+        result = typer.testing.CliRunner().invoke(app, arguments)
+        assert result.exit_code == 2
+        assert "a graph or --live" in result.stderr
