@@ -5,25 +5,33 @@ The equation is defined on sorted depths. Sorting is expensive, and almost never
 1. Depths are counted in buckets that are narrower than half of the smallest possible threshold. A
    larger step leaves an empty bucket.
 2. Runs of non-empty buckets are the *blocks*. Clusters are cut between blocks only. The lowest and
-   highest depth of each block give the exact step.
+   highest depth of each block give the exact step. Depths with very many blocks are sorted.
 3. d_ref is found in the bucket that contains it.
 4. median(Δz) needs the sorted depths, but only if it can matter. At least half of the N - 1 steps
    are as large as their median, and all steps sum to the range: median(Δz) <= 2 range / (N - 1).
 
-All arithmetic is float64 on float32 depths, as in the definition. Sums are compensated, so the
-means do not depend on the order of the pixels.
+All arithmetic is float64 on float32 depths, as in the definition. Means come from integer sums, so
+they do not depend on the order of the pixels. The loops over all pixels have no branches and no
+dependent steps where possible, so that the compiler makes vector instructions of them.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt16
 
-# With more buckets, sorting is faster.
-MAX_BUCKETS = 1 << 16
+# With more buckets, sorting is faster; and the index of a bucket is 16 bits long.
+MAX_BUCKETS = (1 << 16) - 2
 MIN_BUCKETS = 64
+# Each gap between blocks is a pass over all depths; from about this number on, sorting is faster.
+MAX_GAPS = 32
+# Neighbouring pixels often fall into one bucket. So that their counts do not wait for one another,
+# they are counted in turn in this number of tables.
+COUNT_TABLES = 4
 
 
 def dominant_layer(
@@ -58,22 +66,62 @@ def _extremes(depths: Float32) -> tuple[float, float]:
 
 
 @kernel
-def _bucket_counts(depths: Float32, lowest: float, scale: float, buckets: int) -> Int64:
-    """Number of depths in each bucket.
+def _buckets(depths: Float32, lowest: float, scale: float, count: int) -> UInt16:
+    """Bucket of each depth.
 
     int((depth - lowest) * scale) is monotone in the depth, even with rounding. So buckets are
     ordered and never overlap.
     """
-    counts = np.zeros(buckets, np.int64)
-    last = np.uint64(buckets - 1)
+    buckets = np.empty(depths.size, np.uint16)
+    last = np.int32(count - 1)
     for index in range(depths.size):
-        counts[min(np.uint64((np.float64(depths[index]) - lowest) * scale), last)] += 1
+        bucket = np.int32((np.float64(depths[index]) - lowest) * scale)
+        buckets[index] = min(bucket, last)
+    return buckets
+
+
+@kernel
+def _bucket_counts(buckets: UInt16, count: int) -> Int64:
+    """Number of depths in each bucket."""
+    tables = np.zeros((COUNT_TABLES, count), np.int64)
+    whole = buckets.size // COUNT_TABLES
+    groups = buckets[: whole * COUNT_TABLES].reshape(whole, COUNT_TABLES)
+    for group in groups:
+        for table in range(COUNT_TABLES):
+            tables[table, group[table]] += 1
+    for bucket in buckets[whole * COUNT_TABLES :]:
+        tables[0, bucket] += 1
+    for table in range(1, COUNT_TABLES):
+        for bucket in range(count):
+            tables[0, bucket] += tables[table, bucket]
+    counts: Int64 = tables[0]
     return counts
 
 
 @kernel
-def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> float:
-    """Median of depths, from their counts in buckets."""
+def _members(depths: Float32, buckets: UInt16, bucket: int, count: int) -> Float32:
+    """The depths in a bucket, by their number."""
+    members = np.empty(count + 1, np.float32)
+    member, wanted = np.uint64(0), np.uint16(bucket)
+    for index in range(depths.size):
+        members[member] = depths[index]
+        member += np.uint64(buckets[index] == wanted)
+    return members[:-1]
+
+
+@kernel
+def _least_above(depths: Float32, buckets: UInt16, bucket: int) -> float:
+    """The lowest depth in a later bucket."""
+    least = np.int32(np.iinfo(np.int32).max)
+    bits = depths.view(np.int32)
+    for index in range(bits.size):
+        least = min(least, bits[index] if buckets[index] > bucket else least)
+    return np.float64(np.array([least]).view(np.float32)[0])
+
+
+@kernel
+def _median(depths: Float32, buckets: UInt16, counts: Int64) -> float:
+    """Median of depths, from their buckets and the counts of these."""
     rank, next_rank = (depths.size - 1) // 2, depths.size // 2
     while True:
         bucket = 0
@@ -81,49 +129,48 @@ def _median(depths: Float32, lowest: float, scale: float, counts: Int64) -> floa
             rank -= counts[bucket]
             next_rank -= counts[bucket]
             bucket += 1
-        median_bucket, last = np.uint64(bucket), np.uint64(counts.size - 1)
-        members = np.empty(counts[bucket] + 1, np.float32)
-        member = np.uint64(0)
-        above = np.float32(np.inf)
-        for index in range(depths.size):
-            depth = depths[index]
-            at = min(np.uint64((np.float64(depth) - lowest) * scale), last)
-            members[member] = depth
-            member += np.uint64(at == median_bucket)
-            if at > median_bucket:
-                above = min(above, depth)
-        depths = members[:-1]
-        lowest, highest = _extremes(depths)
-        if next_rank == depths.size:  # the upper middle is the first of a later bucket
-            return (highest + np.float64(above)) / 2.0
+        members = _members(depths, buckets, bucket, counts[bucket])
+        lowest, highest = _extremes(members)
+        if next_rank == members.size:  # the upper middle is the first of a later bucket
+            return (highest + _least_above(depths, buckets, bucket)) / 2.0
         if lowest == highest:
             return lowest
+        depths = members
         if depths.size <= 64:
             depths.sort()
             return (np.float64(depths[rank]) + np.float64(depths[next_rank])) / 2.0
-        scale = 256 / (highest - lowest)
-        counts = _bucket_counts(depths, lowest, scale, 256)
+        buckets = _buckets(depths, lowest, 256 / (highest - lowest), 256)
+        counts = _bucket_counts(buckets, 256)
 
 
 @kernel
-def _blocks(depths: Float32, lowest: float, scale: float, counts: Int64) -> tuple[Float64, Float64]:
-    """Lowest and highest depth of each run of non-empty buckets."""
-    block_of = np.empty(counts.size, np.uint64)
-    blocks = 0
-    for bucket in range(counts.size):
-        if counts[bucket] > 0 and (bucket == 0 or counts[bucket - 1] == 0):
-            blocks += 1
-        block_of[bucket] = blocks - 1
-    lows = np.full(blocks, np.inf)
-    highs = np.full(blocks, -np.inf)
-    last = np.uint64(counts.size - 1)
-    for index in range(depths.size):
-        depth = np.float64(depths[index])
-        block = block_of[min(np.uint64((depth - lowest) * scale), last)]
-        if depth < lows[block]:
-            lows[block] = depth
-        if depth > highs[block]:
-            highs[block] = depth
+def _gaps(counts: Int64) -> Int64:
+    """Buckets that follow each run of empty buckets: each begins a block."""
+    starts = np.empty(counts.size, np.int64)
+    gaps = 0
+    for bucket in range(1, counts.size):
+        starts[gaps] = bucket
+        gaps += int(counts[bucket] > 0 and counts[bucket - 1] == 0)
+    return starts[:gaps]
+
+
+@kernel
+def _blocks(
+    depths: Float32, buckets: UInt16, starts: Int64, lowest: float, highest: float
+) -> tuple[Float64, Float64]:
+    """Lowest and highest depth of each block; the blocks but the first begin at `starts`."""
+    ends = np.empty((2, starts.size), np.int32)
+    bits = depths.view(np.int32)
+    for gap in range(starts.size):
+        start = np.uint16(starts[gap])
+        below, above = np.int32(0), np.int32(np.iinfo(np.int32).max)
+        for index in range(bits.size):
+            is_above = buckets[index] >= start
+            above = min(above, bits[index] if is_above else above)
+            below = max(below, below if is_above else bits[index])
+        ends[0, gap], ends[1, gap] = above, below
+    lows, highs = np.full(starts.size + 1, lowest), np.full(starts.size + 1, highest)
+    lows[1:], highs[:-1] = ends[0].view(np.float32), ends[1].view(np.float32)
     return lows, highs
 
 
@@ -137,21 +184,29 @@ def _median_step(depths: Float32) -> float:
 
 
 @kernel
-def _mean_between(depths: Float32, low: float, high: float) -> float:
-    """Mean of the depths in [low, high].
+def _mean_between(depths: Float32, low: float, high: float, unit: float) -> float:
+    """Mean of the depths in [low, high], summed as multiples of a unit of length.
 
-    The sum is compensated (Knuth). It is correctly rounded for depths of 2^-14 to 2^14 m.
+    Depths that are multiples of the unit have an exact sum.
     """
-    total, lost, count = 0.0, 0.0, 0
+    total, count, per_unit = np.int64(0), np.int64(0), 1.0 / unit
     for index in range(depths.size):
         depth = np.float64(depths[index])
-        if low <= depth <= high:
-            new = total + depth
-            part = new - total
-            lost += (total - (new - part)) + (depth - part)
-            total = new
-            count += 1
-    return (total + lost) / count
+        inside = (depth >= low) & (depth <= high)
+        total += np.int64(depth * per_unit) if inside else np.int64(0)
+        count += np.int64(inside)
+    return np.float64(total) * unit / count
+
+
+@kernel
+def _unit(count: int, lowest: float, highest: float) -> float:
+    """The last binary place of the lowest depth, a unit of all depths.
+
+    It is coarser if the sum of so many depths would have more than 62 bits: with 640 x 480 depths,
+    if the highest is more than 2^20 times the lowest.
+    """
+    finest = math.floor(math.log2(lowest)) - 23
+    return float(2.0 ** max(finest, math.ceil(math.log2(highest * count)) - 62))
 
 
 @kernel
@@ -163,12 +218,14 @@ def _nearest_cluster(
     The reference lies in a cluster or between two, and the means are ordered. So only this cluster
     and its neighbours are candidates.
     """
+    unit = _unit(depths.size, lows[0], highs[-1])
     at = 0
     while at < lows.size - 1 and highs[at] < reference:
         at += 1
     best, best_distance = -1, np.inf
     for cluster in range(max(at - 1, 0), min(at + 2, lows.size)):
-        distance = abs(_mean_between(depths, lows[cluster], highs[cluster]) - reference)
+        mean = _mean_between(depths, lows[cluster], highs[cluster], unit)
+        distance = abs(mean - reference)
         if distance < best_distance:
             best, best_distance = cluster, distance
     return lows[best], highs[best]
@@ -184,15 +241,16 @@ def _dominant_layer(
     spread = highest - lowest
     steps = depths.size - 1
 
-    if 2.0 * spread / gamma_base < MAX_BUCKETS:
-        buckets = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
-        scale = buckets / spread
-        counts = _bucket_counts(depths, lowest, scale, buckets)
-        reference = _median(depths, lowest, scale, counts)
-        if counts.min() > 0:
-            lows, highs = np.array([lowest]), np.array([highest])
-        else:
-            lows, highs = _blocks(depths, lowest, scale, counts)
+    is_counted = 2.0 * spread / gamma_base < MAX_BUCKETS
+    if is_counted:
+        count = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
+        buckets = _buckets(depths, lowest, count / spread, count)
+        counts = _bucket_counts(buckets, count)
+        starts = _gaps(counts)
+        is_counted = starts.size <= MAX_GAPS
+    if is_counted:
+        reference = _median(depths, buckets, counts)
+        lows, highs = _blocks(depths, buckets, starts, lowest, highest)
     else:
         lows = np.sort(depths).astype(np.float64)
         highs = lows

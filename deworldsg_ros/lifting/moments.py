@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.lifting.pixels import Pixels
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.gaussian import transform
+
+# Points that are computed at once; they fit into the first-level cache.
+CHUNK = 256
 
 
 def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
@@ -19,43 +19,42 @@ def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64
     Returns:
         (N, 3) float64, metres.
     """
-    depths_m = pixels.depths_m.astype(np.float64)
-    points_camera = intrinsics.back_project(pixels.columns, pixels.rows, depths_m)
+    camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    points_camera = _back_project(pixels.columns, pixels.rows, pixels.depths_m, *camera)
     return points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
 
 
-def estimate_gaussians(
-    objects: Sequence[Pixels], intrinsics: Intrinsics, T_world_camera: Float64, ridge_m2: float
-) -> tuple[Float64, Float64, Float64]:
-    """Sample mean and covariance of each object's points, world frame (Eq. 4).
+def estimate_gaussian(pixels: Pixels, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
+    """Sample mean and covariance of an object's points, camera frame (Eq. 4).
 
-    The moments are computed in the camera frame, then μ → Rμ + t, Σ → RΣRᵀ. The ridge εI is the
-    same in both frames. The points themselves are never stored.
+    The Gaussian of the points in the world frame follows by `scene.gaussian.transform`: μ → Rμ + t,
+    Σ → RΣRᵀ. The points themselves are never stored.
 
     Args:
-        objects: the final inliers of n objects, two pixels or more each.
+        pixels: the final inliers of the object, two or more.
         intrinsics: of the depth image.
-        T_world_camera: (4, 4) float64.
-        ridge_m2: the ε of εI, square metres.
 
     Returns:
-        means (n, 3) metres, covariances (n, 3, 3) square metres with N - 1 in the denominator, and
-        the mean depths in the camera frame (n,) metres; all float64.
+        mean (3,) float64 metres, and covariance (3, 3) float64 square metres with N - 1 in the
+        denominator, without the ridge εI.
     """
-    means_camera = np.empty((len(objects), 3))
-    covariances_camera = np.empty((len(objects), 3, 3))
-    for row, pixels in enumerate(objects):
-        means_camera[row], covariances_camera[row] = _camera_moments(
-            pixels.columns,
-            pixels.rows,
-            pixels.depths_m,
-            intrinsics.fx,
-            intrinsics.fy,
-            intrinsics.cx,
-            intrinsics.cy,
-        )
-    means, covariances = transform(means_camera, covariances_camera, T_world_camera)
-    return means, covariances + ridge_m2 * np.eye(3), means_camera[:, 2].copy()
+    camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    mean, covariance = _camera_moments(pixels.columns, pixels.rows, pixels.depths_m, *camera)
+    return mean, covariance
+
+
+@kernel
+def _back_project(
+    columns: Int32, rows: Int32, depths_m: Float32, fx: float, fy: float, cx: float, cy: float
+) -> Float64:
+    """`Intrinsics.back_project`, with the same operations, in one pass."""
+    points = np.empty((depths_m.size, 3))
+    for index in range(depths_m.size):
+        depth = np.float64(depths_m[index])
+        points[index, 0] = (columns[index] - cx) / fx * depth
+        points[index, 1] = (rows[index] - cy) / fy * depth
+        points[index, 2] = depth
+    return points
 
 
 @kernel
@@ -78,20 +77,27 @@ def _camera_moments(
     per_fx, per_fy = 1.0 / fx, 1.0 / fy
     sx = sy = sz = 0.0
     sxx = sxy = sxz = syy = syz = szz = 0.0
-    for index in range(count):
-        depth = np.float64(depths_m[index])
-        x = (columns[index] - cx) * per_fx * depth - x0
-        y = (rows[index] - cy) * per_fy * depth - y0
-        z = depth - z0
-        sx += x
-        sy += y
-        sz += z
-        sxx += x * x
-        sxy += x * y
-        sxz += x * z
-        syy += y * y
-        syz += y * z
-        szz += z * z
+    # Points are computed in parallel, sums one after the other: their order decides the rounding.
+    xs, ys, zs = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    for start in range(0, count, CHUNK):
+        u, v = columns[start : start + CHUNK], rows[start : start + CHUNK]
+        depths = depths_m[start : start + CHUNK]
+        for index in range(depths.size):
+            depth = np.float64(depths[index])
+            xs[index] = (u[index] - cx) * per_fx * depth - x0
+            ys[index] = (v[index] - cy) * per_fy * depth - y0
+            zs[index] = depth - z0
+        for index in range(depths.size):
+            x, y, z = xs[index], ys[index], zs[index]
+            sx += x
+            sy += y
+            sz += z
+            sxx += x * x
+            sxy += x * y
+            sxz += x * z
+            syy += y * y
+            syz += y * z
+            szz += z * z
     mean = np.array([sx / count, sy / count, sz / count])
     covariance = np.array([[sxx, sxy, sxz], [sxy, syy, syz], [sxz, syz, szz]])
     for i in range(3):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.kernels import kernel, read_only
-from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt16
+from deworldsg_ros.scene.arrays import Float32, Int32
 
 
 @dataclass(frozen=True)
@@ -31,56 +31,38 @@ class Pixels:
         """The pixels with depth in [lowest_m, highest_m], metres."""
         return Pixels(*_within(self.columns, self.rows, self.depths_m, lowest_m, highest_m))
 
+    def sample(self, count: int) -> Pixels:
+        """`count` of the pixels, evenly spaced; at most as many as there are."""
+        return Pixels(*_sample(self.columns, self.rows, self.depths_m, count))
+
 
 def valid_depth(depth_m: Float32) -> Float32:
-    """Depth image (H, W) float32, metres; NaN, infinity and negative values become 0."""
-    return _valid_depth(read_only(depth_m, np.float32))
+    """Depth image (H, W) float32, metres; NaN, infinity and negative values become 0.
 
-
-def valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64:
-    """Number of valid pixels in the mask of each object.
-
-    Args:
-        depth_m: (H, W) float32, 0 = invalid.
-        instances: (H, W) uint16, 0 = no object, k = k-th object.
-        count: number of objects.
-
-    Returns:
-        (count + 1,) int64: entry k belongs to object k, entry 0 to all ids above `count`.
+    The result is read-only and contiguous. An image without such values is not copied.
     """
-    return _valid_pixel_counts(
-        read_only(depth_m, np.float32), read_only(instances, np.uint16), count
-    )
+    image_m = read_only(depth_m, np.float32)
+    return image_m if _is_valid(image_m) else read_only(_valid_depth(image_m))
+
+
+@kernel
+def _is_valid(depth_m: Float32) -> bool:
+    """Whether all depths are finite and not negative: their bits are below those of infinity."""
+    bits, greatest = depth_m.reshape(-1).view(np.uint32), np.uint32(0)
+    for index in range(bits.size):
+        greatest = max(greatest, bits[index])
+    return bool(greatest < 0x7F800000)
 
 
 @kernel
 def _valid_depth(depth_m: Float32) -> Float32:
     valid = np.empty_like(depth_m)
     flat_in, flat_out = depth_m.reshape(-1), valid.reshape(-1)
-    zero = np.float32(0)
+    zero, infinity = np.float32(0), np.float32(np.inf)
     for index in range(flat_in.size):
         depth = flat_in[index]
-        flat_out[index] = depth if (depth > zero) & (depth < np.inf) else zero
+        flat_out[index] = depth if (depth > zero) & (depth < infinity) else zero
     return valid
-
-
-@kernel
-def _valid_pixel_counts(depth_m: Float32, instances: UInt16, count: int) -> Int64:
-    counts = np.zeros(count + 1, np.int64)
-    depths, labels = depth_m.reshape(-1), instances.reshape(-1)
-    index = 0
-    while index < labels.size:
-        label = labels[index]
-        # Ids come in runs: each run is counted at once.
-        valid, start = 0, index
-        while index < labels.size and labels[index] == label:
-            valid += depths[index] > 0
-            index += 1
-        if label > count:
-            counts[0] += index - start
-        elif label > 0:
-            counts[label] += valid
-    return counts
 
 
 @kernel
@@ -98,3 +80,16 @@ def _within(
         kept_depths[kept] = depth
         kept += (depth >= lowest_m) & (depth <= highest_m)
     return kept_columns[:kept], kept_rows[:kept], kept_depths[:kept]
+
+
+@kernel
+def _sample(
+    columns: Int32, rows: Int32, depths_m: Float32, count: int
+) -> tuple[Int32, Int32, Float32]:
+    some_columns, some_rows = np.empty(count, np.int32), np.empty(count, np.int32)
+    some_depths = np.empty(count, np.float32)
+    for index in range(count):
+        place = index * depths_m.size // count
+        some_columns[index], some_rows[index] = columns[place], rows[place]
+        some_depths[index] = depths_m[place]
+    return some_columns, some_rows, some_depths

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,11 +16,11 @@ from deworldsg_ros.lifting.constants import (
     LiftingConstants,
 )
 from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.moments import back_project, estimate_gaussians
-from deworldsg_ros.lifting.pixels import Pixels, valid_depth, valid_pixel_counts
-from deworldsg_ros.lifting.spatial import spatial_inliers
+from deworldsg_ros.lifting.moments import back_project, estimate_gaussian
+from deworldsg_ros.lifting.pixels import Pixels, valid_depth
+from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
 from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt16
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
@@ -28,6 +30,7 @@ from deworldsg_ros.scene.frame_graph import (
     Relations,
     Vocabulary,
 )
+from deworldsg_ros.scene.gaussian import transform
 
 
 class Lifting:
@@ -75,14 +78,12 @@ class Lifting:
         _check_grids(frame_graph, instances, depth_m, intrinsics)
         check_pose(T_world_camera)
         depth_m = valid_depth(depth_m)
-        inliers, drops = self._inliers(depth_m, instances, frame_graph)
+        objects, drops = self._objects(depth_m, instances, frame_graph, intrinsics)
 
-        rows = np.array(sorted(inliers), np.int64)
-        objects = [inliers[row] for row in rows]
-        means, covariances, depths_m = estimate_gaussians(
-            objects, intrinsics, T_world_camera, self._config.covariance_ridge_m2
-        )
-        point_counts = self._point_counts(objects, depths_m, intrinsics)
+        rows = np.array([item.row for item in objects], np.int64)
+        means_camera = np.array([item.mean_camera for item in objects]).reshape(-1, 3)
+        covariances = np.array([item.covariance_camera for item in objects]).reshape(-1, 3, 3)
+        means, covariances = transform(means_camera, covariances, T_world_camera)
         return LocalGraph(
             stamp_ns=frame_graph.stamp_ns,
             frame_id=frame_id,
@@ -95,10 +96,10 @@ class Lifting:
             class_probabilities=frame_graph.class_probabilities[rows],
             scores=frame_graph.scores[rows],
             means_world=means,
-            covariances_world=covariances,
-            depths_m=depths_m,
-            pixel_counts=np.array([len(pixels) for pixels in objects], np.int64),
-            surface_points_world=_surface_points(objects, point_counts, intrinsics, T_world_camera),
+            covariances_world=covariances + self._config.covariance_ridge_m2 * np.eye(3),
+            depths_m=means_camera[:, 2].copy(),
+            pixel_counts=np.array([item.pixel_count for item in objects], np.int64),
+            surface_points_world=_surface_points(objects, intrinsics, T_world_camera),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
             depth_grid=_depth_grid(depth_m, instances, intrinsics),
@@ -114,71 +115,87 @@ class Lifting:
         # Two depth layers with steps of many sizes run every kernel.
         depth_m = (1.0 + 0.001 * np.arange(64) ** 1.5).reshape(8, 8).astype(np.float32)
         depth_m[5:] += 5.0
+        depth_m[0, 0] = np.nan
         instances = np.ones((8, 8), np.uint16)
         intrinsics = Intrinsics(8.0, 8.0, 4.0, 4.0, 8, 8)
         Lifting(LiftingConfig()).lift(graph, instances, depth_m, intrinsics, np.eye(4), "")
 
-    def _inliers(
-        self, depth_m: Float32, instances: UInt16, frame_graph: FrameGraph
-    ) -> tuple[dict[int, Pixels], dict[str, int]]:
-        """Final pixels of each kept object, by row of the frame graph, and the drops by reason."""
-        config, constants = self._config, self._constants
-        min_pixels = constants.min_pixels
-        inliers: dict[int, Pixels] = {}
-        drops: Counter[str] = Counter()
-        candidates, valid_counts = self._candidates(depth_m, instances, frame_graph)
-        for row, (pixels, valid_count) in enumerate(zip(candidates, valid_counts)):
-            if valid_count < min_pixels:
-                drops["few_mask_pixels"] += 1
-                continue
-            if len(pixels) < min_pixels:
-                drops["few_spatial_inliers"] += 1
-                continue
-            if config.pixels == "refined":
-                layer_m = dominant_layer(
-                    pixels.depths_m, config.gamma_base_m, constants.alpha, constants.beta
-                )
-                pixels = pixels.within(*layer_m)
-                if len(pixels) < min_pixels:
-                    drops["few_depth_inliers"] += 1
-                    continue
-            inliers[row] = pixels
-        return inliers, dict(drops)
+    def _objects(
+        self,
+        depth_m: Float32,
+        instances: UInt16,
+        frame_graph: FrameGraph,
+        intrinsics: Intrinsics,
+    ) -> tuple[list[_Object], dict[str, int]]:
+        """The objects with enough pixels, and the drops by reason.
 
-    def _candidates(
-        self, depth_m: Float32, instances: UInt16, frame_graph: FrameGraph
-    ) -> tuple[list[Pixels], list[int]]:
-        """Pixels of each object before Eq. 2, and its number of valid pixels before Eq. 1."""
-        counts = valid_pixel_counts(depth_m, instances, len(frame_graph))
-        if counts[0]:
+        One object after the other: its pixels stay in the cache until they are reduced.
+        """
+        masks = masks_of(instances, len(frame_graph))
+        if masks.unknown:
             raise RefusedInput(
                 "unknown_instance",
-                f"{counts[0]} pixels of the instance image have an id above {len(frame_graph)}, up "
-                f"to {instances.max()}: expected at most {len(frame_graph)}, the number of objects "
-                "in the frame graph",
+                f"{masks.unknown} pixels of the instance image have an id above "
+                f"{len(frame_graph)}, up to {instances.max()}: expected at most "
+                f"{len(frame_graph)}, the number of objects in the frame graph",
             )
-        if self._config.pixels == "box":
-            candidates = box_pixels(depth_m, frame_graph.boxes_xyxy)
-            return candidates, [len(pixels) for pixels in candidates]
-        if self._config.pixels == "mask":
-            candidates = mask_pixels(depth_m, instances, counts)
-        else:
-            candidates = spatial_inliers(
-                depth_m, instances, counts, self._config.tau, self._constants.epsilon_m
-            )
-        return candidates, counts[1:].tolist()
+        objects: list[_Object] = []
+        drops: Counter[str] = Counter()
+        for row, box_xyxy in enumerate(frame_graph.boxes_xyxy):
+            pixels = self._pixels(depth_m, masks.runs_of(row), box_xyxy)
+            if isinstance(pixels, str):
+                drops[pixels] += 1
+                continue
+            mean, covariance = estimate_gaussian(pixels, intrinsics)
+            sample = pixels.sample(self._point_count(len(pixels), float(mean[2]), intrinsics))
+            objects.append(_Object(row, len(pixels), mean, covariance, sample))
+        return objects, dict(drops)
 
-    def _point_counts(
-        self, objects: list[Pixels], depths_m: Float64, intrinsics: Intrinsics
-    ) -> list[int]:
-        """Number of surface points of each object: more for a large surface, at most its pixels."""
+    def _pixels(self, depth_m: Float32, runs: Int32, box_xyxy: Float64) -> Pixels | str:
+        """Final pixels of an object by its mask or box; the reason if there are too few."""
+        config, constants = self._config, self._constants
+        if config.pixels == "box":
+            pixels = box_pixels(depth_m, box_xyxy)
+        elif config.pixels == "mask":
+            pixels = mask_pixels(depth_m, runs)
+        else:
+            pixels = spatial_inliers(depth_m, runs, config.tau, constants.epsilon_m)
+        if len(pixels) < constants.min_pixels:
+            had_few = (
+                config.pixels != "refined"
+                or valid_pixel_count(depth_m, runs) < constants.min_pixels
+            )
+            return "few_mask_pixels" if had_few else "few_spatial_inliers"
+        if config.pixels == "refined":
+            layer_m = dominant_layer(
+                pixels.depths_m, config.gamma_base_m, constants.alpha, constants.beta
+            )
+            pixels = pixels.within(*layer_m)
+        return pixels if len(pixels) >= constants.min_pixels else "few_depth_inliers"
+
+    def _point_count(self, pixel_count: int, depth_m: float, intrinsics: Intrinsics) -> int:
+        """Number of surface points of an object: more for a large surface, at most its pixels."""
         usual = self._constants.surface_points
-        pixels = np.array([len(item) for item in objects], np.int64)
-        areas_m2 = pixels * depths_m**2 / (intrinsics.fx * intrinsics.fy)
-        by_area = (areas_m2 / POINT_AREA_M2).astype(np.int64)
-        counts = np.clip(by_area, usual, LARGE_SURFACE_FACTOR * usual)
-        numbers: list[int] = np.minimum(counts, pixels).tolist()
-        return numbers
+        area_m2 = pixel_count * depth_m**2 / (intrinsics.fx * intrinsics.fy)
+        by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * usual)
+        return min(max(by_area, usual), pixel_count)
+
+
+class _Object(NamedTuple):
+    """An object of a frame in the camera frame.
+
+    Attributes:
+        row: in the frame graph.
+        pixel_count: number of its final pixels.
+        mean_camera, covariance_camera: (3,) and (3, 3), metres and square metres.
+        sample: some of the pixels.
+    """
+
+    row: int
+    pixel_count: int
+    mean_camera: Float64
+    covariance_camera: Float64
+    sample: Pixels
 
 
 def _check_grids(
@@ -202,21 +219,20 @@ def _check_grids(
 
 
 def _surface_points(
-    objects: list[Pixels], counts: list[int], intrinsics: Intrinsics, T_world_camera: Float64
+    objects: list[_Object], intrinsics: Intrinsics, T_world_camera: Float64
 ) -> tuple[Float32, ...]:
-    """Evenly spaced sample of each object's pixels as points (count, 3), world frame, metres."""
+    """Sample of each object's pixels as points (k, 3), world frame, metres."""
     if not objects:
         return ()
-    chosen = [
-        np.arange(count) * len(pixels) // max(count, 1) for count, pixels in zip(counts, objects)
-    ]
+    samples = [item.sample for item in objects]
     sample = Pixels(
-        np.concatenate([pixels.columns[at] for pixels, at in zip(objects, chosen)]),
-        np.concatenate([pixels.rows[at] for pixels, at in zip(objects, chosen)]),
-        np.concatenate([pixels.depths_m[at] for pixels, at in zip(objects, chosen)]),
+        np.concatenate([pixels.columns for pixels in samples]),
+        np.concatenate([pixels.rows for pixels in samples]),
+        np.concatenate([pixels.depths_m for pixels in samples]),
     )
     points = back_project(sample, intrinsics, T_world_camera).astype(np.float32)
-    return tuple(np.split(points, np.cumsum(counts)[:-1]))
+    ends = [*accumulate(map(len, samples))]
+    return tuple(points[start:end] for start, end in zip([0, *ends], ends))
 
 
 def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> DepthGrid:
@@ -230,6 +246,8 @@ def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> 
 
 def _kept_relations(relations: Relations, rows: Int64, count: int) -> Relations:
     """Relations between kept rows, with the rows renumbered."""
+    if len(rows) == count:
+        return relations
     renumbered = np.full(count, -1, np.int64)
     renumbered[rows] = np.arange(len(rows))
     pairs = renumbered[relations.pairs]

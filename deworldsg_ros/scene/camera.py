@@ -117,13 +117,21 @@ def check_pose(T: Float64) -> None:
     """Check a rigid transform (4, 4); raises RefusedInput ``invalid_pose``."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise RefusedInput("invalid_pose", f"pose {T.tolist()}: expected a finite 4x4 matrix")
-    rotation = T[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > _ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:
+    (a, b, c, _), (d, e, f, _), (g, h, i, _) = T[:3].tolist()
+    error = max(
+        abs(a * a + b * b + c * c - 1.0),
+        abs(d * d + e * e + f * f - 1.0),
+        abs(g * g + h * h + i * i - 1.0),
+        abs(a * d + b * e + c * f),
+        abs(a * g + b * h + c * i),
+        abs(d * g + e * h + f * i),
+    )
+    determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    if error > _ROTATION_TOLERANCE or determinant < 0:
         raise RefusedInput(
             "invalid_pose",
             f"pose rotation is off orthonormal by {error:.2g} (determinant "
-            f"{np.linalg.det(rotation):.3f}): expected a right-handed rotation",
+            f"{determinant:.3f}): expected a right-handed rotation",
         )
 
 

@@ -11,6 +11,9 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.gaussian import log_determinant
 
+# Maximum difference of a sum of probabilities from 1: they may be written with six decimals.
+SUM_TOLERANCE = 1.1e-5
+
 
 @dataclass(frozen=True)
 class Vocabulary:
@@ -172,8 +175,7 @@ class LocalGraph:
         _check("pixel counts", self.pixel_counts, (count,))
         if len(self.surface_points_world) != count:
             raise ValueError(f"{len(self.surface_points_world)} point sets for {count} objects")
-        for row, points in enumerate(self.surface_points_world):
-            _check(f"surface points of object {row}", points, (len(points), 3))
+        _check_surfaces(self.surface_points_world)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
 
@@ -193,8 +195,24 @@ def _check_covariances(covariances: Float64) -> None:
     if asymmetric.any():
         row = int(asymmetric.any(axis=(1, 2)).argmax())
         raise ValueError(f"covariance {covariances[row].tolist()} of row {row} is not symmetric")
-    for covariance in covariances:
-        log_determinant(covariance)
+    # The pivots of `log_determinant`, of all covariances at once; it also states the error.
+    (c00, _, _), (c10, c11, _), (c20, c21, c22) = covariances.transpose(1, 2, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pivot_1 = c11 - c10 / c00 * c10
+        rest = c21 - c20 / c00 * c10
+        pivot_2 = c22 - c20 / c00 * c20 - rest / pivot_1 * rest
+    for row in np.flatnonzero(~((c00 > 0) & (pivot_1 > 0) & (pivot_2 > 0))).tolist():
+        log_determinant(covariances[row])
+
+
+def _check_surfaces(surfaces: tuple[Float32, ...]) -> None:
+    for row, points in enumerate(surfaces):
+        if points.ndim != 2 or points.shape[1] != 3:
+            _check(f"surface points of object {row}", points, (len(points), 3))
+    # One test for all of them; the objects are searched only to state the error.
+    if surfaces and not np.isfinite(np.concatenate(surfaces)).all():
+        for row, points in enumerate(surfaces):
+            _check(f"surface points of object {row}", points, (len(points), 3))
 
 
 def _check_objects(
@@ -202,10 +220,10 @@ def _check_objects(
 ) -> None:
     _check("class probabilities", class_probabilities, (count, len(vocabulary.classes)))
     _check("scores", scores, (count,))
-    if count and not np.allclose(class_probabilities.sum(axis=1), 1.0, atol=1e-6):
-        worst = class_probabilities.sum(axis=1)
+    sums = class_probabilities.sum(axis=1)
+    if (np.abs(sums - 1.0) > SUM_TOLERANCE).any():
         raise ValueError(
-            f"class probabilities sum to {worst[np.abs(worst - 1).argmax()]:.6f}: expected 1"
+            f"class probabilities sum to {sums[np.abs(sums - 1).argmax()]:.6f}: expected 1"
         )
 
 

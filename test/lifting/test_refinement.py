@@ -11,8 +11,8 @@ from support.reference_lifting import kept_layer, reference_lift
 from deworldsg_ros.config import LiftingConfig
 from deworldsg_ros.lifting.constants import LiftingConstants
 from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.pixels import valid_depth, valid_pixel_counts
-from deworldsg_ros.lifting.spatial import spatial_inliers
+from deworldsg_ros.lifting.pixels import valid_depth
+from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
 from deworldsg_ros.scene.camera import Intrinsics
 
 PAPER, PRINTED = LiftingConfig(), LiftingConstants()
@@ -21,9 +21,10 @@ PAPER, PRINTED = LiftingConfig(), LiftingConstants()
 def kept_by_kernels(instances, depth_m, count):
     """Inlier mask of each object by the compiled kernels, without dropping any object."""
     depth_m = valid_depth(depth_m)
-    counts = valid_pixel_counts(depth_m, instances, count)
+    objects = masks_of(instances, count)
     masks = []
-    for pixels in spatial_inliers(depth_m, instances, counts, PAPER.tau, PRINTED.epsilon_m):
+    for k in range(count):
+        pixels = spatial_inliers(depth_m, objects.runs_of(k), PAPER.tau, PRINTED.epsilon_m)
         mask = np.zeros(depth_m.shape, bool)
         if len(pixels):
             layer = dominant_layer(pixels.depths_m, PAPER.gamma_base_m, PRINTED.alpha, PRINTED.beta)
@@ -156,16 +157,14 @@ def test_spatial_test_is_strict_and_counts_holes_as_zero():
     # 3x3 frame, all valid: the centre is τ D~ + ε off its median, within rounding.
     depth = np.full((3, 3), 1.0, np.float32)
     depth[1, 1] = 1.0625
-    counts = np.array([0, 9])
-    instances = np.ones((3, 3), np.uint16)
-    assert len(spatial_inliers(depth, instances, counts, 0.0625, 0.0)[0]) == 8
-    assert len(spatial_inliers(depth, instances, counts, 0.0625, 1e-12)[0]) == 9
+    runs = masks_of(np.ones((3, 3), np.uint16), 1).runs_of(0)
+    assert len(spatial_inliers(depth, runs, 0.0625, 0.0)) == 8
+    assert len(spatial_inliers(depth, runs, 0.0625, 1e-12)) == 9
     # Five holes around the centre: its median is 0, and 1.0 is far from it.
     depth = np.ones((3, 3), np.float32)
     depth[0, :] = 0
     depth[1, ::2] = 0
-    counts = np.array([0, 4])
-    kept = spatial_inliers(depth, instances, counts, 0.05, 1e-3)[0]
+    kept = spatial_inliers(depth, runs, 0.05, 1e-3)
     assert (1, 1) not in set(zip(kept.rows.tolist(), kept.columns.tolist()))
 
 
@@ -186,3 +185,29 @@ def test_valid_depth_does_not_change_its_argument():
         valid_depth(depth), np.array([[0, 0, 0], [0, 0, 1.5]], np.float32)
     )
     np.testing.assert_array_equal(depth, before)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    height=st.integers(1, 12),
+    width=st.integers(1, 40),
+    ids=st.integers(1, 6),
+)
+def test_runs_of_the_masks(seed, height, width, ids):
+    rng = np.random.default_rng(seed)
+    instances = np.repeat(rng.integers(0, ids + 1, (height, width)), 3, axis=1).astype(np.uint16)
+    depth = rng.integers(0, 2, instances.shape).astype(np.float32)
+    count = 4
+    masks = masks_of(instances, count)
+    painted = np.zeros_like(instances)
+    for row, start, stop, index in masks.runs.tolist():
+        assert not painted[row, start:stop].any()
+        painted[row, start:stop] = index + 1
+    np.testing.assert_array_equal(painted, np.where(instances > count, 0, instances))
+    assert masks.unknown == (instances > count).sum()
+    for k in range(count):
+        mask, runs = instances == k + 1, masks.runs_of(k)
+        assert set(runs[:, 3].tolist()) <= {k} and (np.diff(runs[:, 0]) >= 0).all()
+        assert masks.sizes[k] == mask.sum()
+        assert valid_pixel_count(depth, runs) == (mask & (depth > 0)).sum()

@@ -274,10 +274,13 @@ def test_warm_up_compiles_everything_that_a_frame_needs():
     Lifting(LiftingConfig()).warm_up()
     entry_points = (
         pixels._valid_depth,
-        pixels._valid_pixel_counts,
+        pixels._is_valid,
         pixels._within,
-        spatial._scatter_inliers,
+        pixels._sample,
+        spatial._masks_of,
+        spatial._spatial_inliers,
         depth_layer._dominant_layer,
+        moments._back_project,
         moments._camera_moments,
     )
     for kernel in entry_points:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from deworldsg_ros.config import LiftingConfig
+from deworldsg_ros.lifting.spatial import masks_of
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
 from deworldsg_ros.scene.camera import Intrinsics
@@ -65,7 +66,7 @@ def test_boxes_may_overlap_and_leave_the_image() -> None:
     depth_m = np.full((30, 40), 2.0, np.float32)
     depth_m[:, 0] = 0.0
     boxes = np.array([[-5, -5, 4.5, 4.5], [2, 2, 4.5, 4.5], [50, 50, 60, 60], [3.2, 3.2, 3.8, 9]])
-    found = box_pixels(depth_m, boxes)
+    found = [box_pixels(depth_m, box) for box in boxes]
     assert [len(pixels) for pixels in found] == [4 * 5, 3 * 3, 0, 0]
     assert (found[1].columns.min(), found[1].rows.max()) == (2, 4)
 
@@ -85,9 +86,8 @@ def test_a_rectangular_mask_has_the_pixels_of_its_box() -> None:
     depth_m[generator.random((30, 40)) < 0.2] = 0.0
     instances = np.zeros((30, 40), np.uint16)
     instances[5:25, 7:33] = 1
-    counts = np.array([0, np.count_nonzero(depth_m[5:25, 7:33])], np.int64)
-    (mask,) = mask_pixels(depth_m, instances, counts)
-    (box,) = box_pixels(depth_m, np.array([[7, 5, 32, 24]], float))
+    mask = mask_pixels(depth_m, masks_of(instances, 1).runs_of(0))
+    box = box_pixels(depth_m, np.array([7, 5, 32, 24], float))
     assert len(mask) > 0
     np.testing.assert_array_equal(mask.columns, box.columns)
     np.testing.assert_array_equal(mask.rows, box.rows)
