@@ -19,6 +19,8 @@ INDEX_BIAS = 1 << 20
 INDEX_MASK = (1 << 21) - 1
 # An owner with fewer cells says too little by lying within a set.
 MIN_OWNER_CELLS = 4
+# A block and the touching cells of its six neighbours have 160 cells with four owners each.
+MAX_BLOCK_OWNERS = 640
 # The six faces of a block. For each face: its cells, the rotation to the right that turns their
 # bits into the bits of the cells that they touch in the adjacent block, and the step to that block.
 _FACES = np.array(
@@ -79,6 +81,9 @@ class CellTable(NamedTuple):
 # The kernels take the same arrays as plain tuples: numba is slower to call with named ones.
 TableArrays = tuple[Int64, UInt64, Int32, UInt64, UInt64, Int8, Int32]
 SetArrays = tuple[Int64, UInt64, Int64]
+# Sums of a query by owner, zero between queries: cells of a block of the set that lie on the owner;
+# number of cells of the set on the owner, and of the owner on the set.
+SumArrays = tuple[UInt64, Int64, Int64]
 
 
 def new_table(capacity: int) -> CellTable:
@@ -309,48 +314,54 @@ def _mark(slot: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_coun
 
 @kernel
 def overlaps(
-    table: TableArrays, counts: Int64, used: int, sets: SetArrays
+    table: TableArrays, counts: Int64, sums: SumArrays, used: int, sets: SetArrays
 ) -> tuple[Int64, Float64, Float64]:
     """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
-    keys, masks, slot_owners, marks, _, _, _ = table
+    slot_owners, marks = table[2], table[3]
     blocks, set_masks, starts = sets
+    on_block, on_owner, of_owner = sums
     set_count = len(starts) - 1
-    # Cells of the set that lie on the owner, and cells of the owner that the set meets.
-    on_owner = np.zeros((set_count, len(counts)), np.int64)
-    of_owner = np.zeros((set_count, len(counts)), np.int64)
-    met = np.zeros(len(counts), np.bool_)
-    # Cells of one block of the set that lie on each owner, and the list of these owners.
-    on_block = np.zeros(len(counts), np.uint64)
-    block_owners = np.empty(len(counts), np.int64)
-    marked = np.empty(used, np.int64)
+    # For each set and owner that meet: both, and the two numbers of cells.
+    found, total = np.empty((64, 4), np.int64), 0
+    block_owners = np.empty(MAX_BLOCK_OWNERS, np.int64)
+    most = 0 if set_count == 0 else (starts[1:] - starts[:-1]).max()
+    marked = np.empty(min(used, most * MAX_BLOCK_OWNERS), np.int64)
     for index in range(set_count):
-        marked_count = 0
+        marked_count, first = 0, total
         for at in range(starts[index], starts[index + 1]):
             owner_count, marked_count = _meet(
                 table, blocks[at], set_masks[at], on_block, block_owners, marked, marked_count
             )
             for position in range(owner_count):
                 owner = block_owners[position]
-                on_owner[index, owner] += _bit_count(on_block[owner])
+                if on_block[owner] != 0 and on_owner[owner] == 0:
+                    if total == len(found):
+                        found = np.concatenate((found, found))
+                    found[total, 0], found[total, 1] = index, owner
+                    total += 1
+                on_owner[owner] += _bit_count(on_block[owner])
                 on_block[owner] = 0
-                met[owner] = True
         for position in range(marked_count):
             slot = marked[position]
-            of_owner[index, slot_owners[slot]] += _bit_count(marks[slot])
+            of_owner[slot_owners[slot]] += _bit_count(marks[slot])
             marks[slot] = 0
-    columns = np.flatnonzero(met)
+        for row in range(first, total):
+            owner = found[row, 1]
+            found[row, 2], found[row, 3] = on_owner[owner], of_owner[owner]
+            on_owner[owner] = of_owner[owner] = 0
+    columns = np.unique(found[:total, 1])
     on_fractions = np.zeros((set_count, len(columns)))
     of_fractions = np.zeros((set_count, len(columns)))
+    cell_counts = np.zeros(set_count)
     for index in range(set_count):
-        cell_count = 0
         for at in range(starts[index], starts[index + 1]):
-            cell_count += _bit_count(set_masks[at])
-        for column in range(len(columns)):
-            owner = columns[column]
-            if on_owner[index, owner] > 0:
-                on_fractions[index, column] = on_owner[index, owner] / cell_count
-                if counts[owner] >= MIN_OWNER_CELLS:
-                    of_fractions[index, column] = of_owner[index, owner] / counts[owner]
+            cell_counts[index] += _bit_count(set_masks[at])
+    for row in range(total):
+        index, owner = found[row, 0], found[row, 1]
+        column = np.searchsorted(columns, owner)
+        on_fractions[index, column] = found[row, 2] / cell_counts[index]
+        if counts[owner] >= MIN_OWNER_CELLS:
+            of_fractions[index, column] = found[row, 3] / counts[owner]
     return columns, on_fractions, of_fractions
 
 

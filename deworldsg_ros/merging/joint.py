@@ -46,6 +46,8 @@ class JointEvidence:
     def __init__(self) -> None:
         # Evidence for one object minus evidence for two: by the smaller owner, then the greater.
         self._balances: defaultdict[int, Counter[int]] = defaultdict(Counter)
+        # The smaller owners that have evidence about a greater one.
+        self._smaller: defaultdict[int, set[int]] = defaultdict(set)
         self._due: list[Pair] = []
         self._camera_world = np.full(3, np.nan)
 
@@ -58,6 +60,7 @@ class JointEvidence:
         """Continue with the `balances` of an earlier run."""
         for (a, b), balance in balances.items():
             self._balances[min(a, b)][max(a, b)] = balance
+            self._smaller[max(a, b)].add(min(a, b))
 
     def add_frame(
         self,
@@ -92,6 +95,7 @@ class JointEvidence:
         factor = WIDE_STEP_FACTOR if step_m > WIDE_STEP_M else 1
         for (a, b), weight in evidence.items():
             self._balances[a][b] += weight * factor
+            self._smaller[b].add(a)
             if self._balances[a][b] >= MERGE_THRESHOLD:
                 self._due.append((a, b))
 
@@ -107,19 +111,21 @@ class JointEvidence:
     def merge(self, kept: int, removed: int) -> None:
         """Combine the evidence against one object of two owners that are one."""
         against = {b: balance for b, balance in self._balances[removed].items() if balance < 0}
-        for a, row in self._balances.items():
-            if row[removed] < 0:
-                against[a] = row[removed]
+        for a in self._smaller[removed]:
+            if self._balances[a][removed] < 0:
+                against[a] = self._balances[a][removed]
         self.forget(removed)
         for other, balance in against.items():
             if other != kept:
                 self._balances[min(kept, other)][max(kept, other)] += balance
+                self._smaller[max(kept, other)].add(min(kept, other))
 
     def forget(self, owner: int) -> None:
         """Drop the evidence of a removed owner."""
-        self._balances.pop(owner, None)
-        for row in self._balances.values():
-            row.pop(owner, None)
+        for b in self._balances.pop(owner, ()):
+            self._smaller[b].discard(owner)
+        for a in self._smaller.pop(owner, ()):
+            self._balances[a].pop(owner, None)
 
     def _separate(self, sure: dict[int, bool], nested: Counter[Pair]) -> None:
         """Count the pairs of a frame as two objects, except some."""
@@ -128,4 +134,5 @@ class JointEvidence:
             row = self._balances[a]
             for b, b_sure in ascending[position + 1 :]:
                 if (a, b) not in nested:
+                    self._smaller[b].add(a)
                     row[b] -= SEPARATE_WEIGHT if a_sure and b_sure else OVERLAPPING_WEIGHT

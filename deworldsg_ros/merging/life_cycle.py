@@ -10,6 +10,7 @@ from deworldsg_ros.merging import existence
 from deworldsg_ros.merging.lost_nodes import LostNodes, moved_object
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
+from deworldsg_ros.scene.arrays import Bool
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -36,6 +37,14 @@ class LifeCycle:
         self._records = records
         self._min_existence = min_existence
         self._lost = LostNodes(LOST_S)
+        # Nodes that may be forgotten; some may have been removed.
+        self._improbable: set[int] = set()
+
+    def restore(self, graph: SceneGraph) -> None:
+        """Continue with a graph of an earlier run; call it before the first frame."""
+        nodes = graph.nodes
+        improbable = _are_improbable(graph, list(range(len(nodes))))
+        self._improbable = set(nodes.ids[improbable].tolist())
 
     def observe(
         self, graph: SceneGraph, local: LocalGraph, view: View, node_ids: list[int]
@@ -53,10 +62,13 @@ class LifeCycle:
         scores: dict[int, float] = {}
         for node_id, score in zip(node_ids, local.scores.tolist()):
             scores[node_id] = max(scores.get(node_id, 0.0), score)
+        visible = view.visibilities > NOT_VISIBLE
         shown = {
             node_id: visibility
-            for node_id, visibility in zip(view.ids.tolist(), view.visibilities.tolist())
-            if node_id in records and (visibility or node_id in scores)
+            for node_id, visibility in zip(
+                view.ids[visible].tolist(), view.visibilities[visible].tolist()
+            )
+            if node_id in records
         }
         ids = sorted(scores.keys() | shown.keys())
         records.look(
@@ -76,18 +88,17 @@ class LifeCycle:
     def _absent(self, view: View, detected: Collection[int]) -> list[int]:
         """Nodes that enough consecutive frames have seen through."""
         records, absent = self._records, []
-        for node_id, visibility, through in zip(
-            view.ids.tolist(), view.visibilities.tolist(), view.through.tolist()
-        ):
-            if node_id not in records:
+        present = {*detected, *view.ids[view.visibilities >= HALF].tolist()}
+        owners = [records.owner(node_id) for node_id in present if node_id in records]
+        frames = records.rows["through_frames"]
+        frames[owners] = 0
+        for node_id in view.ids[view.through].tolist():
+            if node_id in present or node_id not in records:
                 continue
-            record = records.rows[records.owner(node_id)]
-            if node_id in detected or visibility >= HALF:
-                record["through_frames"] = 0
-            elif through:
-                record["through_frames"] += 1
-                if record["through_frames"] >= ABSENT_FRAMES:
-                    absent.append(node_id)
+            owner = records.owner(node_id)
+            frames[owner] += 1
+            if frames[owner] >= ABSENT_FRAMES:
+                absent.append(node_id)
         return absent
 
     def hidden(self, graph: SceneGraph) -> dict[str, int]:
@@ -108,7 +119,11 @@ class LifeCycle:
         owners = [records.owner(node_id) for node_id in node_ids]
         probabilities = records.existence(owners)
         existence.settle(records.rows, records.fates, owners, probabilities)
-        for node_id in graph.set_existence(node_ids, probabilities, self._min_existence):
+        new_ids = graph.set_existence(node_ids, probabilities, self._min_existence)
+        improbable = _are_improbable(graph, [graph.nodes.row(node_id) for node_id in node_ids])
+        self._improbable.difference_update(node_ids)
+        self._improbable.update(np.array(node_ids, np.int64)[improbable].tolist())
+        for node_id in new_ids:
             # A new node that is the object of a lost node takes the id of the lost node.
             lost_id = self._lost.match(graph, node_id)
             if lost_id is not None:
@@ -118,10 +133,14 @@ class LifeCycle:
     def _forget(self, graph: SceneGraph, stamp_ns: int) -> None:
         """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
         nodes = graph.nodes
-        old = ~nodes.confirmed & (nodes.existence < FORGOTTEN)
-        old &= nodes.last_seen_ns < stamp_ns - FORGOTTEN_NS
-        for node_id in nodes.ids[old].tolist():
+        # In the order of the rows, which depends on nothing but the frames.
+        ids = sorted((i for i in self._improbable if i in nodes), key=nodes.row)
+        self._improbable.intersection_update(ids)
+        rows = [nodes.row(node_id) for node_id in ids]
+        old = _are_improbable(graph, rows) & (nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS)
+        for node_id in np.array(ids, np.int64)[old].tolist():
             if node_id not in self._lost:
+                self._improbable.discard(node_id)
                 graph.remove_node(node_id)
                 self._records.remove(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
@@ -145,3 +164,10 @@ class LifeCycle:
         """Continue the id of a lost node at the node that its object has become."""
         graph.take_over(old_id, new_id)
         self._records.rename(new_id, old_id)
+
+
+def _are_improbable(graph: SceneGraph, rows: list[int]) -> Bool:
+    """Whether (n,) the nodes of rows are hidden and too improbable to be kept."""
+    nodes = graph.nodes
+    improbable: Bool = ~nodes.confirmed[rows] & (nodes.existence[rows] < FORGOTTEN)
+    return improbable

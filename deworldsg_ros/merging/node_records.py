@@ -11,6 +11,7 @@ from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.joint import JointEvidence
 from deworldsg_ros.merging.memory_checks import check_memory
+from deworldsg_ros.merging.node_grid import NodeGrid
 from deworldsg_ros.merging.voxel_map import VoxelMap
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.graph import SceneGraph
@@ -36,6 +37,7 @@ class NodeRecords:
         fates: errors and objects among the nodes so far (`existence.first_fates`).
         last_ns: stamp of the newest frame; 0 = none.
         map: cells of the surfaces, by owner.
+        grid: owners by the position of their node.
         joint: evidence that two owners are one object.
     """
 
@@ -45,6 +47,7 @@ class NodeRecords:
         self.fates = existence.first_fates()
         self.last_ns = 0
         self.map = VoxelMap()
+        self.grid = NodeGrid()
         self.joint = JointEvidence()
         self._owners: dict[int, int] = {}
         self._free: list[int] = []
@@ -81,6 +84,11 @@ class NodeRecords:
         self.rows["node_id"][owner] = node_id
         names.start(self.rows[owner], np.ascontiguousarray(class_probabilities), stamp_ns)
         return owner
+
+    def place(self, graph: SceneGraph, owners: list[int]) -> None:
+        """Note where the nodes of owners are, after a change of their Gaussians."""
+        nodes, rows = graph.nodes, self.graph_rows(graph, owners)
+        self.grid.put(owners, nodes.means[rows], nodes.eigenvalue_bounds[rows])
 
     def look(
         self,
@@ -128,6 +136,7 @@ class NodeRecords:
         self.rows["node_id"][owner] = 0
         self._free.append(owner)
         self.joint.forget(owner)
+        self.grid.remove(owner)
         return self.map.remove(owner)
 
     def rename(self, old_id: int, new_id: int) -> None:
@@ -147,6 +156,7 @@ class NodeRecords:
         cells = self.remove(removed_id)
         self.map.add([kept], cells)
         self.map.add_scores(kept, cells.blocks, scores)
+        self.place(graph, [kept])
 
     def memory(self) -> Memory:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
@@ -171,6 +181,7 @@ class NodeRecords:
             node_id: self.add(node_id, nodes.class_probabilities[row], int(nodes.last_seen_ns[row]))
             for row, node_id in enumerate(nodes.ids.tolist())
         }
+        self.place(graph, list(owner_of.values()))
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or memory["cell_m"] != self.map.cell_m:
             self._rebuild(graph, list(owner_of.values()))
@@ -224,6 +235,7 @@ class NodeRecords:
             cells = self.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
             self.map.remove(owner)
             self.map.add([owner], cells)
+            self.place(graph, [owner])
 
 
 def _cells(map_: VoxelMap, owners: list[int]) -> Memory:

@@ -15,7 +15,7 @@ from deworldsg_ros.merging.common import Memory, add_relations, check_fits
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
 from deworldsg_ros.merging.node_records import NodeRecords
-from deworldsg_ros.merging.views import View, see
+from deworldsg_ros.merging.views import View, frame_arrays, see, see_nothing
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
@@ -56,7 +56,7 @@ class SurfaceMerging:
         """
         check_fits(graph, local)
         cells = self._records.map.cells_of(local.surface_points_world)
-        view = see(graph.nodes, local)
+        view = self._see(graph, local)
         matches = self._associate(graph, local, cells, view)
         node_ids = self._update(graph, local, cells, matches)
         node_ids = self._merge_parts(graph, local, matches, node_ids)
@@ -77,10 +77,20 @@ class SurfaceMerging:
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """See `Merging.restore`."""
         self._records.restore(graph, memory)
+        self._life_cycle.restore(graph)
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
         self._records.apply_correction(graph, node_ids, T_correction)
+
+    def _see(self, graph: SceneGraph, local: LocalGraph) -> View:
+        """What the frame shows of the nodes that may be in view."""
+        if local.depth_grid is None:
+            return see_nothing(local)
+        frame = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
+        owners = self._records.grid.in_view(frame).tolist()
+        rows = np.sort(np.array(self._records.graph_rows(graph, owners), np.int64))
+        return see(graph.nodes, rows, local, frame)
 
     def _associate(
         self, graph: SceneGraph, local: LocalGraph, cells: CellSets, view: View
@@ -88,16 +98,17 @@ class SurfaceMerging:
         """Match the objects with the nodes whose surfaces they meet."""
         records = self._records
         owners, on_nodes, covered = records.map.overlaps(cells)
-        column_of = {node_id: column for column, node_id in enumerate(view.ids.tolist())}
-        for column, node_id in enumerate(records.rows["node_id"][owners].tolist()):
-            # If the frame shows enough of a node, its visible part counts, and not the whole node.
-            shown = column_of.get(node_id)
-            if shown is not None and not np.isnan(view.covered[:, shown]).any():
-                covered[:, column] = view.covered[:, shown]
+        rows = np.array(records.graph_rows(graph, owners), np.int64)
+        # If the frame shows enough of a node, its visible part counts, and not the whole node.
+        shown = ~np.isnan(view.covered).any(axis=0)
+        _, columns, places = np.intersect1d(
+            rows, view.rows[shown], assume_unique=True, return_indices=True
+        )
+        covered[:, columns] = view.covered[:, shown][:, places]
         return match(
             local,
             graph.nodes,
-            np.array(records.graph_rows(graph, owners), np.int64),
+            rows,
             owners,
             on_nodes,
             covered,
@@ -139,6 +150,7 @@ class SurfaceMerging:
                 )
                 owners[row] = records.add(node_id, classes, local.stamp_ns)
         records.map.add(owners, cells)
+        records.place(graph, owners)
         node_ids = [records.node(owner) for owner in owners]
         self._judge_cells(graph, local, cells, owners, node_ids)
         return node_ids

@@ -7,14 +7,12 @@ that is present may lie in the mask of an object.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.kernels import kernel
+from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
-from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
 
@@ -39,8 +37,6 @@ NEAR_M = 0.1
 # Surface points of a node that are compared with the image: the first in the order of their
 # hashes, which are a sample.
 SAMPLED_POINTS = 48
-# A node is compared if a ball of this many standard deviations around its mean may be in view.
-BALL_DEVIATIONS = 3.0
 
 # A frame: T_camera_world (4, 4); depth in millimetres and instances, both (h, w); and fx, fy, cx
 # and cy of these images in their own pixels.
@@ -52,6 +48,7 @@ class View:
     """The m nodes that a frame with n objects may show.
 
     Attributes:
+        rows: (m,) int64, rows of the nodes before the frame is merged, ascending.
         ids: (m,) int64, ids of the nodes.
         visibilities: (m,) int64, how much of each is visible and present, of `VISIBILITIES`.
         through: (m,) bool, whether the frame sees through most of it.
@@ -59,34 +56,44 @@ class View:
             if too few are present, or without instances.
     """
 
+    rows: Int64
     ids: Int64
     visibilities: Int64
     through: Bool
     covered: Float64
 
 
-def see(nodes: NodeTable, local: LocalGraph) -> View:
-    """What a frame shows of the nodes; nothing without a depth grid."""
-    grid = local.depth_grid
-    if grid is None:
-        none = np.zeros(0, np.int64)
-        return View(none, none, none.astype(bool), np.zeros((len(local), 0)))
-    frame = frame_arrays(invert_pose(local.T_world_camera), grid)
-    rows = _in_view(nodes.means, nodes.eigenvalue_bounds, frame)
+def see(nodes: NodeTable, rows: Int64, local: LocalGraph, frame: FrameArrays) -> View:
+    """What a frame shows of some nodes.
+
+    Args:
+        nodes: of the graph.
+        rows: (m,) rows of the nodes to compare with it.
+        local: the frame.
+        frame: its arrays, with those of its depth grid.
+    """
     visibilities, through, covered = _see(
         nodes.surface_points_world, nodes.surface_counts, rows, local.instance_ids, frame
     )
-    if grid.instances is None:
+    if local.depth_grid is None or local.depth_grid.instances is None:
         covered[:] = np.nan
-    return View(nodes.ids[rows], visibilities, through, covered)
+    return View(rows, nodes.ids[rows], visibilities, through, covered)
+
+
+def see_nothing(local: LocalGraph) -> View:
+    """The view of a frame without a depth grid."""
+    none = np.zeros(0, np.int64)
+    return View(none, none, none, none.astype(bool), np.zeros((len(local), 0)))
 
 
 def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
     """The arrays of a frame for kernels; without instances, no pixel shows an object."""
     camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
     instances = np.zeros_like(grid.depth_mm) if grid.instances is None else grid.instances
+    # Images of a message are read-only, those of the lifting stage are not.
+    depth_mm, instances = read_only(grid.depth_mm, np.uint16), read_only(instances, np.uint16)
     intrinsics = camera.fx * per_px, camera.fy * per_px, camera.cx * per_px, camera.cy * per_px
-    return T_camera_world, grid.depth_mm, instances, intrinsics
+    return T_camera_world, depth_mm, instances, intrinsics
 
 
 @kernel
@@ -96,28 +103,6 @@ def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, 
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
         T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
     )
-
-
-@kernel
-def _in_view(means: Float64, eigenvalue_bounds: Float64, frame: FrameArrays) -> Int64:
-    """Rows of the nodes that are not wholly behind the camera or beyond one side of the image."""
-    T, depth_mm, _, (fx, fy, cx, cy) = frame
-    right, below = cx - depth_mm.shape[1], cy - depth_mm.shape[0]
-    rows = np.empty(len(means), np.int64)
-    count = 0
-    for row in range(len(means)):
-        radius = BALL_DEVIATIONS * math.sqrt(eigenvalue_bounds[row])
-        x, y, z = _in_camera(T, means[row, 0], means[row, 1], means[row, 2])
-        beyond = (
-            z < NEAR_M - radius
-            or fx * x + cx * z < -radius * math.hypot(fx, cx)
-            or fx * x + right * z > radius * math.hypot(fx, right)
-            or fy * y + cy * z < -radius * math.hypot(fy, cy)
-            or fy * y + below * z > radius * math.hypot(fy, below)
-        )
-        rows[count] = row
-        count += int(not beyond)
-    return rows[:count]
 
 
 @kernel

@@ -13,7 +13,7 @@ from itertools import accumulate
 import numpy as np
 
 from deworldsg_ros.merging import cell_beliefs, cell_kernels
-from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets
+from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets, SumArrays
 from deworldsg_ros.merging.views import frame_arrays
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64
 from deworldsg_ros.scene.frame_graph import DepthGrid
@@ -43,6 +43,7 @@ class VoxelMap:
         # Number of cells of each owner, and its first slot.
         self._counts = np.zeros(64, np.int64)
         self._firsts = np.full(64, -1, np.int64)
+        self._sums = _new_sums(64)
 
     @property
     def capacity(self) -> int:
@@ -153,7 +154,9 @@ class VoxelMap:
             The k owners that any set meets, ascending; and two fractions (n, k) float64 in [0, 1]:
             of the set's cells that lie on the owner, and of the owner's cells that lie on the set.
         """
-        owners, on, of = cell_kernels.overlaps(self._table[:], self._counts, self._used, sets[:])
+        owners, on, of = cell_kernels.overlaps(
+            self._table[:], self._counts, self._sums, self._used, sets[:]
+        )
         return owners.tolist(), on, of
 
     def remove(self, owner: int) -> CellSets:
@@ -177,6 +180,7 @@ class VoxelMap:
             more = (0, 2 * owner_count - len(self._counts))
             self._counts = np.pad(self._counts, more)
             self._firsts = np.pad(self._firsts, more, constant_values=-1)
+            self._sums = _new_sums(len(self._counts))
 
     def _grow(self, more_slots: int) -> None:
         # Slots of removed owners are not copied.
@@ -187,3 +191,8 @@ class VoxelMap:
         larger = cell_kernels.new_table(capacity)
         self._used = cell_kernels.rehash(self._table[:], larger[:], self._firsts)
         self._table = larger
+
+
+def _new_sums(owner_count: int) -> SumArrays:
+    counts = np.zeros(owner_count, np.int64)
+    return np.zeros(owner_count, np.uint64), counts, counts.copy()

@@ -8,14 +8,13 @@ Stein), so that exact poses stay as they are.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
 from deworldsg_ros.poses.surfels import JOINT, SurfelMap, about_camera, difference
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, derived
 from deworldsg_ros.scene.gaussian import transform
 
 # Squared errors add rotation and translation: a radian counts as `surfels.RADIAN_M` metres.
@@ -129,7 +128,7 @@ def moved(local: LocalGraph, T: Float64) -> LocalGraph:
     """A local graph with the camera pose T · T_world_camera instead of T_world_camera."""
     means_world, covariances_world = transform(local.means_world, local.covariances_world, T)
     rotation, translation = T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32)
-    return replace(
+    return derived(
         local,
         T_world_camera=T @ local.T_world_camera,
         means_world=means_world,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,6 +182,16 @@ class LocalGraph:
 
     def __len__(self) -> int:
         return len(self.means_world)
+
+
+def derived(local: LocalGraph, **changes: Any) -> LocalGraph:
+    """A local graph with some attributes replaced, without the checks of a new one.
+
+    For changes that cannot make it invalid: it came in checked, and no value comes from outside.
+    """
+    copy = object.__new__(LocalGraph)
+    copy.__dict__.update(local.__dict__, **changes)
+    return copy
 
 
 def _check(name: str, array: NDArray[np.generic], shape: tuple[int, ...]) -> None:
