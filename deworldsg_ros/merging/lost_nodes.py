@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from deworldsg_ros.scene.arrays import Bool, Int64
 from deworldsg_ros.scene.gaussian import hellinger_distance
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -35,14 +36,10 @@ class LostNodes:
     def match(self, graph: SceneGraph, node_id: int) -> int | None:
         """The lost node that is the same object as a new node; None if there is not exactly one."""
         nodes = graph.nodes
-        first_ns = nodes.first_seen_ns[nodes.row(node_id)]
-        similar = [
-            lost_id
-            for lost_id in self._lost_ns
-            if nodes.last_seen_ns[nodes.row(lost_id)] < first_ns
-            and _are_similar(graph, lost_id, node_id)
-        ]
-        return similar[0] if len(similar) == 1 else None
+        rows = np.array([nodes.row(lost_id) for lost_id in self._lost_ns], np.int64)
+        earlier = rows[nodes.last_seen_ns[rows] < nodes.first_seen_ns[nodes.row(node_id)]]
+        similar = earlier[_are_similar(graph, node_id, earlier)]
+        return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
     def remove(self, node_id: int) -> None:
         """Remove a lost node that was recognised."""
@@ -68,17 +65,21 @@ def moved_object(graph: SceneGraph, lost_id: int) -> int | None:
     """
     nodes = graph.nodes
     last_ns = nodes.last_seen_ns[nodes.row(lost_id)]
-    later = nodes.ids[nodes.confirmed & (nodes.first_seen_ns > last_ns)].tolist()
-    similar = [node_id for node_id in later if _are_similar(graph, lost_id, node_id)]
-    return similar[0] if len(similar) == 1 else None
+    later = np.flatnonzero(nodes.confirmed & (nodes.first_seen_ns > last_ns))
+    similar = later[_are_similar(graph, lost_id, later)]
+    return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
 
-def _are_similar(graph: SceneGraph, a_id: int, b_id: int) -> bool:
-    """Whether two nodes have the same class and similar shapes."""
+def _are_similar(graph: SceneGraph, node_id: int, rows: Int64) -> Bool:
+    """Whether a node and each of some rows (n,) have the same class and similar shapes."""
     nodes = graph.nodes
-    a, b = nodes.row(a_id), nodes.row(b_id)
-    if nodes.class_probabilities[a].argmax() != nodes.class_probabilities[b].argmax():
-        return False
-    origin = np.zeros(3)
-    distance = hellinger_distance(origin, nodes.covariances[a], origin, nodes.covariances[b])
-    return bool(distance < SHAPE_THRESHOLD)
+    row = nodes.row(node_id)
+    label = nodes.class_probabilities[row].argmax()
+    similar: Bool = nodes.class_probabilities[rows].argmax(axis=1) == label
+    if similar.any():
+        origin, alike = np.zeros(3), rows[similar]
+        similar[similar] = (
+            hellinger_distance(origin, nodes.covariances[row], origin, nodes.covariances[alike])
+            < SHAPE_THRESHOLD
+        )
+    return similar

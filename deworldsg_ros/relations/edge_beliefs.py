@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, derived
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.votes import frame_votes
@@ -74,7 +73,7 @@ class EdgeBeliefs:
         if not self._robust:
             return local
         logits = bounded_logits(local.relations.logits, OUTLIER_RATE)
-        return replace(local, relations=replace(local.relations, logits=logits))
+        return derived(local, relations=derived(local.relations, logits=logits))
 
     def observe(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
         """Count the votes of a merged frame, also for pairs without a relation.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,13 +184,16 @@ class LocalGraph:
         return len(self.means_world)
 
 
-def derived(local: LocalGraph, **changes: Any) -> LocalGraph:
-    """A local graph with some attributes replaced, without the checks of a new one.
+Checked = TypeVar("Checked", Relations, LocalGraph)
+
+
+def derived(item: Checked, **changes: Any) -> Checked:
+    """A local graph or relations with some attributes replaced, without the checks of new ones.
 
     For changes that cannot make it invalid: it came in checked, and no value comes from outside.
     """
-    copy = object.__new__(LocalGraph)
-    copy.__dict__.update(local.__dict__, **changes)
+    copy = object.__new__(type(item))
+    copy.__dict__.update(item.__dict__, **changes)
     return copy
 
 
