@@ -41,6 +41,8 @@ ENTRIES = {
     entry.name: entry
     for entry in (
         Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=15),
+        Entry("integration", "bench.integration:figures", limit_s=240, takes_s=60),
+        Entry("fross", "bench.fross:figures", limit_s=240, takes_s=60),
         Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=15),
     )
 }
