@@ -96,9 +96,9 @@ def _masks_of(instances: UInt16, count: int) -> tuple[Int32, Int64, Int64, int]:
     starts = np.cumsum(numbers)
     ends, ordered = starts[:-1].copy(), np.empty((total, 4), np.int32)
     for run in range(total):
-        label = found[run, 3]
-        ordered[ends[label]] = found[run]
-        ends[label] += 1
+        index = found[run, 3]
+        ordered[ends[index]] = found[run]
+        ends[index] += 1
     return ordered, starts, sizes, unknown
 
 
