@@ -110,7 +110,7 @@ def _valid_pixel_count(depth_m: Float32, runs: Int32) -> int:
         run_m, valid = depth_m[row, start:stop], np.int32(0)
         for step in range(run_m.size):
             valid += np.int32(run_m[step] > zero)
-        count += valid
+        count += int(valid)
     return count
 
 

@@ -184,7 +184,7 @@ class NodeRecords:
         self.place(graph, list(owner_of.values()))
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or memory["cell_m"] != self.map.cell_m:
-            self._rebuild(graph, list(owner_of.values()))
+            _rebuild(self, graph, list(owner_of.values()))
             return
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records = memory["records"].astype(RECORD)
@@ -208,14 +208,6 @@ class NodeRecords:
                 if a in owner_of and b in owner_of
             }
         )
-
-    def _rebuild(self, graph: SceneGraph, owners: list[int]) -> None:
-        """Make records from the surfaces and observations in the graph."""
-        nodes = graph.nodes
-        surfaces = [nodes.surface(row) for row in range(len(nodes))]
-        self.map.add(owners, self.map.cells_of(surfaces))
-        for owner, observations in zip(owners, nodes.observations.tolist()):
-            existence.assume(self.rows[owner], observations)
 
     def apply_correction(
         self, graph: SceneGraph, node_ids: list[int], T_correction: Float64
@@ -251,3 +243,12 @@ def _cells(map_: VoxelMap, owners: list[int]) -> Memory:
         "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
         "scores": np.concatenate([np.zeros((0, 64), np.int8), *scores]),
     }
+
+
+def _rebuild(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
+    """Make records from the surfaces and observations in the graph."""
+    nodes = graph.nodes
+    surfaces = [nodes.surface(row) for row in range(len(nodes))]
+    records.map.add(owners, records.map.cells_of(surfaces))
+    for owner, observations in zip(owners, nodes.observations.tolist()):
+        existence.assume(records.rows[owner], observations)
