@@ -44,5 +44,9 @@ ENTRIES = {
         Entry("integration", "bench.integration:figures", limit_s=240, takes_s=60),
         Entry("fross", "bench.fross:figures", limit_s=240, takes_s=60),
         Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=15),
+        Entry("kitchen", "bench.kitchen:figures", limit_s=240, takes_s=45),
+        Entry("memory", "bench.memory:figures", limit_s=120, takes_s=20),
+        Entry("compile", "bench.start:compile_figures", limit_s=240, takes_s=40),
+        Entry("start", "bench.start:node_figures", limit_s=180, takes_s=25),
     )
 }

@@ -24,6 +24,9 @@ from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.up import UpEstimator
 
+# Parts of the kernels that take about equally long to compile.
+KERNEL_PARTS = ("merging", "drift", "pairs")
+
 
 class GraphBuilder:
     """Keeps the global graph and publishes it.
@@ -151,11 +154,20 @@ class GraphBuilder:
         return self._publication.full()
 
 
-def warm_up(config: Config) -> None:
-    """Compile the kernels before the first frame."""
-    build_merging(config.merging, config.output.min_existence).warm_up()
-    Drift().warm_up()
-    pair_geometry.warm_up()
+def warm_up(config: Config, *parts: str) -> None:
+    """Compile the kernels before the first frame.
+
+    Args:
+        config: kernels that it does not use are not compiled.
+        parts: of `KERNEL_PARTS`, to compile in several processes; none = all.
+    """
+    for part in parts or KERNEL_PARTS:
+        if part == "merging":
+            build_merging(config.merging, config.output.min_existence).warm_up()
+        elif part == "drift" and config.merging.association == "surface":
+            Drift().warm_up()
+        elif part == "pairs":
+            pair_geometry.warm_up()
 
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:

@@ -152,6 +152,8 @@ install_project() {
   quietly "installing deworldsg_ros" pip_install --no-deps --no-build-isolation --force-reinstall \
     "$stamps/source"
   rm -rf "$stamps/source"
+  # Otherwise the first run would wait for the compiler.
+  quietly "compiling the kernels" "$venv/bin/deworldsg" compile
   echo "$expected" >"$stamps/project"
 }
 

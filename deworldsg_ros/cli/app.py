@@ -318,6 +318,15 @@ def info(recording: RecordingPath) -> None:
         show_recording(recording, Console())
 
 
+@app.command("compile")
+def compile_kernels() -> None:
+    """Compile the kernels ahead of the first run."""
+    with _reporting_errors():
+        from deworldsg_ros.cli import compilation
+
+        compilation.compile_kernels(Console())
+
+
 @app.command("config")
 def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
     """Print all options: description, range, value."""

@@ -29,6 +29,14 @@ def working(console: Console, text: str) -> Status:
     return console.status(text)
 
 
+def say_instead(console: Console, status: Status, text: str) -> None:
+    """Give a spinner another text; without a terminal, print it."""
+    if console.is_terminal:
+        status.update(text)
+    else:
+        console.print(text, highlight=False, soft_wrap=True)
+
+
 def frame_progress(console: Console) -> Progress:
     """Progress over frames: bar, count, frames per second, time, and a field `note`."""
     return Progress(

@@ -20,10 +20,11 @@ from rich.table import Table
 from deworldsg_ros import __version__
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.progress import frame_progress, working
+from deworldsg_ros.cli.progress import frame_progress, say_instead, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import warm_up
+from deworldsg_ros.kernels import on_compilation
 from deworldsg_ros.map_file import claim_map, continue_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
@@ -42,7 +43,8 @@ from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
 
 # Clips that the world model lost.
 FAILURES = ("world_model_error", "nan_features")
-LOADING = "loading the models … (the first run compiles kernels, which takes a minute or two)"
+LOADING = "loading the models …"
+COMPILING = "compiling the kernels, for the first run on this machine …"
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,8 @@ def _run(options: RunOptions, console: Console) -> None:
 
 def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
     """A pipeline with its models loaded, and with the map's graph if the map file exists."""
-    with working(console, LOADING):
+    with working(console, LOADING) as status:
+        on_compilation(lambda: say_instead(console, status, COMPILING))
         # OpenCV's own threads would compete with those of the stages.
         cv2.setNumThreads(1)
         pipeline = Pipeline(config, overlapped=True)

@@ -53,7 +53,10 @@ class Columns:
         row = len(self._rows)
         if row == len(self._storage["ids"]):
             for name, column in self._storage.items():
-                self._storage[name] = np.concatenate((column, np.zeros_like(column)))
+                # Zeros that were never written take no memory; a copy of zeros would.
+                larger = np.zeros((2 * len(column), *column.shape[1:]), column.dtype)
+                larger[: len(column)] = column
+                self._storage[name] = larger
         for column in self._storage.values():
             column[row] = 0
         self._rows[node_id] = row

@@ -14,6 +14,7 @@ import pytest
 from bench.__main__ import main, run_all
 from bench.entries import ENTRIES, Entry
 from bench.figures import Figure, Setup, in_turn
+from bench.page import page
 
 # The quickest, without data.
 QUICK = ("lifting", "merging_search")
@@ -67,3 +68,17 @@ def test_two_calls_in_turn_are_compared_pair_by_pair() -> None:
     ticks = iter([0.0, 1.0, 3.0, 10.0, 13.0, 25.0])
     paired = in_turn(lambda: None, lambda: None, 2, lambda: next(ticks))
     assert (paired.ours_ms, paired.reference_ms, paired.ratio) == (2000.0, 7000.0, 3.0)
+
+
+def test_the_page_of_figures_shows_every_figure_and_what_was_not_measured() -> None:
+    row = {"benchmark": "a", **dataclasses.asdict(Figure("fast", 2.0, "ms", 2.5)), "reached": True}
+    report = {
+        **dict.fromkeys(("commit", "date", "machine", "python"), "x"),
+        "load_at_start": 1.0,
+        "load_at_end": 2.0,
+        "benchmarks": {"a": {}, "b": {"error": "Traceback\nOSError: gone"}},
+        "figures": [row],
+    }
+    text = page(report)
+    assert "| `fast` |  | 2 ms ✓ | ≤ 2.5 ms |" in text
+    assert "Not measured: OSError: gone" in text

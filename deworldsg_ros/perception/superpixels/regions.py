@@ -113,7 +113,8 @@ def find_regions(cells: Cells) -> Regions:
     weights = _edge_weights(cells.lab, cells.points, cells.normals)
     labels, count = _merge(weights)
     sums = _region_sums(labels, count, cells.lab, cells.points, cells.normals)
-    area, valid = sums[:, 0], sums[:, 4]
+    # Contiguous also for one region: kernels are compiled for one layout.
+    area, valid = np.ascontiguousarray(sums[:, 0]), np.ascontiguousarray(sums[:, 4])
     normal_length = np.linalg.norm(sums[:, 8:11], axis=1)
     pairs, strength = _adjacency(labels, count, weights)
     return Regions(

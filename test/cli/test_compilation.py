@@ -1,0 +1,65 @@
+"""Compilation of kernels: ahead, in several processes, and announced only when it happens."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from deworldsg_ros.cli import compilation
+from deworldsg_ros.graph_builder import KERNEL_PARTS
+
+SCRIPT = """
+import gc
+from deworldsg_ros.kernels import on_compilation
+from small import twice, thrice
+on_compilation(lambda: print("compiling", gc.isenabled()))
+assert twice(2) == 4 and thrice(2) == 6
+assert gc.isenabled()
+"""
+KERNELS = """
+from deworldsg_ros.kernels import kernel
+
+@kernel
+def twice(x):
+    return 2 * x
+
+@kernel
+def thrice(x):
+    return twice(x) + x
+"""
+
+
+def run_script(folder: Path) -> str:
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(folder / "cache"),
+        "PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
+    command = [sys.executable, "-c", SCRIPT]
+    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    return done.stdout
+
+
+def test_compilation_is_announced_once_and_only_if_it_happens(tmp_path: Path) -> None:
+    (tmp_path / "small.py").write_text(KERNELS)
+    assert run_script(tmp_path).splitlines() == ["compiling False"]
+    assert run_script(tmp_path) == ""  # loaded from the cache
+
+
+def test_all_kernels_of_a_run_have_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert set(compilation.PARTS) == {"perception", "lifting", *KERNEL_PARTS}
+    done = []
+    monkeypatch.setattr(compilation, "_in_own_process", lambda part: done.append(part) or "")
+    compilation.compile_kernels(Console(quiet=True))
+    assert sorted(done) == sorted(compilation.PARTS)
+
+
+def test_a_failed_part_is_reported_with_its_output() -> None:
+    with pytest.raises(compilation.CompilationFailed, match="KeyError: 'nothing'"):
+        compilation.raise_failure(compilation._in_own_process("nothing"))
+    assert compilation._in_own_process("pairs") == ""
