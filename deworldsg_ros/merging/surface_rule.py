@@ -48,6 +48,11 @@ class SurfaceMerging:
         spare.hidden(graph)
         spare._records.remove(1)
         graph.merge_nodes(1, 2)
+        # Points are dropped only from nodes whose parts belong to others.
+        node_ids = graph.nodes.ids.tolist()
+        rows = [graph.nodes.row(node_id) for node_id in node_ids]
+        cells = spare._records.map.cells_of([graph.nodes.surface(row) for row in rows])
+        graph.drop_points(node_ids, spare._records.map.points_in(cells, graph.nodes, rows))
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.

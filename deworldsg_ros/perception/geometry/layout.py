@@ -99,7 +99,10 @@ def measure_layout(
         valid=valid,
         low=low,
         high=high,
-        contact_m=_contacts(points, owners, low, high, valid),
+        # Contiguous: a kernel is compiled for one layout.
+        contact_m=_contacts(
+            points, owners, np.ascontiguousarray(low), np.ascontiguousarray(high), valid
+        ),
         beneath=surfaces_beneath(depth_m, intrinsics, instances, axes[2], low[:, 2]),
         shared=_fraction(overlap_m, np.minimum(length_m[:, None], length_m[None])),
         shared_deep=_fraction(
