@@ -53,6 +53,7 @@ class SurfaceMerging:
         rows = [graph.nodes.row(node_id) for node_id in node_ids]
         cells = spare._records.map.cells_of([graph.nodes.surface(row) for row in rows])
         graph.drop_points(node_ids, spare._records.map.points_in(cells, graph.nodes, rows))
+        spare._records.map.warm_up()
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.

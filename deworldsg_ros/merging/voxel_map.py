@@ -170,6 +170,10 @@ class VoxelMap:
             self._counts[owner], self._firsts[owner] = 0, -1
         return cells
 
+    def warm_up(self) -> None:
+        """Compile the kernel that the first frames do not need."""
+        self._grow(0)
+
     def _slots_of(self, owner: int) -> Int64:
         """Slots of an owner."""
         first = int(self._firsts[owner]) if owner < len(self._firsts) else -1

@@ -52,7 +52,8 @@ class SurfelMap:
         """
         view, rows = _view(grid), self._rows[: self._count]
         self._seen = _in_view(rows, invert_pose(T_world_camera), view)
-        sample = self._seen[:: max(1, len(self._seen) // SAMPLES)]
+        # Contiguous: a kernel is compiled for one layout.
+        sample = np.ascontiguousarray(self._seen[:: max(1, len(self._seen) // SAMPLES)])
         T, matches = _fit(rows, sample, T_world_camera, view)
         return T if matches >= MIN_MATCHES else None
 

@@ -1,0 +1,43 @@
+"""All kernels of a run are compiled before its first frame, each for one layout."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import warm_up
+from deworldsg_ros.pipeline import Pipeline
+from deworldsg_ros.recordings.recording import open_recording
+
+# By then a surface was seen through, and relations were inferred.
+FRAMES = 60
+
+
+def signatures() -> dict[str, set[object]]:
+    """Compiled signatures of each kernel of the package."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("deworldsg_ros.")]
+    kernels = {item for module in modules for item in vars(module).values()
+               if isinstance(item, Dispatcher)}  # fmt: skip
+    return {f"{k.__module__}.{k.__name__}": set(k.signatures) for k in kernels}
+
+
+@pytest.mark.slow
+def test_no_frame_waits_for_the_compiler(root_dir: Path) -> None:
+    pipeline = Pipeline(Config())
+    pipeline.lifting.warm_up()
+    warm_up(Config())
+    before = signatures()
+    assert len(before) > 60
+    recording = open_recording(root_dir / "bags" / "demo_room")
+    for frame in itertools.islice(recording.frames(), FRAMES):
+        pipeline.process(frame)
+        assert pipeline.builder is not None
+        pipeline.builder.update()
+    recording.close()
+    late = {name: found - before.get(name, set()) for name, found in signatures().items()}
+    assert {name: found for name, found in late.items() if found} == {}
