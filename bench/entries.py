@@ -48,5 +48,6 @@ ENTRIES = {
         Entry("memory", "bench.memory:figures", limit_s=120, takes_s=20),
         Entry("compile", "bench.start:compile_figures", limit_s=240, takes_s=40),
         Entry("start", "bench.start:node_figures", limit_s=180, takes_s=25),
+        Entry("latency", "bench.latency:figures", limit_s=420, takes_s=240),
     )
 }
