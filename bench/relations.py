@@ -147,8 +147,7 @@ def belief_costs(objects: int, nodes: int, turns: int) -> None:
     for node in range(nodes):
         points = cloud(node, 512)
         graph.add_node(points.mean(0).astype(float), np.eye(3) * 0.01, classes[node], 1, points)
-    ids = set(graph.nodes.ids.tolist())
-    beliefs.states(ids)
+    beliefs.refresh()
     votes, states = [], []
     for turn in range(turns):
         first = int(generator.integers(nodes - objects))
@@ -160,7 +159,7 @@ def belief_costs(objects: int, nodes: int, turns: int) -> None:
         pair_votes = np.zeros((2, len(REPLICA_SSG_PREDICATES)))
         pair_votes[0, REPLICA_SSG_PREDICATES.index("on")] = 0.9
         votes.append(timed(lambda seen=seen, counts=pair_votes: vote(seen, counts)))
-        states.append(timed(lambda: beliefs.states(ids)))
+        states.append(timed(lambda: beliefs.refresh(whole=False)))
     size = f"{objects} objects, {nodes} nodes"
     print(f"votes of a frame, {size}        {1e3 * np.median(votes):8.3f} ms")
     print(f"edges after a frame, {size}     {1e3 * np.median(states):8.3f} ms")

@@ -11,7 +11,7 @@ from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.common import check_fits
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
-from deworldsg_ros.relations import pair_geometry
+from deworldsg_ros.relations import edge_beliefs
 from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
 from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.scene import wire
@@ -64,6 +64,7 @@ class GraphBuilder:
         self._publication = Publication(
             graph,
             self._edges.states,
+            self._edges.refresh,
             top_k=output.top_k,
             include_surface_points=output.include_surface_points,
         )
@@ -167,7 +168,7 @@ def warm_up(config: Config, *parts: str) -> None:
         elif part == "drift" and config.merging.association == "surface":
             Drift().warm_up()
         elif part == "pairs":
-            pair_geometry.warm_up()
+            edge_beliefs.warm_up(config)
 
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,14 +16,14 @@ from deworldsg_ros.relations.evidence import (
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.paper_beliefs import PaperBeliefs, edge_state
 from deworldsg_ros.relations.physics_model import load_physics_model
-from deworldsg_ros.relations.predicted_prior import predicted_prior
-from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.relations.robust_beliefs import DirectedBeliefs, RobustBeliefs
+from deworldsg_ros.relations.predicted_prior import PredictedPrior
+from deworldsg_ros.relations.prior import ClassPairPrior, Prior
+from deworldsg_ros.relations.robust_beliefs import ChangedBeliefs, RobustBeliefs
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, derived
+from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.votes import frame_votes
@@ -33,6 +32,9 @@ from deworldsg_ros.scene.votes import frame_votes
 MAX_DISTANCE_M = 2.5
 # An edge is published if its best predicate has at least this probability.
 MIN_PROBABILITY = 0.2
+# Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
+# 12 objects changes about 80 pairs.
+JUDGED_A_CALL = 32
 # Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
 
@@ -48,6 +50,8 @@ class EdgeBeliefs:
     Attributes:
         prior: of class pairs, from clips.
         up: estimates the direction against gravity from the poses of the frames.
+        states: the messages of the edges by subject and object; those that did not change are the
+            same objects.
     """
 
     def __init__(self, config: Config, graph: SceneGraph, prior: ClassPairPrior) -> None:
@@ -65,8 +69,10 @@ class EdgeBeliefs:
         self._has_predictions = relations.world_model == "physics"
         self._paper_beliefs = PaperBeliefs(relations, graph, self._top_k)
         self._robust_beliefs = RobustBeliefs(config, graph, self._table)
-        # The last message of each pair, with what it was made from.
-        self._known: dict[Pair, tuple[Any, wire.EdgeState]] = {}
+        self._predicted = PredictedPrior(graph.vocabulary)
+        self.states: dict[Pair, wire.EdgeState] = {} if self._robust else self._paper_beliefs.states
+        # What each message was made from, beside the evidence of its edge.
+        self._basis: dict[Pair, tuple[bytes, wire.Provenance]] = {}
 
     def weigh(self, local: LocalGraph) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
@@ -118,42 +124,47 @@ class EdgeBeliefs:
         for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
             self._graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
 
-    def states(self, node_ids: Collection[int]) -> list[wire.EdgeState]:
-        """Messages of the edges between nodes, in order; unchanged ones are the same objects.
+    def refresh(self, whole: bool = True) -> list[Pair]:
+        """Bring `states` up to date; returns the pairs with another message, or none.
 
         Args:
-            node_ids: of the published nodes.
+            whole: judge all pairs that wait. False: at most `JUDGED_A_CALL`.
         """
-        prior = self.prior
+        prior: Prior = self.prior
         if self._robust or self._has_predictions:
-            self._table.refresh(self.up.up_world())
+            self._table.refresh(self.up.up_world(), None if whole else JUDGED_A_CALL)
         if self._has_predictions:
-            prior = predicted_prior(self._table, self._graph)
-        if not self._robust:
-            return self._paper_beliefs.states(node_ids, prior)
-        return self._messages(self._robust_beliefs.beliefs(prior))
+            self._predicted.follow(self._table, self._table.changed_pairs)
+            prior = self._predicted
+        if self._robust:
+            return self._follow(self._robust_beliefs.refresh(prior))
+        self._table.changed_pairs.clear()
+        self._table.changed_nodes.clear()
+        return self._paper_beliefs.refresh(prior)
 
-    def _messages(self, beliefs: DirectedBeliefs) -> list[wire.EdgeState]:
+    def _follow(self, beliefs: ChangedBeliefs) -> list[Pair]:
         """Messages of the edges that are probable enough."""
+        evidence_changed = self._graph.take_changed_edges()
         rounded = np.round(beliefs.probabilities, DECIMALS)
-        rows = np.flatnonzero(rounded.max(axis=1, initial=0.0) >= MIN_PROBABILITY)
-        order = np.lexsort((beliefs.pairs[rows, 1], beliefs.pairs[rows, 0]))
-        known: dict[Pair, tuple[Any, wire.EdgeState]] = {}
-        for row in rows[order].tolist():
-            pair = (int(beliefs.pairs[row, 0]), int(beliefs.pairs[row, 1]))
-            evidence = self._graph.edges.get(pair)
-            basis = (rounded[row].tobytes(), evidence and evidence.revision, beliefs.sources(row))
-            last = self._known.get(pair)
-            known[pair] = last if last and last[0] == basis else (
-                basis, self._message(pair, rounded[row], beliefs.sources(row))
-            )  # fmt: skip
-        self._known = known
-        return [state for _, state in known.values()]
+        said = rounded.max(axis=1, initial=0.0) >= MIN_PROBABILITY
+        gone = beliefs.unrelated + [beliefs.pairs[i] for i in np.flatnonzero(~said).tolist()]
+        changed = [pair for pair in gone if self.states.pop(pair, None) is not None]
+        for pair in changed:
+            del self._basis[pair]
+        for index in np.flatnonzero(said).tolist():
+            pair, basis = beliefs.pairs[index], (rounded[index].tobytes(), beliefs.sources[index])
+            if self._basis.get(pair) != basis or pair in evidence_changed:
+                self._basis[pair] = basis
+                changed.append(pair)
+        changed.extend((evidence_changed & self.states.keys()).difference(changed))
+        for pair in changed:
+            if pair in self._basis:
+                self.states[pair] = self._message(pair, *self._basis[pair])
+        return changed
 
-    def _message(
-        self, pair: Pair, probabilities: Float64, provenance: wire.Provenance
-    ) -> wire.EdgeState:
+    def _message(self, pair: Pair, rounded: bytes, provenance: wire.Provenance) -> wire.EdgeState:
         evidence = self._graph.edges.get(pair)
+        probabilities = np.frombuffer(rounded)
         logits = np.zeros(len(probabilities))
         frames = 0
         if evidence is not None and evidence.frames:
@@ -178,3 +189,20 @@ class EdgeBeliefs:
                 f"{len(known.predicates)}, with the same names in the same order (do all nodes "
                 "run with one configuration?)",
             )
+
+
+def warm_up(config: Config) -> None:
+    """Compile the kernels, or load them from the cache: things come, move, rest in a circle, go."""
+    graph = SceneGraph(Vocabulary(("table", "cup"), ("on", "near", "with", "other")), "world")
+    beliefs = EdgeBeliefs(config, graph, ClassPairPrior(2, 4))
+    points = np.indices((3, 3, 3)).reshape(3, -1).T.astype(np.float32) / 10.0
+    for index in range(3):
+        mean, surface = np.zeros(3), points + np.float32(0.1 * index)
+        graph.add_node(mean, np.eye(3), np.array([0.7, 0.3]), 1, surface)
+    for pair in ((1, 2), (2, 3), (3, 1)):
+        graph.add_votes(*pair, np.array([[30.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]))
+    beliefs.refresh()
+    graph.move_node(2, np.array([[1.0, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    beliefs.refresh()
+    graph.remove_node(1)
+    beliefs.refresh()

@@ -16,7 +16,7 @@ from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 _CARRIED = np.isin(RELATIONS_OF_STATE, SUPPORTS)
 CARRIED_FIRST, CARRIED_SECOND = _CARRIED[:, 0], _CARRIED[:, 1]
 # Odds are finite.
-_MOST = 1.0 - 1e-6
+MOST = 1.0 - 1e-6
 
 # Near: horizontal gap of furniture on the floor, and of objects on one support; and the standard
 # deviation of a measured gap.
@@ -57,12 +57,12 @@ def one_support(
         second one, and the opposite; and (n,) probability that an object stands on the floor.
     """
     carried = np.column_stack([states[:, CARRIED_FIRST].sum(1), states[:, CARRIED_SECOND].sum(1)])
-    carried = np.minimum(carried, _MOST)
+    carried = np.minimum(carried, MOST)
     odds = carried / (1.0 - carried)
     total = 1.0 + floor_odds
     np.add.at(total, pairs, odds)
     kept = odds / total[pairs]
-    kept *= np.minimum(1.0, _MOST / np.maximum(kept.sum(axis=1, keepdims=True), 1e-300))
+    kept *= np.minimum(1.0, MOST / np.maximum(kept.sum(axis=1, keepdims=True), 1e-300))
     _cut_circles(kept, pairs, len(floor_odds))
     result = states.copy()
     for end, chosen in enumerate((CARRIED_FIRST, CARRIED_SECOND)):

@@ -6,18 +6,19 @@ All lengths are metres in an upright frame: axes 0 and 1 are horizontal, axis 2 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from deworldsg_ros.kernels import kernel
+from deworldsg_ros.relations.reach import REACH_M
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.columns import Columns
 
 # Points of a node that its shape uses, which is all that a node keeps. With half of them, tables
 # have no point near the small objects on them.
 SHAPE_POINTS = 512
-# A node with fewer points has no reliable bounds; its relations are not judged.
-MIN_SHAPE_POINTS = 8
 # Bounds leave out this fraction of the points at either end: masks bleed, and edges fly.
 TRIM_FRACTION = 0.02
 # An object rests on a surface within this horizontal distance of its own bounds.
@@ -26,13 +27,6 @@ MARGIN_M = 0.06
 LAYER_M = 0.035
 # Points of a surface count for its height beside an object by exp(-(distance / this)²).
 SOFT_RADIUS_M = 0.15
-# Pairs of objects that are farther apart are not related: horizontally, vertically, and
-# vertically for objects that are not over one another.
-REACH_M = 0.6
-OVER_REACH_M = 1.3
-BESIDE_REACH_M = 0.15
-# Directions around an object in which a container's wall may be.
-SECTORS = 8
 
 FEATURES = (
     "gap_m", "overlap_small_m", "overlap_large_m", "overlap_up_m", "covered", "covers",
@@ -56,7 +50,6 @@ class NodeShapes(Columns):
         means: (n, 3), and
         covariances: (n, 3, 3) of the points.
         counts: (n,) int64, number of points used.
-        points: (n, SHAPE_POINTS, 3) float32.
     """
 
     revisions: Int64
@@ -65,9 +58,8 @@ class NodeShapes(Columns):
     means: Float64
     covariances: Float64
     counts: Int64
-    points: Float32
 
-    def __init__(self) -> None:
+    def __init__(self, more: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] | None = None) -> None:
         super().__init__(
             {
                 "revisions": (np.int64, ()),
@@ -76,48 +68,90 @@ class NodeShapes(Columns):
                 "means": (np.float64, (3,)),
                 "covariances": (np.float64, (3, 3)),
                 "counts": (np.int64, ()),
-                "points": (np.float32, (SHAPE_POINTS, 3)),
+                **(more or {}),
             }
         )
 
-    def put(self, row: int, points_world: Float32, R_up_world: Float64) -> None:
-        """Replace the shape of a row.
+    def put(self, rows: Int64, points_world: Float32, counts: Int64, R_up_world: Float64) -> None:
+        """Replace the shapes of rows.
 
         Args:
-            row: of the node.
-            points_world: (k, 3) sample of its surface, world frame.
+            rows: (k,) of the nodes.
+            points_world: (k, K, 3) samples of their surfaces, world frame.
+            counts: (k,) numbers of these points.
             R_up_world: (3, 3) rotation from the world frame to the upright frame.
         """
-        used = points_world[:SHAPE_POINTS]
-        count = self.counts[row] = len(used)
-        if not count:
-            return
-        upright = used @ R_up_world.T.astype(np.float32)
-        self.points[row, :count] = upright
-        ordered = np.sort(upright.astype(np.float64), axis=0)
-        cut = round(TRIM_FRACTION * (count - 1))
-        low, high = ordered[cut], ordered[count - 1 - cut]
-        # Give back what the quantiles cut off an evenly covered surface. Not in height: most
-        # visible points of a table are at one height.
-        trimmed = (high - low)[:2] * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
-        low[:2] -= trimmed
-        high[:2] += trimmed
-        self.low[row], self.high[row] = low, high
-        self.means[row] = ordered.mean(axis=0)
-        offsets = upright.astype(np.float64) - self.means[row]
-        self.covariances[row] = offsets.T @ offsets / count
+        points = upright(points_world[:, :SHAPE_POINTS], R_up_world)
+        self.counts[rows] = np.minimum(counts, points.shape[1])
+        cuts = np.rint(TRIM_FRACTION * (self.counts[rows] - 1)).astype(np.int64)
+        shapes = (self.low, self.high, self.means, self.covariances, self.counts)
+        _measure(rows, points, cuts, *shapes)
 
 
-def warm_up() -> None:
-    """Compile the kernels, or load them from the cache."""
-    shapes = NodeShapes()
-    points = np.indices((2, 2, 2)).reshape(3, -1).T.astype(np.float32)
-    for node_id in (1, 2):
-        shapes.put(shapes.append(node_id), points, np.eye(3))
-    pairs = pairs_in_reach(np.arange(2), shapes.low, shapes.high, shapes.counts)
-    columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
-    first, second = np.ascontiguousarray(pairs.T)
-    pair_features(first, second, *columns, shapes.points, 0.0)
+def upright(points_world: Float32, R_up_world: Float64) -> Float32:
+    """Points (..., 3) float32 in the upright frame."""
+    if np.array_equal(R_up_world, np.eye(3)):
+        return points_world
+    turned: Float32 = points_world @ R_up_world.T.astype(np.float32)
+    return turned
+
+
+@kernel
+def _measure(
+    rows: Int64,
+    points: Float32,
+    cuts: Int64,
+    low: Float64,
+    high: Float64,
+    means: Float64,
+    covariances: Float64,
+    counts: Int64,
+) -> None:
+    """Bounds without `cuts` points at either end, mean and covariance of points (k, K, 3)."""
+    for index in range(len(rows)):
+        row, cut = rows[index], cuts[index]
+        if not counts[row]:
+            continue
+        cloud = points[index, : counts[row]]
+        for axis in range(3):
+            least, greatest, total = _ends(cloud[:, axis], cut)
+            # Give back what the quantiles cut off an evenly covered surface. Not in height: most
+            # visible points of a table are at one height.
+            given = 0.0
+            if axis < 2:
+                given = (greatest - least) * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
+            low[row, axis], high[row, axis] = least - given, greatest + given
+            means[row, axis] = total / len(cloud)
+        for i in range(3):
+            for j in range(i, 3):
+                total = 0.0
+                for k in range(len(cloud)):
+                    total += (cloud[k, i] - means[row, i]) * (cloud[k, j] - means[row, j])
+                covariances[row, i, j] = covariances[row, j, i] = total / len(cloud)
+
+
+@kernel
+def _ends(values: Float32, cut: int) -> tuple[float, float, float]:
+    """The values (k,) that `cut` others are below, and above; and the sum of all."""
+    least = np.full(cut + 1, np.inf)
+    greatest = np.full(cut + 1, -np.inf)
+    total = 0.0
+    for k in range(len(values)):
+        value = np.float64(values[k])
+        total += value
+        if value < least[cut]:
+            place = cut
+            while place > 0 and least[place - 1] > value:
+                least[place] = least[place - 1]
+                place -= 1
+            least[place] = value
+        if value > greatest[cut]:
+            place = cut
+            while place > 0 and greatest[place - 1] < value:
+                greatest[place] = greatest[place - 1]
+                place -= 1
+            greatest[place] = value
+    return least[cut], greatest[cut], total
 
 
 def rotation_to_upright(up_world: Float64) -> Float64:
@@ -141,41 +175,9 @@ def rotation_to_upright(up_world: Float64) -> Float64:
 
 
 @kernel
-def pairs_in_reach(changed: Int64, low: Float64, high: Float64, counts: Int64) -> Int64:
-    """Unordered pairs of rows (m, 2) in reach, with at least one of the changed rows.
-
-    Args:
-        changed: (k,) rows.
-        low: (n, 3) bounds, and
-        high: (n, 3).
-        counts: (n,) numbers of points.
-    """
-    is_changed = np.zeros(len(low), np.bool_)
-    is_changed[changed] = True
-    found = np.empty((len(changed) * len(low), 2), np.int64)
-    count = 0
-    for a in changed:
-        if counts[a] < MIN_SHAPE_POINTS:
-            continue
-        for b in range(len(low)):
-            if b == a or counts[b] < MIN_SHAPE_POINTS or (is_changed[b] and b < a):
-                continue
-            x = max(low[a, 0], low[b, 0]) - min(high[a, 0], high[b, 0])
-            y = max(low[a, 1], low[b, 1]) - min(high[a, 1], high[b, 1])
-            z = max(low[a, 2], low[b, 2]) - min(high[a, 2], high[b, 2])
-            if x > REACH_M or y > REACH_M or z > OVER_REACH_M:
-                continue
-            if z > BESIDE_REACH_M and (x > BESIDE_REACH_M or y > BESIDE_REACH_M):
-                continue
-            found[count, 0], found[count, 1] = a, b
-            count += 1
-    return found[:count]
-
-
-@kernel
 def pair_features(  # noqa: D417
-    subjects: Int64,
-    objects: Int64,
+    first: Int64,
+    second: Int64,
     low: Float64,
     high: Float64,
     means: Float64,
@@ -184,51 +186,100 @@ def pair_features(  # noqa: D417
     points: Float32,
     floor_m: float,
 ) -> Float64:
-    """Features (m, len(FEATURES)) of ordered pairs of rows of `NodeShapes`.
+    """Features (2, m, len(FEATURES)) of pairs of rows: first to second, and second to first.
 
     Args:
-        subjects: (m,) rows, and
-        objects: (m,) rows of the pairs.
-        low, high, means, covariances, counts, points: the columns of `NodeShapes`.
+        first: (m,) rows, and
+        second: (m,) rows of the pairs.
+        low, high, means, covariances, counts: columns of `NodeShapes`.
+        points: (n, K, 3) points of the rows in the upright frame; the first `counts` are used.
         floor_m: height of the floor.
     """
-    result = np.zeros((len(subjects), len(FEATURES)))
-    for pair in range(len(subjects)):
-        a, b = subjects[pair], objects[pair]
-        out = result[pair]
-        overlap = np.minimum(high[a], high[b]) - np.maximum(low[a], low[b])
-        size_a, size_b = high[a] - low[a], high[b] - low[b]
-        gap_x, gap_y = max(0.0, -overlap[0]), max(0.0, -overlap[1])
-        out[0] = np.sqrt(gap_x * gap_x + gap_y * gap_y)
-        out[1] = min(overlap[0], overlap[1])
-        out[2] = max(overlap[0], overlap[1])
-        out[3] = overlap[2]
-        shared = max(0.0, overlap[0]) * max(0.0, overlap[1])
-        out[4] = min(1.0, shared / (max(size_a[0], 0.01) * max(size_a[1], 0.01)))
-        out[5] = min(1.0, shared / (max(size_b[0], 0.01) * max(size_b[1], 0.01)))
-        _contact(out, a, b, low, high, counts, points)
-        out[15] = _enclosure(a, b, low, high, means, counts, points)
-        out[16] = _enclosure(b, a, low, high, means, counts, points)
-        out[17] = _inside(a, b, low, high, counts, points)
-        out[18] = _inside(b, a, low, high, counts, points)
-        out[19] = _distance(a, b, low, high, counts, points)
-        offset = means[a] - means[b]
-        spread = covariances[a] + covariances[b] + 1e-4 * np.eye(3)
-        out[20] = np.sqrt(max(0.0, offset @ np.linalg.solve(spread, offset)))
-        out[21] = low[a, 2] - low[b, 2]
-        out[22] = high[a, 2] - high[b, 2]
-        out[23] = low[a, 2] - high[b, 2]
-        out[24] = high[a, 2] - low[b, 2]
-        out[25] = low[a, 2] - floor_m
-        out[26] = low[b, 2] - floor_m
-        for size, first in ((size_a, 27), (size_b, 30)):
-            out[first] = np.log(max(0.01, max(size[0], size[1])))
-            out[first + 1] = np.log(max(0.01, min(size[0], size[1])))
-            out[first + 2] = np.log(max(0.01, size[2]))
-        out[33] = out[27] - out[30]
-        out[34] = np.log(float(counts[a]))
-        out[35] = np.log(float(counts[b]))
+    result = np.zeros((2, len(first), len(FEATURES)))
+    for pair in range(len(first)):
+        a, b = first[pair], second[pair]
+        there, back = result[0, pair], result[1, pair]
+        _bounds(there, a, b, low, high, counts, floor_m)
+        _contact(there, a, b, low, high, counts, points)
+        _contact(back, b, a, low, high, counts, points)
+        there[15] = _enclosure(a, b, low, high, counts, points)
+        there[16] = _enclosure(b, a, low, high, counts, points)
+        there[17] = _inside(a, b, low, high, counts, points)
+        there[18] = _inside(b, a, low, high, counts, points)
+        there[19] = _distance(a, b, low, high, counts, points)
+        there[20] = _mahalanobis(a, b, means, covariances)
+        _reverse(there, back)
     return result
+
+
+@kernel
+def _bounds(
+    out: Float64, a: int, b: int, low: Float64, high: Float64, counts: Int64, floor_m: float
+) -> None:
+    """Features 0 to 5 and 21 to 35: sizes, gaps and heights of the bounds."""
+    overlap_x = min(high[a, 0], high[b, 0]) - max(low[a, 0], low[b, 0])
+    overlap_y = min(high[a, 1], high[b, 1]) - max(low[a, 1], low[b, 1])
+    gap_x, gap_y = max(0.0, -overlap_x), max(0.0, -overlap_y)
+    out[0] = math.sqrt(gap_x * gap_x + gap_y * gap_y)
+    out[1], out[2] = min(overlap_x, overlap_y), max(overlap_x, overlap_y)
+    out[3] = min(high[a, 2], high[b, 2]) - max(low[a, 2], low[b, 2])
+    shared = max(0.0, overlap_x) * max(0.0, overlap_y)
+    out[4] = min(1.0, shared / _area(a, low, high))
+    out[5] = min(1.0, shared / _area(b, low, high))
+    out[21] = low[a, 2] - low[b, 2]
+    out[22] = high[a, 2] - high[b, 2]
+    out[23] = low[a, 2] - high[b, 2]
+    out[24] = high[a, 2] - low[b, 2]
+    out[25] = low[a, 2] - floor_m
+    out[26] = low[b, 2] - floor_m
+    for row, place in ((a, 27), (b, 30)):
+        x, y = high[row, 0] - low[row, 0], high[row, 1] - low[row, 1]
+        out[place] = math.log(max(0.01, max(x, y)))
+        out[place + 1] = math.log(max(0.01, min(x, y)))
+        out[place + 2] = math.log(max(0.01, high[row, 2] - low[row, 2]))
+    out[33] = out[27] - out[30]
+    out[34] = math.log(float(counts[a]))
+    out[35] = math.log(float(counts[b]))
+
+
+@kernel
+def _reverse(there: Float64, back: Float64) -> None:
+    """Fill the features of the opposite direction, except `_contact`'s."""
+    for place in (0, 1, 2, 3, 19, 20):
+        back[place] = there[place]
+    for place in (21, 22, 33):
+        back[place] = -there[place]
+    for one, other in (
+        (4, 5),
+        (15, 16),
+        (17, 18),
+        (25, 26),
+        (34, 35),
+        (27, 30),
+        (28, 31),
+        (29, 32),
+    ):
+        back[one], back[other] = there[other], there[one]
+    back[23], back[24] = -there[24], -there[23]
+
+
+@kernel
+def _mahalanobis(a: int, b: int, means: Float64, covariances: Float64) -> float:
+    """Distance of the means in standard deviations of both objects."""
+    offset = means[a] - means[b]
+    s = covariances[a] + covariances[b]
+    for axis in range(3):
+        s[axis, axis] += 1e-4
+    # Cholesky factor of the symmetric matrix, and forward substitution.
+    l00 = math.sqrt(s[0, 0])
+    l10, l20 = s[1, 0] / l00, s[2, 0] / l00
+    l11 = math.sqrt(max(1e-12, s[1, 1] - l10 * l10))
+    l21 = (s[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(max(1e-12, s[2, 2] - l20 * l20 - l21 * l21))
+    x = offset[0] / l00
+    y = (offset[1] - l10 * x) / l11
+    z = (offset[2] - l20 * x - l21 * y) / l22
+    return math.sqrt(x * x + y * y + z * z)
 
 
 @kernel
@@ -293,21 +344,28 @@ def _area(row: int, low: Float64, high: Float64) -> float:
 
 @kernel
 def _enclosure(
-    a: int, b: int, low: Float64, high: Float64, means: Float64, counts: Int64, points: Float32
+    a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32
 ) -> float:
-    """Fraction of the directions around the centre of a in which b has points beside a."""
+    """Fraction of eight directions around the centre of a in which b has points beside a."""
     x = (low[a, 0] + high[a, 0]) / 2
     y = (low[a, 1] + high[a, 1]) / 2
     reach = REACH_M / 2 + max(high[a, 0] - low[a, 0], high[a, 1] - low[a, 1]) / 2
-    found = np.zeros(SECTORS, np.bool_)
+    bottom, top = low[a, 2] + 0.02, high[a, 2] + 0.1
+    found = 0
     for k in range(counts[b]):
-        if points[b, k, 2] < low[a, 2] + 0.02 or points[b, k, 2] > high[a, 2] + 0.1:
+        if points[b, k, 2] < bottom or points[b, k, 2] > top:
             continue
         step_x, step_y = points[b, k, 0] - x, points[b, k, 1] - y
         if step_x * step_x + step_y * step_y < reach * reach:
-            angle = np.arctan2(step_y, step_x) / (2 * np.pi)
-            found[min(SECTORS - 1, int(SECTORS * (angle + 0.5)))] = True
-    return float(found.sum()) / SECTORS
+            half = int(step_y >= 0.0)
+            quarter = int(step_x >= 0.0)
+            steep = int(abs(step_y) >= abs(step_x))
+            found |= 1 << (4 * half + 2 * quarter + steep)
+    sectors = 0
+    while found:
+        found &= found - 1
+        sectors += 1
+    return sectors / 8
 
 
 @kernel

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
-from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.node_states import best_beliefs
-
-# What a belief is computed from: revision of the evidence, classes, and the prior as bytes.
-_Basis = tuple[int, int, int, bytes]
 
 
 class PaperBeliefs:
@@ -26,43 +23,78 @@ class PaperBeliefs:
         config: `fusion_alpha` and `entropy_threshold_nats` are used.
         graph: whose edges these are.
         top_k: number of predicates in the message of an edge.
+
+    Attributes:
+        states: the messages by subject and object; those that did not change are the same objects.
     """
 
     def __init__(self, config: RelationsConfig, graph: SceneGraph, top_k: int) -> None:
         self._config = config
         self._graph = graph
         self._top_k = top_k
-        # The last message of each pair, with its basis; None = no belief, no edge.
-        self._known: dict[Pair, tuple[_Basis, wire.EdgeState | None]] = {}
+        self.states: dict[Pair, wire.EdgeState] = {}
+        self._touched = graph.watch_nodes()
+        # Classes of subject and object of each pair of published nodes, and the pairs of each two.
+        self._classes: dict[Pair, tuple[int, int]] = {}
+        self._by_classes: dict[tuple[int, int], set[Pair]] = {}
+        # Classes of the published nodes.
+        self._class_of: dict[int, int] = {}
 
-    def states(self, node_ids: Collection[int], prior: ClassPairPrior) -> list[wire.EdgeState]:
-        """Messages of the edges between these nodes; unchanged messages are the same objects.
+    def refresh(self, prior: Prior) -> list[Pair]:
+        """Bring `states` up to date; returns the pairs with another message, or none.
 
         Args:
-            node_ids: of published nodes.
             prior: of class pairs.
         """
-        pairs = [p for p in sorted(self._graph.edges) if p[0] in node_ids and p[1] in node_ids]
-        if not pairs:
-            self._known = {}
-            return []
-        classes = self._classes(pairs)
-        priors, has_prior = prior.lookup(classes)
-        bases = {
-            pair: (self._graph.edges[pair].revision, *ends, priors[row].tobytes())
-            for row, (pair, ends) in enumerate(zip(pairs, classes.tolist()))
-        }
-        stale = [
-            row
-            for row, (pair, basis) in enumerate(bases.items())
-            if pair not in self._known or self._known[pair][0] != basis
-        ]
-        made = self._make([pairs[row] for row in stale], priors[stale], has_prior[stale])
-        self._known = {
-            pair: (basis, made[pair] if pair in made else self._known[pair][1])
-            for pair, basis in bases.items()
-        }
-        return [state for _, state in self._known.values() if state is not None]
+        touched = self._graph.take_changed_edges() | self._follow_nodes()
+        for classes in prior.changed:
+            touched |= self._by_classes.get(classes, set())
+        prior.changed.clear()
+        pairs = sorted(pair for pair in touched if self._index(pair))
+        made = self._make(pairs, *prior.lookup(self._pair_classes(pairs)))
+        changed = []
+        for pair in touched:
+            state, known = made.get(pair), self.states.get(pair)
+            if state == known:
+                continue
+            changed.append(pair)
+            if state is None:
+                del self.states[pair]
+            else:
+                self.states[pair] = state
+        return changed
+
+    def _follow_nodes(self) -> set[Pair]:
+        """Pairs of the nodes that came, went or have another class now."""
+        nodes = self._graph.nodes
+        pairs = set()
+        for node_id in self._touched:
+            best = -1
+            if node_id in nodes and nodes.confirmed[row := nodes.row(node_id)]:
+                best = int(nodes.class_probabilities[row].argmax())
+            if self._class_of.get(node_id, -1) == best:
+                continue
+            self._class_of[node_id] = best
+            if best < 0:
+                del self._class_of[node_id]
+            for other in self._graph.partners(node_id):
+                pairs.update({(node_id, other), (other, node_id)})
+        self._touched.clear()
+        return pairs
+
+    def _index(self, pair: Pair) -> bool:
+        """Note the classes of a pair; false if it is no pair of published nodes."""
+        if pair in self._classes:
+            self._by_classes[self._classes.pop(pair)].discard(pair)
+        if pair not in self._graph.edges or not (self._class_of.keys() >= set(pair)):
+            return False
+        classes = self._class_of[pair[0]], self._class_of[pair[1]]
+        self._classes[pair] = classes
+        self._by_classes.setdefault(classes, set()).add(pair)
+        return True
+
+    def _pair_classes(self, pairs: Sequence[Pair]) -> Int64:
+        return np.array([self._classes[pair] for pair in pairs], np.int64).reshape(-1, 2)
 
     def _make(
         self, pairs: Sequence[Pair], priors: Float64, has_prior: Bool
@@ -85,13 +117,6 @@ class PaperBeliefs:
         for row in np.flatnonzero(fused.known).tolist():
             made[pairs[row]] = self._state(pairs[row], evidence[row], fused, row)
         return made
-
-    def _classes(self, pairs: Sequence[Pair]) -> Int64:
-        """Arg-max classes of subject and object of each pair, (E, 2)."""
-        table = self._graph.nodes
-        classes = table.class_probabilities.argmax(axis=1)
-        rows = np.array([[table.row(subject), table.row(object_)] for subject, object_ in pairs])
-        return np.asarray(classes[rows], np.int64)
 
     def _state(
         self, pair: Pair, evidence: EdgeEvidence, fused: FusedEdges, row: int

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import msgspec
 import numpy as np
@@ -34,11 +34,28 @@ class PriorState(msgspec.Struct, frozen=True):
     sums: list[list[float]]
 
 
+class Prior(Protocol):
+    """A prior of class pairs.
+
+    Attributes:
+        changed: class pairs whose prior changed, since the reader emptied it.
+    """
+
+    changed: set[tuple[int, int]]
+
+    def lookup(self, pair_classes: Int64) -> tuple[Float64, Bool]:
+        """Priors (m, R) of class pairs (m, 2), and (m,) bool, whether there is one."""
+        ...
+
+
 class ClassPairPrior:
     """P_WM(r | c_s, c_o): mean of the probe's distributions by (subject class, object class).
 
     It is computed from predictions only, never from ground truth. Up to rounding, the order of the
     predictions does not matter. A pair of classes without a prediction has no prior.
+
+    Attributes:
+        changed: class pairs whose prior changed, since the reader emptied it.
     """
 
     def __init__(self, class_count: int, predicate_count: int) -> None:
@@ -48,6 +65,7 @@ class ClassPairPrior:
         self._rows = np.full((class_count, class_count), -1, np.int64)
         self._sums: Float64 = np.zeros((0, predicate_count))
         self._counts: Int64 = np.zeros(0, np.int64)
+        self.changed: set[tuple[int, int]] = set()
 
     def __len__(self) -> int:
         """Number of class pairs that have a prior."""
@@ -75,6 +93,7 @@ class ClassPairPrior:
         rows = self._rows[classes[:, 0], classes[:, 1]]
         np.add.at(self._sums, rows, values / values.sum(axis=1, keepdims=True))
         np.add.at(self._counts, rows, 1)
+        self.changed.update(map(tuple, pairs.tolist()))
 
     def lookup(self, pair_classes: Int64) -> tuple[Float64, Bool]:
         """The priors of many class pairs.

@@ -25,6 +25,10 @@ from deworldsg_ros.relations.physical_states import (
 )
 from deworldsg_ros.scene.arrays import Float64, Int64
 
+# Relations of each state in both directions, and which of them have a name.
+_STATES = RELATIONS_OF_STATE
+_NAMED = (_STATES != NONE).astype(np.float64)
+
 
 @dataclass(frozen=True)
 class VoteScales:
@@ -53,13 +57,14 @@ def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
     """Votes by relation.
 
     Args:
-        votes: (m, R) sums of the votes.
+        votes: (..., R) sums of the votes.
         relation_of: (R,) relation of each predicate, -1 = it names none.
 
     Returns:
-        (m, NONE) float64.
+        (..., NONE) float64.
     """
-    return np.stack([votes[:, relation_of == r].sum(axis=1) for r in range(NONE)], axis=1)
+    names = (relation_of[:, None] == np.arange(NONE)).astype(np.float64)
+    return np.asarray(votes @ names)
 
 
 def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
@@ -73,10 +78,9 @@ def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64
         scales: of the evidence.
     """
     logits = np.zeros((len(counts), STATE_COUNT))
-    for state in range(1, STATE_COUNT):
-        ends = [end for end in (0, 1) if RELATIONS_OF_STATE[state, end] != NONE]
-        votes = [counts[:, end, RELATIONS_OF_STATE[state, end]] for end in ends]
-        logits[:, state] = scales.evidence(np.mean(votes, axis=0), frames)
+    named = _NAMED[1:] / _NAMED[1:].sum(axis=1, keepdims=True)
+    first, second = (counts[:, end, _STATES[1:, end] % NONE] * named[:, end] for end in (0, 1))
+    logits[:, 1:] = scales.evidence(first + second, frames[:, None])
     return logits
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,19 +50,23 @@ class Columns:
 
     def append(self, node_id: int) -> int:
         """Add a row of zeros for a new id and return it."""
-        row = len(self._rows)
-        if row == len(self._storage["ids"]):
+        self.extend([node_id])
+        return len(self) - 1
+
+    def extend(self, ids: Sequence[int]) -> None:
+        """Add a row of zeros for each of these new ids, in their order."""
+        first, count = len(self._rows), len(self._rows) + len(ids)
+        while count > len(self._storage["ids"]):
             for name, column in self._storage.items():
                 # Zeros that were never written take no memory; a copy of zeros would.
                 larger = np.zeros((2 * len(column), *column.shape[1:]), column.dtype)
                 larger[: len(column)] = column
                 self._storage[name] = larger
         for column in self._storage.values():
-            column[row] = 0
-        self._rows[node_id] = row
-        self._show(row + 1)
-        self.ids[row] = node_id
-        return row
+            column[first:count] = 0
+        self._rows.update(zip(ids, range(first, count)))
+        self._show(count)
+        self.ids[first:] = ids
 
     def remove(self, node_id: int) -> None:
         """Remove a row; the last row takes its place."""

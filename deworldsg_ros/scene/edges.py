@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -41,11 +41,21 @@ class EdgeMap:
         self._no_logits.flags.writeable = False
         self._evidence: dict[Pair, EdgeEvidence] = {}
         self._partners: dict[int, dict[int, None]] = {}
+        self._changed: set[Pair] = set()
 
     @property
     def evidence(self) -> Mapping[Pair, EdgeEvidence]:
         """The map itself, read only."""
         return MappingProxyType(self._evidence)
+
+    def partners(self, node_id: int) -> Collection[int]:
+        """Ids of the nodes that share a pair with a node; do not change it."""
+        return self._partners.get(node_id, {}).keys()
+
+    def take_changed(self) -> set[Pair]:
+        """Pairs that changed since the last call; some may have been dropped."""
+        changed, self._changed = self._changed, set()
+        return changed
 
     def add_visual(self, pair: Pair, logits: Float64, stamp_ns: int, revision: int) -> None:
         """Sum a frame's relation logits (R,) into a pair (Eq. 9).
@@ -70,6 +80,7 @@ class EdgeMap:
             known = EdgeEvidence(self._no_logits, 0, more.last_seen_ns, 0, more.revision)
             self._partners.setdefault(pair[0], {})[pair[1]] = None
             self._partners.setdefault(pair[1], {})[pair[0]] = None
+        self._changed.add(pair)
         self._evidence[pair] = EdgeEvidence(
             known.visual_logits + more.visual_logits if more.frames else known.visual_logits,
             known.frames + more.frames,
@@ -103,4 +114,5 @@ class EdgeMap:
                 evidence = self._evidence.pop(pair, None)
                 if evidence is not None:
                     popped.append((pair, evidence))
+                    self._changed.add(pair)
         return popped

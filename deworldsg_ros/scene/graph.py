@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import IdState, NodeIds
-from deworldsg_ros.scene.node_states import NodeStateCache
+from deworldsg_ros.scene.node_states import NodeStates
 from deworldsg_ros.scene.node_store import NodeStore
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
 from deworldsg_ros.scene.votes import PairVotes, VoteMap
@@ -69,7 +69,7 @@ class SceneGraph(NodeStore):
         self.even_gaussians = even_gaussians
         self._edges = EdgeMap(len(vocabulary.predicates))
         self._votes = VoteMap(len(vocabulary.predicates))
-        self._states = NodeStateCache(even_gaussians)
+        self._states: dict[int, NodeStates] = {}
 
     @classmethod
     def from_state(cls, state: GraphState) -> SceneGraph:
@@ -203,11 +203,27 @@ class SceneGraph(NodeStore):
     def node_states(self, top_k: int, with_points: bool = False) -> dict[int, wire.NodeState]:
         """Messages of the confirmed nodes by ascending id.
 
-        Messages of nodes that did not change are the same objects as before.
+        Messages without points of nodes that did not change are the same objects as before.
         """
-        return self._states.states(self.nodes, self.vocabulary.classes, top_k, with_points)
+        if top_k not in self._states:
+            self._states[top_k] = NodeStates(self, top_k, self.even_gaussians)
+        states = self._states[top_k]
+        states.refresh()
+        known = {node_id: states.states[node_id] for node_id in sorted(states.states)}
+        if not with_points:
+            return known
+        return {node_id: states.with_points(state) for node_id, state in known.items()}
+
+    def partners(self, node_id: int) -> Collection[int]:
+        """Ids of the nodes that share an edge with a node; do not change it."""
+        return self._edges.partners(node_id)
+
+    def take_changed_edges(self) -> set[Pair]:
+        """Pairs whose evidence changed since the last call; some may have been removed."""
+        return self._edges.take_changed()
 
     def _remove(self, node_id: int, successor: int) -> None:
         self.nodes.remove(node_id)
-        self._states.forget(node_id)
+        for watcher in self._watchers:
+            watcher.add(node_id)
         self._ids.retire(node_id, successor)

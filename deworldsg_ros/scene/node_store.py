@@ -43,6 +43,7 @@ class NodeStore:
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.revision = 0
         self._ids = NodeIds(self.nodes, remembered_frames)
+        self._watchers: list[set[int]] = []
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -195,7 +196,19 @@ class NodeStore:
         """The live node of each row of a frame (0 = removed); None = the frame is forgotten."""
         return self._ids.nodes_of_frame(stamp_ns)
 
+    def watch_nodes(self) -> set[int]:
+        """A set that gets the ids of all nodes that change, come or go from now on.
+
+        It starts with all ids. The caller empties it.
+        """
+        watcher: set[int] = set(self.nodes.ids.tolist())
+        self._watchers.append(watcher)
+        return watcher
+
     def _changed(self, rows: list[int]) -> None:
         """Count one change for each row."""
         self.nodes.revisions[rows] = self.revision + 1 + np.arange(len(rows))
         self.revision += len(rows)
+        ids = self.nodes.ids[rows].tolist()
+        for watcher in self._watchers:
+            watcher.update(ids)

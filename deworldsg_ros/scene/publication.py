@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TypeVar
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff, empty_scene_graph
+from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import NodeStates
+
+Key = TypeVar("Key", int, Pair)
+Message = TypeVar("Message", wire.NodeState, wire.EdgeState)
+# Brings the messages of the edges up to date, and returns the pairs whose message is another.
+EdgeRefresh = Callable[[bool], Iterable[Pair]]
 
 
 class Publication:
@@ -15,8 +23,8 @@ class Publication:
 
     Args:
         graph: to publish.
-        edge_states: the messages of the edges between nodes, in order; unchanged messages are the
-            same objects.
+        edges: the messages of its edges by pair, kept up to date by
+        refresh_edges: its argument says whether nothing may wait.
         top_k: number of labels of each node.
         include_surface_points: whether snapshots and updates contain surface points.
     """
@@ -24,20 +32,28 @@ class Publication:
     def __init__(
         self,
         graph: SceneGraph,
-        edge_states: Callable[[Collection[int]], list[wire.EdgeState]],
+        edges: Mapping[Pair, wire.EdgeState],
+        refresh_edges: EdgeRefresh,
         *,
         top_k: int,
         include_surface_points: bool,
     ) -> None:
         self._graph = graph
-        self._edge_states = edge_states
-        self._top_k = top_k
+        self._edges = edges
+        self._refresh_edges = refresh_edges
         self._include_surface_points = include_surface_points
+        self._nodes = NodeStates(graph, top_k, graph.even_gaussians)
         # Frames to come may be older than the newest one of a map.
         self._stamp_ns = int(graph.nodes.last_seen_ns.max(initial=0))
         # Clients cannot use associations of frames that the graph has forgotten.
         self._associations: deque[wire.Association] = deque(maxlen=graph.remembered_frames)
-        self._published = empty_scene_graph(graph.frame_id)
+        # What clients know, and which parts may differ from it now.
+        self._known_nodes: dict[int, wire.NodeState] = {}
+        self._known_edges: dict[Pair, wire.EdgeState] = {}
+        self._touched_nodes: set[int] = set()
+        self._touched_edges: set[Pair] = set()
+        self._sequence = 0
+        self._snapshot = empty_scene_graph(graph.frame_id)
 
     def note_frame(self, stamp_ns: int, node_ids: Sequence[int]) -> None:
         """Note a merged frame, and the node of each row of its local graph."""
@@ -45,33 +61,82 @@ class Publication:
         self._associations.append(wire.Association(wire.stamp_from_ns(stamp_ns), list(node_ids)))
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
-        """The changes since the last call; None if there are none."""
-        current = self._message(self._published.sequence + 1, self._include_surface_points)
+        """The changes since the last call; None if there are none.
+
+        It costs as much as what changed, however large the graph is.
+        """
+        self._refresh(whole=False)
+        nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._nodes.states)
+        edges, gone_edges = _take(self._touched_edges, self._known_edges, self._edges)
         removed = self._graph.take_removals()
-        same = (current.nodes, current.edges) == (self._published.nodes, self._published.edges)
-        if same and not removed:
+        if not (nodes or edges or gone_nodes or gone_edges or removed):
             return None
-        message = diff(self._published, current, removed, self._associations)
+        # A live node that was hidden is removed from the snapshot. Clients know ids that no
+        # snapshot contained from associations.
+        left = {**dict.fromkeys(gone_nodes), **removed}
+        self._sequence += 1
+        message = wire.SceneGraphUpdateMessage(
+            schema=wire.schema_of(wire.SceneGraphUpdateMessage),
+            stamp=wire.stamp_from_ns(self._stamp_ns),
+            frame_id=self._graph.frame_id,
+            sequence=self._sequence,
+            removed_nodes=[wire.RemovedNode(node, left[node]) for node in sorted(left)],
+            removed_edges=[wire.RemovedEdge(*pair) for pair in gone_edges],
+            nodes=self._shown(nodes, self._include_surface_points),
+            edges=edges,
+            associations=list(self._associations),
+        )
         self._associations.clear()
-        self._published = current
         return message
 
     def snapshot(self) -> wire.SceneGraphMessage:
         """The graph after the last `update`."""
-        return self._published
+        if self._snapshot.sequence != self._sequence:
+            points = self._include_surface_points
+            self._snapshot = self._message(self._known_nodes, self._known_edges, points)
+        return self._snapshot
 
     def full(self) -> wire.SceneGraphMessage:
         """The present graph with surface points; the next `update` is unaffected."""
-        return self._message(self._published.sequence, with_points=True)
+        self._refresh(whole=True)
+        return self._message(self._nodes.states, self._edges, with_points=True)
 
-    def _message(self, sequence: int, with_points: bool) -> wire.SceneGraphMessage:
-        graph = self._graph
-        nodes = graph.node_states(self._top_k, with_points)
+    def _refresh(self, whole: bool) -> None:
+        self._touched_nodes.update(self._nodes.refresh())
+        self._touched_edges.update(self._refresh_edges(whole))
+
+    def _message(
+        self,
+        nodes: Mapping[int, wire.NodeState],
+        edges: Mapping[Pair, wire.EdgeState],
+        with_points: bool,
+    ) -> wire.SceneGraphMessage:
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=wire.stamp_from_ns(self._stamp_ns),
-            frame_id=graph.frame_id,
-            sequence=sequence,
-            nodes=list(nodes.values()),
-            edges=self._edge_states(nodes.keys()),
+            frame_id=self._graph.frame_id,
+            sequence=self._sequence,
+            nodes=self._shown([nodes[node_id] for node_id in sorted(nodes)], with_points),
+            edges=[edges[pair] for pair in sorted(edges)],
         )
+
+    def _shown(self, nodes: list[wire.NodeState], with_points: bool) -> list[wire.NodeState]:
+        return [self._nodes.with_points(node) for node in nodes] if with_points else nodes
+
+
+def _take(
+    touched: set[Key], known: dict[Key, Message], present: Mapping[Key, Message]
+) -> tuple[list[Message], list[Key]]:
+    """Messages that differ from the known ones, and keys that are gone; they are known then."""
+    changed, gone = [], []
+    for key in sorted(touched):
+        now = present.get(key)
+        if now is None:
+            if known.pop(key, None) is not None:
+                gone.append(key)
+        # Identity first: an unchanged message is usually the same object.
+        elif known.get(key) is not now and known.get(key) != now:
+            known[key] = now
+            changed.append(now)
+    touched.clear()
+    return changed, gone

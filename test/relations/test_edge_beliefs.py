@@ -31,7 +31,8 @@ from deworldsg_ros.relations.edge_beliefs import DECIMALS, MAX_DISTANCE_M, MIN_P
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physics_model import load_physics_model
-from deworldsg_ros.relations.predicted_prior import predicted_prior
+from deworldsg_ros.relations.predicted_prior import PredictedPrior
+from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.relations.robust_beliefs import RobustBeliefs, fuse_prior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Relations
@@ -59,19 +60,14 @@ def beliefs_of(builder: GraphBuilder, of: Config) -> dict[tuple[int, int], np.nd
     """The probabilities (R,) of all pairs, also of those that are not published."""
     builder.full()  # it takes the votes that changed
     relations = of.relations
-    pairs = PairTable(
-        builder.graph,
-        load_physics_model(),
-        geometry=relations.world_model != "none",
-    )
-    pairs.refresh(builder.up.up_world())
-    prior = (
-        predicted_prior(pairs, builder.graph)
-        if relations.world_model == "physics"
-        else builder.prior
-    )
-    found = RobustBeliefs(of, builder.graph, pairs).beliefs(prior)
-    return dict(zip(map(tuple, found.pairs.tolist()), found.probabilities))
+    table = PairTable(builder.graph, load_physics_model(), geometry=relations.world_model != "none")
+    table.refresh(builder.up.up_world())
+    prior: Prior = builder.prior
+    if relations.world_model == "physics":
+        prior = PredictedPrior(builder.graph.vocabulary)
+        prior.follow(table, table.changed_pairs)
+    found = RobustBeliefs(of, builder.graph, table).refresh(prior)
+    return dict(zip(found.pairs, found.probabilities))
 
 
 def edges_of(builder: GraphBuilder) -> dict[tuple[int, int], wire.EdgeState]:

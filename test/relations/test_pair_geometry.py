@@ -11,22 +11,18 @@ from hypothesis import strategies as st
 from support.room_nodes import bowl, box, surface, table, thing
 
 from deworldsg_ros.relations.pair_geometry import (
-    BESIDE_REACH_M,
     FEATURES,
     LAYER_M,
     MARGIN_M,
-    MIN_SHAPE_POINTS,
-    OVER_REACH_M,
-    REACH_M,
-    SECTORS,
     SHAPE_POINTS,
     SOFT_RADIUS_M,
     TRIM_FRACTION,
     NodeShapes,
     pair_features,
-    pairs_in_reach,
     rotation_to_upright,
+    upright,
 )
+from deworldsg_ros.relations.reach import REACH_M
 
 seeds = st.integers(0, 10_000)
 up_components = st.floats(-1, 1, allow_subnormal=False)
@@ -34,20 +30,37 @@ up_components = st.floats(-1, 1, allow_subnormal=False)
 OVER_FLOOR = ("bottom_over_floor_m", "object_bottom_over_floor_m")
 
 
-def shapes_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> NodeShapes:
-    """Shapes of clouds of points, with the ids 1, 2, …"""
-    shapes = NodeShapes()
-    for node_id, points in enumerate(clouds, 1):
-        shapes.put(shapes.append(node_id), points.astype(np.float32), np.eye(3) if R is None else R)
+class Clouds(NodeShapes):
+    """Shapes of clouds of points, with the ids 1, 2, … and the points (n, K, 3)."""
+
+    points: np.ndarray
+
+
+def shapes_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> Clouds:
+    shapes = Clouds()
+    shapes.extend(range(1, len(clouds) + 1))
+    counts = np.array([len(points) for points in clouds], np.int64)
+    shapes.points = np.zeros((len(clouds), max(counts, default=0), 3), np.float32)
+    for row, points in enumerate(clouds):
+        shapes.points[row, : len(points)] = points
+    R = np.eye(3) if R is None else R
+    shapes.put(np.arange(len(clouds)), shapes.points, counts, R)
+    shapes.points = upright(shapes.points, R)
     return shapes
 
 
-def features_of(shapes: NodeShapes, pairs: np.ndarray, floor_m: float = 0.0) -> np.ndarray:
+def features_of(shapes: Clouds, pairs: np.ndarray, floor_m: float = 0.0) -> np.ndarray:
+    """Features (m, F) of ordered pairs; those of the opposite direction are compared as well."""
     columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
-    return pair_features(pairs[:, 0], pairs[:, 1], *columns, shapes.points, floor_m)
+    first, second = np.ascontiguousarray(pairs.T)
+    there, back = pair_features(first, second, *columns, shapes.points, floor_m)
+    again, reverse = pair_features(second, first, *columns, shapes.points, floor_m)
+    np.testing.assert_allclose(back, again, atol=1e-12)
+    np.testing.assert_allclose(there, reverse, atol=1e-12)
+    return there
 
 
-def named(shapes: NodeShapes, floor_m: float = 0.0) -> dict[str, float]:
+def named(shapes: Clouds, floor_m: float = 0.0) -> dict[str, float]:
     """Features of the first two shapes by name."""
     row = features_of(shapes, np.array([[0, 1]]), floor_m)[0]
     return dict(zip(FEATURES, row.tolist()))
@@ -75,7 +88,7 @@ def random_clouds(seed: int, count: int = 4) -> list[np.ndarray]:
 # --- the reference -------------------------------------------------------------------------------
 
 
-def reference(shapes: NodeShapes, a: int, b: int, floor_m: float) -> dict[str, float]:
+def reference(shapes: Clouds, a: int, b: int, floor_m: float) -> dict[str, float]:
     """The features by name, a definition a line."""
     (low_a, low_b), (high_a, high_b) = shapes.low[[a, b]], shapes.high[[a, b]]
     points_a, points_b = (shapes.points[r, : shapes.counts[r]].astype(float) for r in (a, b))
@@ -157,7 +170,7 @@ def enclosure(low, high, points) -> float:
     reach = REACH_M / 2 + (high - low)[:2].max() / 2
     beside = beside[(beside**2).sum(axis=1) < reach**2]
     turns = np.arctan2(beside[:, 1], beside[:, 0]) / (2 * np.pi) + 0.5
-    return len(set(np.minimum(SECTORS - 1, (SECTORS * turns).astype(int)).tolist())) / SECTORS
+    return len(set(np.minimum(8 - 1, (8 * turns).astype(int)).tolist())) / 8
 
 
 def within(points, low, high, margin_m) -> np.ndarray:
@@ -306,7 +319,11 @@ def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
 def test_a_shape_that_is_put_again_forgets_the_old_one() -> None:
     clouds = random_clouds(3)
     shapes = shapes_of(clouds[0], clouds[1])
-    shapes.put(0, clouds[2].astype(np.float32), np.eye(3))
+    points = clouds[2].astype(np.float32)
+    shapes.put(np.array([0]), points[None], np.array([len(points)]), np.eye(3))
+    shapes.points = np.zeros((2, 50, 3), np.float32)
+    for row, cloud in enumerate((points, clouds[1])):
+        shapes.points[row, : len(cloud)] = cloud
     fresh = shapes_of(clouds[2], clouds[1])
     pairs = every_pair(2)
     np.testing.assert_array_equal(features_of(shapes, pairs), features_of(fresh, pairs))
@@ -343,52 +360,3 @@ def test_a_world_whose_z_axis_points_down(up: tuple[float, float, float]) -> Non
 
 def test_a_world_whose_z_axis_points_up_is_upright() -> None:
     np.testing.assert_array_equal(rotation_to_upright(np.array([0.0, 0.0, 2.0])), np.eye(3))
-
-
-# --- reach ---------------------------------------------------------------------------------------
-
-
-def in_reach(low_a, high_a, low_b, high_b) -> bool:
-    gap = np.maximum(low_a, low_b) - np.minimum(high_a, high_b)
-    over = (gap[:2] <= BESIDE_REACH_M).all()
-    return bool((gap[:2] <= REACH_M).all() and gap[2] <= (OVER_REACH_M if over else BESIDE_REACH_M))
-
-
-@settings(max_examples=30, deadline=None)
-@given(seed=seeds, count=st.integers(0, 9))
-def test_pairs_in_reach_are_those_of_brute_force(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    low = rng.uniform(-1.5, 1.5, (count, 3))
-    high = low + rng.uniform(0, 0.6, (count, 3))
-    counts = rng.integers(MIN_SHAPE_POINTS - 2, 3 * MIN_SHAPE_POINTS, count)
-    changed = rng.permutation(count)[: int(rng.integers(0, count + 1))]
-    found = pairs_in_reach(changed, low, high, counts)
-    assert found.shape == (len(found), 2)
-    pairs = [frozenset(pair) for pair in found.tolist()]
-    assert len(set(pairs)) == len(pairs)  # each pair once
-    assert set(pairs) == {
-        frozenset((a, b))
-        for a, b in itertools.combinations(range(count), 2)
-        if (a in changed or b in changed)
-        and min(counts[a], counts[b]) >= MIN_SHAPE_POINTS
-        and in_reach(low[a], high[a], low[b], high[b])
-    }
-
-
-@pytest.mark.parametrize(
-    ("offset", "reached"),
-    [
-        ((0.0, 0.0, 0.0), True),
-        ((0.65, 0.0, 0.0), True),
-        ((0.75, 0.0, 0.0), False),
-        ((0.0, 0.0, 1.3), True),
-        ((0.0, 0.0, 1.5), False),
-        ((0.2, 0.0, 1.3), True),
-        ((0.3, 0.0, 1.3), False),
-    ],
-)
-def test_how_far_related_objects_may_be_apart(offset, reached: bool) -> None:
-    """Two cubes of 0.1 m."""
-    low = np.array([[0.0, 0, 0], offset])
-    counts = np.array([100, 100])
-    assert len(pairs_in_reach(np.array([0]), low, low + 0.1, counts)) == int(reached)

@@ -206,12 +206,12 @@ def test_invalid_edits_raise_and_change_nothing() -> None:
 
 def test_unchanged_nodes_keep_their_message() -> None:
     graph = graph_of(3)
-    first = graph.node_states(2, with_points=True)
+    first = graph.node_states(2)
     graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
-    second = graph.node_states(2, with_points=True)
+    second = graph.node_states(2)
     assert [second[node_id] is first[node_id] for node_id in (1, 2, 3)] == [True, False, True]
     graph.merge_nodes(1, 2)
-    third = graph.node_states(2, with_points=True)
+    third = graph.node_states(2)
     assert list(third) == [1, 3]
     assert third[1].observations == 3
     assert third[3] is first[3]

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.relations.pair_geometry import NodeShapes, pair_features, pairs_in_reach
+from deworldsg_ros.relations.pair_geometry import NodeShapes, pair_features
 from deworldsg_ros.relations.pair_table import floor_height
 from deworldsg_ros.relations.physical_states import DIRECTED, RELATIONS, relation_of_predicates
+from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, pairs_in_reach
 from deworldsg_ros.relations.vote_model import relation_counts
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.graph import SceneGraph
@@ -63,22 +64,21 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
         graph.remove_node(node_id)
     nodes = graph.nodes
     shapes = NodeShapes()
-    for row, node_id in enumerate(nodes.ids.tolist()):
-        shapes.put(shapes.append(node_id), nodes.surface(row), np.eye(3))
+    shapes.extend(nodes.ids.tolist())
+    points = nodes.surface_points_world
+    shapes.put(np.arange(len(nodes)), points, nodes.surface_counts, np.eye(3))
     at = _match(graph, objects)
-    floor_m = floor_height(shapes)
-    pairs = pairs_in_reach(np.arange(len(nodes)), shapes.low, shapes.high, shapes.counts)
+    solid = shapes.counts >= MIN_SHAPE_POINTS
+    floor_m = floor_height(np.sort(shapes.low[solid, 2]).tolist())
+    pairs = pairs_in_reach(shapes.low, shapes.high, shapes.counts)
     pairs = pairs[(at[pairs] >= 0).all(axis=1) & (at[pairs[:, 0]] != at[pairs[:, 1]])]
     # Two people may judge these differently.
     unclear = {tuple(ids) for ids in content.get("unclear", ())}
     ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
     pairs = pairs[[not {(a, b), (b, a)} & unclear for a, b in ids]]
     columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
-    ends = (pairs, pairs[:, ::-1])
-    features = [
-        pair_features(p[:, 0].copy(), p[:, 1].copy(), *columns, shapes.points, floor_m)
-        for p in ends
-    ]
+    first, second = np.ascontiguousarray(pairs.T)
+    features = pair_features(first, second, *columns, points, floor_m)
     ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
     states = np.array([_state(truth, a, b) for a, b in ids], np.int64)
     counts, frames = _votes(graph, nodes.ids[pairs])
@@ -87,7 +87,7 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
         class_probabilities=nodes.class_probabilities.copy(),
         observations=nodes.observations.copy(),
         pairs=pairs,
-        features=np.stack(features),
+        features=features,
         states=states,
         counts=counts,
         frames=frames,

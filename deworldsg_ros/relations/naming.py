@@ -1,0 +1,116 @@
+"""The predicates of a pair, from the probabilities of its relations and the votes on it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.relations.physical_states import NEAR, NONE
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+
+# Several predicates may name one relation, and share its probability by their votes. The default
+# name gets these votes in addition, so that a relation without votes has a name.
+NAMING_VOTES = 0.5
+# Least sum of votes for a predicate that names no physical relation. Less is no evidence: a frame
+# that votes gives every predicate a small probability.
+MIN_OTHER_VOTES = 0.5
+# Odds, before any vote, that a predicate beyond the physical relations holds.
+OTHER_ODDS = 0.02
+# Evidence in nats is limited to this: odds are finite.
+MAX_EVIDENCE = 30.0
+
+
+@kernel
+def predicate_probabilities(
+    relations: Float64,
+    votes: Float32,
+    frames: Float64,
+    by_votes: Float64,
+    with_: Bool,
+    relation_of: Int64,
+    canonical: Int64,
+    with_index: int,
+    scales: Float64,
+) -> Float64:
+    """Probabilities (k, 2, R) of the predicates of pairs in both directions.
+
+    Each relation's probability is divided among its predicates by their votes. Without votes, a
+    relation has the name that comes first in `PREDICATES`; a table is "with" the seats that are
+    near it. Predicates that name no physical relation live from votes alone, which are believed as
+    those on "on" are.
+
+    Args:
+        relations: (k, 2, NONE + 1) probabilities.
+        votes: (k, 2, R) sums of the votes.
+        frames: (k,) number of frames that showed both.
+        by_votes: (k,) exponent of the votes.
+        with_: (k, 2) bool; a table and a seat in its reach.
+        relation_of: (R,) relation of each predicate; -1 = it names none.
+        canonical: (NONE,) predicate that names each relation; -1 = there is none.
+        with_index: of the predicate "with"; -1 = there is none.
+        scales: (4,) of `VoteScales`.
+    """
+    count, _, width = votes.shape
+    result = np.zeros((count, 2, width))
+    sums = np.empty(NONE)
+    slope, n_half, low, even = scales
+    for row in range(count):
+        for end in range(2):
+            told = votes[row, end]
+            out = result[row, end]
+            sums[:] = NAMING_VOTES
+            others = 0.0
+            for name in range(width):
+                if relation_of[name] >= 0:
+                    sums[relation_of[name]] += told[name]
+                elif told[name] > others:
+                    others = told[name]
+            for name in range(width):
+                relation = relation_of[name]
+                if relation >= 0 and canonical[relation] >= 0:
+                    out[name] = relations[row, end, relation] * told[name] / sums[relation]
+            for relation in range(NONE):
+                name = canonical[relation]
+                if relation == NEAR and with_index >= 0 and with_[row, end]:
+                    name = with_index
+                if canonical[relation] >= 0:
+                    out[name] += relations[row, end, relation] * NAMING_VOTES / sums[relation]
+            if others < MIN_OTHER_VOTES:
+                continue
+            number = max(frames[row], 1e-9)
+            worth = frames[row] / (frames[row] + n_half) * slope * by_votes[row]
+            total = 1.0
+            for name in range(width):
+                if relation_of[name] < 0:
+                    share = (told[name] / number + low) / (even + low)
+                    evidence = worth * math.log(share)
+                    evidence = min(max(evidence, -MAX_EVIDENCE), MAX_EVIDENCE)
+                    out[name] = OTHER_ODDS * math.exp(evidence)
+                    total += out[name]
+            for name in range(width):
+                if relation_of[name] < 0:
+                    out[name] *= relations[row, end, NONE] / total
+    return result
+
+
+@kernel
+def uncertain(probabilities: Float64, threshold_nats: float) -> Bool:
+    """Whether the entropies of distributions (k, 2, R), scaled to sum to one, exceed a threshold.
+
+    Returns:
+        (k, 2) bool; false where a sum is zero.
+    """
+    result = np.zeros(probabilities.shape[:2], np.bool_)
+    for row in range(len(probabilities)):
+        for end in range(2):
+            total = 0.0
+            for value in probabilities[row, end]:
+                total += value
+            entropy = 0.0
+            for value in probabilities[row, end]:
+                if value > 0.0:
+                    entropy -= value / total * math.log(value / total)
+            result[row, end] = total > 0.0 and entropy > threshold_nats
+    return result

@@ -1,0 +1,343 @@
+"""What relations of different pairs exclude, settled around the objects that changed.
+
+`exclusions` states the rules for all pairs at once: one support an object, no circles, and what is
+near. These kernels apply the same rules, but only where something changed. Objects and pairs are
+rows of arrays; `ends`, `links` and `first_links` are those of `pair_links`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from deworldsg_ros.kernels import kernel
+from deworldsg_ros.relations.exclusions import (
+    CARRIED_FIRST,
+    CARRIED_SECOND,
+    CENTRE_FRACTION,
+    MOST,
+    NEAR_CERTAINTY,
+    NEAR_FLOOR_M,
+    NEAR_FLOOR_SPREAD_M,
+    NEAR_LEVEL_M,
+    NEAR_LEVEL_SPREAD_M,
+    NEAR_SUPPORT_M,
+    NEAR_SUPPORT_SPREAD_M,
+    NEAREST,
+    SEAT_GAP_M,
+)
+from deworldsg_ros.relations.physical_states import NEAR, NONE, RELATIONS_OF_STATE, STATE_COUNT
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+
+# Objects are not stacked deeper. Longer circles of supports are not cut.
+MAX_CIRCLE = 64
+# A pair that is near with this probability, and in no more specific relation, counts as a
+# neighbour when neighbours are ranked.
+MIN_NEIGHBOUR = 0.3
+# States in which the first object rests on the second, and the opposite.
+# Numba keeps contiguous arrays only in its cache.
+_FIRST, _SECOND = np.ascontiguousarray(CARRIED_FIRST), np.ascontiguousarray(CARRIED_SECOND)
+
+
+@kernel
+def share_supports(  # noqa: D417
+    objects: Int64,
+    carried: Float64,
+    kept: Float64,
+    floor_odds: Float64,
+    on_floor: Float64,
+    totals: Float64,
+    ends: Int64,
+    links: Int64,
+    first_links: Int64,
+) -> Int64:
+    """Let each object have one support at most, and cut circles.
+
+    Args:
+        objects: (k,) rows of the objects to settle; each may stand where it wants now.
+        carried: (m, 2) probability that one object of a pair rests on the other, by the pair alone.
+        kept: (m, 2) the same if each object has one support at most; written.
+        floor_odds: (n,) odds that an object stands on the floor.
+        on_floor: (n,) probability that it does; written.
+        totals: (n,) sum of the odds of all that an object may rest on; written.
+        ends, links, first_links: see `pair_links`.
+
+    Returns:
+        Places (2 · row + end) of the supports that were cut, to break circles.
+    """
+    for item in objects:
+        total = 1.0 + floor_odds[item]
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            total += carried[row, end] / (1.0 - carried[row, end])
+            place = links[row, end]
+        totals[item] = total
+        on_floor[item] = floor_odds[item] / total
+    for item in objects:
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            first = carried[row, 0] / (1.0 - carried[row, 0]) / totals[ends[row, 0]]
+            second = carried[row, 1] / (1.0 - carried[row, 1]) / totals[ends[row, 1]]
+            factor = min(1.0, MOST / max(first + second, 1e-300))
+            kept[row, 0], kept[row, 1] = first * factor, second * factor
+            place = links[row, end]
+    cut = np.empty(len(objects), np.int64)
+    count = 0
+    for item in objects:
+        node, weakest, least = item, 0, 2.0
+        for _ in range(MAX_CIRCLE):
+            place = _likely(node, kept, links, first_links)
+            if not place:
+                break
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            if kept[row, end] < least:
+                weakest, least = place - 1, kept[row, end]
+            node = ends[row, 1 - end]
+            if node == item:
+                kept[weakest >> 1, weakest & 1] *= 0.5
+                cut[count] = weakest
+                count += 1
+                break
+    return cut[:count]
+
+
+@kernel
+def _likely(item: int, kept: Float64, links: Int64, first_links: Int64) -> int:
+    """Place + 1 of the pair in which an object probably rests on the other one; 0 = none."""
+    place = first_links[item]
+    while place:
+        row, end = (place - 1) >> 1, (place - 1) & 1
+        if kept[row, end] > 0.5:
+            return int(place)
+        place = links[row, end]
+    return 0
+
+
+@kernel
+def find_neighbours(  # noqa: D417
+    objects: Int64,
+    states: Float64,
+    carried: Float64,
+    kept: Float64,
+    on_floor: Float64,
+    gaps_m: Float64,
+    bottom_steps_m: Float64,
+    with_: Bool,
+    near: Float64,
+    eligible: Bool,
+    shares: Float64,
+    marks: Bool,
+    ends: Int64,
+    links: Int64,
+    first_links: Int64,
+) -> Int64:
+    """Judge which pairs of the objects stand side by side on one support.
+
+    Args:
+        objects: (k,) rows.
+        states: (m, STATE_COUNT) probabilities by the pair alone.
+        carried, kept, on_floor: see `share_supports`.
+        gaps_m: (m,) horizontal gap of the bounds; infinite out of reach.
+        bottom_steps_m: (m,) difference of the heights of the bottoms.
+        with_: (m, 2) bool; a table and a seat in its reach, in this order or the other.
+        near: (m,) probability that both stand on one support within reach; written.
+        eligible: (m,) bool; the pair counts when neighbours are ranked; written.
+        shares: (n,) zeros, scratch.
+        marks: (n,) false, scratch.
+        ends, links, first_links: see `pair_links`.
+
+    Returns:
+        The objects, and those with a pair whose eligibility changed: they are to be ranked.
+    """
+    found = [item for item in objects]
+    for item in objects:
+        marks[item] = True
+    for item in objects:
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            shares[ends[row, 1 - end]] = kept[row, end]
+            place = links[row, end]
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            place = links[row, end]
+            other = ends[row, 1 - end]
+            now = False
+            near[row] = 0.0
+            if not np.isinf(gaps_m[row]):
+                together = _together(other, kept, shares, ends, links, first_links)
+                reach = SEAT_GAP_M if with_[row, 0] or with_[row, 1] else NEAR_FLOOR_M
+                floor = on_floor[item] * on_floor[other]
+                floor *= _expit((reach - gaps_m[row]) / NEAR_FLOOR_SPREAD_M)
+                together *= _expit((NEAR_SUPPORT_M - gaps_m[row]) / NEAR_SUPPORT_SPREAD_M)
+                rise = abs(bottom_steps_m[row])
+                together *= _expit((NEAR_LEVEL_M - rise) / NEAR_LEVEL_SPREAD_M)
+                near[row] = min(floor + together, 1.0)
+                free = _unrelated(states[row], carried[row], kept[row])
+                now = near[row] * free > MIN_NEIGHBOUR
+            if now != eligible[row] and not marks[other]:
+                marks[other] = True
+                found.append(other)
+            eligible[row] = now
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            shares[ends[row, 1 - end]] = 0.0
+            place = links[row, end]
+    for item in found:
+        marks[item] = False
+    return np.array(found)
+
+
+@kernel
+def _together(
+    item: int, kept: Float64, shares: Float64, ends: Int64, links: Int64, first_links: Int64
+) -> float:
+    """Probability that an object rests on the support of another one, whose shares are given."""
+    total = 0.0
+    place = first_links[item]
+    while place:
+        row, end = (place - 1) >> 1, (place - 1) & 1
+        total += kept[row, end] * shares[ends[row, 1 - end]]
+        place = links[row, end]
+    return total
+
+
+@kernel
+def _expit(value: float) -> float:
+    return 1.0 / (1.0 + math.exp(-value)) if value > -700.0 else 0.0
+
+
+@kernel
+def _unrelated(states: Float64, carried: Float64, kept: Float64) -> float:
+    """Probability of state 0 after `share_supports`."""
+    scaled, left = _scaled(states, carried, kept)
+    return float(states[0] * (1.0 - scaled) / max(left, 1e-300))
+
+
+@kernel
+def _scaled(states: Float64, carried: Float64, kept: Float64) -> tuple[float, float]:
+    """Sum of the supports of a pair that are left, and of its other states before."""
+    first = second = left = 0.0
+    for state in range(STATE_COUNT):
+        if _FIRST[state]:
+            first += states[state]
+        elif _SECOND[state]:
+            second += states[state]
+        else:
+            left += states[state]
+    first *= kept[0] / max(carried[0], 1e-300)
+    second *= kept[1] / max(carried[1], 1e-300)
+    return first + second, left
+
+
+@kernel
+def rank_neighbours(  # noqa: D417
+    objects: Int64,
+    gaps_m: Float64,
+    centre_steps_m: Float64,
+    eligible: Bool,
+    close: Bool,
+    links: Int64,
+    first_links: Int64,
+) -> Int64:
+    """Find the `NEAREST` eligible pairs of each object.
+
+    Args:
+        objects: (k,) rows.
+        gaps_m, eligible: see `find_neighbours`.
+        centre_steps_m: (m,) horizontal distance of the centres.
+        close: (m, 2) bool; the pair is one of the nearest of that object; written.
+        links, first_links: see `pair_links`.
+
+    Returns:
+        Rows of the pairs whose `close` changed; some twice.
+    """
+    changed = [np.int64(0)][:0]
+    places = np.zeros(NEAREST, np.int64)
+    distances = np.empty(NEAREST)
+    for item in objects:
+        places[:], distances[:] = 0, np.inf
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            if eligible[row]:
+                distance = gaps_m[row] + CENTRE_FRACTION * centre_steps_m[row]
+                index = NEAREST
+                # Of equal distances, the earlier pair counts first.
+                while index > 0 and (
+                    distance < distances[index - 1]
+                    or (distance == distances[index - 1] and place < places[index - 1])
+                ):
+                    index -= 1
+                    if index + 1 < NEAREST:
+                        distances[index + 1], places[index + 1] = distances[index], places[index]
+                if index < NEAREST:
+                    distances[index], places[index] = distance, place
+            place = links[row, end]
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            now = False
+            for known in places:
+                now |= known == place
+            if close[row, end] != now:
+                close[row, end] = now
+                changed.append(row)
+            place = links[row, end]
+    return np.array(changed)
+
+
+@kernel
+def relate(  # noqa: D417
+    rows: Int64,
+    states: Float64,
+    carried: Float64,
+    kept: Float64,
+    near: Float64,
+    close: Bool,
+    with_: Bool,
+    near_votes: Float64,
+    relations: Float64,
+) -> Bool:
+    """The relations of pairs in both directions.
+
+    Args:
+        rows: (k,) rows of pairs.
+        states, carried, kept, near, close, with_: see above.
+        near_votes: (m,) logits that votes add to "near".
+        relations: (m, 2, len(RELATIONS)) probabilities; written.
+
+    Returns:
+        (k,) bool, whether the relations of a pair changed.
+    """
+    changed = np.zeros(len(rows), np.bool_)
+    now = np.empty((2, NONE + 1))
+    for index in range(len(rows)):
+        row = rows[index]
+        scaled, left = _scaled(states[row], carried[row], kept[row])
+        factor = (1.0 - scaled) / max(left, 1e-300)
+        first = kept[row, 0] / max(carried[row, 0], 1e-300)
+        second = kept[row, 1] / max(carried[row, 1], 1e-300)
+        now[:] = 0.0
+        for state in range(1, STATE_COUNT):
+            by = first if _FIRST[state] else (second if _SECOND[state] else factor)
+            now[0, RELATIONS_OF_STATE[state, 0]] += states[row, state] * by
+            now[1, RELATIONS_OF_STATE[state, 1]] += states[row, state] * by
+        unrelated = states[row, 0] * factor
+        beside = NEAR_CERTAINTY * near[row]
+        if not (with_[row, 0] or with_[row, 1] or (close[row, 0] and close[row, 1])):
+            beside = 0.0
+        beside = min(max(beside, 1.0 - NEAR_CERTAINTY), NEAR_CERTAINTY)
+        beside = _expit(math.log(beside / (1.0 - beside)) + near_votes[row])
+        for end in range(2):
+            now[end, NEAR] = unrelated * beside
+            now[end, NONE] += unrelated * (1.0 - beside)
+            for relation in range(NONE + 1):
+                changed[index] |= relations[row, end, relation] != now[end, relation]
+                relations[row, end, relation] = now[end, relation]
+    return changed
