@@ -55,7 +55,6 @@ def predicate_probabilities(
     count, _, width = votes.shape
     result = np.zeros((count, 2, width))
     sums = np.empty(NONE)
-    slope, n_half, low, even = scales
     for row in range(count):
         for end in range(2):
             told = votes[row, end]
@@ -77,22 +76,35 @@ def predicate_probabilities(
                     name = with_index
                 if canonical[relation] >= 0:
                     out[name] += relations[row, end, relation] * NAMING_VOTES / sums[relation]
-            if others < MIN_OTHER_VOTES:
-                continue
-            number = max(frames[row], 1e-9)
-            worth = frames[row] / (frames[row] + n_half) * slope * by_votes[row]
-            total = 1.0
-            for name in range(width):
-                if relation_of[name] < 0:
-                    share = (told[name] / number + low) / (even + low)
-                    evidence = worth * math.log(share)
-                    evidence = min(max(evidence, -MAX_EVIDENCE), MAX_EVIDENCE)
-                    out[name] = OTHER_ODDS * math.exp(evidence)
-                    total += out[name]
-            for name in range(width):
-                if relation_of[name] < 0:
-                    out[name] *= relations[row, end, NONE] / total
+            if others >= MIN_OTHER_VOTES:
+                free = relations[row, end, NONE]
+                _add_others(out, free, told, frames[row], by_votes[row], relation_of, scales)
     return result
+
+
+@kernel
+def _add_others(
+    out: Float64,
+    free: float,
+    votes: Float32,
+    frames: float,
+    by_votes: float,
+    relation_of: Int64,
+    scales: Float64,
+) -> None:
+    """Probabilities of the predicates that name no physical relation, of a pair that is `free`."""
+    slope, n_half, low, even = scales
+    worth = frames / (frames + n_half) * slope * by_votes
+    total = 1.0
+    for name in range(len(out)):
+        if relation_of[name] < 0:
+            share = (votes[name] / max(frames, 1e-9) + low) / (even + low)
+            evidence = min(max(worth * math.log(share), -MAX_EVIDENCE), MAX_EVIDENCE)
+            out[name] = OTHER_ODDS * math.exp(evidence)
+            total += out[name]
+    for name in range(len(out)):
+        if relation_of[name] < 0:
+            out[name] *= free / total
 
 
 @kernel

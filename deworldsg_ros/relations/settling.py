@@ -84,6 +84,14 @@ def share_supports(  # noqa: D417
             factor = min(1.0, MOST / max(first + second, 1e-300))
             kept[row, 0], kept[row, 1] = first * factor, second * factor
             place = links[row, end]
+    return _cut_circles(objects, kept, ends, links, first_links)
+
+
+@kernel
+def _cut_circles(
+    objects: Int64, kept: Float64, ends: Int64, links: Int64, first_links: Int64
+) -> Int64:
+    """Halve the weakest likely support of each circle with one of the objects; their places."""
     cut = np.empty(len(objects), np.int64)
     count = 0
     for item in objects:
@@ -145,9 +153,7 @@ def find_neighbours(  # noqa: D417
         with_: (m, 2) bool; a table and a seat in its reach, in this order or the other.
         near: (m,) probability that both stand on one support within reach; written.
         eligible: (m,) bool; the pair counts when neighbours are ranked; written.
-        shares: (n,) zeros, scratch.
-        marks: (n,) false, scratch.
-        ends, links, first_links: see `pair_links`.
+        shares, marks: (n,) zeros and false, scratch.
 
     Returns:
         The objects, and those with a pair whose eligibility changed: they are to be ranked.
@@ -156,11 +162,7 @@ def find_neighbours(  # noqa: D417
     for item in objects:
         marks[item] = True
     for item in objects:
-        place = first_links[item]
-        while place:
-            row, end = (place - 1) >> 1, (place - 1) & 1
-            shares[ends[row, 1 - end]] = kept[row, end]
-            place = links[row, end]
+        _spread(item, 1.0, kept, shares, ends, links, first_links)
         place = first_links[item]
         while place:
             row, end = (place - 1) >> 1, (place - 1) & 1
@@ -170,27 +172,37 @@ def find_neighbours(  # noqa: D417
             near[row] = 0.0
             if not np.isinf(gaps_m[row]):
                 together = _together(other, kept, shares, ends, links, first_links)
-                reach = SEAT_GAP_M if with_[row, 0] or with_[row, 1] else NEAR_FLOOR_M
                 floor = on_floor[item] * on_floor[other]
-                floor *= _expit((reach - gaps_m[row]) / NEAR_FLOOR_SPREAD_M)
-                together *= _expit((NEAR_SUPPORT_M - gaps_m[row]) / NEAR_SUPPORT_SPREAD_M)
-                rise = abs(bottom_steps_m[row])
-                together *= _expit((NEAR_LEVEL_M - rise) / NEAR_LEVEL_SPREAD_M)
-                near[row] = min(floor + together, 1.0)
+                seated = with_[row, 0] or with_[row, 1]
+                near[row] = _beside(floor, together, gaps_m[row], bottom_steps_m[row], seated)
                 free = _unrelated(states[row], carried[row], kept[row])
                 now = near[row] * free > MIN_NEIGHBOUR
             if now != eligible[row] and not marks[other]:
                 marks[other] = True
                 found.append(other)
             eligible[row] = now
-        place = first_links[item]
-        while place:
-            row, end = (place - 1) >> 1, (place - 1) & 1
-            shares[ends[row, 1 - end]] = 0.0
-            place = links[row, end]
+        _spread(item, 0.0, kept, shares, ends, links, first_links)
     for item in found:
         marks[item] = False
     return np.array(found)
+
+
+@kernel
+def _spread(
+    item: int,
+    factor: float,
+    kept: Float64,
+    shares: Float64,
+    ends: Int64,
+    links: Int64,
+    first_links: Int64,
+) -> None:
+    """Write what an object may rest on into `shares`, times a factor."""
+    place = first_links[item]
+    while place:
+        row, end = (place - 1) >> 1, (place - 1) & 1
+        shares[ends[row, 1 - end]] = factor * kept[row, end]
+        place = links[row, end]
 
 
 @kernel
@@ -205,6 +217,18 @@ def _together(
         total += kept[row, end] * shares[ends[row, 1 - end]]
         place = links[row, end]
     return total
+
+
+@kernel
+def _beside(
+    floor: float, together: float, gap_m: float, bottom_step_m: float, seated: bool
+) -> float:
+    """Probability that two objects stand side by side, on the floor or together on a support."""
+    reach = SEAT_GAP_M if seated else NEAR_FLOOR_M
+    floor *= _expit((reach - gap_m) / NEAR_FLOOR_SPREAD_M)
+    together *= _expit((NEAR_SUPPORT_M - gap_m) / NEAR_SUPPORT_SPREAD_M)
+    together *= _expit((NEAR_LEVEL_M - abs(bottom_step_m)) / NEAR_LEVEL_SPREAD_M)
+    return float(min(floor + together, 1.0))
 
 
 @kernel
