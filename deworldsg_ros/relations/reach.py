@@ -205,27 +205,30 @@ def _pairs(
         searches += 1
         if counts[a] < MIN_SHAPE_POINTS:
             continue
+        seen[a] = searches
         left, back, right, front = _span(low[a], high[a], REACH_M)
-        lists = _cells(left, back, right, front)
-        for index in range(len(lists) + 1):
-            cell = lists[index] if index < len(lists) else LISTS
-            entry = heads[cell]
-            while entry:
-                b = items[entry]
-                entry = next_[entry]
-                if b != a and seen[b] != searches:
-                    seen[b] = searches
-                    if _in_reach(a, b, low, high):
-                        found.append((int(a), int(b)))
-        if len(lists) == 1 and lists[0] == LISTS:  # as vast as that: compare with all
-            for b in range(len(low)):
-                known = spans[b, 0] != _NOWHERE
-                if known and b != a and seen[b] != searches and _in_reach(a, b, low, high):
-                    found.append((int(a), int(b)))
+        for b in _around(heads, items, next_, spans, _cells(left, back, right, front)):
+            if seen[b] != searches and _in_reach(a, b, low, high):
+                found.append((int(a), int(b)))
+            seen[b] = searches
     pairs = np.empty((len(found), 2), np.int64)
     for index in range(len(found)):
         pairs[index, 0], pairs[index, 1] = found[index]
     return pairs
+
+
+@kernel
+def _around(heads: Int64, items: Int64, next_: Int64, spans: Int64, lists: Int64) -> Int64:
+    """The objects in lists, and those over many cells; some twice."""
+    if len(lists) == 1 and lists[0] == LISTS:  # over as many cells: all objects
+        return np.flatnonzero(spans[:, 0] != _NOWHERE)
+    found = [0][:0]
+    for index in range(len(lists) + 1):
+        entry = heads[lists[index] if index < len(lists) else LISTS]
+        while entry:
+            found.append(int(items[entry]))
+            entry = next_[entry]
+    return np.array(found)
 
 
 @kernel

@@ -288,32 +288,35 @@ def rank_neighbours(  # noqa: D417
         places[:], distances[:] = 0, np.inf
         place = first_links[item]
         while place:
-            row, end = (place - 1) >> 1, (place - 1) & 1
+            row = (place - 1) >> 1
             if eligible[row]:
                 distance = gaps_m[row] + CENTRE_FRACTION * centre_steps_m[row]
-                index = NEAREST
-                # Of equal distances, the earlier pair counts first.
-                while index > 0 and (
-                    distance < distances[index - 1]
-                    or (distance == distances[index - 1] and place < places[index - 1])
-                ):
-                    index -= 1
-                    if index + 1 < NEAREST:
-                        distances[index + 1], places[index + 1] = distances[index], places[index]
-                if index < NEAREST:
-                    distances[index], places[index] = distance, place
-            place = links[row, end]
+                _insert(distance, place, distances, places)
+            place = links[row, (place - 1) & 1]
         place = first_links[item]
         while place:
             row, end = (place - 1) >> 1, (place - 1) & 1
-            now = False
-            for known in places:
-                now |= known == place
+            now = np.any(places == place)
             if close[row, end] != now:
                 close[row, end] = now
                 changed.append(row)
             place = links[row, end]
     return np.array(changed)
+
+
+@kernel
+def _insert(distance: float, place: int, distances: Float64, places: Int64) -> None:
+    """Keep the smallest distances, in order. Of equal ones, the smaller place counts first."""
+    index = len(distances)
+    while index > 0:
+        before = distances[index - 1]
+        if before < distance or (before == distance and places[index - 1] < place):
+            break
+        index -= 1
+        if index + 1 < len(distances):
+            distances[index + 1], places[index + 1] = distances[index], places[index]
+    if index < len(distances):
+        distances[index], places[index] = distance, place
 
 
 @kernel

@@ -26,12 +26,12 @@ from support.room_nodes import (
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations.pair_geometry import NodeShapes
+from deworldsg_ros.relations.pair_rows import key
 from deworldsg_ros.relations.pair_table import (
     FLOOR_QUANTILE,
     FLOOR_STEP_M,
     PairTable,
     floor_height,
-    key,
     stepped_up,
 )
 from deworldsg_ros.relations.physical_states import (

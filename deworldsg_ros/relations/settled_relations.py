@@ -1,0 +1,176 @@
+"""The physical relations of all pairs, settled around what changed."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import softmax
+
+from deworldsg_ros.config import Config
+from deworldsg_ros.relations.exclusions import CARRIED_FIRST, CARRIED_SECOND, MOST, SEAT_GAP_M
+from deworldsg_ros.relations.naming import MIN_OTHER_VOTES
+from deworldsg_ros.relations.pair_links import pairs_of
+from deworldsg_ros.relations.pair_table import PairTable
+from deworldsg_ros.relations.physical_states import NONE
+from deworldsg_ros.relations.physics_model import believed_logits, load_physics_model
+from deworldsg_ros.relations.settling import (
+    find_neighbours,
+    rank_neighbours,
+    relate,
+    share_supports,
+)
+from deworldsg_ros.relations.vote_model import near_logits, vote_logits
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.class_kinds import SEATS, TABLES
+from deworldsg_ros.scene.graph import SceneGraph
+
+
+class SettledRelations:
+    """Writes the belief columns of a table: what its pairs say, and what they exclude.
+
+    The columns of `PairRows` are: ``states`` (STATE_COUNT,), ``carried`` (2,) and ``near_votes`` by
+    the pair alone; ``kept`` (2,), ``near``, ``eligible`` and ``close`` (2,) after what others
+    exclude (see `settling`); ``relations`` (2, NONE + 1) of both directions; ``by_votes``, the
+    exponent of the votes; ``with_`` (2,), a table and a seat; ``live``, false for pairs that are
+    apart and have no votes that matter.
+
+    Args:
+        config: `world_model` and `relation_head` are used.
+        graph: of the table.
+        table: of pairs.
+    """
+
+    def __init__(self, config: Config, graph: SceneGraph, table: PairTable) -> None:
+        self._geometry = config.relations.world_model != "none"
+        self._own_head = config.perception.relation_head == "geometric"
+        self._graph = graph
+        self._table = table
+        self._model = load_physics_model()
+        classes = graph.vocabulary.classes
+        self._tables = np.array([name in TABLES for name in classes], np.float64)
+        self._seats = np.array([name in SEATS for name in classes], np.float64)
+        # Nodes of each circle of supports that was cut.
+        self._circles: list[set[int]] = []
+
+    def settle(self, rows: Int64) -> Int64:
+        """Relations around the changed rows; returns the rows whose relations changed."""
+        t, shapes = self._table, self._table.shapes
+        nodes = [shapes.row(node_id) for node_id in t.changed_nodes]
+        objects = np.union1d(t.ends[rows], np.array(nodes, np.int64)).astype(np.int64)
+        if not len(objects):
+            return objects
+        self._judge(rows)
+        objects = self._reopen_circles(objects)
+        shapes.floor_odds[objects] = self._floor_odds(objects)
+        lists = (t.ends, t.links, shapes.first_links)
+        cut = share_supports(
+            objects, t.carried, t.kept, shapes.floor_odds, shapes.on_floor, shapes.totals, *lists
+        )
+        self._note_circles(cut.tolist())
+        ranked = find_neighbours(
+            objects,
+            t.states,
+            t.carried,
+            t.kept,
+            shapes.on_floor,
+            t.gaps_m,
+            t.bottom_steps_m,
+            t.with_,
+            t.near,
+            t.eligible,
+            shapes.shares,
+            shapes.marks,
+            *lists,
+        )
+        moved = rank_neighbours(
+            ranked, t.gaps_m, t.centre_steps_m, t.eligible, t.close, t.links, shapes.first_links
+        )
+        around = np.union1d(pairs_of(shapes.first_links, t.links, objects), moved).astype(np.int64)
+        around = around[t.live[around]]
+        changed = relate(
+            around,
+            t.states,
+            t.carried,
+            t.kept,
+            t.near,
+            t.close,
+            t.with_,
+            t.near_votes,
+            t.relations,
+        )
+        return around[changed]
+
+    def _judge(self, rows: Int64) -> None:
+        """What the evidence on each changed pair alone says."""
+        if not len(rows):
+            return
+        table, model = self._table, self._model
+        counts, frames, judged = table.counts[rows], table.frames[rows], table.judged[rows]
+        geometry = np.where(judged[:, None], table.state_logits[rows], 0.0)
+        votes = vote_logits(counts, frames, model.votes)
+        independent = ~judged | (not self._own_head)
+        states = softmax(believed_logits(model, geometry, votes, independent), axis=1)
+        table.states[rows] = states
+        carried = [states[:, CARRIED_FIRST].sum(1), states[:, CARRIED_SECOND].sum(1)]
+        table.carried[rows] = np.minimum(np.column_stack(carried), MOST)
+        by_votes = np.where(independent, model.source_weights[1], 1.0)
+        near_votes = by_votes * near_logits(counts, frames, model.votes)
+        table.near_votes[rows] = near_votes
+        table.by_votes[rows] = by_votes
+        apart = judged & np.isinf(table.gaps_m[rows])
+        spoken = (votes > 0.0).any(axis=1) | (near_votes > 0.0)
+        live = ~apart | spoken | (table.other_votes[rows] >= MIN_OTHER_VOTES)
+        table.live[rows] = live
+        idle = rows[~live]
+        table.near[idle], table.eligible[idle], table.relations[idle] = 0.0, False, 0.0
+        table.relations[idle, :, NONE] = 1.0
+        table.with_[rows] = self._tables_with_seats(rows)
+
+    def _tables_with_seats(self, rows: Int64) -> Bool:
+        """(m, 2) bool: a table and a seat in its reach; the table is the first, or the second."""
+        t, nodes = self._table, self._graph.nodes
+        ends = t.nodes[rows]
+        ids, places = np.unique(ends, return_inverse=True)
+        classes = nodes.class_probabilities[[nodes.row(node_id) for node_id in ids.tolist()]]
+        classes = classes.reshape(-1, nodes.class_probabilities.shape[1])
+        first, second = places.reshape(-1, 2).T
+        table, seat = classes @ self._tables > 0.5, classes @ self._seats > 0.5
+        found = np.column_stack([table[first] & seat[second], table[second] & seat[first]])
+        return found & (t.judged[rows] & (t.gaps_m[rows] <= SEAT_GAP_M))[:, None]
+
+    def _floor_odds(self, objects: Int64) -> Float64:
+        """Odds (n,) that nodes stand on the floor; 0 without surfaces or a world model."""
+        if not self._geometry:
+            return np.zeros(len(objects))
+        shapes = self._table.shapes
+        low, high = shapes.low[objects, 2], shapes.high[objects, 2]
+        logits = self._model.floor_logits(low - self._table.floor_m, high - low)
+        known = shapes.counts[objects] > 0
+        return np.where(known, np.exp(np.clip(logits, -20.0, 20.0)), 0.0)
+
+    def _reopen_circles(self, objects: Int64) -> Int64:
+        """The objects, and those of the circles that contain one of them."""
+        if not self._circles:
+            return objects
+        shapes = self._table.shapes
+        ids = set(shapes.ids[objects].tolist())
+        opened = [circle for circle in self._circles if not circle.isdisjoint(ids)]
+        self._circles = [circle for circle in self._circles if circle.isdisjoint(ids)]
+        more = [shapes.row(i) for circle in opened for i in circle if i in shapes]
+        return np.union1d(objects, np.array(more, np.int64)).astype(np.int64)
+
+    def _note_circles(self, cut: list[int]) -> None:
+        """Remember the nodes of the circles that were cut at these places."""
+        table = self._table
+        for place in cut:
+            row, end = place >> 1, place & 1
+            circle = {int(table.nodes[row, end])}
+            node = int(table.nodes[row, 1 - end])
+            while node not in circle:
+                circle.add(node)
+                rows = table.rows_of([node])
+                ends = (table.nodes[rows, 1] == node).astype(np.int64)
+                likely = np.flatnonzero(table.kept[rows, ends] > 0.5)
+                if not len(likely):
+                    break
+                node = int(table.nodes[rows[likely[0]], 1 - ends[likely[0]]])
+            self._circles.append(circle)
