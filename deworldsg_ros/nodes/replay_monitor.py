@@ -62,7 +62,7 @@ class _LocalGraph(msgspec.Struct):
     """The fields of a local graph that are read here."""
 
     stamp: wire.Stamp
-    T_world_camera: wire.Matrix4
+    T_world_camera: wire.Pose
 
 
 @dataclass(frozen=True)

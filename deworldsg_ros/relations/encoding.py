@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 
 from deworldsg_ros.relations.clips import QueuedClip, Rgb, crop_clip, without_first
-from deworldsg_ros.relations.prior import SUM_TOLERANCE
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import RelationEvidence
+from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
 
 
 class ClipEncoder:
@@ -100,7 +100,8 @@ def checked_distributions(output: Float64, pair_count: int, predicate_count: int
     """A world model's output as float64 rows that sum to one.
 
     Args:
-        output: (pair_count, predicate_count), any float type; sums within `SUM_TOLERANCE` of one.
+        output: (pair_count, predicate_count), any float type; sums within
+            `MAX_PREDICTION_SUM_ERROR` of one.
         pair_count: rows expected.
         predicate_count: columns expected.
 
@@ -115,7 +116,7 @@ def checked_distributions(output: Float64, pair_count: int, predicate_count: int
     sums = values.sum(axis=1)
     if (
         not (np.isfinite(values).all() and (values >= 0).all())
-        or (np.abs(sums - 1) > SUM_TOLERANCE).any()
+        or (np.abs(sums - 1) > MAX_PREDICTION_SUM_ERROR).any()
     ):
         raise ValueError(
             f"output is {values.tolist()}: expected rows >= 0 that sum to one, one per pair"

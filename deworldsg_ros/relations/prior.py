@@ -9,9 +9,7 @@ import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.errors import RefusedInput
-
-# Distributions of a float32 network sum to one within this.
-SUM_TOLERANCE = 1e-3
+from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
 
 
 Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
@@ -161,7 +159,9 @@ class ClassPairPrior:
                 f"expected 0 to {self.class_count - 1}"
             )
         sums = values.sum(axis=1)
-        if not (values.min() >= 0 and np.allclose(sums, 1.0, rtol=0, atol=SUM_TOLERANCE)):
+        if not (
+            values.min() >= 0 and np.allclose(sums, 1.0, rtol=0, atol=MAX_PREDICTION_SUM_ERROR)
+        ):
             raise ValueError(
                 f"predictions have a minimum of {values.min():.3g} and sums from "
                 f"{sums.min():.6g} to {sums.max():.6g}: expected distributions"

@@ -15,10 +15,13 @@ REASONS: dict[str, str] = {
     "driver and the network.",
     "grid_mismatch": "RGB, depth and camera_info differ in size. Publish depth that is registered "
     "to RGB.",
-    "invalid_intrinsics": "camera_info contains zeros or NaN. Calibrate the camera.",
+    "invalid_intrinsics": "camera_info contains zeros, NaN or absurd values. Calibrate the camera.",
+    "invalid_frame_id": "A frame_id contains control characters or more than 256 characters. "
+    "Correct it in the node that publishes it.",
     # Poses
-    "invalid_pose": "A pose contains NaN or infinity, or its quaternion is not of length 1. Check "
-    "the source of the poses.",
+    "invalid_pose": "A pose contains NaN or infinity, its quaternion is not of length 1, or it is "
+    "more than 10 km from the origin. Check the source of the poses; publish them in a frame that "
+    "begins near the robot.",
     "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "
     "session. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
     "pose_jump": "The camera moved more than 1 m between two frames, or rotated faster than 360 "
@@ -81,6 +84,9 @@ REASONS: dict[str, str] = {
     # Messages between the nodes
     "invalid_message": "A JSON message does not fit its schema. The log line names the field; run "
     "all nodes in one version.",
+    "message_too_large": "A JSON message is larger than 16 MiB, or 256 MiB for the global graph. "
+    "Look for a second publisher on its topic.",
+    "invalid_stamp": "The stamp of a message is negative. Check the clock of its publisher.",
     "unknown_schema": "A JSON message has another schema, or a later version of it. Run all nodes "
     "in one version.",
     "unknown_instance": "The instance image contains an id without an object in the frame graph. "

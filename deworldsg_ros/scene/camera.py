@@ -16,9 +16,17 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.limits import (
+    MAX_COORDINATE_M,
+    MAX_FOCAL_PX,
+    MAX_SIDE_PX,
+    MAX_TRANSFORM_M,
+    MIN_FOCAL_PX,
+)
 
 # Maximum difference of R Rᵀ from the identity: poses are often written with four decimals.
 _ROTATION_TOLERANCE = 1e-3
+_LAST_ROW = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -26,7 +34,8 @@ class Intrinsics:
     """Pinhole intrinsics of a rectified image, in pixels.
 
     Raises:
-        RefusedInput: ``invalid_intrinsics`` for non-finite values, focal lengths or sizes <= 0.
+        RefusedInput: ``invalid_intrinsics`` for focal lengths or sizes <= 0, and for values that
+            are not finite or beyond the limits of `scene.limits`.
     """
 
     fx: float
@@ -38,15 +47,18 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not all(math.isfinite(value) for value in values) or self.fx <= 0 or self.fy <= 0:
+        in_range = all(abs(value) <= MAX_FOCAL_PX for value in values)
+        if not in_range or min(self.fx, self.fy) < MIN_FOCAL_PX:
             raise RefusedInput(
                 "invalid_intrinsics",
-                f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: "
-                "expected finite values with fx > 0 and fy > 0 (is the camera calibrated?)",
+                f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}: expected values "
+                f"up to {MAX_FOCAL_PX:g}, fx and fy from {MIN_FOCAL_PX:g} on (is the camera "
+                "calibrated?)",
             )
-        if self.width <= 0 or self.height <= 0:
+        if not (0 < self.width <= MAX_SIDE_PX and 0 < self.height <= MAX_SIDE_PX):
             raise RefusedInput(
-                "invalid_intrinsics", f"image size {self.width}x{self.height}: expected > 0"
+                "invalid_intrinsics",
+                f"image size {self.width}x{self.height}: expected 1 to {MAX_SIDE_PX}",
             )
 
     @property
@@ -115,8 +127,16 @@ def _size(image: NDArray[Any]) -> str:
 
 def check_pose(T: Float64) -> None:
     """Check a rigid transform (4, 4); raises RefusedInput ``invalid_pose``."""
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise RefusedInput("invalid_pose", f"pose {T.tolist()}: expected a finite 4x4 matrix")
+    if T.shape != (4, 4) or not np.abs(T).max() <= MAX_COORDINATE_M:
+        raise RefusedInput(
+            "invalid_pose",
+            f"pose {T.tolist()}: expected a finite 4x4 matrix, at most {MAX_COORDINATE_M:g} m from "
+            "the origin",
+        )
+    if (T[3] != _LAST_ROW).any():
+        raise RefusedInput(
+            "invalid_pose", f"last row of the pose is {T[3].tolist()}: expected 0, 0, 0, 1"
+        )
     (a, b, c, _), (d, e, f, _), (g, h, i, _) = T[:3].tolist()
     error = max(
         abs(a * a + b * b + c * c - 1.0),
@@ -139,16 +159,18 @@ def pose_from_quaternion(translation_m: Float64, quat_xyzw: Float64) -> Float64:
     """Rigid transform from a translation (3,) in metres and a quaternion (4,) x, y, z, w.
 
     Raises:
-        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion whose norm is not about 1.
+        RefusedInput: ``invalid_pose`` for NaN, infinity, an absurd translation, or a quaternion
+            whose norm is not about 1.
     """
     quat = np.asarray(quat_xyzw, dtype=np.float64)
     translation = np.asarray(translation_m, dtype=np.float64)
-    norm = float(np.linalg.norm(quat))
-    if not (np.isfinite(quat).all() and np.isfinite(translation).all()):
+    if not (np.abs(quat).max() <= 2.0 and np.abs(translation).max() <= MAX_TRANSFORM_M):
         raise RefusedInput(
             "invalid_pose",
-            f"pose position {translation.tolist()}, orientation {quat.tolist()}: expected finite",
+            f"pose position {translation.tolist()}, orientation {quat.tolist()}: expected finite "
+            f"values, at most {MAX_TRANSFORM_M:g} m and a quaternion of norm 1",
         )
+    norm = float(np.linalg.norm(quat))
     if abs(norm - 1.0) > 1e-2:
         raise RefusedInput(
             "invalid_pose", f"orientation {quat.tolist()} has norm {norm:.4f}: expected 1"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from deworldsg_ros.scene import wire
@@ -16,6 +18,8 @@ from deworldsg_ros.scene.frame_graph import (
     Relations,
     Vocabulary,
 )
+from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
+from deworldsg_ros.scene.names import check_labels
 
 
 def _relations_to_wire(relations: Relations) -> list[wire.RelationLogits]:
@@ -37,11 +41,35 @@ def _relations_from_wire(items: list[wire.RelationLogits], predicate_count: int)
     )
 
 
+def _predictions(pairs: list[wire.PairEvidence], predicate_count: int) -> Float64:
+    """Predictions (m, R); rows of NaN for pairs without one."""
+    nothing = [float("nan")] * predicate_count
+    predictions = _rows(
+        [item.prediction or nothing for item in pairs], predicate_count, "prediction"
+    )
+    sums = predictions.sum(axis=1)
+    if (np.abs(sums - 1.0) > MAX_PREDICTION_SUM_ERROR).any():
+        row = int(np.nanargmax(np.abs(sums - 1.0)))
+        raise RefusedInput(
+            "invalid_prediction",
+            f"prediction of row {row} sums to {sums[row]:.6g}: expected 1",
+        )
+    return predictions
+
+
 def _rows(rows: list[list[float]], width: int, name: str) -> Float64:
     for index, row in enumerate(rows):
         if len(row) != width:
             raise ValueError(f"{name} of row {index} have {len(row)} values: expected {width}")
     return np.array(rows, np.float64).reshape(len(rows), width)
+
+
+@lru_cache(maxsize=4)
+def _vocabulary(classes: tuple[str, ...], predicates: tuple[str, ...]) -> Vocabulary:
+    """The vocabulary, checked once: every message of a session repeats it."""
+    check_labels(classes)
+    check_labels(predicates)
+    return Vocabulary(classes, predicates)
 
 
 def frame_graph_to_message(graph: FrameGraph) -> wire.FrameGraphMessage:
@@ -75,7 +103,7 @@ def frame_graph_from_message(message: wire.FrameGraphMessage) -> FrameGraph:
             frame_id=message.frame_id,
             width=message.width,
             height=message.height,
-            vocabulary=Vocabulary(tuple(message.classes), tuple(message.predicates)),
+            vocabulary=_vocabulary(tuple(message.classes), tuple(message.predicates)),
             boxes_xyxy=_rows([item.box_xyxy for item in objects], 4, "box"),
             class_probabilities=_rows(
                 [item.class_probabilities for item in objects],
@@ -130,7 +158,7 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             width=message.width,
             height=message.height,
             T_world_camera=np.array(message.T_world_camera, np.float64).reshape(4, 4),
-            vocabulary=Vocabulary(tuple(message.classes), tuple(message.predicates)),
+            vocabulary=_vocabulary(tuple(message.classes), tuple(message.predicates)),
             instance_ids=np.array([item.instance for item in objects], np.int64),
             boxes_xyxy=_rows([item.box_xyxy for item in objects], 4, "box"),
             class_probabilities=_rows(
@@ -215,11 +243,10 @@ def evidence_to_message(evidence: RelationEvidence, frame_id: str) -> wire.Relat
 def evidence_from_message(message: wire.RelationEvidenceMessage) -> RelationEvidence:
     """The relation evidence of a message; ``invalid_message`` if its parts do not fit."""
     pairs = message.pairs
-    width = len(message.predicates)
     try:
         return RelationEvidence(
             stamp_ns=wire.ns_from_stamp(message.stamp),
-            vocabulary=Vocabulary(tuple(message.classes), tuple(message.predicates)),
+            vocabulary=_vocabulary(tuple(message.classes), tuple(message.predicates)),
             pairs=np.array([[item.subject, item.object] for item in pairs], np.int64).reshape(
                 -1, 2
             ),
@@ -227,9 +254,7 @@ def evidence_from_message(message: wire.RelationEvidenceMessage) -> RelationEvid
                 [[item.subject_class, item.object_class] for item in pairs], np.int64
             ).reshape(-1, 2),
             geo_costs=np.array([item.geo_cost for item in pairs], np.float64),
-            predictions=_rows(
-                [item.prediction or [float("nan")] * width for item in pairs], width, "prediction"
-            ),
+            predictions=_predictions(pairs, len(message.predicates)),
             source=message.source,
         )
     except ValueError as error:

@@ -6,14 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deworldsg_ros.scene import checks, limits
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16
-from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.gaussian import log_determinant
-
-# Maximum difference of a sum of probabilities from 1: they may be written with six decimals.
-SUM_TOLERANCE = 1.1e-5
+from deworldsg_ros.scene.camera import Intrinsics, check_pose
+from deworldsg_ros.scene.errors import RefusedInput
 
 
 @dataclass(frozen=True)
@@ -40,11 +37,10 @@ class Relations:
 
     def __post_init__(self) -> None:
         count = len(self.pairs)
-        _check("relation pairs", self.pairs, (count, 2))
-        _check("relation logits", self.logits, (count, self.logits.shape[-1]))
-        _check("relation scores", self.scores, (count,))
-        if (self.pairs[:, 0] == self.pairs[:, 1]).any():
-            raise ValueError("relation pairs: an object cannot be related to itself")
+        checks.check_pairs("relation pairs", self.pairs, count, limits.MAX_INT)
+        width = self.logits.shape[-1]
+        checks.check_array("relation logits", self.logits, (count, width), limits.MAX_LOGIT)
+        checks.check_probabilities("relation scores", self.scores, (count,))
 
     @staticmethod
     def none(predicate_count: int) -> Relations:
@@ -81,7 +77,7 @@ class FrameGraph:
 
     def __post_init__(self) -> None:
         count = len(self.boxes_xyxy)
-        _check("boxes", self.boxes_xyxy, (count, 4))
+        checks.check_boxes(self.boxes_xyxy, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
 
@@ -117,9 +113,9 @@ class DepthGrid:
             len(range(first, size, self.stride_px))
             for size in (self.intrinsics.height, self.intrinsics.width)
         )
-        _check("depth grid", self.depth_mm, shape)
+        checks.check_shape("depth grid", self.depth_mm, shape)
         if self.instances is not None:
-            _check("instances of the depth grid", self.instances, shape)
+            checks.check_shape("instances of the depth grid", self.instances, shape)
 
 
 @dataclass(frozen=True)
@@ -167,16 +163,17 @@ class LocalGraph:
 
     def __post_init__(self) -> None:
         count = len(self.means_world)
-        _check("means", self.means_world, (count, 3))
-        _check("covariances", self.covariances_world, (count, 3, 3))
-        _check_covariances(self.covariances_world)
-        _check("boxes", self.boxes_xyxy, (count, 4))
-        _check("depths", self.depths_m, (count,))
-        _check("instance ids", self.instance_ids, (count,))
-        _check("pixel counts", self.pixel_counts, (count,))
-        if len(self.surface_points_world) != count:
-            raise ValueError(f"{len(self.surface_points_world)} point sets for {count} objects")
-        _check_surfaces(self.surface_points_world)
+        try:
+            check_pose(self.T_world_camera)
+        except RefusedInput as refusal:
+            raise ValueError(str(refusal)) from refusal
+        checks.check_array("means", self.means_world, (count, 3), limits.MAX_COORDINATE_M)
+        checks.check_covariances(self.covariances_world, count)
+        checks.check_boxes(self.boxes_xyxy, count)
+        checks.check_depths(self.depths_m, count)
+        checks.check_instance_ids(self.instance_ids, count)
+        checks.check_counts("pixel counts", self.pixel_counts, count)
+        checks.check_surfaces(self.surface_points_world, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
 
@@ -197,48 +194,12 @@ def derived(item: Checked, **changes: Any) -> Checked:
     return copy
 
 
-def _check(name: str, array: NDArray[np.generic], shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise ValueError(f"{name} have shape {array.shape}: expected {shape}")
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name} contain NaN or infinity: expected finite values")
-
-
-def _check_covariances(covariances: Float64) -> None:
-    asymmetric = np.abs(covariances - np.swapaxes(covariances, 1, 2)) > 1e-9 * np.abs(covariances)
-    if asymmetric.any():
-        row = int(asymmetric.any(axis=(1, 2)).argmax())
-        raise ValueError(f"covariance {covariances[row].tolist()} of row {row} is not symmetric")
-    # The pivots of `log_determinant`, of all covariances at once; it also states the error.
-    (c00, _, _), (c10, c11, _), (c20, c21, c22) = covariances.transpose(1, 2, 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        pivot_1 = c11 - c10 / c00 * c10
-        rest = c21 - c20 / c00 * c10
-        pivot_2 = c22 - c20 / c00 * c20 - rest / pivot_1 * rest
-    for row in np.flatnonzero(~((c00 > 0) & (pivot_1 > 0) & (pivot_2 > 0))).tolist():
-        log_determinant(covariances[row])
-
-
-def _check_surfaces(surfaces: tuple[Float32, ...]) -> None:
-    for row, points in enumerate(surfaces):
-        if points.ndim != 2 or points.shape[1] != 3:
-            _check(f"surface points of object {row}", points, (len(points), 3))
-    # One test for all of them; the objects are searched only to state the error.
-    if surfaces and not np.isfinite(np.concatenate(surfaces)).all():
-        for row, points in enumerate(surfaces):
-            _check(f"surface points of object {row}", points, (len(points), 3))
-
-
 def _check_objects(
     count: int, vocabulary: Vocabulary, class_probabilities: Float64, scores: Float64
 ) -> None:
-    _check("class probabilities", class_probabilities, (count, len(vocabulary.classes)))
-    _check("scores", scores, (count,))
-    sums = class_probabilities.sum(axis=1)
-    if (np.abs(sums - 1.0) > SUM_TOLERANCE).any():
-        raise ValueError(
-            f"class probabilities sum to {sums[np.abs(sums - 1).argmax()]:.6f}: expected 1"
-        )
+    shape = (count, len(vocabulary.classes))
+    checks.check_distributions("class probabilities", class_probabilities, shape)
+    checks.check_probabilities("scores", scores, (count,))
 
 
 def _check_relations(count: int, vocabulary: Vocabulary, relations: Relations) -> None:
@@ -247,7 +208,7 @@ def _check_relations(count: int, vocabulary: Vocabulary, relations: Relations) -
             f"relation logits have {relations.logits.shape[1]} predicates: "
             f"expected {len(vocabulary.predicates)}"
         )
-    if len(relations.pairs) and (relations.pairs.min() < 0 or relations.pairs.max() >= count):
+    if len(relations.pairs) and relations.pairs.max() >= count:
         raise ValueError(f"a relation names object {relations.pairs.max()} of {count}")
 
 
@@ -275,10 +236,13 @@ class RelationEvidence:
     source: str
 
     def __post_init__(self) -> None:
-        count = len(self.pairs)
-        _check("evidence pairs", self.pairs, (count, 2))
-        _check("evidence pair classes", self.pair_classes, (count, 2))
-        _check("geometric costs", self.geo_costs, (count,))
+        count, class_count = len(self.pairs), len(self.vocabulary.classes)
+        checks.check_pairs("evidence pairs", self.pairs, count, limits.MAX_INT)
+        name = "evidence pair classes"
+        checks.check_array(name, self.pair_classes, (count, 2), class_count - 1)
+        if count and self.pair_classes.min() < 0:
+            raise ValueError(f"{name} contain {self.pair_classes.min()}: expected >= 0")
+        checks.check_array("geometric costs", self.geo_costs, (count,), limits.MAX_COST)
         if self.predictions.shape != (count, len(self.vocabulary.predicates)):
             raise ValueError(
                 f"predictions have shape {self.predictions.shape}: "

@@ -16,6 +16,8 @@ from deworldsg_ros.scene.columns import Columns
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
 from deworldsg_ros.scene.surface import add_points, drop_points
 
+# A covariance with a pivot below this fraction of its trace is singular up to rounding.
+SINGULAR = 1e-13
 # Saved columns of a node, beside its surface points; the other columns follow from these.
 SAVED_COLUMNS = (
     "ids",
@@ -258,6 +260,18 @@ class NodeTable(Columns):
 
 
 @kernel
+def _pivots(c: Float64) -> tuple[float, float]:
+    """Second and third LDLᵀ pivot of a covariance (3, 3); 0 if the one before is not positive."""
+    if not c[0, 0] > 0.0:
+        return 0.0, 0.0
+    pivot_1 = c[1, 1] - c[1, 0] / c[0, 0] * c[1, 0]
+    if not pivot_1 > 0.0:
+        return 0.0, 0.0
+    rest = c[2, 1] - c[2, 0] / c[0, 0] * c[1, 0]
+    return pivot_1, c[2, 2] - c[2, 0] / c[0, 0] * c[2, 0] - rest / pivot_1 * rest
+
+
+@kernel
 def _fuse(
     rows: Int64,
     means: Float64,
@@ -292,9 +306,13 @@ def _fuse(
                 mixed = known * covariances[row, i, j] + weight * new_covariances[index, i, j]
                 c[i, j] = mixed / total + cross * apart
                 squares += c[i, j] * c[i, j]
-        pivot_1 = c[1, 1] - c[1, 0] / c[0, 0] * c[1, 0]
-        rest = c[2, 1] - c[2, 0] / c[0, 0] * c[1, 0]
-        pivot_2 = c[2, 2] - c[2, 0] / c[0, 0] * c[2, 0] - rest / pivot_1 * rest
+        pivot_1, pivot_2 = _pivots(c)
+        trace = c[0, 0] + c[1, 1] + c[2, 2]
+        if not min(pivot_1, pivot_2) > SINGULAR * trace:
+            # The sum of positive definite matrices is one; here rounding has made it singular.
+            for i in range(3):
+                c[i, i] += 10.0 * SINGULAR * trace
+            pivot_1, pivot_2 = _pivots(c)
         if not (c[0, 0] > 0.0 and pivot_1 > 0.0 and pivot_2 > 0.0):
             return index
         log_determinants[row] = math.log(c[0, 0] * pivot_1 * pivot_2)

@@ -10,28 +10,83 @@ from typing import Annotated, Any, Literal, TypeVar, Union
 import msgspec
 
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.limits import (
+    MAX_COORDINATE_M,
+    MAX_COST,
+    MAX_FOCAL_PX,
+    MAX_FRAME_BYTES,
+    MAX_GRAPH_BYTES,
+    MAX_INSTANCE,
+    MAX_INT,
+    MAX_LOGIT,
+    MAX_NAME_CHARACTERS,
+    MAX_NAMES,
+    MAX_OBJECTS,
+    MAX_PAIRS,
+    MAX_POINTS,
+    MAX_RELATIONS,
+    MAX_SECONDS,
+    MAX_SIDE_PX,
+    MAX_VARIANCE_M2,
+)
+from deworldsg_ros.scene.names import checked_frame_id
 
 # A reader of version N reads N - 1 too.
 VERSION = 1
 
-NonNegative = Annotated[int, msgspec.Meta(ge=0)]
+NonNegative = Annotated[int, msgspec.Meta(ge=0, le=MAX_INT)]
+Positive = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
+NodeId = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
+# The sum of rounded probabilities may exceed 1 by some ulp.
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0 + 1e-9)]
-Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
-Box = Annotated[
-    list[float], msgspec.Meta(min_length=4, max_length=4, description="x1 y1 x2 y2, pixels")
+Distribution = Annotated[
+    list[Probability], msgspec.Meta(max_length=MAX_NAMES, description="sums to one")
 ]
+Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
 Matrix3 = Annotated[
     list[float], msgspec.Meta(min_length=9, max_length=9, description="3x3, row by row")
 ]
-Matrix4 = Annotated[
-    list[float], msgspec.Meta(min_length=16, max_length=16, description="4x4, row by row")
+Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+Point = Annotated[list[Coordinate], msgspec.Meta(min_length=3, max_length=3)]
+Points = Annotated[list[Point], msgspec.Meta(max_length=MAX_POINTS)]
+Side = Annotated[int, msgspec.Meta(ge=1, le=MAX_SIDE_PX, description="pixels")]
+Pixel = Annotated[float, msgspec.Meta(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)]
+Focal = Annotated[float, msgspec.Meta(ge=-MAX_FOCAL_PX, le=MAX_FOCAL_PX)]
+Box = Annotated[
+    list[Pixel],
+    msgspec.Meta(
+        min_length=4, max_length=4, description="x1 y1 x2 y2, pixels; x1 <= x2 and y1 <= y2"
+    ),
 ]
+Covariance = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-MAX_VARIANCE_M2, le=MAX_VARIANCE_M2)]],
+    msgspec.Meta(
+        min_length=9, max_length=9, description="3x3, row by row, symmetric, positive definite"
+    ),
+]
+Pose = Annotated[
+    list[Coordinate],
+    msgspec.Meta(
+        min_length=16, max_length=16, description="4x4, row by row, a rigid transform, metres"
+    ),
+]
+Logits = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-MAX_LOGIT, le=MAX_LOGIT)]],
+    msgspec.Meta(max_length=MAX_NAMES),
+]
+Name = Annotated[
+    str,
+    msgspec.Meta(max_length=MAX_NAME_CHARACTERS, description="without control characters"),
+]
+Names = Annotated[list[Name], msgspec.Meta(min_length=1, max_length=MAX_NAMES)]
+# Row of an object in the message of its frame.
+Row = Annotated[int, msgspec.Meta(ge=0, lt=MAX_OBJECTS)]
 
 
 class Stamp(msgspec.Struct, frozen=True):
     """A ROS time."""
 
-    sec: Annotated[int, msgspec.Meta(ge=-(2**31), lt=2**31)]
+    sec: Annotated[int, msgspec.Meta(ge=0, le=MAX_SECONDS)]
     nanosec: Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
 
 
@@ -50,7 +105,7 @@ class Schema(msgspec.Struct, frozen=True):
     """Name and version of a message's schema."""
 
     name: str
-    version: Annotated[int, msgspec.Meta(ge=1)] = VERSION
+    version: Positive = VERSION
 
 
 class Message(msgspec.Struct, kw_only=True):
@@ -58,59 +113,64 @@ class Message(msgspec.Struct, kw_only=True):
 
     schema: Schema
     stamp: Stamp
-    frame_id: str
+    frame_id: Name
 
 
 class RelationLogits(msgspec.Struct):
     """Pre-sigmoid predicate logits of one ordered pair of a frame's objects."""
 
-    subject: Annotated[int, msgspec.Meta(ge=0, description="row in objects")]
-    object: Annotated[int, msgspec.Meta(ge=0, description="row in objects")]
+    subject: Annotated[Row, msgspec.Meta(description="row in objects")]
+    object: Annotated[Row, msgspec.Meta(description="row in objects, another one")]
     score: Probability
-    logits: list[float]
+    logits: Logits
 
 
 class DetectedObject(msgspec.Struct):
     """One object in the image; its instance value is its row + 1."""
 
     box_xyxy: Box
-    score: float
-    class_probabilities: list[float]
+    score: Probability
+    class_probabilities: Distribution
 
 
 class FrameGraphMessage(Message, kw_only=True):
     """deworldsg/frame_graph: the 2D scene graph of one frame; frame_id is the camera's."""
 
-    width: NonNegative
-    height: NonNegative
-    classes: list[str]
-    predicates: list[str]
-    objects: list[DetectedObject]
-    relations: list[RelationLogits]
+    width: Side
+    height: Side
+    classes: Names
+    predicates: Names
+    objects: Annotated[list[DetectedObject], msgspec.Meta(max_length=MAX_OBJECTS)]
+    relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
 
 
 class LiftedObject(msgspec.Struct):
     """One object as a 3D Gaussian in the world frame."""
 
-    instance: Annotated[int, msgspec.Meta(ge=1, description="value in the instance image")]
+    instance: Annotated[
+        int,
+        msgspec.Meta(
+            ge=1, le=MAX_INSTANCE, description="value in the instance image, each only once"
+        ),
+    ]
     box_xyxy: Box
-    score: float
-    class_probabilities: list[float]
-    mean_m: Vector3
-    covariance_m2: Matrix3
-    depth_m: float
-    pixel_count: NonNegative
-    surface_points_m: list[Vector3]
+    score: Probability
+    class_probabilities: Distribution
+    mean_m: Point
+    covariance_m2: Covariance
+    depth_m: Annotated[float, msgspec.Meta(ge=0.0, le=MAX_COORDINATE_M)]
+    pixel_count: Annotated[int, msgspec.Meta(ge=1, le=MAX_SIDE_PX**2)]
+    surface_points_m: Points
 
 
 class DepthGridState(msgspec.Struct, frozen=True):
     """The depth image and the instance image on every n-th pixel, from pixel n // 2 on."""
 
-    stride_px: Annotated[int, msgspec.Meta(ge=1)]
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+    stride_px: Side
+    fx: Focal
+    fy: Focal
+    cx: Focal
+    cy: Focal
     depth_mm: Annotated[
         bytes, msgspec.Meta(description="row by row, uint16 little-endian, base64; 0 = invalid")
     ]
@@ -122,35 +182,35 @@ class DepthGridState(msgspec.Struct, frozen=True):
 class LocalGraphMessage(Message, kw_only=True):
     """deworldsg/local_graph: the local 3D graph of one frame; frame_id is the world's."""
 
-    width: NonNegative
-    height: NonNegative
-    T_world_camera: Matrix4
-    classes: list[str]
-    predicates: list[str]
-    objects: list[LiftedObject]
-    relations: list[RelationLogits]
-    drops: dict[str, int] = {}
+    width: Side
+    height: Side
+    T_world_camera: Pose
+    classes: Names
+    predicates: Names
+    objects: Annotated[list[LiftedObject], msgspec.Meta(max_length=MAX_OBJECTS)]
+    relations: Annotated[list[RelationLogits], msgspec.Meta(max_length=MAX_RELATIONS)]
+    drops: Annotated[dict[Name, NonNegative], msgspec.Meta(max_length=MAX_OBJECTS)] = {}
     depth_grid: Union[DepthGridState, None] = None
 
 
 class PairEvidence(msgspec.Struct):
     """A geometric neighbour pair (Eq. 8), with the world model's prediction if there is one."""
 
-    subject: Annotated[int, msgspec.Meta(ge=0, description="row in the local graph")]
-    object: Annotated[int, msgspec.Meta(ge=0, description="row in the local graph")]
-    subject_class: NonNegative
-    object_class: NonNegative
-    geo_cost: float
-    prediction: list[float] = []
+    subject: Annotated[Row, msgspec.Meta(description="row in the local graph")]
+    object: Annotated[Row, msgspec.Meta(description="row in the local graph, another one")]
+    subject_class: Annotated[int, msgspec.Meta(ge=0, lt=MAX_NAMES, description="index in classes")]
+    object_class: Annotated[int, msgspec.Meta(ge=0, lt=MAX_NAMES, description="index in classes")]
+    geo_cost: Annotated[float, msgspec.Meta(ge=0.0, le=MAX_COST)]
+    prediction: Distribution = []
 
 
 class RelationEvidenceMessage(Message, kw_only=True):
     """deworldsg/relation_evidence: pairs of the local graph with the same stamp."""
 
-    classes: list[str]
-    predicates: list[str]
-    source: str
-    pairs: list[PairEvidence]
+    classes: Names
+    predicates: Names
+    source: Name
+    pairs: Annotated[list[PairEvidence], msgspec.Meta(max_length=MAX_PAIRS)]
 
 
 class Belief(msgspec.Struct, frozen=True):
@@ -176,12 +236,12 @@ class GravityBox(msgspec.Struct, frozen=True):
 class NodeState(msgspec.Struct, frozen=True):
     """One object of the global graph."""
 
-    id: Annotated[int, msgspec.Meta(ge=1, description="stable, never reused")]
+    id: Annotated[NodeId, msgspec.Meta(description="stable, never reused")]
     label: str
     classes: Annotated[list[Belief], msgspec.Meta(description="most probable first, top k")]
     mean_m: Vector3
     covariance_m2: Matrix3
-    observations: Annotated[int, msgspec.Meta(ge=1)]
+    observations: Positive
     first_seen: Stamp
     last_seen: Stamp
     confirmed: Annotated[
@@ -233,8 +293,8 @@ Provenance = Literal["visual", "prior", "fused"]
 class EdgeState(msgspec.Struct, frozen=True):
     """One directed edge of the global graph."""
 
-    subject: Annotated[int, msgspec.Meta(ge=1)]
-    object: Annotated[int, msgspec.Meta(ge=1)]
+    subject: NodeId
+    object: NodeId
     predicate: Annotated[str, msgspec.Meta(description="the most probable one")]
     probability: Annotated[
         Probability,
@@ -257,7 +317,7 @@ class EdgeState(msgspec.Struct, frozen=True):
     entropy_nats: Annotated[
         float, msgspec.Meta(ge=0.0, description="of the visual distribution (uniform if none)")
     ]
-    observations: Annotated[int, msgspec.Meta(ge=0, description="frames with visual evidence")]
+    observations: Annotated[NonNegative, msgspec.Meta(description="frames with visual evidence")]
     remainder: Annotated[
         Union[Probability, msgspec.UnsetType],
         msgspec.Meta(description="probability of all predicates that are not listed"),
@@ -286,22 +346,22 @@ class SceneGraphMessage(Message, kw_only=True):
 class RemovedNode(msgspec.Struct, frozen=True):
     """A removed node; after a merge, with the node that replaces it."""
 
-    id: Annotated[int, msgspec.Meta(ge=1)]
-    merged_into: Union[int, None] = None
+    id: NodeId
+    merged_into: Union[NodeId, None] = None
 
 
 class RemovedEdge(msgspec.Struct, frozen=True):
     """A removed edge."""
 
-    subject: Annotated[int, msgspec.Meta(ge=1)]
-    object: Annotated[int, msgspec.Meta(ge=1)]
+    subject: NodeId
+    object: NodeId
 
 
 class Association(msgspec.Struct, frozen=True):
     """Which node each object of a frame's local graph became, row by row."""
 
     stamp: Stamp
-    nodes: list[int]
+    nodes: list[NonNegative]
 
 
 class SceneGraphUpdateMessage(Message, kw_only=True):
@@ -310,7 +370,7 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     Apply removals first. Then replace each given node and edge.
     """
 
-    sequence: Annotated[int, msgspec.Meta(ge=1)]
+    sequence: Positive
     removed_nodes: list[RemovedNode]
     removed_edges: list[RemovedEdge]
     nodes: list[NodeState]
@@ -340,24 +400,38 @@ def encode(message: Message) -> str:
     return msgspec.json.encode(message).decode()
 
 
+def max_bytes(kind: type[Message]) -> int:
+    """Size of the largest message of this type that is read."""
+    is_graph = kind in (SceneGraphMessage, SceneGraphUpdateMessage)
+    return MAX_GRAPH_BYTES if is_graph else MAX_FRAME_BYTES
+
+
 def decode(text: Union[str, bytes], kind: type[M]) -> M:
     """Read and validate a message.
 
     Raises:
-        RefusedInput: ``invalid_message`` if the text does not fit the schema,
-            ``unknown_schema`` if it is another message or of a later version.
+        RefusedInput: ``invalid_message`` if the text does not fit the schema, ``message_too_large``
+            if it is longer than `max_bytes`, ``unknown_schema`` if it is another message or of a
+            later version, ``invalid_frame_id``.
     """
+    if len(text) > max_bytes(kind):
+        raise RefusedInput(
+            "message_too_large",
+            f"{kind.__name__} of {len(text)} bytes: expected at most {max_bytes(kind)}",
+        )
     try:
         message = msgspec.json.decode(text, type=kind)
-    except msgspec.MsgspecError as error:
+    # UnicodeError: text that is no UTF-8. RecursionError: nested deeper than the interpreter.
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
         raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     known = schema_of(kind)
     if message.schema.name != known.name or message.schema.version > known.version:
         raise RefusedInput(
             "unknown_schema",
-            f"message is {message.schema.name} version {message.schema.version}: "
+            f"message is {message.schema.name!r} version {message.schema.version}: "
             f"expected {known.name} version {known.version} or older",
         )
+    checked_frame_id(message.frame_id)
     return message
 
 

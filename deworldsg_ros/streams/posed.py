@@ -10,6 +10,7 @@ from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.names import checked_frame_id
 from deworldsg_ros.streams.assembler import Assembler, OnDrop, Out, T
 from deworldsg_ros.streams.camera_info import intrinsics_from_message
 from deworldsg_ros.streams.images import depth_from_message
@@ -87,10 +88,11 @@ class PosedAssembler(Assembler[T, Out]):
         self._info.heard()
         try:
             intrinsics = intrinsics_from_message(message)
+            camera_frame = checked_frame_id(str(message.header.frame_id))
         except RefusedInput as refusal:
             self._drop(refusal.reason, str(refusal))
             return
-        self.camera_frame = str(message.header.frame_id)
+        self.camera_frame = camera_frame
         if not self._intrinsics or self._intrinsics[-1][1] != intrinsics:
             self._intrinsics = [*self._intrinsics, (stamp_ns, intrinsics)][-MAX_INTRINSICS:]
 

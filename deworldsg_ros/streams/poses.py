@@ -8,16 +8,19 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import interpolate_pose, pose_from_quaternion
+from deworldsg_ros.scene.camera import check_pose, interpolate_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.names import checked_frame_id
 
 # If neither the configuration nor the message names the world frame.
 UNNAMED_FRAME = "world"
 
 
 def stamp_ns_of(message: Any) -> int:
-    """Time of a message's header, nanoseconds."""
+    """Time of a message's header, nanoseconds; raises RefusedInput ``invalid_stamp`` below 0."""
     stamp = message.header.stamp
+    if stamp.sec < 0:
+        raise RefusedInput("invalid_stamp", f"stamp is {stamp.sec} s: expected 0 or later")
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
@@ -30,13 +33,15 @@ def pose_from_message(message: Any) -> tuple[Float64, str]:
     """T_world_camera (4, 4) and the world frame of a PoseStamped or Odometry message.
 
     Raises:
-        RefusedInput: ``invalid_pose`` for NaN, infinity, or a quaternion that is not of norm 1.
+        RefusedInput: ``invalid_pose`` for NaN, infinity, a position out of bounds, or a quaternion
+            that is not of norm 1; ``invalid_frame_id``.
     """
     pose = message.pose
     if not hasattr(pose, "position"):  # Odometry: a PoseWithCovariance
         pose = pose.pose
     T = _rigid(pose.position, pose.orientation)
-    return T, str(message.header.frame_id) or UNNAMED_FRAME
+    check_pose(T)
+    return T, checked_frame_id(str(message.header.frame_id)) or UNNAMED_FRAME
 
 
 def pose_from_transform(transform: Any) -> Float64:

@@ -9,6 +9,7 @@ import numpy as np
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.names import checked_frame_id
 from deworldsg_ros.streams.poses import PoseBuffer, pose_from_transform, stamp_ns_of
 
 
@@ -35,12 +36,13 @@ class TransformTree:
         """Keep the transforms of a `tf2_msgs/TFMessage`.
 
         Raises:
-            RefusedInput: ``invalid_pose``; the transforms before the bad one are kept.
+            RefusedInput: ``invalid_pose``, ``invalid_frame_id`` or ``invalid_stamp``; the
+                transforms before the bad one are kept.
         """
         for transform in message.transforms:
             # Old bags write frames with a leading slash.
-            parent = str(transform.header.frame_id).lstrip("/")
-            child = str(transform.child_frame_id).lstrip("/")
+            parent = checked_frame_id(str(transform.header.frame_id).lstrip("/"))
+            child = checked_frame_id(str(transform.child_frame_id).lstrip("/"))
             T_parent_child = pose_from_transform(transform.transform)
             if static:
                 self._static[child] = T_parent_child

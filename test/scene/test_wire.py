@@ -38,6 +38,7 @@ from deworldsg_ros.scene.frame_graph import (
     RelationEvidence,
     Relations,
 )
+from deworldsg_ros.scene.limits import MAX_OBJECTS
 
 
 def random_relations(rng: np.random.Generator, count: int) -> Relations:
@@ -49,6 +50,10 @@ def random_relations(rng: np.random.Generator, count: int) -> Relations:
     )
 
 
+def random_boxes(rng: np.random.Generator, count: int) -> np.ndarray:
+    return np.sort(rng.uniform(0, 480, (count, 2, 2)), axis=1).reshape(count, 4)
+
+
 def random_frame_graph(rng: np.random.Generator) -> FrameGraph:
     count = int(rng.integers(0, 5))
     return FrameGraph(
@@ -57,7 +62,7 @@ def random_frame_graph(rng: np.random.Generator) -> FrameGraph:
         width=640,
         height=480,
         vocabulary=VOCABULARY,
-        boxes_xyxy=rng.uniform(0, 480, (count, 4)),
+        boxes_xyxy=random_boxes(rng, count),
         class_probabilities=random_classes(rng, count),
         scores=rng.random(count),
         relations=random_relations(rng, count),
@@ -85,7 +90,7 @@ def random_local_graph(rng: np.random.Generator) -> LocalGraph:
         T_world_camera=random_pose(rng),
         vocabulary=VOCABULARY,
         instance_ids=rng.permutation(np.arange(1, count + 1)),
-        boxes_xyxy=rng.uniform(0, 480, (count, 4)),
+        boxes_xyxy=random_boxes(rng, count),
         class_probabilities=random_classes(rng, count),
         scores=rng.random(count),
         means_world=rng.normal(0, 10 ** rng.uniform(-9, 3), (count, 3)),
@@ -108,7 +113,7 @@ def random_evidence(rng: np.random.Generator) -> RelationEvidence:
     return RelationEvidence(
         stamp_ns=int(rng.integers(0, 2**31 * 10**9 - 1)),
         vocabulary=VOCABULARY,
-        pairs=rng.integers(0, 5, (count, 2)),
+        pairs=rng.integers(0, 5, (count, 1)) + [0, 1],
         pair_classes=rng.integers(0, 4, (count, 2)),
         geo_costs=rng.random(count),
         predictions=predictions,
@@ -157,7 +162,7 @@ def test_relation_evidence_survives_the_wire(seed: int) -> None:
     assert_same(evidence_from_message(message), evidence)
 
 
-@given(st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
+@given(st.integers(0, 2**31 * 10**9 - 1))
 def test_stamps_survive(stamp_ns: int) -> None:
     stamp = wire.stamp_from_ns(stamp_ns)
     assert wire.ns_from_stamp(stamp) == stamp_ns
@@ -198,6 +203,39 @@ def _set(path: str, value: object) -> Callable[[dict], None]:
         (_set("relations.0.logits", [1.0]), "invalid_message"),
         (_set("relations.0.score", 2.0), "invalid_message"),
         (_set("stamp.nanosec", 10**9), "invalid_message"),
+        (_set("stamp.sec", -1), "invalid_message"),
+        (_set("objects.0.score", 1.5), "invalid_message"),
+        (_set("objects.0.score", -0.1), "invalid_message"),
+        (_set("objects.0.class_probabilities", [2.0, -1.0, 0.0, 0.0]), "invalid_message"),
+        (_set("objects.0.box_xyxy", [9.0, 0.0, 1.0, 1.0]), "invalid_message"),
+        (_set("objects.0.box_xyxy", [0.0, 9.0, 1.0, 1.0]), "invalid_message"),
+        (_set("objects.0.box_xyxy", [0.0, 0.0, 1e300, 1.0]), "invalid_message"),
+        (_set("objects.0.instance", 0), "invalid_message"),
+        (_set("objects.0.instance", 2**16), "invalid_message"),
+        (_set("objects.0.pixel_count", 0), "invalid_message"),
+        (_set("objects.0.pixel_count", 10**40), "invalid_message"),
+        (_set("objects.0.depth_m", -1.0), "invalid_message"),
+        (_set("objects.0.mean_m", [0.0, 1.0, 1e300]), "invalid_message"),
+        (_set("objects.0.surface_points_m", [[0.0, 1.0, 1e39]]), "invalid_message"),
+        (_set("objects.0.covariance_m2", [1e300, 0, 0, 0, 1, 0, 0, 0, 1.0]), "invalid_message"),
+        (_set("objects.0.covariance_m2", [1.0, 0, 0, 0, 1, 0, 0, 0, 1e-300]), "invalid_message"),
+        (_set("objects.0.covariance_m2", [1.0, 1, 0, 1, 1, 0, 0, 0, 1.0]), "invalid_message"),
+        (_set("relations.0.logits", [1e308, 0.0, 0.0]), "invalid_message"),
+        (_set("relations.0.object", -1), "invalid_message"),
+        (_set("width", 10**40), "invalid_message"),
+        (_set("height", 0), "invalid_message"),
+        (_set("T_world_camera", [2.0, *np.eye(4).ravel().tolist()[1:]]), "invalid_message"),
+        (_set("T_world_camera", (-np.eye(4)).ravel().tolist()), "invalid_message"),
+        (_set("T_world_camera", np.diag([1.0, 1, 1, 2]).ravel().tolist()), "invalid_message"),
+        (
+            _set("T_world_camera", [*np.eye(4)[0, :3], 1e300, *np.eye(4).ravel()[4:]]),
+            "invalid_message",
+        ),
+        (_set("classes", ["cup", "table", "chair", "bo\x1bok"]), "invalid_message"),
+        (_set("classes", []), "invalid_message"),
+        (_set("frame_id", "map\n[ERROR] forged"), "invalid_frame_id"),
+        (_set("frame_id", "m" * 1000), "invalid_message"),
+        (_set("drops", {"few": -1}), "invalid_message"),
         (_set("T_world_camera", [0.0] * 15), "invalid_message"),
         (_set("classes", "cup"), "invalid_message"),
         (_set("schema.name", "scene_graph"), "unknown_schema"),
@@ -209,6 +247,93 @@ def test_inconsistent_messages_are_refused(change: Callable[[dict], None], reaso
     change(content)
     with pytest.raises(RefusedInput) as refused:
         local_graph_from_message(wire.decode(json.dumps(content), wire.LocalGraphMessage))
+    assert refused.value.reason == reason
+
+
+def refused_reason(content: dict) -> str:
+    """The reason for which a local graph with this content is refused."""
+    with pytest.raises(RefusedInput) as refused:
+        local_graph_from_message(wire.decode(json.dumps(content), wire.LocalGraphMessage))
+    return refused.value.reason
+
+
+def test_an_object_is_named_once() -> None:
+    content = json.loads(wire.encode(local_message()))
+    content["objects"][1]["instance"] = content["objects"][0]["instance"]
+    assert refused_reason(content) == "invalid_message"
+
+
+def test_an_object_has_no_relation_to_itself() -> None:
+    content = json.loads(wire.encode(local_message()))
+    content["relations"][0]["object"] = content["relations"][0]["subject"]
+    assert refused_reason(content) == "invalid_message"
+
+
+def test_the_number_of_objects_has_a_limit() -> None:
+    content = json.loads(wire.encode(local_message()))
+    content["relations"] = []
+    one = content["objects"][0]
+    content["objects"] = [{**one, "instance": row + 1} for row in range(MAX_OBJECTS)]
+    local_graph_from_message(wire.decode(json.dumps(content), wire.LocalGraphMessage))
+    content["objects"].append({**one, "instance": MAX_OBJECTS + 1})
+    assert refused_reason(content) == "invalid_message"
+
+
+@pytest.mark.parametrize("kind", list(wire.MESSAGES.values()))
+def test_a_message_that_is_too_long_is_not_read(kind: type[wire.Message]) -> None:
+    with pytest.raises(RefusedInput) as refused:
+        wire.decode(b" " * (wire.max_bytes(kind) + 1), kind)
+    assert refused.value.reason == "message_too_large"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"more": ' + "[" * 10**5 + "]" * 10**5 + "}",
+        '{"more": ' + '{"a":' * 10**5 + "1" + "}" * 10**5 + "}",
+        "[" * 10**6,
+        b'{"frame_id": "\xff"}',
+        '{"frame_id": "\ud800"}',
+        '{"frame_id": "\\ud800"}',
+        '{"stamp": {"sec": 1e400, "nanosec": 0}}',
+        '{"stamp": {"sec": 1%s, "nanosec": 0}}' % ("0" * 5000),
+    ],
+    ids=lambda text: repr(text[:24]),
+)
+def test_hostile_text_is_refused(text: str | bytes) -> None:
+    with pytest.raises(RefusedInput) as refused:
+        wire.decode(text, wire.LocalGraphMessage)
+    assert refused.value.reason == "invalid_message"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (_set("pairs.0.object", 0), "invalid_message"),
+        (_set("pairs.0.subject_class", 4), "invalid_message"),
+        (_set("pairs.0.subject_class", 10**40), "invalid_message"),
+        (_set("pairs.0.geo_cost", -1.0), "invalid_message"),
+        (_set("pairs.0.prediction", [2.0, -1.0, 0.0]), "invalid_message"),
+        (_set("pairs.0.prediction", [1.0]), "invalid_message"),
+        (_set("pairs.0.prediction", [0.9, 0.9, 0.0]), "invalid_prediction"),
+    ],
+)
+def test_evidence_that_the_schema_excludes_is_refused(
+    change: Callable[[dict], None], reason: str
+) -> None:
+    evidence = RelationEvidence(
+        stamp_ns=1,
+        vocabulary=VOCABULARY,
+        pairs=np.array([[0, 1]]),
+        pair_classes=np.array([[0, 1]]),
+        geo_costs=np.array([0.1]),
+        predictions=np.array([[0.5, 0.5, 0.0]]),
+        source="fake",
+    )
+    content = json.loads(wire.encode(evidence_to_message(evidence, "map")))
+    change(content)
+    with pytest.raises(RefusedInput) as refused:
+        evidence_from_message(wire.decode(json.dumps(content), wire.RelationEvidenceMessage))
     assert refused.value.reason == reason
 
 

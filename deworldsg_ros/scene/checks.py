@@ -1,0 +1,132 @@
+"""What the graphs of a frame must fulfil before a stage works with them, checked once.
+
+Each check is one pass of numpy over all objects, because a frame is checked in every node. An
+array passes if its largest absolute value is below a limit; NaN and infinity do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene import limits
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+
+# Distributions may be written with six decimals.
+SUM_TOLERANCE = 1.1e-5
+
+
+def check_shape(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
+    """Check the shape of an array."""
+    if array.shape != shape:
+        raise ValueError(f"{name} have shape {array.shape}: expected {shape}")
+
+
+def check_array(name: str, array: NDArray[Any], shape: tuple[int, ...], limit: float) -> None:
+    """Check the shape of an array, and that no value exceeds a limit."""
+    check_shape(name, array, shape)
+    if array.size and not max(array.max(), -array.min()) <= limit:
+        worst = np.nanargmax(np.where(np.isfinite(array), np.abs(array), np.inf))
+        raise ValueError(
+            f"{name} contain {array.flat[worst]:.6g}: expected finite values up to {limit:g}"
+        )
+
+
+def check_probabilities(name: str, array: Float64, shape: tuple[int, ...]) -> None:
+    """Check that all values are from 0 to 1."""
+    check_array(name, array, shape, 1.0 + 1e-9)
+    if array.size and array.min() < 0.0:
+        raise ValueError(f"{name} contain {array.min():.6g}: expected 0 to 1")
+
+
+def check_distributions(name: str, array: Float64, shape: tuple[int, ...]) -> None:
+    """Check that all rows are probabilities that sum to one."""
+    check_probabilities(name, array, shape)
+    if not len(array):
+        return
+    sums = array.sum(axis=1)
+    errors = np.abs(sums - 1.0)
+    if errors.max() > SUM_TOLERANCE:
+        raise ValueError(f"{name} sum to {sums[errors.argmax()]:.6f}: expected 1")
+
+
+def check_boxes(boxes_xyxy: Float64, count: int) -> None:
+    """Check boxes (n, 4): x1 <= x2 and y1 <= y2."""
+    check_array("boxes", boxes_xyxy, (count, 4), limits.MAX_SIDE_PX)
+    if count and (boxes_xyxy[:, :2] > boxes_xyxy[:, 2:]).any():
+        row = int((boxes_xyxy[:, :2] > boxes_xyxy[:, 2:]).any(axis=1).argmax())
+        raise ValueError(
+            f"box {boxes_xyxy[row].tolist()} of row {row} is inverted: expected x1 <= x2, y1 <= y2"
+        )
+
+
+def check_covariances(covariances: Float64, count: int) -> None:
+    """Check covariances (n, 3, 3): symmetric, positive definite, and not nearly singular."""
+    check_array("covariances", covariances, (count, 3, 3), limits.MAX_VARIANCE_M2)
+    if not count:
+        return
+    apart = np.abs(covariances - covariances.swapaxes(1, 2))
+    if (apart > 1e-9 * np.abs(covariances)).any():
+        row = int((apart > 1e-9 * np.abs(covariances)).any(axis=(1, 2)).argmax())
+        raise ValueError(f"covariance {covariances[row].tolist()} of row {row} is not symmetric")
+    variances = np.linalg.eigvalsh(covariances)
+    least = np.maximum(limits.MIN_VARIANCE_RATIO * variances[:, 2], limits.MIN_VARIANCE_M2)
+    if not (variances[:, 0] >= least).all():
+        row = int((variances[:, 0] < least).argmax())
+        raise ValueError(
+            f"covariance {covariances[row].tolist()} of row {row} is not positive definite: its "
+            f"smallest variance is {variances[row, 0]:.3g}, expected at least {least[row]:.3g}"
+        )
+
+
+def check_instance_ids(instance_ids: Int64, count: int) -> None:
+    """Check ids (n,): each from 1 on, and only once."""
+    check_array("instance ids", instance_ids, (count,), limits.MAX_INSTANCE)
+    if count and instance_ids.min() < 1:
+        raise ValueError(f"an instance id is {instance_ids.min()}: expected >= 1")
+    if len(set(instance_ids.tolist())) < count:
+        raise ValueError(f"instance ids {instance_ids.tolist()} contain an id twice")
+
+
+def check_counts(name: str, counts: Int64, count: int) -> None:
+    """Check numbers (n,): 1 or more."""
+    check_array(name, counts, (count,), limits.MAX_SIDE_PX**2)
+    if count and counts.min() < 1:
+        raise ValueError(f"{name} contain {counts.min()}: expected >= 1")
+
+
+def check_depths(depths_m: Float64, count: int) -> None:
+    """Check depths (n,): in front of the camera."""
+    check_array("depths", depths_m, (count,), limits.MAX_COORDINATE_M)
+    if count and depths_m.min() < 0.0:
+        raise ValueError(f"a depth is {depths_m.min():.6g} m: expected >= 0")
+
+
+def check_surfaces(surfaces: Sequence[Float32], count: int) -> None:
+    """Check sets of surface points, (k, 3) each."""
+    if len(surfaces) != count:
+        raise ValueError(f"{len(surfaces)} point sets for {count} objects")
+    for row, points in enumerate(surfaces):
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(
+                f"surface points of object {row} have shape {points.shape}: expected (k, 3)"
+            )
+    if count:
+        points = np.concatenate(surfaces)
+        check_array("surface points", points, points.shape, limits.MAX_COORDINATE_M)
+
+
+def check_pairs(name: str, pairs: Int64, count: int, rows: int) -> None:
+    """Check pairs (m, 2) of different rows, from 0 to `rows` - 1."""
+    check_array(name, pairs, (count, 2), limits.MAX_INT)
+    if not count:
+        return
+    if pairs.min() < 0 or pairs.max() >= rows:
+        raise ValueError(
+            f"{name} name objects {pairs.min()} to {pairs.max()}: expected 0 to {rows - 1}"
+        )
+    if (pairs[:, 0] == pairs[:, 1]).any():
+        raise ValueError(f"{name}: an object cannot be paired with itself")

@@ -1,0 +1,56 @@
+"""The largest values that a message may contain, and why. What exceeds them is refused by name.
+
+A value inside these limits cannot overflow a sum, an index or the memory. A value outside of them
+is an error of its sender.
+"""
+
+from __future__ import annotations
+
+# A file or message with 64-bit integers: larger ones do not fit the arrays.
+MAX_INT = 2**63 - 1
+# ROS times have 32 bits of seconds.
+MAX_SECONDS = 2**31 - 1
+# The instance image has 16 bits.
+MAX_INSTANCE = 2**16 - 1
+# Objects of a frame. Perception keeps at most 50; this leaves room for other detectors. Matching
+# 256 objects takes a second at most.
+MAX_OBJECTS = 256
+# Relations of a frame: the largest value of `perception.max_relations`.
+MAX_RELATIONS = 1000
+# Neighbour pairs of a frame: each ordered pair of its objects.
+MAX_PAIRS = MAX_OBJECTS * (MAX_OBJECTS - 1)
+# Classes or predicates. The largest vocabularies in use have 21 843 (ImageNet) and 1203 (LVIS).
+# The table of class pairs needs 8 bytes times the square: 512 MiB at this limit.
+MAX_NAMES = 8192
+# Surface points of an object in one frame. Lifting samples 800 at most.
+MAX_POINTS = 4096
+# Side of an image. OpenCV writes no larger PNG, and its largest JPEG has 65 535.
+MAX_SIDE_PX = 32768
+# Focal lengths and principal points. A lens of 1 m on pixels of 1 µm has 10^6 px.
+MAX_FOCAL_PX = 1e6
+# Less than a pixel shows all directions in one.
+MIN_FOCAL_PX = 1e-3
+# Distance of objects and cameras from the world's origin. A float32 point keeps a millimetre up
+# to 16 km, and the map of cells ends at 31 km.
+MAX_COORDINATE_M = 1e4
+# Length of a transform in TF: the distance to the centre of the earth (REP 105) is 6.4e6 m.
+MAX_TRANSFORM_M = 1e8
+# Variances of an object: its extent is below MAX_COORDINATE_M, and no sensor measures micrometres.
+MAX_VARIANCE_M2 = MAX_COORDINATE_M**2
+MIN_VARIANCE_M2 = 1e-12
+# Ratio of the smallest to the largest variance. A rotation keeps a covariance positive definite
+# if the ratio is far above 2e-16, the rounding of float64.
+MIN_VARIANCE_RATIO = 1e-13
+# Relation logits. A sigmoid is 0 or 1 to the last bit beyond 745, and 10^9 frames of this logit
+# still have a finite sum.
+MAX_LOGIT = 1e9
+# Geometric costs of pairs (Eq. 8): half a diagonal and a difference of depths, metres.
+MAX_COST = 1e6
+# Length of a label or frame_id, characters.
+MAX_NAME_CHARACTERS = 256
+# Size of a message of one frame: 256 objects with 800 points each need 12 MB.
+MAX_FRAME_BYTES = 16 * 2**20
+# Size of a message of the global graph: 5000 nodes with 512 points each need 150 MB.
+MAX_GRAPH_BYTES = 256 * 2**20
+# Error of the sum of a predicted distribution: that of float32 networks.
+MAX_PREDICTION_SUM_ERROR = 1e-3

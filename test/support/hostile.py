@@ -1,0 +1,149 @@
+"""Local graphs and evidence that fulfil their schema, with the worst values that it allows."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.scene import limits, wire
+from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.frame_graph import (
+    DepthGrid,
+    LocalGraph,
+    RelationEvidence,
+    Relations,
+    Vocabulary,
+)
+from deworldsg_ros.scene.replica import GraphReplica
+
+VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
+PLACES_M = [0.0, 1e-9, 0.01, 0.5, 1.0, 31.0, 1e3, limits.MAX_COORDINATE_M]
+LOGITS = [0.0, 1e-300, 5.0, -5.0, 745.0, 1e4, limits.MAX_LOGIT, -limits.MAX_LOGIT]
+PROBABILITIES = [0.0, 1e-300, 1e-9, 0.2, 0.45, 0.5, 1.0 - 1e-9, 1.0]
+STEPS_NS = [1, 10**3, 10**8, 10**8, 10**9, 3600 * 10**9, 10**17]
+PIXELS = [1, 2, 50, 1000, limits.MAX_SIDE_PX**2]
+
+
+def hostile_covariances(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Covariances (n, 3, 3) from the smallest to the largest, and from round to needles."""
+    bases = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    largest = 10.0 ** rng.uniform(-9, 8, (count, 1, 1)) * 0.99
+    ratios = 10.0 ** -rng.uniform(0, 12, (count, 1, 3)) * rng.choice([1.0, 1e-3], (count, 1, 3))
+    ratios[:, :, 0] = 1.0
+    variances = np.maximum(largest * np.maximum(ratios, 1e-12), 2e-12)
+    covariances = bases * variances @ bases.swapaxes(1, 2)
+    return np.clip(covariances + covariances.swapaxes(1, 2), -2e8, 2e8) / 2
+
+
+def hostile_distributions(rng: np.random.Generator, count: int, width: int) -> np.ndarray:
+    """Distributions (n, C), from certain to uniform."""
+    rows = rng.dirichlet(np.full(width, rng.choice([1e-3, 0.1, 1.0, 100.0])), count)
+    certain = rng.random(count) < 0.3
+    rows[certain] = np.eye(width)[rng.integers(0, width, int(certain.sum()))]
+    return rows / rows.sum(axis=1, keepdims=True)
+
+
+def hostile_pose(rng: np.random.Generator) -> np.ndarray:
+    """A rigid transform (4, 4), near the origin or far away."""
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    pose[:3, 3] = rng.choice(PLACES_M, 3) * rng.choice([-1, 1], 3)
+    return pose
+
+
+def hostile_grid(rng: np.random.Generator, width: int, height: int) -> DepthGrid | None:
+    """A depth grid of random or constant depth; None in a third of the cases."""
+    if rng.random() < 0.33:
+        return None
+    stride_px = int(rng.choice([1, 8, 100]))
+    shape = [len(range(stride_px // 2, size, stride_px)) for size in (height, width)]
+    depth_mm = rng.integers(0, 2**16, shape).astype(np.uint16)
+    if rng.random() < 0.5:
+        depth_mm[:] = rng.choice([0, 1, 1000, 2**16 - 1])
+    instances = rng.choice([0, 1, 2, 3, 2**16 - 1], shape).astype(np.uint16)
+    focal = float(rng.choice([limits.MIN_FOCAL_PX, 1.0, 500.0, limits.MAX_FOCAL_PX]))
+    centre = float(rng.choice([0.0, 320.0, -limits.MAX_FOCAL_PX, limits.MAX_FOCAL_PX]))
+    camera = Intrinsics(focal, focal, centre, centre, width, height)
+    return DepthGrid(depth_mm, stride_px, camera, instances if rng.random() < 0.7 else None)
+
+
+def hostile_local_graph(rng: np.random.Generator, stamp_ns: int) -> LocalGraph:
+    """A local graph of 0 to 6 objects."""
+    count = int(rng.integers(0, 7))
+    width, height = int(rng.choice([1, 64, 640])), int(rng.choice([1, 48, 480]))
+    means = rng.choice(PLACES_M, (count, 3)) * rng.choice([-1, 1], (count, 3))
+    if rng.random() < 0.5:
+        means = means[:1].repeat(count, axis=0) if count else means
+    spread = float(rng.choice([0.0, 0.01, 0.2, 100.0]))
+    points = tuple(
+        np.clip(mean + rng.normal(0, 1, (int(rng.choice([0, 1, 5, 60])), 3)) * spread, -1e4, 1e4)
+        .astype(np.float32)
+        for mean in means
+    )  # fmt: skip
+    pairs = [(a, b) for a in range(count) for b in range(count) if a != b and rng.random() < 0.5]
+    corners = np.sort(rng.choice([-32768, 0, 1, 9.5, 639, 32768], (count, 2, 2)), axis=1)
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id="map",
+        width=width,
+        height=height,
+        T_world_camera=hostile_pose(rng),
+        vocabulary=VOCABULARY,
+        instance_ids=rng.choice([1, 2, 3, 4, 5, 2**16 - 2, 2**16 - 1], count, replace=False),
+        boxes_xyxy=corners.reshape(count, 4).astype(np.float64),
+        class_probabilities=hostile_distributions(rng, count, 4),
+        scores=rng.choice(PROBABILITIES, count),
+        means_world=means,
+        covariances_world=hostile_covariances(rng, count),
+        depths_m=np.abs(rng.choice(PLACES_M, count)),
+        pixel_counts=rng.choice(PIXELS, count),
+        surface_points_world=points,
+        relations=Relations(
+            np.array(pairs, np.int64).reshape(-1, 2),
+            rng.choice(LOGITS, (len(pairs), 3)),
+            rng.choice(PROBABILITIES, len(pairs)),
+        ),
+        depth_grid=hostile_grid(rng, width, height),
+    )
+
+
+def hostile_evidence(rng: np.random.Generator, local: LocalGraph) -> RelationEvidence:
+    """Evidence for pairs of a local graph, some of which it does not contain."""
+    count = int(rng.integers(0, 4))
+    predictions = hostile_distributions(rng, count, 3)
+    predictions[rng.random(count) < 0.5] = np.nan
+    first = rng.integers(0, max(len(local) - 1, 1), (count, 1))
+    return RelationEvidence(
+        stamp_ns=local.stamp_ns,
+        vocabulary=VOCABULARY,
+        pairs=np.concatenate([first, first + 1], axis=1),
+        pair_classes=rng.integers(0, 4, (count, 2)),
+        geo_costs=rng.choice([0.0, 1e-300, 0.4, limits.MAX_COST], count),
+        predictions=predictions,
+        source="fake",
+    )
+
+
+def state_of(builder: GraphBuilder) -> bytes:
+    """Everything that a graph builder knows, as bytes."""
+    memory = builder.merging.memory()
+    return pickle.dumps(
+        (builder.graph.state(), memory, builder.prior.to_state(), builder.up.state().tobytes())
+    )
+
+
+def check_published(builder: GraphBuilder, replica: GraphReplica) -> None:
+    """Publish; the update has to be valid JSON that keeps a replica equal to the graph."""
+    update = builder.update()
+    if update is not None:
+        text = wire.encode(update)
+        replica.apply(wire.decode(text, wire.SceneGraphUpdateMessage))
+    snapshot: Any = wire.decode(wire.encode(builder.snapshot()), wire.SceneGraphMessage)
+    assert (replica.message().nodes, replica.message().edges) == (snapshot.nodes, snapshot.edges)
+    for node in snapshot.nodes:
+        assert np.isfinite([*node.mean_m, *node.covariance_m2]).all()
+        assert 0.0 <= node.classes[0].probability <= 1.0 + 1e-9
