@@ -7,6 +7,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple, Protocol
 
+from msgspec import UNSET, UnsetType
+
 from deworldsg_ros.relations.evidence import entropy_nats, visual_distribution
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
@@ -99,8 +101,8 @@ class PublishedGraph:
     """A copy of another process's graph, kept up to date from `/scene_graph/updates`.
 
     It needs a snapshot when it starts late and after lost updates, and keeps its last state until
-    the snapshot arrives. Sequence numbers that start again mean a new graph, which replaces the
-    old one.
+    the snapshot arrives. Another session, or sequence numbers that start again, mean a new graph,
+    which replaces the old one.
 
     Attributes:
         wants_snapshot: whether it needs a snapshot, by `reset`.
@@ -112,17 +114,20 @@ class PublishedGraph:
         self.wants_snapshot = True
         self._replica = GraphReplica()
         self._last_sequence = 0
+        self._session: str | UnsetType = UNSET
         self._frames: dict[int, list[int]] = {}
         # The node that each removed node was merged into; 0 = none.
         self._successors: dict[int, int] = {}
 
     def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
         """Apply an update; call it in the order of publication."""
-        if update.sequence <= self._last_sequence:
-            self.generation += 1
+        if update.session != self._session or update.sequence <= self._last_sequence:
+            if self._last_sequence:
+                self.generation += 1
             self._replica = GraphReplica()
             self._frames.clear()
             self._successors.clear()
+            self._session = update.session
         self._last_sequence = update.sequence
         for removed in update.removed_nodes:
             self._successors[removed.id] = removed.merged_into or 0
@@ -141,9 +146,15 @@ class PublishedGraph:
             self.wants_snapshot = True
 
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
-        """Take the nodes and edges of a snapshot; ignore one older than the last update."""
-        if snapshot.sequence < self._last_sequence:
+        """Take the nodes and edges of a snapshot; ignore one older than the last update.
+
+        A snapshot of another session than the last update is ignored, too: one of both is old.
+        """
+        if self._last_sequence and (
+            snapshot.session != self._session or snapshot.sequence < self._last_sequence
+        ):
             return
+        self._session = snapshot.session
         self._replica.reset(snapshot)
         self.wants_snapshot = False
         if self.newest_ns is None:

@@ -5,6 +5,7 @@ Diagnostics and signals are served by the executor's thread, so they do not wait
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -68,6 +69,8 @@ class GraphKeeper:
         warm_up(node.parameters)
         self._pending = PendingEvidence()
         self.newest_ns = 0
+        # A continued map is a new session, too: its sequence numbers start again.
+        self._session = secrets.token_hex(8)
         self._corrections = self._corrected_nodes = 0
         self._values: dict[str, str] = {}
         self._times = UpdateTimes(self._parameters.output.rate_hz)
@@ -192,6 +195,7 @@ class GraphKeeper:
         update = self._builder.update()
         if update is None:
             return
+        update.session = self._session
         self._publish_update(update)
         self._node.health.published(time.monotonic() - changed_s)
         self._whole.changed()
@@ -201,6 +205,7 @@ class GraphKeeper:
     def _publish_whole(self) -> None:
         assert self._builder is not None
         snapshot = self._builder.snapshot()
+        snapshot.session = self._session
         self._whole.publish(snapshot, time.monotonic())
         self._values = {
             "nodes": str(len(snapshot.nodes)),

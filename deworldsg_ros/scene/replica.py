@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from msgspec import UNSET
+
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.errors import RefusedInput
@@ -16,6 +18,9 @@ class GraphReplica:
     A client that receives every update from the first one needs no snapshot. A client that joins
     later, or that lost an update, calls `reset` with the newest `/scene_graph` and continues with
     the updates; those that the snapshot already contains are skipped.
+
+    Sequence numbers start again when graph_node restarts. Its messages then have a new session: the
+    first update of a session replaces the copy, and later ones require a `reset`.
     """
 
     def __init__(self) -> None:
@@ -25,6 +30,11 @@ class GraphReplica:
     def sequence(self) -> int:
         """Number of the last update in this copy."""
         return self._sequence
+
+    @property
+    def session(self) -> str | None:
+        """The session of the graph; None = its messages name none."""
+        return None if self._session is UNSET else self._session
 
     @property
     def nodes(self) -> Mapping[int, wire.NodeState]:
@@ -40,6 +50,7 @@ class GraphReplica:
         """Replace the copy by a snapshot."""
         self._stamp = snapshot.stamp
         self._frame_id = snapshot.frame_id
+        self._session = snapshot.session
         self._sequence = snapshot.sequence
         self._nodes = {node.id: node for node in snapshot.nodes}
         self._edges = {(edge.subject, edge.object): edge for edge in snapshot.edges}
@@ -48,9 +59,18 @@ class GraphReplica:
         """Apply the next update; returns False for one that this copy already contains.
 
         Raises:
-            RefusedInput: ``lost_updates`` if updates in between are missing; the copy is unchanged
-                and needs a `reset`.
+            RefusedInput: ``lost_updates`` if updates in between are missing, ``other_session`` for
+                a later update of another session; the copy is unchanged and needs a `reset`.
         """
+        if update.session != self._session:
+            if update.sequence > 1:
+                raise RefusedInput(
+                    "other_session",
+                    f"update {update.sequence} is of session {update.session!r}: expected "
+                    f"{self._session!r}. graph_node was restarted: reset from /scene_graph",
+                )
+            self.reset(empty_scene_graph(update.frame_id))
+            self._session = update.session
         if update.sequence <= self._sequence:
             return False
         if update.sequence > self._sequence + 1:
@@ -76,6 +96,7 @@ class GraphReplica:
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=self._stamp,
             frame_id=self._frame_id,
+            session=self._session,
             sequence=self._sequence,
             nodes=[self._nodes[node_id] for node_id in sorted(self._nodes)],
             edges=[self._edges[pair] for pair in sorted(self._edges)],

@@ -330,9 +330,17 @@ Up = Annotated[
 ]
 
 
+# Sequence numbers start again with each session.
+Session = Annotated[
+    Union[Name, msgspec.UnsetType],
+    msgspec.Meta(description="random id of this run of graph_node; absent = not published live"),
+]
+
+
 class SceneGraphMessage(Message, kw_only=True):
     """/scene_graph: the whole graph after the update with this sequence number."""
 
+    session: Session = msgspec.UNSET
     sequence: NonNegative
     nodes: list[NodeState]
     edges: list[EdgeState]
@@ -370,6 +378,7 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
     Apply removals first. Then replace each given node and edge.
     """
 
+    session: Session = msgspec.UNSET
     sequence: Positive
     removed_nodes: list[RemovedNode]
     removed_edges: list[RemovedEdge]

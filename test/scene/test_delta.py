@@ -12,6 +12,7 @@ from deworldsg_ros.scene.delta import diff, empty_scene_graph
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.scene.wire import SceneGraphMessage, SceneGraphUpdateMessage
 
 
 def snapshot_of(graph: SceneGraph, sequence: int):
@@ -125,3 +126,40 @@ def test_a_lost_update_is_noticed_and_a_snapshot_mends_it() -> None:
     assert replica.sequence == 3
     assert replica.apply(updates[3])
     assert replica.message() == snapshots[4]
+
+
+def session_of(name: str, nodes: int) -> tuple[list[SceneGraphUpdateMessage], SceneGraphMessage]:
+    """The updates and the last snapshot of a session that adds one node each time."""
+    graph = SceneGraph(VOCABULARY, "world")
+    snapshots, updates = [empty_scene_graph("world")], []
+    for sequence in range(1, nodes + 1):
+        graph.add_node(np.zeros(3), np.eye(3), np.full(4, 0.25), sequence)
+        snapshots.append(snapshot_of(graph, sequence))
+        updates.append(diff(snapshots[-2], snapshots[-1]))
+        updates[-1].session = snapshots[-1].session = name
+    return updates, snapshots[-1]
+
+
+def test_the_next_number_of_another_session_is_not_applied() -> None:
+    old, old_snapshot = session_of("a", 3)
+    new, new_snapshot = session_of("b", 4)
+    replica = GraphReplica()
+    for update in old:
+        replica.apply(update)
+    assert replica.session == "a"
+    with pytest.raises(RefusedInput, match="session 'b'") as refused:
+        replica.apply(new[3])
+    assert refused.value.reason == "other_session"
+    assert replica.message() == old_snapshot
+    replica.reset(new_snapshot)
+    assert not replica.apply(new[3])
+    assert replica.message() == new_snapshot
+
+
+def test_the_first_update_of_a_session_replaces_the_copy() -> None:
+    old, _ = session_of("a", 5)
+    new, new_snapshot = session_of("b", 2)
+    replica = GraphReplica()
+    for update in [*old, *new]:
+        assert replica.apply(update)
+    assert replica.message() == new_snapshot
