@@ -21,6 +21,7 @@ from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.limits import RESTART_NS
 from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.up import UpEstimator
 
@@ -94,10 +95,12 @@ class GraphBuilder:
         """Merge a frame's local graph; returns the node id of each of its rows.
 
         Raises:
-            RefusedInput: ``out_of_order`` for a frame that is not newer than the newest one; also
-                the reasons of `Merging.merge`.
+            RefusedInput: ``out_of_order`` for a frame that is not newer than the last one, by up to
+                a second; also the reasons of `Merging.merge`. An older frame is of a clock that was
+                set back, and is merged.
         """
-        if self._newest_ns is not None and local.stamp_ns <= self._newest_ns:
+        last_ns = self._newest_ns
+        if last_ns is not None and last_ns - RESTART_NS <= local.stamp_ns <= last_ns:
             raise RefusedInput(
                 "out_of_order",
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.merging import set_confirmed
+from support.merging import VOCABULARY as VOCABULARY_OF_FRAMES
+from support.merging import local_graph, set_confirmed
 
 from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.scene.wire import SceneGraphMessage
@@ -133,3 +135,21 @@ def test_edges_do_not_depend_on_the_history_of_the_builder(robust: bool, seed: i
         )
         assert builder.full().edges == fresh.full().edges
         assert replica.edges == {(e.subject, e.object): e for e in fresh.full().edges}
+
+
+def test_a_clock_that_was_set_back_does_not_end_the_graph() -> None:
+    means, covariances = np.zeros((1, 3)), 0.01 * np.eye(3)[None]
+    builder = GraphBuilder(builder_config(robust=True), VOCABULARY_OF_FRAMES, "world")
+
+    def seen_at(stamp_ns: int) -> list[int]:
+        classes = np.full((1, 4), 0.25)
+        return builder.integrate(local_graph(stamp_ns, means, covariances, classes))
+
+    hour_ns = 3600 * 10**9
+    seen_at(hour_ns)
+    with pytest.raises(RefusedInput, match="came after"):
+        seen_at(hour_ns - 10**9)
+    assert seen_at(10**9)
+    assert seen_at(2 * 10**9)
+    builder.update()
+    assert builder.snapshot().stamp.sec == 2

@@ -25,6 +25,7 @@ from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+from deworldsg_ros.streams.clock_gate import ClockGate, jump_text
 from deworldsg_ros.streams.pending import PendingEvidence
 from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
 
@@ -69,6 +70,7 @@ class GraphKeeper:
         warm_up(node.parameters)
         self._pending = PendingEvidence()
         self.newest_ns = 0
+        self._clock: ClockGate[LocalGraph] = ClockGate()
         # A continued map is a new session, too: its sequence numbers start again.
         self._session = secrets.token_hex(8)
         self._corrections = self._corrected_nodes = 0
@@ -132,10 +134,24 @@ class GraphKeeper:
     # The methods below run in the graph's thread.
 
     def integrate(self, local: LocalGraph) -> None:
+        """Merge a local graph; one whose stamp jumps is held back until the next one."""
+        admitted, lost_ns = self._clock.admit(local.stamp_ns, local)
+        if lost_ns is not None:
+            self._node.drop("time_jump", jump_text("local graph", lost_ns))
+        for _, item in admitted:
+            with self._node.refusing():
+                self._merge(item)
+
+    def _merge(self, local: LocalGraph) -> None:
         """Merge a local graph, and the evidence that waited for it."""
         if self._builder is None:
             self._builder = GraphBuilder(self._parameters, local.vocabulary, local.frame_id)
         self._builder.integrate(local)
+        if local.stamp_ns < self.newest_ns:
+            self._node.drop("time_jump", jump_text("local graph", self.newest_ns))
+            lost = self._pending.clear()
+            if lost:
+                self._node.drop("unmatched_evidence", "the clock was set back", lost)
         self.newest_ns = local.stamp_ns
         self._times.changed(self._running_s, time.monotonic())
         for evidence in self._pending.take(local.stamp_ns):

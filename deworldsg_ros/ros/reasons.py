@@ -59,8 +59,9 @@ REASONS: dict[str, str] = {
     "no_rgb": "A local graph arrived without its RGB image. Use `config/fastdds.xml` in every "
     "process.",
     "stale": "A message is not newer than the last one on its topic. Look for a second publisher.",
-    "time_jump": "Stamps went back by more than a second, because a recording was restarted. "
-    "No action is needed.",
+    "time_jump": "Stamps jumped back by more than a second, or forward by more than a minute. A "
+    "jump of one message costs this message. If the next message confirms it, the node continues "
+    "at the new time: a recording was restarted, or a clock was set.",
     "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
     "queue. Lower the camera's frame rate, or choose a faster model.",
     "lost_rgb": "RGB images were overwritten by newer ones before the node took them, or lost on "
@@ -93,8 +94,8 @@ REASONS: dict[str, str] = {
     "Run one segmentation_node only.",
     "vocabulary_mismatch": "A message has other classes or predicates than the graph. Run all "
     "nodes with one configuration.",
-    "out_of_order": "A local graph is older than one that is already merged. Restart graph_node "
-    "after restarting a recording.",
+    "out_of_order": "A local graph is up to a second older than one that is already merged. Look "
+    "for a second lifting_node.",
     "no_graph": "A pose correction arrived before the first local graph, and is ignored. Nothing "
     "has to be done.",
     "unknown_frame": "The graph no longer remembers the frame of relation evidence. Choose a "

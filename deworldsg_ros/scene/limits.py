@@ -10,6 +10,9 @@ from __future__ import annotations
 MAX_INT = 2**63 - 1
 # ROS times have 32 bits of seconds.
 MAX_SECONDS = 2**31 - 1
+# Stamps that go back by more are of a clock that was set, or of a recording that was restarted;
+# else the message is late.
+RESTART_NS = 10**9
 # The instance image has 16 bits.
 MAX_INSTANCE = 2**16 - 1
 # Objects of a frame. Perception keeps at most 50; this leaves room for other detectors. Matching

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Generic, TypeVar
 
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.clock_gate import jump_text
 from deworldsg_ros.streams.stamped import Stream
 
 T = TypeVar("T")
@@ -103,6 +104,9 @@ class Assembler(ABC, Generic[T, Out]):
 
     def flush(self) -> list[Out]:
         """Decide all waiting items as they are: the streams have ended."""
+        for stream in reversed(self._streams):  # the leader last
+            for stamp_ns, item in stream.gate.release():
+                self._take(stream, stamp_ns, item)
         ready: list[Callable[[], Out]] = []
         while len(self._leader):
             self._decide(ready)
@@ -164,6 +168,15 @@ class Assembler(ABC, Generic[T, Out]):
         self._forget(item.stamp_ns)
 
     def _add(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
+        """Take an item; it is held back if its stamp jumps."""
+        stream.heard()
+        admitted, lost_ns = stream.gate.admit(stamp_ns, value)
+        if lost_ns is not None:
+            self._drop("time_jump", jump_text(stream.name, lost_ns))
+        for at_ns, item in admitted:
+            self._take(stream, at_ns, item)
+
+    def _take(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
         """Buffer an item; count it if it is refused, and the items that it displaces."""
         if stream.restarts(stamp_ns):
             self._restart(stamp_ns)

@@ -37,6 +37,12 @@ class PendingEvidence:
                 f"stamp arrived during {self._capacity} later messages. Check lifting_node",
             )
 
+    def clear(self) -> int:
+        """Drop all messages, after a jump of the clock; returns their number."""
+        count = len(self._waiting)
+        self._waiting.clear()
+        return count
+
     def take(self, stamp_ns: int) -> list[RelationEvidence]:
         """Remove and return the messages with this stamp, in order of arrival; drop older ones."""
         taken = [evidence for evidence in self._waiting if evidence.stamp_ns == stamp_ns]

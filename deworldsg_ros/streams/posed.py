@@ -15,7 +15,6 @@ from deworldsg_ros.streams.assembler import Assembler, OnDrop, Out, T
 from deworldsg_ros.streams.camera_info import intrinsics_from_message
 from deworldsg_ros.streams.images import depth_from_message
 from deworldsg_ros.streams.pose_stream import PoseStream
-from deworldsg_ros.streams.poses import stamp_ns_of
 from deworldsg_ros.streams.stamped import Stream
 from deworldsg_ros.streams.transforms import TransformTree
 
@@ -102,9 +101,15 @@ class PosedAssembler(Assembler[T, Out]):
 
     def add_pose(self, message: Any, stamp_ns: int) -> None:
         """Keep a PoseStamped or Odometry of the camera's optical frame."""
+        self._add(self._pose, stamp_ns, message)
+
+    def _take(self, stream: Stream[Any], stamp_ns: int, value: Any) -> None:
+        if stream is not self._pose:
+            super()._take(stream, stamp_ns, value)
+            return
         self._hear_pose(stamp_ns)
         try:
-            self._poses.add(message, stamp_ns)
+            self._poses.add(value, stamp_ns)
             self._had_poses = True
         except RefusedInput as refusal:
             self._drop(refusal.reason, str(refusal))
@@ -120,14 +125,12 @@ class PosedAssembler(Assembler[T, Out]):
         # /tf has many publishers with different stamps: an older stamp is no jump back in time.
         self._pose.heard()
         if not static:
-            stamps_ns = map(stamp_ns_of, message.transforms)
-            self._pose.newest_ns = max(self._pose.newest_ns or 0, *stamps_ns, 0)
+            self._pose.newest_ns = max(self._pose.newest_ns or 0, self._transforms.newest_ns)
 
     def _hear_pose(self, stamp_ns: int) -> None:
         """Note the stamp of a pose; the poses themselves are in `self._poses`."""
         if self._pose.restarts(stamp_ns):
             self._restart(stamp_ns)
-        self._pose.heard()
         self._pose.newest_ns = max(stamp_ns, self._pose.newest_ns or stamp_ns)
 
     def _restart(self, stamp_ns: int) -> None:

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.limits import RESTART_NS
+from deworldsg_ros.streams.clock_gate import ClockGate
 
 T = TypeVar("T")
-
-# A stream whose stamps go back by more has restarted (a looped recording); else it is late.
-RESTART_NS = 10**9
 
 
 @dataclass
@@ -32,6 +31,7 @@ class Stream(Generic[T]):
 
     Attributes:
         newest_ns: stamp of the newest item so far; None before the first.
+        gate: holds back an item whose stamp jumps; for the owner of the stream to ask.
     """
 
     def __init__(self, name: str, topic: str, capacity: int) -> None:
@@ -40,6 +40,7 @@ class Stream(Generic[T]):
         self._capacity = capacity
         self._items: deque[_Item[T]] = deque()
         self.newest_ns: int | None = None
+        self.gate: ClockGate[T] = ClockGate()
         self._fresh = False
         self._heard_ns: int | None = None
 

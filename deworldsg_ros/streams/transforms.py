@@ -10,6 +10,7 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.names import checked_frame_id
+from deworldsg_ros.streams.clock_gate import ClockGate, jump_text
 from deworldsg_ros.streams.poses import PoseBuffer, pose_from_transform, stamp_ns_of
 
 
@@ -20,6 +21,9 @@ class TransformTree:
         slop_ns: maximum time between a stamp and the transforms that are used for it, nanoseconds.
         world_frame: world frame of the poses; empty = the root of the tree above the camera when
             the first pose is read. A transform between the two must be a moving one.
+
+    Attributes:
+        newest_ns: stamp of the newest moving transform; 0 = none.
     """
 
     def __init__(self, slop_ns: int, world_frame: str = "") -> None:
@@ -28,6 +32,8 @@ class TransformTree:
         self._parents: dict[str, str] = {}
         self._static: dict[str, Float64] = {}
         self._moving: dict[str, PoseBuffer] = {}
+        self._gates: dict[str, ClockGate[Float64]] = {}
+        self.newest_ns = 0
 
     def __len__(self) -> int:
         return len(self._parents)
@@ -37,8 +43,10 @@ class TransformTree:
 
         Raises:
             RefusedInput: ``invalid_pose``, ``invalid_frame_id`` or ``invalid_stamp``; the
-                transforms before the bad one are kept.
+                transforms before the bad one are kept. ``time_jump`` for a transform that is lost;
+                the others are kept.
         """
+        lost: list[str] = []
         for transform in message.transforms:
             # Old bags write frames with a leading slash.
             parent = checked_frame_id(str(transform.header.frame_id).lstrip("/"))
@@ -47,10 +55,23 @@ class TransformTree:
             if static:
                 self._static[child] = T_parent_child
             else:
-                buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
-                buffer.add(stamp_ns_of(transform), T_parent_child)
+                lost_ns = self._add_moving(child, stamp_ns_of(transform), T_parent_child)
+                if lost_ns is not None:
+                    lost.append(jump_text(f"transform of '{child}'", lost_ns))
             # Last: a reader in another thread then finds the transform of each frame in the tree.
             self._parents[child] = parent
+        if lost:
+            raise RefusedInput("time_jump", lost[0])
+
+    def _add_moving(self, child: str, stamp_ns: int, T_parent_child: Float64) -> int | None:
+        """Keep a transform; returns the stamp of one that is lost (`ClockGate`)."""
+        buffer = self._moving.setdefault(child, PoseBuffer(self._slop_ns))
+        gate = self._gates.setdefault(child, ClockGate())
+        admitted, lost_ns = gate.admit(stamp_ns, T_parent_child)
+        for at_ns, T in admitted:
+            buffer.add(at_ns, T)
+            self.newest_ns = max(self.newest_ns, at_ns)
+        return lost_ns
 
     def settled(self, stamp_ns: int, camera_frame: str, parent_frame: str = "") -> bool:
         """Whether later transforms cannot change the result of `at` or `between`."""
@@ -107,6 +128,7 @@ class TransformTree:
         for frame in self._moving:
             self._parents.pop(frame, None)
         self._moving.clear()
+        self.newest_ns = 0
 
     def _chain(self, frames: list[str], stamp_ns: int) -> Float64:
         """T_ancestor_frame (4, 4) along a path from the frame upwards."""

@@ -104,7 +104,7 @@ def test_an_image_without_a_near_pose_is_refused(segmentation: Bench) -> None:
 def test_a_restarted_recording_is_processed(segmentation: Bench) -> None:
     works(segmentation, lambda: send_frame(segmentation))
     segmentation.stamp_ns -= 100 * 10**9
-    segmentation.refuses("time_jump", lambda: send_frame(segmentation))
+    segmentation.refuses("time_jump", lambda: [send_frame(segmentation) for _ in range(2)])
     works(segmentation, lambda: [send_frame(segmentation) for _ in range(3)])
 
 
@@ -298,6 +298,36 @@ def test_evidence_of_an_unknown_frame_is_refused(graph: Bench) -> None:
     works(graph, lambda: send_graph(graph))
     stray = evidence(graph.stamp_ns - 1)
     graph.refuses("unknown_frame", lambda: graph.send(deworldsg__relation_evidence=stray))
+    works(graph, lambda: send_graph(graph))
+
+
+HOUR_NS = 3600 * 10**9
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR_NS, -HOUR_NS, -1_700_000_000 * 10**9])
+def test_one_wrong_stamp_costs_one_local_graph(graph: Bench, jump_ns: int) -> None:
+    works(graph, lambda: send_graph(graph))
+    before = dict(graph.node.health.drops)
+
+    def provoke() -> None:
+        send_graph(graph, lambda stamp_ns: local_graph(stamp_ns + jump_ns))
+        send_graph(graph)
+
+    graph.refuses("time_jump", provoke)
+    works(graph, lambda: send_graph(graph))
+    assert graph.products() == graph.stamp_ns
+    drops = graph.node.health.drops
+    assert drops.get("out_of_order", 0) == before.get("out_of_order", 0)
+
+
+def test_a_clock_that_was_set_back_is_followed(graph: Bench) -> None:
+    works(graph, lambda: send_graph(graph))
+    graph.stamp_ns -= HOUR_NS
+    graph.refuses("time_jump", lambda: [send_graph(graph) for _ in range(2)])
+    graph.expect(lambda: graph.products() == graph.stamp_ns, "the new time")
+    works(graph, lambda: send_graph(graph))
+    graph.stamp_ns += 2 * HOUR_NS
+    send_graph(graph)
     works(graph, lambda: send_graph(graph))
 
 

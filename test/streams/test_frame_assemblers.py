@@ -207,11 +207,12 @@ def test_tf_does_not_replace_an_odometry_that_restarts() -> None:
     assembler.add_transforms(tf(transform("base_link", "camera", MOUNT)), static=True)
     assert len(assembler.pop_ready(0)) == 1
     again_ns = T0 - 100 * SECOND
-    for event in complete(again_ns):
-        if event.method != "add_pose":
-            add(assembler, event)
-    assembler.add_pose(odometry(again_ns, float("nan"), "base_link"), again_ns)
-    assembler.add_transforms(tf(transform("map", "base_link", np.eye(4), again_ns)))
+    for stamp_ns in (again_ns, again_ns + PERIOD):
+        for event in complete(stamp_ns):
+            if event.method != "add_pose":
+                add(assembler, event)
+        assembler.add_pose(odometry(stamp_ns, float("nan"), "base_link"), stamp_ns)
+        assembler.add_transforms(tf(transform("map", "base_link", np.eye(4), stamp_ns)))
     assert assembler.pop_ready(0) == []
     assembler.add_pose(odometry(again_ns, 1.0, "base_link"), again_ns)
     (frame,) = assembler.pop_ready(0)
@@ -309,6 +310,37 @@ def test_frames_continue_after_a_recording_restarts() -> None:
     frames, drops = feed(first + first)
     assert len(frames) >= 30 + 28
     assert drops["time_jump"] >= 1
+
+
+HOUR = 3600 * SECOND
+METHODS = ["add_pose", "add_depth", "add_rgb"]
+
+
+@pytest.mark.parametrize("jump_ns", [HOUR, 61 * SECOND, -HOUR, -2 * SECOND, -T0])
+@pytest.mark.parametrize("methods", [[name] for name in METHODS] + [METHODS])
+def test_a_wrong_stamp_costs_its_message(jump_ns: int, methods: list[str]) -> None:
+    """The clock of one stream, or of all, is wrong for one message."""
+    steps = [complete(T0 + step * PERIOD) for step in range(10)]
+    wrong_ns = T0 + 5 * PERIOD + jump_ns
+    steps[5] = [
+        *[event for event in steps[5] if event.method not in methods],
+        *[event for event in complete(wrong_ns) if event.method in methods],
+    ]
+    frames, drops = feed([event for step in steps for event in step])
+    expected = [step * PERIOD for step in range(10) if step != 5]
+    if methods == ["add_pose"]:  # interpolated
+        expected.insert(5, 5 * PERIOD)
+    assert [frame[0] - T0 for frame in frames] == expected
+    assert drops.pop("time_jump") == len(methods)
+    assert set(drops) <= {"no_depth", "unmatched_depth"}
+
+
+def test_a_clock_that_was_set_is_followed() -> None:
+    steps = [T0 + step * PERIOD for step in range(5)]
+    steps += [HOUR + stamp_ns for stamp_ns in steps]
+    frames, drops = feed([event for stamp_ns in steps for event in complete(stamp_ns)])
+    assert [frame[0] for frame in frames] == steps
+    assert drops == {}
 
 
 @pytest.mark.parametrize("late", [False, True])

@@ -218,6 +218,32 @@ def test_a_refusal_of_tf_lists_the_known_frames() -> None:
         tree.at(T0, "camera")
 
 
+def test_a_transform_of_the_future_is_lost_and_the_others_are_used() -> None:
+    tree = TransformTree(SLOP, "map")
+    hour_ns = 3600 * 10**9
+    for stamp_ns in (T0, T0 + hour_ns):
+        tree.add(tf(transform("map", "camera", np.eye(4), stamp_ns)), static=False)
+    with pytest.raises(RefusedInput) as refused:
+        tree.add(tf(transform("map", "camera", at(2.0), T0 + 50 * MS)), static=False)
+    assert refused.value.reason == "time_jump"
+    assert tree.newest_ns == T0 + 50 * MS
+    assert not tree.settled(T0 + 100 * MS, "camera")
+    assert tree.at(T0 + 25 * MS, "camera")[0][0, 3] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("x", [1e300, 1e4 + 1, math.inf, -1e9])
+def test_a_pose_far_from_the_origin_is_refused(x: float) -> None:
+    with pytest.raises(RefusedInput) as refused:
+        pose_from_message(pose(x=x))
+    assert refused.value.reason == "invalid_pose"
+
+
+def test_a_frame_id_with_control_characters_is_refused() -> None:
+    with pytest.raises(RefusedInput) as refused:
+        pose_from_message(pose(frame_id="map\x1b[31m"))
+    assert refused.value.reason == "invalid_frame_id"
+
+
 def test_a_loop_in_tf_ends() -> None:
     tree = TransformTree(SLOP, "map")
     tree.add(tf(transform("a", "b", at(1.0)), transform("b", "a", at(1.0))), static=True)
