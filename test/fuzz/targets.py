@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from fuzz import file_targets
+from fuzz import file_targets, wire_targets
 from fuzz.target import Target
 
-TARGETS: dict[str, Target] = {target.name: target for target in file_targets.TARGETS}
+TARGETS: dict[str, Target] = {
+    target.name: target for target in (*file_targets.TARGETS, *wire_targets.TARGETS)
+}

@@ -1,0 +1,179 @@
+"""The messages of all topics, and graphs that get hostile but well-formed local graphs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+from support.hostile import (
+    STEPS_NS,
+    VOCABULARY,
+    check_published,
+    hostile_evidence,
+    hostile_local_graph,
+    state_of,
+)
+
+from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.relations.graph_view import PublishedGraph
+from deworldsg_ros.scene import codec, wire
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, RelationEvidence
+from deworldsg_ros.scene.replica import GraphReplica
+from fuzz.target import Target
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIGS = {
+    "paper": Config(
+        merging=MergingConfig(association="paper"),
+        relations=RelationsConfig(edge_belief="paper", world_model="none"),
+    ),
+    "default": Config(),
+}
+FRAMES = 6
+
+
+@lru_cache
+def _validator(name: str) -> Any:
+    schema = json.loads((ROOT / "msg_schemas" / f"{name}.schema.json").read_text())
+    return jsonschema.Draft202012Validator(schema)
+
+
+def _example(name: str) -> bytes:
+    return (ROOT / "msg_schemas" / f"{name}.example.json").read_bytes()
+
+
+def _message(name: str, use: Callable[[Any], object]) -> Target:
+    """A kind of message. What `wire.decode` accepts has to fit the committed schema."""
+
+    def read(folder: Path) -> None:
+        text = (folder / "message.json").read_bytes()
+        message = wire.decode(text, wire.MESSAGES[name])
+        _validator(name).validate(json.loads(wire.encode(message)))
+        use(message)
+
+    def make(folder: Path) -> None:
+        (folder / "message.json").write_bytes(_example(name))
+
+    return Target(f"wire_{name}", make, read, weight=3)
+
+
+def _rows_are_distributions(rows: np.ndarray) -> bool:
+    return bool((rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4))
+
+
+def _boxes_are_ordered(boxes: np.ndarray) -> bool:
+    return bool((boxes[:, :2] <= boxes[:, 2:]).all())
+
+
+def _use_frame_graph(message: wire.FrameGraphMessage) -> None:
+    graph: FrameGraph = codec.frame_graph_from_message(message)
+    assert _rows_are_distributions(graph.class_probabilities)
+    assert _boxes_are_ordered(graph.boxes_xyxy)
+    assert codec.frame_graph_to_message(graph) is not None
+
+
+def _check_local_graph(local: LocalGraph) -> None:
+    assert _rows_are_distributions(local.class_probabilities)
+    assert _boxes_are_ordered(local.boxes_xyxy)
+    assert len(set(local.instance_ids.tolist())) == len(local)
+    assert local.pixel_counts.min(initial=1) >= 1
+    rotation = local.T_world_camera[:3, :3]
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2)
+    for covariance in local.covariances_world:
+        np.linalg.cholesky(covariance)
+    for subject, object_ in local.relations.pairs.tolist():
+        assert subject != object_
+
+
+def _use_local_graph(message: wire.LocalGraphMessage) -> None:
+    local = codec.local_graph_from_message(message)
+    _check_local_graph(local)
+    for config in CONFIGS.values():
+        builder = GraphBuilder(config, local.vocabulary, local.frame_id)
+        builder.integrate(local)
+        check_published(builder, GraphReplica())
+
+
+def _use_evidence(message: wire.RelationEvidenceMessage) -> None:
+    evidence: RelationEvidence = codec.evidence_from_message(message)
+    assert (evidence.pair_classes < len(evidence.vocabulary.classes)).all()
+    assert (evidence.pairs[:, 0] != evidence.pairs[:, 1]).all()
+    predictions = evidence.predictions[evidence.predicted]
+    assert np.allclose(predictions.sum(axis=1), 1.0, atol=1e-2)
+    builder = GraphBuilder(CONFIGS["default"], evidence.vocabulary, "map")
+    classes = np.full(len(evidence.vocabulary.classes), 1.0)
+    ids = [builder.graph.add_node(np.full(3, place), np.eye(3), classes, 1) for place in range(3)]
+    builder.graph.remember_frame(evidence.stamp_ns, ids)
+    builder.add_evidence(evidence)
+    check_published(builder, GraphReplica())
+
+
+def _use_snapshot(message: wire.SceneGraphMessage) -> None:
+    replica, published = GraphReplica(), PublishedGraph()
+    replica.reset(message)
+    published.reset(message)
+    for node in message.nodes:
+        published.node(node.id)
+    wire.encode(replica.message())
+
+
+def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
+    replica, published = GraphReplica(), PublishedGraph()
+    published.apply(message)
+    for association in message.associations:
+        published.nodes_of_frame(wire.ns_from_stamp(association.stamp))
+    replica.apply(message)
+    wire.encode(replica.message())
+
+
+def _graph(name: str) -> Target:
+    """A graph that gets local graphs of the worst allowed values; the content is their seed."""
+
+    def make(folder: Path) -> None:
+        (folder / "seed").write_bytes(b"hostile")
+
+    def read(folder: Path) -> None:
+        digest = hashlib.sha256((folder / "seed").read_bytes()).digest()
+        rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
+        builder, replica = GraphBuilder(CONFIGS[name], VOCABULARY, "map"), GraphReplica()
+        stamp_ns = 0
+        for _ in range(FRAMES):
+            stamp_ns = abs(stamp_ns + int(rng.choice([*STEPS_NS, -(10**9), -(10**12)])))
+            stamp_ns = min(stamp_ns, 2**31 * 10**9 - 1)
+            local = hostile_local_graph(rng, stamp_ns)
+            before = state_of(builder)
+            try:
+                builder.integrate(local)
+            except RefusedInput:
+                assert state_of(builder) == before, "a refused local graph changed the graph"
+                continue
+            builder.add_evidence(hostile_evidence_in(rng, local))
+            check_published(builder, replica)
+
+    return Target(f"graph_{name}", make, read, weight=3)
+
+
+def hostile_evidence_in(rng: np.random.Generator, local: LocalGraph) -> RelationEvidence:
+    """Evidence for pairs that the local graph contains."""
+    while True:
+        evidence = hostile_evidence(rng, local)
+        if not len(evidence.pairs) or evidence.pairs.max() < len(local):
+            return evidence
+
+
+TARGETS: list[Target] = [
+    _message("frame_graph", _use_frame_graph),
+    _message("local_graph", _use_local_graph),
+    _message("relation_evidence", _use_evidence),
+    _message("scene_graph", _use_snapshot),
+    _message("scene_graph_updates", _use_update),
+    *map(_graph, CONFIGS),
+]
