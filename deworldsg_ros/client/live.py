@@ -144,7 +144,8 @@ class SceneGraphClient:
 
     def _snapshot(self, text: str) -> bool:
         snapshot = wire.decode(text, wire.SceneGraphMessage)
-        if self._graph is not None and snapshot.sequence == self._replica.sequence:
+        same = self._graph is not None and (snapshot.session or None) == self._replica.session
+        if same and snapshot.sequence <= self._replica.sequence:
             return False
         self._replica.reset(snapshot)
         return True

@@ -11,7 +11,6 @@ from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
 
-
 Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
