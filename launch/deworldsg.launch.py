@@ -46,6 +46,11 @@ def generate_launch_description() -> LaunchDescription:
             description="use the time of /clock, e.g. of ros2 bag play --clock",
         ),
         DeclareLaunchArgument(
+            "namespace",
+            default_value="",
+            description="of a robot among several: all topics are below it, /robot1/scene_graph",
+        ),
+        DeclareLaunchArgument(
             "odometry",
             default_value="false",
             choices=["true", "false"],
@@ -63,6 +68,7 @@ def generate_launch_description() -> LaunchDescription:
             package=PACKAGE,
             executable=name,
             name=name,
+            namespace=LaunchConfiguration("namespace"),
             output="screen",
             parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
             remappings=[(topic, LaunchConfiguration(argument)) for argument, topic, _ in INPUTS],

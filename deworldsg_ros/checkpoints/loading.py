@@ -121,6 +121,7 @@ class CheckpointSource:
                     self.name,
                     config=config,
                     dtype=torch.float32,
+                    use_safetensors=True,  # never a pickle
                     local_files_only=self.local_files_only,
                     output_loading_info=True,
                     key_mapping=dict(renamed) or None,

@@ -63,10 +63,10 @@ class RelationNode(JoiningNode[PairingFrame]):
     def _watch_graph(self) -> None:
         self._reasoner.watch(self._graph)
         self.listen_json(
-            "/scene_graph/updates", wire.SceneGraphUpdateMessage, self._update_graph, 50
+            "scene_graph/updates", wire.SceneGraphUpdateMessage, self._update_graph, 50
         )
         self.create_subscription(
-            String, "/scene_graph", self.guarded(self._keep_snapshot), reliable(1, latched=True)
+            String, "scene_graph", self.guarded(self._keep_snapshot), reliable(1, latched=True)
         )
 
     def _update_graph(self, update: wire.SceneGraphUpdateMessage) -> None:

@@ -206,7 +206,11 @@ class PipelineMonitor:
         return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
 
     def _on_local(self, message: Any) -> None:
-        local = msgspec.json.decode(message.data, type=_LocalGraph)
+        try:
+            local = msgspec.json.decode(message.data, type=_LocalGraph)
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            self._node.get_logger().warning(f"a local graph is ignored: {error}")
+            return
         self.poses.append(local.T_world_camera)
         self._local_graphs += 1
         self._progress_s = None
@@ -219,14 +223,19 @@ class PipelineMonitor:
 
     def _on_diagnostics(self, message: Any) -> None:
         for status in message.status:
-            if status.hardware_id == "deworldsg_ros":
-                name = status.name.split(":")[0]
+            # /diagnostics is shared: other robots have nodes of the same names.
+            name, _, full_name = status.name.partition(": ")
+            if status.hardware_id == "deworldsg_ros" and full_name == self._full_name(name):
                 self.diagnostics[name] = {item.key: item.value for item in status.values}
         refused = self._drops(SEGMENTATION) + self._drops(LIFTING)
         if refused > self._refused_frames:
             self.window.excuse(refused - self._refused_frames)
             self._refused_frames = refused
             self._progress_s = None
+
+    def _full_name(self, name: str) -> str:
+        """Full name of a node in the namespace of the replay."""
+        return f"{self._node.get_namespace().rstrip('/')}/{name}"
 
     def _drops(self, name: str) -> int:
         """Frames that a node has dropped; unmatched and lost messages are not frames."""

@@ -77,7 +77,7 @@ class GraphKeeper:
         self._values: dict[str, str] = {}
         self._times = UpdateTimes(self._parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
-        self._publish_update = node.json_publisher("/scene_graph/updates", 50)
+        self._publish_update = node.json_publisher("scene_graph/updates", 50)
         self._whole = WholeGraph(node, markers)
         self._files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.

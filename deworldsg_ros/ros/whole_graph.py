@@ -79,9 +79,9 @@ class WholeGraph:
         self._node = node
         self._make_markers = markers
         self._encoder = PiecewiseEncoder()
-        self._publish_text = node.text_publisher("/scene_graph", 1, latched=True)
+        self._publish_text = node.text_publisher("scene_graph", 1, latched=True)
         self._markers = node.create_publisher(
-            MarkerArray, "/scene_graph/markers", reliable(1, latched=True)
+            MarkerArray, "scene_graph/markers", reliable(1, latched=True)
         )
         self._changed = False
         self._due_s = 0.0

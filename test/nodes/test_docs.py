@@ -10,13 +10,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "test")]
+
+from support import abnormal  # noqa: E402
 
 from deworldsg_ros.ros.options import Parameters, ReplayParameters  # noqa: E402
 from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
 from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
 
-PAGES = (ROOT / "docs" / "nodes.md", ROOT / "docs" / "recordings.md")
+PAGES = (
+    ROOT / "docs" / "nodes.md",
+    ROOT / "docs" / "recordings.md",
+    ROOT / "docs" / "reliability.md",
+)
 # Everything that runs in the nodes.
 PACKAGES = (
     "ros",
@@ -50,6 +56,7 @@ def parameters_table(listed: list[Field]) -> str:
 def with_tables(text: str) -> str:
     tables = {
         "reasons": reasons_table(),
+        "abnormal": abnormal.table(),
         "parameters": parameters_table(fields(Parameters)),
         # The configuration is in the other table.
         "replay": parameters_table([f for f in fields(ReplayParameters) if f.path[0] == "node"]),

@@ -92,7 +92,7 @@ def test_every_launch_configuration_is_a_declared_argument(
         entity.args[0] for entity in describe(path, launch_classes, "DeclareLaunchArgument")
     }
     assert declared == {
-        *("params_file", "use_sim_time", "odometry"),
+        *("params_file", "use_sim_time", "namespace", "odometry"),
         *("rgb", "camera_info", "depth", "pose"),
     }
 
