@@ -133,7 +133,7 @@ def check_pose(T: Float64) -> None:
             f"pose {T.tolist()}: expected a finite 4x4 matrix, at most {MAX_COORDINATE_M:g} m from "
             "the origin",
         )
-    if (T[3] != _LAST_ROW).any():
+    if np.abs(T[3] - _LAST_ROW).max() > 1e-6:
         raise RefusedInput(
             "invalid_pose", f"last row of the pose is {T[3].tolist()}: expected 0, 0, 0, 1"
         )
