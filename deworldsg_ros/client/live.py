@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -32,7 +33,8 @@ class SceneGraphClient:
     """Follows `/scene_graph` and `/scene_graph/updates`; use it in a `with` block.
 
     It starts from the latched snapshot and applies the numbered updates. After a gap it waits for
-    the next snapshot, which follows every update. Messages arrive in a thread of its own.
+    the next snapshot, about a second, and continues from there. Messages arrive in a thread of its
+    own.
 
     Args:
         namespace: of the robot, e.g. ``/robot_1``; empty = the topics as they are.
@@ -50,6 +52,7 @@ class SceneGraphClient:
         self._namespace = namespace.rstrip("/")
         self._replica = GraphReplica()
         self._graph: SceneGraph | None = None
+        self._waiting: deque[wire.SceneGraphUpdateMessage] = deque(maxlen=UPDATE_DEPTH)
         self._callbacks: list[Callback] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
@@ -148,15 +151,22 @@ class SceneGraphClient:
         if same and snapshot.sequence <= self._replica.sequence:
             return False
         self._replica.reset(snapshot)
+        # Updates that came during the gap, and are newer than the snapshot.
+        waiting, self._waiting = self._waiting, deque(maxlen=UPDATE_DEPTH)
+        for update in waiting:
+            self._apply(update)
         return True
 
     def _update(self, text: str) -> bool:
-        update = wire.decode(text, wire.SceneGraphUpdateMessage)
+        return self._apply(wire.decode(text, wire.SceneGraphUpdateMessage))
+
+    def _apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        """Apply an update, or keep it until a snapshot closes the gap before it."""
         try:
             return self._replica.apply(update)
         except RefusedInput:
-            # The snapshot that follows this update closes the gap.
-            self.gaps += self._graph is not None
+            self.gaps += self._graph is not None and not self._waiting
+            self._waiting.append(update)
             return False
 
     def _publish(self, graph: SceneGraph) -> None:

@@ -15,6 +15,7 @@ import msgspec
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import MarkerArray
 
+from deworldsg_ros.ros.detections import TOPIC, detection_array, vision_msgs
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
@@ -83,6 +84,11 @@ class WholeGraph:
         self._markers = node.create_publisher(
             MarkerArray, "scene_graph/markers", reliable(1, latched=True)
         )
+        self._detections: Any = None
+        if vision_msgs is not None:
+            self._detections = node.create_publisher(
+                vision_msgs.Detection3DArray, TOPIC, reliable(1, latched=True)
+            )
         self._changed = False
         self._due_s = 0.0
         self._worker = Worker("whole graph", self._work, size=1, on_overrun=lambda snapshot: None)
@@ -113,5 +119,7 @@ class WholeGraph:
             self._markers.publish(
                 marker_array(self._make_markers(snapshot), snapshot.frame_id, stamp)
             )
+            if self._detections is not None:
+                self._detections.publish(detection_array(snapshot, stamp))
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)
