@@ -5,6 +5,7 @@ The graph node and the in-process pipeline both use this, so that they give the 
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
@@ -22,6 +23,7 @@ from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.limits import RESTART_NS
+from deworldsg_ros.scene.node_states import hidden_node
 from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.up import UpEstimator
 
@@ -89,7 +91,7 @@ class GraphBuilder:
     @property
     def hidden(self) -> dict[str, int]:
         """Number of nodes that are not published, by reason, in words."""
-        return self.merging.hidden(self.graph)
+        return dict(Counter(self.merging.hidden(self.graph).values()))
 
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.
@@ -147,6 +149,7 @@ class GraphBuilder:
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """The changes since the last call; None if there are none."""
+        self._publication.set_up(self.up.up_world())
         return self._publication.update()
 
     def snapshot(self) -> wire.SceneGraphMessage:
@@ -154,8 +157,15 @@ class GraphBuilder:
         return self._publication.snapshot()
 
     def full(self) -> wire.SceneGraphMessage:
-        """The present graph with surface points; the next `update` is unaffected."""
-        return self._publication.full()
+        """The present graph with surface points and hidden nodes; `update` is unaffected."""
+        self._publication.set_up(self.up.up_world())
+        message = self._publication.full()
+        message.hidden = self._hidden_nodes()
+        return message
+
+    def _hidden_nodes(self) -> list[wire.HiddenNode]:
+        reasons = self.merging.hidden(self.graph)
+        return [hidden_node(self.graph, node_id, reasons[node_id]) for node_id in sorted(reasons)]
 
 
 def warm_up(config: Config, *parts: str) -> None:

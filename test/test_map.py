@@ -104,7 +104,12 @@ def test_a_map_of_an_older_release_has_no_up_direction_and_no_votes(tmp_path):
     graph_io.write(path, old)
     again = read_map(Config(), path)
     np.testing.assert_array_equal(again.up.up_world(), [0, 0, 1])
-    assert again.full().nodes == builder.full().nodes and not again.graph.votes
+    # Without an up direction, boxes stand on another axis.
+    ours, theirs = (
+        [msgspec.structs.replace(node, box=msgspec.UNSET) for node in one.full().nodes]
+        for one in (again, builder)
+    )
+    assert ours == theirs and not again.graph.votes
     again.integrate(upright_frame(9))
     np.testing.assert_allclose(again.up.up_world(), [0, 1, 0], atol=1e-9)
 

@@ -30,6 +30,7 @@ from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.replica import GraphReplica
 
@@ -66,7 +67,7 @@ def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
     graph = pipeline.graph()
     assert [node.label for node in graph.nodes] == ["cup", "table", "chair"]
     assert [node.observations for node in graph.nodes] == [200, 200, 200]
-    assert all(node.surface_points_m for node in graph.nodes)
+    assert all(len(surface_points(node)) for node in graph.nodes)
     (edge,) = graph.edges
     assert (edge.subject, edge.object, edge.predicate, edge.provenance) == (1, 2, "on", "visual")
     assert edge.observations == 200

@@ -28,6 +28,7 @@ EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
 def message_schema(name: str) -> dict[str, Any]:
     """The JSON Schema of a message. Its `schema.name` is a constant."""
     schema = wire.json_schema(wire.MESSAGES[name])
+    version = wire.schema_of(wire.MESSAGES[name]).version
     definition = schema["$defs"][wire.MESSAGES[name].__name__]
     for described in schema["$defs"].values():
         if "description" in described:  # a docstring; only Python 3.13 removes its indentation
@@ -35,10 +36,10 @@ def message_schema(name: str) -> dict[str, Any]:
     definition["properties"]["schema"] = {
         "allOf": [
             {"$ref": "#/$defs/Schema"},
-            {"properties": {"name": {"const": name}, "version": {"maximum": wire.VERSION}}},
+            {"properties": {"name": {"const": name}, "version": {"maximum": version}}},
         ]
     }
-    return {**schema, "title": f"deworldsg_ros {name}, version {wire.VERSION}"}
+    return {**schema, "title": f"deworldsg_ros {name}, version {version}"}
 
 
 def examples() -> dict[str, wire.Message]:
@@ -108,6 +109,8 @@ def _graph_examples() -> dict[str, wire.Message]:
             sequence=41,
             nodes=[_cup(), _node(2, "table", [0.45, 0.1, 0.71], 0.09, 29)],
             edges=[_cup_on_table()],
+            up=[0.0, 0.0, 1.0],
+            hidden=[wire.HiddenNode("vase", [1.0, 0.2, 0.9], 0.31, 2, "seen too little")],
         ),
         "scene_graph_updates": wire.SceneGraphUpdateMessage(
             **_head("scene_graph_updates"),
@@ -117,6 +120,7 @@ def _graph_examples() -> dict[str, wire.Message]:
             nodes=[_cup()],
             edges=[_cup_on_table()],
             associations=[wire.Association(stamp=STAMP, nodes=[1, 2])],
+            up=[0.0, 0.0, 1.0],
         ),
     }
 
@@ -161,6 +165,9 @@ def _node(
         first_seen=EARLIER,
         last_seen=STAMP,
         entropy_nats=0.32,
+        remainder=0.03,
+        box=wire.GravityBox(mean, [0.12, 0.1, 0.1], [0.0, 0.0, 0.0, 1.0]),
+        surface_mm=b"\n\x00\x00\x00\xec\xff",
     )
 
 
@@ -178,6 +185,8 @@ def _cup_on_table() -> wire.EdgeState:
         provenance="visual",
         entropy_nats=0.34,
         observations=23,
+        remainder=0.01,
+        shown=24,
     )
 
 

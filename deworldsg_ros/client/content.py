@@ -127,7 +127,7 @@ class GraphContent:
             if is_subject(a) and is_object(b):
                 found.append(item)
             elif (
-                plain(item.predicate) in SYMMETRIC
+                (edge.mutual is True or plain(item.predicate) in SYMMETRIC)
                 and (b_id, a_id) not in self._edges
                 and is_subject(b)
                 and is_object(a)

@@ -144,6 +144,7 @@ class Relation:
         other_predicates: probability of all predicates that it does not list.
         provenance: ``visual`` (frames), ``prior`` (world model) or ``fused`` (both).
         observations: number of frames with visual evidence.
+        shown: number of frames that showed both objects; None = not in the message.
         entropy_nats: of the visual distribution.
     """
 
@@ -155,6 +156,7 @@ class Relation:
     other_predicates: float
     provenance: str
     observations: int
+    shown: int | None
     entropy_nats: float
 
     @property
@@ -181,7 +183,8 @@ class Relation:
             "prior": "judged by the world model, not seen",
             "fused": "seen, and judged by the world model",
         }[self.provenance]
-        frames = f" in {self.observations} frames" if self.observations else ""
+        of = f" of {self.shown} that show both" if self.shown else ""
+        frames = f" in {self.observations} frames{of}" if self.observations else ""
         return source + (frames if self.provenance != "prior" else "")
 
     def to_dict(self) -> dict[str, Any]:
@@ -282,6 +285,7 @@ def relation(
         other_predicates=rest,
         provenance=edge.provenance,
         observations=edge.observations,
+        shown=edge.shown if isinstance(edge.shown, int) else None,
         entropy_nats=edge.entropy_nats,
     )
 

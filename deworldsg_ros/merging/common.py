@@ -23,6 +23,7 @@ def warm_up_graph() -> None:
     observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
     graph.observe(graph.add_node(*observation), *observation)
     even_moments(np.zeros((1, 3), np.float32))
+    graph.node_states(1)
 
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:

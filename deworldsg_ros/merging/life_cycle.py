@@ -101,17 +101,18 @@ class LifeCycle:
                 absent.append(node_id)
         return absent
 
-    def hidden(self, graph: SceneGraph) -> dict[str, int]:
-        """Number of nodes that are not published, by reason."""
+    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+        """The nodes that are not published, each with its reason, in words."""
         nodes, records = graph.nodes, self._records
-        ids = [i for i in nodes.ids[~nodes.confirmed].tolist() if i not in self._lost]
+        hidden = nodes.ids[~nodes.confirmed].tolist()
+        ids = [node_id for node_id in hidden if node_id in records]
         missed = records.are_missed([records.owner(i) for i in ids], self._min_existence)
         reasons = {
-            "seen too little": len(ids) - int(missed.sum()),
-            "missed by the detector": int(missed.sum()),
-            "absent from its position": len(self._lost),
+            i: "absent from its position" if i in self._lost else "seen too little" for i in hidden
         }
-        return {reason: count for reason, count in reasons.items() if count}
+        for node_id, is_missed in zip(ids, missed.tolist()):
+            reasons[node_id] = "missed by the detector" if is_missed else "seen too little"
+        return reasons
 
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""

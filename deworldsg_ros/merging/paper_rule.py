@@ -41,7 +41,7 @@ class PaperMerging:
         add_relations(graph, local, node_ids)
         return node_ids
 
-    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+    def hidden(self, graph: SceneGraph) -> dict[int, str]:
         """None: every node is published."""
         return {}
 

@@ -32,8 +32,8 @@ class Merging(Protocol):
         """
         ...
 
-    def hidden(self, graph: SceneGraph) -> dict[str, int]:
-        """Number of nodes that are not published, by reason, in words."""
+    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+        """The nodes that are not published, each with its reason, in words."""
         ...
 
     def memory(self) -> Memory:

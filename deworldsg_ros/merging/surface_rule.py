@@ -72,7 +72,7 @@ class SurfaceMerging:
         add_relations(graph, local, node_ids)
         return node_ids
 
-    def hidden(self, graph: SceneGraph) -> dict[str, int]:
+    def hidden(self, graph: SceneGraph) -> dict[int, str]:
         """See `Merging.hidden`."""
         return self._life_cycle.hidden(graph)
 

@@ -20,11 +20,12 @@ from deworldsg_ros.relations.predicted_prior import PredictedPrior
 from deworldsg_ros.relations.prior import ClassPairPrior, Prior
 from deworldsg_ros.relations.robust_beliefs import ChangedBeliefs, RobustBeliefs
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Bool, Float64
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.predicates import SYMMETRIC, plain
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.votes import frame_votes
 
@@ -35,6 +36,8 @@ MIN_PROBABILITY = 0.2
 # Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
 # 12 objects changes about 80 pairs.
 JUDGED_A_CALL = 32
+# A symmetric relation is sent once a pair if its probabilities in both directions differ by less.
+SAME_PROBABILITY = 0.01
 # Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
 
@@ -71,8 +74,10 @@ class EdgeBeliefs:
         self._robust_beliefs = RobustBeliefs(config, graph, self._table)
         self._predicted = PredictedPrior(graph.vocabulary)
         self.states: dict[Pair, wire.EdgeState] = {} if self._robust else self._paper_beliefs.states
+        names = graph.vocabulary.predicates
+        self._symmetric = np.array([plain(name) in SYMMETRIC for name in names], np.bool_)
         # What each message was made from, beside the evidence of its edge.
-        self._basis: dict[Pair, tuple[bytes, wire.Provenance]] = {}
+        self._basis: dict[Pair, tuple[bytes, wire.Provenance, bool]] = {}
 
     def weigh(self, local: LocalGraph) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
@@ -147,12 +152,16 @@ class EdgeBeliefs:
         evidence_changed = self._graph.take_changed_edges()
         rounded = np.round(beliefs.probabilities, DECIMALS)
         said = rounded.max(axis=1, initial=0.0) >= MIN_PROBABILITY
+        mutual = self._mutual(rounded, said)
+        # The beliefs of both directions of a pair follow each other.
+        said[1::2] &= ~mutual[1::2]
         gone = beliefs.unrelated + [beliefs.pairs[i] for i in np.flatnonzero(~said).tolist()]
         changed = [pair for pair in gone if self.states.pop(pair, None) is not None]
         for pair in changed:
             del self._basis[pair]
         for index in np.flatnonzero(said).tolist():
-            pair, basis = beliefs.pairs[index], (rounded[index].tobytes(), beliefs.sources[index])
+            pair = beliefs.pairs[index]
+            basis = (rounded[index].tobytes(), beliefs.sources[index], bool(mutual[index]))
             if self._basis.get(pair) != basis or pair in evidence_changed:
                 self._basis[pair] = basis
                 changed.append(pair)
@@ -162,9 +171,19 @@ class EdgeBeliefs:
                 self.states[pair] = self._message(pair, *self._basis[pair])
         return changed
 
-    def _message(self, pair: Pair, rounded: bytes, provenance: wire.Provenance) -> wire.EdgeState:
+    def _mutual(self, rounded: Float64, said: Bool) -> Bool:
+        """Whether each belief (m,) is of a symmetric relation that both directions name."""
+        best = rounded.argmax(axis=1).reshape(-1, 2)
+        both = said.reshape(-1, 2).all(axis=1) & (best[:, 0] == best[:, 1])
+        both &= np.ptp(rounded.max(axis=1, initial=0.0).reshape(-1, 2), axis=1) <= SAME_PROBABILITY
+        return np.repeat(both & self._symmetric[best[:, 0]], 2)
+
+    def _message(
+        self, pair: Pair, rounded: bytes, provenance: wire.Provenance, mutual: bool
+    ) -> wire.EdgeState:
         evidence = self._graph.edges.get(pair)
         probabilities = np.frombuffer(rounded)
+        votes = self._graph.votes.get((min(pair), max(pair)))
         logits = np.zeros(len(probabilities))
         frames = 0
         if evidence is not None and evidence.frames:
@@ -177,6 +196,8 @@ class EdgeBeliefs:
             provenance=provenance,
             entropy_nats=float(entropy_nats(visual_distribution(logits))),
             observations=frames,
+            shown=0 if votes is None else votes.frames,
+            mutual=mutual,
         )
 
     def _check_vocabulary(self, evidence: RelationEvidence) -> None:

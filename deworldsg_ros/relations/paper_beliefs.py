@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import UNSET
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
@@ -13,7 +14,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import best_beliefs
+from deworldsg_ros.scene.node_states import DECIMALS, best_beliefs, rest_of
 
 
 class PaperBeliefs:
@@ -141,6 +142,8 @@ def edge_state(
     provenance: wire.Provenance,
     entropy_nats: float,
     observations: int,
+    shown: int | None = None,
+    mutual: bool = False,
 ) -> wire.EdgeState:
     """The message of an edge with the probabilities (R,) of its predicates, the best first."""
     beliefs = best_beliefs(probabilities, predicates, top_k)
@@ -151,6 +154,9 @@ def edge_state(
         probability=beliefs[0].probability,
         predicates=beliefs,
         provenance=provenance,
-        entropy_nats=entropy_nats,
+        entropy_nats=round(entropy_nats, DECIMALS),
         observations=observations,
+        remainder=rest_of(probabilities, beliefs),
+        shown=UNSET if shown is None else shown,
+        mutual=mutual or UNSET,
     )

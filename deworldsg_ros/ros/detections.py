@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from importlib import import_module
 from typing import Any
 
 from deworldsg_ros.scene import wire
 
-try:
-    from vision_msgs import msg as vision_msgs
-except ImportError:
-    vision_msgs = None
+# The messages of the package vision_msgs; None = it is not installed.
+VISION_MSGS: Any = None
+with suppress(ImportError):
+    VISION_MSGS = import_module("vision_msgs.msg")
 
 TOPIC = "/scene_graph/detections"
 
 
-def detection_array(graph: wire.SceneGraphMessage, stamp: Any, messages: Any = vision_msgs) -> Any:
+def detection_array(graph: wire.SceneGraphMessage, stamp: Any, messages: Any = VISION_MSGS) -> Any:
     """All objects that have a box.
 
     The score of a class is its probability times that of existence. The pose of a hypothesis is the

@@ -15,7 +15,7 @@ import msgspec
 from builtin_interfaces.msg import Time
 from visualization_msgs.msg import MarkerArray
 
-from deworldsg_ros.ros.detections import TOPIC, detection_array, vision_msgs
+from deworldsg_ros.ros.detections import TOPIC, VISION_MSGS, detection_array
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
@@ -85,9 +85,9 @@ class WholeGraph:
             MarkerArray, "scene_graph/markers", reliable(1, latched=True)
         )
         self._detections: Any = None
-        if vision_msgs is not None:
+        if VISION_MSGS is not None:
             self._detections = node.create_publisher(
-                vision_msgs.Detection3DArray, TOPIC, reliable(1, latched=True)
+                VISION_MSGS.Detection3DArray, TOPIC, reliable(1, latched=True)
             )
         self._changed = False
         self._due_s = 0.0

@@ -63,6 +63,7 @@ def diff(
             if not _same(known_edges.get((edge.subject, edge.object)), edge)
         ],
         associations=list(associations),
+        up=current.up,
     )
 
 

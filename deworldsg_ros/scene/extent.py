@@ -18,6 +18,9 @@ NEIGHBOURS = 3
 OUTLIER_FACTOR = 2.0
 # Heading of a box: the smallest rectangle of this many directions over 90 degrees.
 DIRECTIONS = 45
+# Points of a box, the first ones: surfaces are stored in random order. 256 of 512 take a quarter of
+# the time and cost 0.2 cm of the median extent.
+MOST_POINTS = 256
 # The up of the world frame if nothing tells it (REP 103).
 DEFAULT_UP = (0.0, 0.0, 1.0)
 # Points in messages are int16 millimetres.
@@ -32,7 +35,7 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         up: unit vector against gravity.
     """
     axes = horizontal_axes(up)
-    points = np.ascontiguousarray(points_world, np.float64) @ axes.T
+    points = np.ascontiguousarray(points_world[:MOST_POINTS], np.float64) @ axes.T
     low, high, heading = _bounds(points)
     cos, sin = np.cos(heading), np.sin(heading)
     turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -72,53 +75,88 @@ def surface_points(node: wire.NodeState) -> Float64:
         whole = len(node.surface_mm) // 6 * 6
         offsets = np.frombuffer(node.surface_mm[:whole], "<i2").reshape(-1, 3)
         return np.asarray(offsets * 1e-3 + np.array(node.mean_m))
-    return np.array(node.surface_points_m, np.float64).reshape(-1, 3)
+    points = node.surface_points_m if isinstance(node.surface_points_m, list) else []
+    return np.array(points, np.float64).reshape(-1, 3)
 
 
 @kernel
 def _bounds(points: Float64) -> tuple[Float64, Float64, float]:
     """Lower and upper corner (3,) along the axes of the smallest box, and its heading."""
-    inliers = points[_inliers(points)]
+    by_y = points[np.argsort(points[:, 1])]
+    ordered = by_y[np.argsort(by_y[:, 0], kind="mergesort")]
+    inliers = ordered[_inliers(ordered)]
+    # Only corners of the convex hull touch a box.
+    hull = _hull(inliers)
     best, heading = np.inf, 0.0
     for step in range(DIRECTIONS):
         angle = 0.5 * np.pi * step / DIRECTIONS
-        low, high = _corners(inliers, np.cos(angle), np.sin(angle))
+        low, high = _corners(hull, np.cos(angle), np.sin(angle))
         area = (high[0] - low[0]) * (high[1] - low[1])
         # Ties go to the axes of the world.
         if area < best - 1e-12:
             best, heading = area, angle
-    low, high = _corners(inliers, np.cos(heading), np.sin(heading))
+    low, high = _corners(hull, np.cos(heading), np.sin(heading))
+    low[2], high[2] = inliers[:, 2].min(), inliers[:, 2].max()
     return low, high, heading
 
 
 @kernel
 def _corners(points: Float64, cos: float, sin: float) -> tuple[Float64, Float64]:
+    """Horizontal bounds along turned axes; the third value is not set."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for row in range(len(points)):
-        x, y, z = points[row]
+        x, y = points[row, 0], points[row, 1]
         u, v = cos * x + sin * y, cos * y - sin * x
         low[0], high[0] = min(low[0], u), max(high[0], u)
         low[1], high[1] = min(low[1], v), max(high[1], v)
-        low[2], high[2] = min(low[2], z), max(high[2], z)
     return low, high
 
 
 @kernel
-def _inliers(points: Float64) -> Int64:
-    """Rows of the points that have neighbours as close as the others have."""
-    count = len(points)
+def _hull(ordered: Float64) -> Float64:
+    """Corners (k, 3) of the convex hull of points seen from above, sorted by x and y."""
+    count = len(ordered)
+    rows = np.empty(2 * count + 2, np.int64)
+    size = 0
+    for turn in range(2):  # the lower side from the left, then the upper side from the right
+        start = size
+        for index in range(count):
+            row = index if turn == 0 else count - 1 - index
+            while size - start >= 2 and _turns_right(ordered, rows[size - 2], rows[size - 1], row):
+                size -= 1
+            rows[size] = row
+            size += 1
+    return ordered[rows[:size]]
+
+
+@kernel
+def _turns_right(points: Float64, a: int, b: int, c: int) -> bool:
+    ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+    vx, vy = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
+    return bool(ux * vy - uy * vx <= 0.0)
+
+
+@kernel
+def _inliers(ordered: Float64) -> Int64:
+    """Rows of points, sorted by x, that have neighbours as close as the others have."""
+    count = len(ordered)
     if count <= 2 * NEIGHBOURS:
         return np.arange(count)
-    nearest = np.full((count, NEIGHBOURS), np.inf)
-    for a in range(count):
-        for b in range(a):
-            squared = 0.0
-            for axis in range(3):
-                step = points[a, axis] - points[b, axis]
-                squared += step * step
-            _insert(nearest[a], squared)
-            _insert(nearest[b], squared)
-    last = nearest[:, NEIGHBOURS - 1]
+    last = np.empty(count)
+    nearest = np.empty(NEIGHBOURS)
+    for row in range(count):
+        nearest[:] = np.inf
+        for step in (1, -1):
+            other = row + step
+            while 0 <= other < count:
+                x = ordered[other, 0] - ordered[row, 0]
+                y = ordered[other, 1] - ordered[row, 1]
+                z = ordered[other, 2] - ordered[row, 2]
+                if x * x >= nearest[NEIGHBOURS - 1]:
+                    break
+                _insert(nearest, x * x + y * y + z * z)
+                other += step
+        last[row] = nearest[NEIGHBOURS - 1]
     return np.flatnonzero(last <= OUTLIER_FACTOR**2 * np.median(last))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import msgspec
@@ -10,8 +11,15 @@ from msgspec import UNSET
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.extent import DEFAULT_UP, box_of, rounded, surface_bytes
 from deworldsg_ros.scene.node_store import NodeStore
 from deworldsg_ros.scene.surface import even_moments
+
+# Decimals of numbers in messages: positions to 0.1 mm, variances to (0.3 mm)², so that a thin
+# object keeps its thickness; probabilities and entropies to more than their calibration.
+POSITION_DECIMALS, VARIANCE_DECIMALS, DECIMALS = 4, 7, 4
+# Smaller turns of the estimated up direction change no box.
+MIN_TURN_RAD = math.radians(1.0)
 
 
 class NodeStates:
@@ -23,6 +31,7 @@ class NodeStates:
         even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
 
     Attributes:
+        up: unit vector against gravity, for the boxes.
         states: messages by id. Those of nodes that did not change are the same objects as before.
     """
 
@@ -32,6 +41,13 @@ class NodeStates:
         self._top_k = top_k
         self._even_gaussians = even_gaussians
         self._touched = store.watch_nodes()
+        self.up: tuple[float, ...] = DEFAULT_UP
+
+    def set_up(self, up_world: Float64) -> None:
+        """Set the direction against gravity (3,); smaller turns than `MIN_TURN_RAD` are ignored."""
+        if float(up_world @ self.up) < math.cos(MIN_TURN_RAD):
+            self.up = tuple(rounded(up_world, POSITION_DECIMALS))
+            self._touched.update(self._store.nodes.ids.tolist())
 
     def refresh(self) -> list[int]:
         """Follow the nodes; returns the ids that have another message now, or none."""
@@ -50,8 +66,8 @@ class NodeStates:
     def with_points(self, state: wire.NodeState) -> wire.NodeState:
         """A message with the surface points of its node."""
         nodes = self._store.nodes
-        points = nodes.surface(nodes.row(state.id)).tolist()
-        return msgspec.structs.replace(state, surface_points_m=points)
+        points = nodes.surface(nodes.row(state.id))
+        return msgspec.structs.replace(state, surface_mm=surface_bytes(points, state.mean_m))
 
     def _state(self, row: int) -> wire.NodeState:
         nodes = self._store.nodes
@@ -59,22 +75,37 @@ class NodeStates:
         beliefs = best_beliefs(probabilities, self._store.vocabulary.classes, self._top_k)
         possible = probabilities[probabilities > 0]
         mean, covariance = nodes.means[row], nodes.covariances[row]
-        if self._even_gaussians and nodes.surface_counts[row]:
-            mean, covariance = even_moments(nodes.surface(row))
+        points = nodes.surface(row)
+        if self._even_gaussians and len(points):
+            mean, covariance = even_moments(points)
         return wire.NodeState(
             id=int(nodes.ids[row]),
             label=beliefs[0].label,
             classes=beliefs,
-            mean_m=mean.tolist(),
-            covariance_m2=covariance.ravel().tolist(),
+            remainder=rest_of(probabilities, beliefs),
+            mean_m=rounded(mean, POSITION_DECIMALS),
+            covariance_m2=rounded(covariance, VARIANCE_DECIMALS),
+            box=box_of(points, self.up) if len(points) else UNSET,
             observations=int(nodes.observations[row]),
             confirmed=True,
             existence=float(existence) if (existence := nodes.existence[row]) >= 0 else UNSET,
             first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
             last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
-            surface_points_m=[],
-            entropy_nats=max(0.0, -float(possible @ np.log(possible))),
+            entropy_nats=round(max(0.0, -float(possible @ np.log(possible))), DECIMALS),
         )
+
+
+def hidden_node(store: NodeStore, node_id: int, reason: str) -> wire.HiddenNode:
+    """The message of a node that is not published."""
+    nodes, row = store.nodes, store.nodes.row(node_id)
+    best = int(nodes.class_probabilities[row].argmax())
+    return wire.HiddenNode(
+        label=store.vocabulary.classes[best],
+        mean_m=rounded(nodes.means[row], POSITION_DECIMALS),
+        existence=max(0.0, float(nodes.existence[row])),
+        observations=int(nodes.observations[row]),
+        reason=reason,
+    )
 
 
 def best_beliefs(probabilities: Float64, names: Sequence[str], top_k: int) -> list[wire.Belief]:
@@ -82,6 +113,12 @@ def best_beliefs(probabilities: Float64, names: Sequence[str], top_k: int) -> li
     # A stable sort: labels of equal probability stay in the order of the vocabulary.
     order = (-probabilities).argsort(kind="stable")[:top_k]
     return [
-        wire.Belief(names[index], probability)
+        wire.Belief(names[index], round(probability, DECIMALS))
         for index, probability in zip(order.tolist(), probabilities[order].tolist())
     ]
+
+
+def rest_of(probabilities: Float64, listed: Sequence[wire.Belief]) -> float:
+    """The probability of all labels that are not listed."""
+    rest = float(probabilities.sum()) - sum(belief.probability for belief in listed)
+    return round(max(rest, 0.0), DECIMALS)

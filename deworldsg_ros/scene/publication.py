@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
@@ -60,6 +61,10 @@ class Publication:
         self._stamp_ns = stamp_ns
         self._associations.append(wire.Association(wire.stamp_from_ns(stamp_ns), list(node_ids)))
 
+    def set_up(self, up_world: Float64) -> None:
+        """Set the direction against gravity (3,)."""
+        self._nodes.set_up(up_world)
+
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """The changes since the last call; None if there are none.
 
@@ -85,6 +90,7 @@ class Publication:
             nodes=self._shown(nodes, self._include_surface_points),
             edges=edges,
             associations=list(self._associations),
+            up=list(self._nodes.up),
         )
         self._associations.clear()
         return message
@@ -118,6 +124,7 @@ class Publication:
             sequence=self._sequence,
             nodes=self._shown([nodes[node_id] for node_id in sorted(nodes)], with_points),
             edges=[edges[pair] for pair in sorted(edges)],
+            up=list(self._nodes.up),
         )
 
     def _shown(self, nodes: list[wire.NodeState], with_points: bool) -> list[wire.NodeState]:

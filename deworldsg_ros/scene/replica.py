@@ -51,6 +51,7 @@ class GraphReplica:
         self._stamp = snapshot.stamp
         self._frame_id = snapshot.frame_id
         self._session = snapshot.session
+        self._up = snapshot.up
         self._sequence = snapshot.sequence
         self._nodes = {node.id: node for node in snapshot.nodes}
         self._edges = {(edge.subject, edge.object): edge for edge in snapshot.edges}
@@ -87,6 +88,7 @@ class GraphReplica:
         self._edges.update(((edge.subject, edge.object), edge) for edge in update.edges)
         self._stamp = update.stamp
         self._frame_id = update.frame_id
+        self._up = update.up
         self._sequence = update.sequence
         return True
 
@@ -100,4 +102,5 @@ class GraphReplica:
             sequence=self._sequence,
             nodes=[self._nodes[node_id] for node_id in sorted(self._nodes)],
             edges=[self._edges[pair] for pair in sorted(self._edges)],
+            up=self._up,
         )

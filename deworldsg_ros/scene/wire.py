@@ -31,8 +31,10 @@ from deworldsg_ros.scene.limits import (
 )
 from deworldsg_ros.scene.names import checked_frame_id
 
-# A reader of version N reads N - 1 too.
+# A reader of version N reads N - 1 too. Version 2 of the graph added up, boxes, remainders, compact
+# surfaces and mutual edges.
 VERSION = 1
+VERSIONS = {"scene_graph": 2, "scene_graph_updates": 2}
 
 NonNegative = Annotated[int, msgspec.Meta(ge=0, le=MAX_INT)]
 Positive = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
@@ -252,7 +254,9 @@ class NodeState(msgspec.Struct, frozen=True):
         Union[Probability, msgspec.UnsetType],
         msgspec.Meta(description="probability that this is an object; absent = not estimated"),
     ] = msgspec.UNSET
-    surface_points_m: list[Vector3] = []
+    surface_points_m: Annotated[
+        Union[list[Vector3], msgspec.UnsetType], msgspec.Meta(description="of version 1")
+    ] = msgspec.UNSET
     entropy_nats: Annotated[
         Union[float, None],
         msgspec.Meta(
@@ -321,6 +325,14 @@ class EdgeState(msgspec.Struct, frozen=True):
     remainder: Annotated[
         Union[Probability, msgspec.UnsetType],
         msgspec.Meta(description="probability of all predicates that are not listed"),
+    ] = msgspec.UNSET
+    mutual: Annotated[
+        Union[bool, msgspec.UnsetType],
+        msgspec.Meta(description="true = the same holds from object to subject; sent once a pair"),
+    ] = msgspec.UNSET
+    shown: Annotated[
+        Union[NonNegative, msgspec.UnsetType],
+        msgspec.Meta(description="frames that showed both objects, when this was computed"),
     ] = msgspec.UNSET
 
 
@@ -401,7 +413,8 @@ M = TypeVar("M", bound=Message)
 
 def schema_of(kind: type[Message]) -> Schema:
     """The schema header of messages of this type."""
-    return Schema(next(name for name, known in MESSAGES.items() if known is kind))
+    name = next(name for name, known in MESSAGES.items() if known is kind)
+    return Schema(name, VERSIONS.get(name, VERSION))
 
 
 def encode(message: Message) -> str:

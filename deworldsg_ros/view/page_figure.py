@@ -12,6 +12,7 @@ import plotly.graph_objects as go
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.view.colours import class_colours, predicate_colours
 from deworldsg_ros.view.geometry import SIGMAS, covariances_of, drawable_edges, means_of
 from deworldsg_ros.view.solids import arrow_head, ellipsoid, joined
@@ -99,7 +100,8 @@ def _class_traces(graph: wire.SceneGraphMessage, axes_of_view: Float64) -> list[
     covariances = axes_of_view @ covariances_of(graph) @ axes_of_view.T
     colours = class_colours(node.label for node in graph.nodes)
     subdivisions = 2 if len(graph.nodes) <= FINE_UP_TO else 1
-    total_points = sum(len(node.surface_points_m) for node in graph.nodes)
+    surfaces = {node.id: surface_points(node) for node in graph.nodes}
+    total_points = sum(map(len, surfaces.values()))
     stride = max(1, -(-total_points // POINTS_SHOWN))
     traces: list[Any] = []
     for label, colour in sorted(colours.items()):
@@ -108,9 +110,7 @@ def _class_traces(graph: wire.SceneGraphMessage, axes_of_view: Float64) -> list[
         group = {"name": label, "hoverinfo": "skip"}
         solids = [ellipsoid(means[row], covariances[row], subdivisions) for row in rows]
         traces.append(_ellipsoid_trace(nodes, solids, label, colour))
-        points = [
-            np.array(node.surface_points_m[::stride], np.float64).reshape(-1, 3) for node in nodes
-        ]
+        points = [surfaces[node.id][::stride] for node in nodes]
         marker = {"size": 1.3, "color": colour, "opacity": 0.5}
         traces.append(
             _scatter(

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.view.colours import class_colours, predicate_colours
 from deworldsg_ros.view.geometry import (
     SIGMAS,
@@ -122,10 +123,7 @@ def _project(
         means @ plane.T,
         plane @ covariances_of(graph) @ plane.T,
         means @ axes_of_view[2],
-        tuple(
-            np.array(node.surface_points_m, np.float64).reshape(-1, 3) @ plane.T
-            for node in graph.nodes
-        ),
+        tuple(surface_points(node) @ plane.T for node in graph.nodes),
         path.reshape(-1, 3) @ plane.T,
     )
 

@@ -14,6 +14,7 @@ from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import load_config
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.extent import surface_points
 
 pytestmark = pytest.mark.slow
 
@@ -30,7 +31,7 @@ def test_a_run_writes_every_file_that_it_names(tmp_path):
     out = tmp_path / "out"
     graph = wire.decode((out / "scene_graph.json").read_bytes(), wire.SceneGraphMessage)
     assert graph.nodes
-    assert all(node.surface_points_m for node in graph.nodes)
+    assert all(len(surface_points(node)) for node in graph.nodes)
     assert all(len(node.classes) <= 3 for node in graph.nodes)
     assert (out / "scene_graph.png").read_bytes().startswith(b"\x89PNG")
     page = (out / "scene_graph.html").read_text(encoding="utf-8")

@@ -27,6 +27,7 @@ from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
 VOCABULARY = Vocabulary(("book", "chair", "table", "lamp"), ("near", "on"))
@@ -349,7 +350,7 @@ def test_a_still_camera_sees_each_object_once(name: str) -> None:
     assert sum(pipeline.drops.values()) == 4
     prediction = to_prediction(graph, VOCABULARY, sampled=False)
     assert [len(points) for points in prediction.points_world] == [
-        len(item.surface_points_m) for item in graph.nodes
+        len(surface_points(item)) for item in graph.nodes
     ]
     assert {stage: times.count for stage, times in pipeline.times_s.items()} == {
         "perception": 4,

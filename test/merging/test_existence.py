@@ -85,7 +85,7 @@ def test_one_frame_of_many_is_not_enough() -> None:
     walk.see(detected=False)
     walk.see(detected=True)
     assert walk.published == [] and 0.0 < walk.existence < 0.5
-    assert walk.merging.hidden(walk.graph) == {"seen too little": 1}
+    assert walk.merging.hidden(walk.graph) == {1: "seen too little"}
     for _ in range(5):
         walk.see(detected=True)
     assert walk.published == [1] and walk.merging.hidden(walk.graph) == {}
@@ -133,7 +133,7 @@ def test_a_node_missed_from_most_positions_is_hidden_until_it_is_detected_again(
     for _ in range(600):
         walk.see(detected=False)
     assert walk.published == [] and walk.graph.nodes.ids.tolist() == [1]
-    assert walk.merging.hidden(walk.graph) == {"missed by the detector": 1}
+    assert walk.merging.hidden(walk.graph) == {1: "missed by the detector"}
     for _ in range(100):
         walk.see(detected=True, score=0.4)
     assert walk.published == [1]

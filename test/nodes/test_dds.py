@@ -21,6 +21,7 @@ from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.replica import GraphReplica
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -173,7 +174,7 @@ def test_the_graph_is_saved_on_request(run: Run) -> None:
     path = Path(future.result().message.split(":")[0])
     saved = wire.decode(path.read_bytes(), wire.SceneGraphMessage)
     assert [node.id for node in saved.nodes] == [node.id for node in run.latest().nodes]
-    assert all(node.surface_points_m for node in saved.nodes)
+    assert all(len(surface_points(node)) for node in saved.nodes)
 
 
 def test_an_interrupt_ends_each_node_with_0(run: Run) -> None:

@@ -112,7 +112,14 @@ def test_the_probabilities_of_a_pair_sum_to_at_most_1(
             assert value == pytest.approx(exact, abs=0.5001 * 10**-DECIMALS)
     for pair, probabilities in found.items():
         is_said = probabilities.max().round(DECIMALS) >= MIN_PROBABILITY
-        assert is_said == (pair in edges_of(builder))
+        known = edges_of(builder)
+        mirrored = known.get(pair[::-1])
+        is_mirrored = mirrored is not None and mirrored.mutual is True
+        assert is_said == (pair in known or is_mirrored)
+        assert not (pair in known and is_mirrored)  # once a pair
+        if is_mirrored:
+            assert mirrored.predicate == "near"
+            assert probabilities.max() == pytest.approx(mirrored.probability, abs=0.011)
 
 
 @pytest.mark.parametrize("world_model", ["physics", "none"])
@@ -211,14 +218,14 @@ def test_messages_have_the_entropy_and_frames_of_the_visual_evidence() -> None:
     builder, ids = room(DESK, config())
     pair = (ids["cup"], ids["table"])
     edge = edges_of(builder)[pair]
-    assert edge.observations == 0 and edge.entropy_nats == pytest.approx(np.log(WIDTH))
+    assert edge.observations == 0 and edge.entropy_nats == pytest.approx(np.log(WIDTH), abs=1e-4)
     logits = np.zeros(WIDTH)
     logits[0] = 2.0
     builder.graph.add_visual(*pair, logits, 3)
     edge = edges_of(builder)[pair]
     assert edge.observations == 1
     expected = entropy_nats(np.exp(logits) / np.exp(logits).sum())
-    assert edge.entropy_nats == pytest.approx(float(expected))
+    assert edge.entropy_nats == pytest.approx(float(expected), abs=1e-4)
 
 
 def test_votes_of_another_relation_head_count_more() -> None:
@@ -298,7 +305,7 @@ def test_the_paper_states_both_directions_of_a_pair(seen: tuple[str, ...]) -> No
     for subject, pair in pairs.items():
         assert edges[pair].provenance == ("fused" if subject in seen else "prior")
         assert edges[pair].predicate == "on"
-        assert edges[pair].probability == pytest.approx(expected.max())
+        assert edges[pair].probability == pytest.approx(expected.max(), abs=1e-4)
 
 
 # --- the prior of Eq. 10 -------------------------------------------------------------------------

@@ -33,9 +33,9 @@ def boxed(node_id: int) -> wire.NodeState:
 
 @pytest.mark.parametrize("installed", [False, True])
 def test_every_object_with_a_box_is_a_detection(installed: bool) -> None:
-    if installed and detections.vision_msgs is None:
+    if installed and detections.VISION_MSGS is None:
         pytest.skip("vision_msgs is not installed")
-    messages = detections.vision_msgs if installed else IMITATED
+    messages = detections.VISION_MSGS if installed else IMITATED
     graph = make_graph([boxed(7), make_node(8, "shadow")])
     array = detections.detection_array(graph, Time(sec=3), messages)
     assert array.header.frame_id == "map"

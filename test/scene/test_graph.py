@@ -18,6 +18,7 @@ from support.merging import (
 
 from deworldsg_ros.scene import graph_io, wire
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -241,8 +242,8 @@ def test_the_message_of_a_node() -> None:
     assert state.covariance_m2 == [1, 0, 0, 0, 2, 0, 0, 0, 3]
     assert state.observations == 1
     assert state.first_seen == state.last_seen == wire.Stamp(1, 500_000_000)
-    assert len(state.surface_points_m) == 2
-    assert graph.node_states(3)[1].surface_points_m == []
+    assert len(surface_points(state)) == 2
+    assert len(surface_points(graph.node_states(3)[1])) == 0
 
 
 def test_class_distributions_are_scaled_to_one() -> None:
@@ -344,4 +345,4 @@ def test_the_entropy_of_a_node_measures_disagreement(classes, entropy_nats) -> N
     graph.add_node(np.zeros(3), np.eye(3), np.array(classes), 1)
     (state,) = graph.node_states(1).values()
     assert len(state.classes) == 1  # the entropy is of all classes
-    assert state.entropy_nats == pytest.approx(entropy_nats)
+    assert state.entropy_nats == pytest.approx(entropy_nats, abs=1e-4)

@@ -30,6 +30,7 @@ from deworldsg_ros.evaluation.measures.reference import ReferenceScene, read_ref
 from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 __all__ = ["Measures", "ReferenceScene", "measure", "measure_prediction", "pool", "read_reference"]
@@ -138,12 +139,12 @@ def measure(graph: wire.SceneGraphMessage, reference: ReferenceScene) -> Measure
             node.label,
             node.classes[0].probability,
             np.array(node.mean_m),
-            np.array(node.surface_points_m, np.float64).reshape(-1, 3),
+            points,
             # Between nodes with equal numbers of observations, the points decide.
-            node.observations + 1e-6 * len(node.surface_points_m),
+            node.observations + 1e-6 * len(points),
             node.observations,
         )
-        for node in graph.nodes
+        for node, points in zip(graph.nodes, map(surface_points, graph.nodes))
     ]
     edges = [
         EdgeView(edge.subject, edge.object, edge.predicate, edge.probability, edge.observations)

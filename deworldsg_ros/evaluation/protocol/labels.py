@@ -7,6 +7,8 @@ translation stays, and its probability counts for no class.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import msgspec
 
 from deworldsg_ros.recordings.folders.annotations import Annotations
@@ -41,7 +43,11 @@ def translation(annotations: Annotations) -> dict[str, str]:
 
 
 def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.SceneGraphMessage:
-    """The graph with classes of the data set; probabilities of labels of one class are added."""
+    """The graph with classes of the data set; probabilities of labels of one class are added.
+
+    Mutual edges are in both directions, as in the ground truth.
+    """
+    graph = msgspec.structs.replace(graph, edges=_both_directions(graph.edges))
     names = translation(annotations)
     if not any(belief.label in names for node in graph.nodes for belief in node.classes):
         return graph
@@ -59,3 +65,12 @@ def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.S
         label = beliefs[0].label if beliefs else node.label
         nodes.append(msgspec.structs.replace(node, classes=beliefs, label=label))
     return msgspec.structs.replace(graph, nodes=nodes)
+
+
+def _both_directions(edges: Sequence[wire.EdgeState]) -> list[wire.EdgeState]:
+    swapped = [
+        msgspec.structs.replace(edge, subject=edge.object, object=edge.subject)
+        for edge in edges
+        if edge.mutual is True
+    ]
+    return sorted([*edges, *swapped], key=lambda edge: (edge.subject, edge.object))

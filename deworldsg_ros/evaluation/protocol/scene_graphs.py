@@ -10,6 +10,7 @@ from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 # About the number of surface points that one observation adds to a node.
@@ -39,7 +40,7 @@ def to_prediction(
     classes = {name: index for index, name in enumerate(vocabulary.classes)}
     predicates = {name: index for index, name in enumerate(vocabulary.predicates)}
     index_of = {node.id: index for index, node in enumerate(graph.nodes)}
-    points = tuple(_segment(node) if sampled else _points(node) for node in graph.nodes)
+    points = tuple(_segment(node) if sampled else surface_points(node) for node in graph.nodes)
     labels = {belief.label for node in graph.nodes for belief in node.classes}
     if labels and not labels & set(classes):
         raise _foreign("class", labels)
@@ -58,13 +59,9 @@ def to_prediction(
     )
 
 
-def _points(node: wire.NodeState) -> Float64:
-    return np.array(node.surface_points_m, np.float64).reshape(-1, 3)
-
-
 def _segment(node: wire.NodeState) -> Float64:
     """Points (n, 3) of a node. The stored sample is in random order, so its start is random too."""
-    return np.tile(_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
+    return np.tile(surface_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
 
 
 def _expand(beliefs: Sequence[wire.Belief], indices: dict[str, int]) -> Float64:
