@@ -8,11 +8,14 @@ declare their ROS parameters `section.field` from this module. A ROS parameter f
 `deworldsg run --config`.
 """
 
+import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
 import msgspec
 
+from deworldsg_ros.files import read_regular
+from deworldsg_ros.parsing import MAX_YAML_BYTES, parse_yaml
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
@@ -294,10 +297,10 @@ def load_config(path: Union[str, Path]) -> Config:
         ConfigurationError: names the file, the field, the value seen and the value expected.
     """
     try:
-        content = msgspec.yaml.decode(Path(path).read_bytes())
+        content = parse_yaml(read_regular(Path(path), MAX_YAML_BYTES))
     except OSError as error:
         raise ConfigurationError(f"configuration {path}: {error.strerror}") from error
-    except msgspec.MsgspecError as error:
+    except ValueError as error:
         raise ConfigurationError(f"configuration {path}: {error}") from error
     for key in ("/**", "ros__parameters"):
         if isinstance(content, dict) and key in content:
@@ -311,9 +314,16 @@ def load_config(path: Union[str, Path]) -> Config:
 def from_mapping(content: Any, source: str = "configuration") -> Config:
     """Check nested plain values and convert them to a Config; raises ConfigurationError."""
     try:
-        return msgspec.convert(content, Config)
+        config = msgspec.convert(content, Config)
     except msgspec.ValidationError as error:
         raise ConfigurationError(f"{source}: {error}") from error
+    for section, fields in to_mapping(config).items():
+        for name, value in fields.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ConfigurationError(
+                    f"{source}: {section}.{name} is {value}: expected a finite number"
+                )
+    return config
 
 
 def to_mapping(config: Config) -> dict[str, Any]:

@@ -48,7 +48,7 @@ def parse_yaml(content: bytes) -> Any:
     if len(content) > MAX_YAML_BYTES:
         raise ValueError(f"YAML has {len(content)} bytes: expected at most {MAX_YAML_BYTES}")
     try:
-        _check_depth(content)
+        check_yaml(content)
         value = msgspec.yaml.decode(content)
         msgspec.json.encode(value)
     except Exception as error:  # PyYAML passes errors of the types that it builds on
@@ -56,7 +56,8 @@ def parse_yaml(content: bytes) -> Any:
     return value
 
 
-def _check_depth(content: bytes) -> None:
+def check_yaml(content: bytes) -> None:
+    """Raise ValueError for YAML with aliases or more than 32 levels; yaml.YAMLError for others."""
     depth = 0
     for event in yaml.parse(content, Loader=yaml.CSafeLoader):
         if isinstance(event, yaml.AliasEvent):

@@ -6,11 +6,14 @@ from typing import Annotated, Literal, Union
 import msgspec
 
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.files import read_regular, write_atomically
+from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
 
 CARD_FILE = "deworldsg.json"
+# Twenty thousand class names have 400 kB; a training record is smaller.
+MAX_CARD_BYTES = 16_000_000
 # Mean and standard deviation of ImageNet, RGB, of values in [0, 1].
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
@@ -48,8 +51,8 @@ def read_card(path: Union[Path, None]) -> CheckpointCard:
     if path is None:
         return CheckpointCard()
     try:
-        return msgspec.json.decode(path.read_bytes(), type=CheckpointCard)
-    except (OSError, msgspec.MsgspecError) as error:
+        return parse_json(read_regular(path, MAX_CARD_BYTES), CheckpointCard)
+    except (OSError, ValueError) as error:
         raise ConfigurationError(f"checkpoint card {path}: {error}") from error
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
+import msgspec
+
+from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.errors import ConfigurationError
 
 # A longer header is not one: that of a network of 40 thousand parameters has 6 MB.
@@ -20,6 +23,13 @@ class ParameterHeader:
     name: str
     dtype: str
     shape: tuple[int, ...]
+
+
+class _Entry(msgspec.Struct):
+    """A parameter in the header of a file of safetensors."""
+
+    dtype: str
+    shape: tuple[Annotated[int, msgspec.Meta(ge=0)], ...]
 
 
 def read_headers(path: Path) -> list[ParameterHeader]:
@@ -38,17 +48,18 @@ def read_headers(path: Path) -> list[ParameterHeader]:
 
 
 def _safetensors(path: Path) -> list[ParameterHeader]:
-    with path.open("rb") as opened:
-        length = int.from_bytes(opened.read(8), "little")
-        text = opened.read(length) if length < MAX_HEADER_BYTES else b""
     try:
-        entries = json.loads(text)
+        with path.open("rb") as opened:
+            length = int.from_bytes(opened.read(8), "little")
+            text = opened.read(length) if length < MAX_HEADER_BYTES else b""
+        entries = parse_json(text, dict[str, Any])
+        entries.pop("__metadata__", None)
+        found = msgspec.convert(entries, dict[str, _Entry])
         return [
-            ParameterHeader(name, DTYPES.get(entry["dtype"], entry["dtype"]), tuple(entry["shape"]))
-            for name, entry in sorted(entries.items())
-            if name != "__metadata__"
+            ParameterHeader(name, DTYPES.get(entry.dtype, entry.dtype), entry.shape)
+            for name, entry in sorted(found.items())
         ]
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, msgspec.ValidationError) as error:
         raise ConfigurationError(
             f"{path} is no complete safetensors file ({error}): get it again"
         ) from error

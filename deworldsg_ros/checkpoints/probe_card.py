@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.checkpoints.card import MAX_CARD_BYTES
+from deworldsg_ros.files import read_regular, write_atomically
+from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -142,8 +144,8 @@ def read_card(folder: Path) -> ProbeCard:
             "or `deworldsg import-probe`"
         )
     try:
-        card = msgspec.json.decode(path.read_bytes(), type=ProbeCard)
-    except (OSError, msgspec.MsgspecError) as error:
+        card = parse_json(read_regular(path, MAX_CARD_BYTES), ProbeCard)
+    except (OSError, ValueError) as error:
         raise ConfigurationError(f"probe {path}: {error}") from error
     if not card.predicates or len(set(card.predicates)) != len(card.predicates):
         raise ConfigurationError(f"probe {path}: expected predicates, each name once")

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from deworldsg_ros.config import Config, from_mapping, load_config, to_mapping
+from deworldsg_ros.parsing import parse_yaml
 from deworldsg_ros.scene.errors import ConfigurationError
 
 HEADER = """\
@@ -60,11 +61,11 @@ def _value(text: str, current: Any) -> Any:
     if isinstance(current, str):
         return text
     try:
-        value = msgspec.yaml.decode(text.encode())
-    except msgspec.MsgspecError:
+        value = parse_yaml(text.encode())
+        is_whole = isinstance(current, float) and isinstance(value, int)
+        return float(value) if is_whole and not isinstance(value, bool) else value
+    except (ValueError, OverflowError):
         return text
-    is_whole = isinstance(current, float) and isinstance(value, int)
-    return float(value) if is_whole and not isinstance(value, bool) else value
 
 
 def described_yaml(config: Config) -> str:

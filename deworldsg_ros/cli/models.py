@@ -7,13 +7,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Optional
 
-import msgspec
 import typer
 from rich.console import Console
 
+from deworldsg_ros.checkpoints.card import MAX_CARD_BYTES
 from deworldsg_ros.checkpoints.catalogue import MODELS_FOLDER
 from deworldsg_ros.cli.exit_codes import EXIT_USAGE
 from deworldsg_ros.cli.model_folder import get_models, inspect_file, list_models
+from deworldsg_ros.files import read_regular
+from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 if TYPE_CHECKING:
@@ -137,8 +139,8 @@ def _import(
     names = None
     if names_file is not None:
         try:
-            names = msgspec.json.decode(names_file.read_bytes(), type=Names)
-        except (OSError, msgspec.MsgspecError) as error:
+            names = parse_json(read_regular(names_file, MAX_CARD_BYTES), Names)
+        except (OSError, ValueError) as error:
             raise ConfigurationError(f"names {names_file}: {error}") from error
     return import_checkpoint(checkpoint, out, names=names, frequency_bias=frequency_bias)
 

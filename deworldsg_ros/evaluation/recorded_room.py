@@ -7,10 +7,8 @@ Classes are those of COCO. Only objects that can be detected, and relations betw
 from __future__ import annotations
 
 import functools
-import io
-import json
 import lzma
-import zipfile
+import math
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +21,9 @@ from deworldsg_ros.recordings.folders.annotations import (
     ScanAnnotation,
     ScanPoints,
 )
-from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.folders.dataset import read_json
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.scene.array_file import read_arrays
 from deworldsg_ros.scene.arrays import UInt8, UInt16
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
@@ -44,6 +43,9 @@ SPELLINGS = {
 CELL_M = 0.02
 PIXEL_STRIDE = 4
 MIN_PIXELS = 3
+# Ten hours at 30 Hz, and an hour of small images at 10 Hz.
+MAX_FRAMES = 1_000_000
+MAX_INSTANCE_BYTES = 4 << 30
 # Surface this far outside the box of its object is noise.
 BOX_MARGIN_M = 0.05
 
@@ -70,7 +72,7 @@ class RecordedRoom(Annotations):
         self._truth_path = _beside(root, ".gt.json")
         self._instances_path = _beside(root, ".instances.npz")
         try:
-            content = json.loads(read_file(self._truth_path))
+            content = read_json(self._truth_path)
             self.boxes = {int(item["id"]): item["aabb"] for item in content["objects"]}
             self._detectable: list[dict[str, Any]] = [
                 {**item, "vg": SPELLINGS.get(item["class"], item["class"])}
@@ -85,13 +87,15 @@ class RecordedRoom(Annotations):
             self._named = [line for line in lines if {*line[:2]} <= known.keys()]
             relations = [(s, o, REPLICA_SSG_PREDICATES.index(name)) for s, o, name in self._named]
             first_ns, rate_hz = int(content["first_stamp_ns"]), float(content["rate_hz"])
-            if not rate_hz > 0:
-                raise ValueError(f"rate_hz is {rate_hz}: expected more than 0")
+            count = int(content["frames"])
+            if not (1e-3 <= rate_hz <= 1e6 and 0 <= count <= MAX_FRAMES):
+                raise ValueError(
+                    f"{count} frames at {rate_hz} Hz: expected at most {MAX_FRAMES}, at 1e-3 to 1e6"
+                )
             self.frame_numbers = {
-                first_ns + round(number * 1e9 / rate_hz): number
-                for number in range(int(content["frames"]))
+                first_ns + round(number * 1e9 / rate_hz): number for number in range(count)
             }
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise RecordingError(f"{self._truth_path}: {type(error).__name__}: {error}") from error
         related = frozenset(end for line in relations for end in line[:2])
         self._annotation = ScanAnnotation(root.resolve().stem, known, relations, related)
@@ -150,10 +154,14 @@ def _beside(recording: Path, suffix: str) -> Path:
 def _read_instances(path: Path) -> UInt8:
     """Instance images (frames, H, W) uint8; raises RecordingError."""
     try:
-        with np.load(io.BytesIO(read_file(path))) as packed:
-            pixels = np.frombuffer(lzma.decompress(packed["lzma"].tobytes()), np.uint8)
-            return pixels.reshape(packed["shape"])
-    except (KeyError, ValueError, lzma.LZMAError, zipfile.BadZipFile) as error:
+        packed = read_arrays(path)
+        shape = tuple(packed["shape"].tolist())
+        size = math.prod(shape)
+        if len(shape) != 3 or min(shape) < 0 or size > MAX_INSTANCE_BYTES:
+            raise ValueError(f"images of shape {shape}")
+        content = lzma.LZMADecompressor().decompress(packed["lzma"].tobytes(), max_length=size)
+        return np.frombuffer(content, np.uint8).reshape(shape)
+    except (OSError, KeyError, ValueError, lzma.LZMAError) as error:
         raise RecordingError(
             f"{path}: {type(error).__name__}: {error}; expected lzma and shape"
         ) from error

@@ -10,12 +10,11 @@ import re
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.files import read_regular, write_atomically
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
     check_pose,
@@ -24,7 +23,10 @@ from deworldsg_ros.scene.camera import (
     quaternion_from_rotation,
 )
 from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
+from deworldsg_ros.scene.stamps import stamp_ns_from_text
 
+# 10^7 poses, which is a day at 100 Hz.
+MAX_FILE_BYTES = 1 << 30
 FORMATS = ("tum", "kitti", "3rscan", "slam")
 SUFFIXES = {"3rscan": ".pose.txt", "slam": ".slam.pose.txt"}
 FRAME_NAME = re.compile(r"frame-(\d+)(\.slam)?\.pose\.txt$")
@@ -135,7 +137,7 @@ Line = tuple[int, list[str]]
 def _lines(path: Path) -> list[Line]:
     """Line numbers and words of all lines except comments."""
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        text = read_regular(path, MAX_FILE_BYTES).decode(errors="replace")
     except OSError as error:
         raise TrajectoryError(f"trajectory {path}: cannot be read ({error.strerror})") from error
     lines = [
@@ -165,10 +167,10 @@ def _read_tum(path: Path, lines: list[Line]) -> Trajectory:
     poses = []
     for number, words in lines:
         try:
-            stamp_ns = int(Decimal(words[0]) * 10**9)
-        except (InvalidOperation, ValueError, OverflowError) as error:
+            stamp_ns = stamp_ns_from_text(words[0])
+        except ValueError as error:
             raise TrajectoryError(
-                f"{path}, line {number}: '{words[0]}' is no stamp: expected {expected}"
+                f"{path}, line {number}: '{words[0][:40]}' is no stamp: expected {expected}"
             ) from error
         _check_count(path, (number, words), 8, expected)
         if keys and stamp_ns <= keys[-1]:

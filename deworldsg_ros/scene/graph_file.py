@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from deworldsg_ros.files import write_atomically
+from deworldsg_ros.files import read_regular, write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 
 GRAPH_FILE = "scene_graph.json"
+# 10^5 nodes with 512 surface points have 3 GB as text.
+MAX_GRAPH_BYTES = 4 << 30
 
 
 def write_graph(folder: Path, graph: wire.SceneGraphMessage) -> Path:
@@ -26,7 +28,7 @@ def read_graph(path: Path) -> wire.SceneGraphMessage:
     """
     path = path / GRAPH_FILE if path.is_dir() else path
     try:
-        content = path.read_bytes()
+        content = read_regular(path, MAX_GRAPH_BYTES)
     except OSError as error:
         message = f"scene graph {path} cannot be read ({error.strerror})"
         raise RefusedInput("unreadable_graph", message) from error

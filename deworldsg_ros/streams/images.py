@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene.arrays import Float32, UInt8, UInt16
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.encoded import decode
 
 # encoding -> (dtype, channels)
 LAYOUTS: dict[str, tuple[str, int]] = {
@@ -152,18 +153,15 @@ def fill_image(message: Any, pixels: NDArray[Any], encoding: str) -> None:
 
 
 def _decode(data: Any, flags: int, description: str) -> NDArray[Any]:
-    buffer = np.frombuffer(data, np.uint8)
+    content = memoryview(data).cast("B")
     try:
-        pixels = cv2.imdecode(buffer, flags) if len(buffer) else None
-    except cv2.error:
-        pixels = None
-    if pixels is None:
+        return decode(content, flags)
+    except ValueError as error:
         raise RefusedInput(
             "decode_failed",
-            f"compressed image '{description}' of {len(buffer)} bytes cannot be decoded: "
+            f"compressed image '{description}' of {len(content)} bytes cannot be decoded: {error}; "
             "expected JPEG or PNG",
-        )
-    return pixels
+        ) from error
 
 
 def _decode_depth(message: Any) -> NDArray[Any]:

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from deworldsg_ros.files import confined
+from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.relations.clips import Rgb
 from deworldsg_ros.scene.arrays import Float32
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -96,7 +97,7 @@ def read_frames(path: Path) -> Rgb:
         try:
             with np.load(path, allow_pickle=False) as content:
                 frames = np.asarray(content["frames"])
-        except (OSError, KeyError, ValueError) as error:
+        except Exception as error:  # numpy and zipfile raise errors of many types
             raise RefusedInput(
                 "unreadable_clip", f"{path}: expected an array 'frames' ({error})"
             ) from error
@@ -137,8 +138,8 @@ def _read_index(index: Path) -> list[LabelledClip]:
         if not text.strip():
             continue
         try:
-            line = msgspec.json.decode(text, type=_Line)
-        except msgspec.MsgspecError as error:
+            line = parse_json(text, _Line)
+        except ValueError as error:
             raise ConfigurationError(f"{index}, line {number}: {error}") from error
         try:
             path = confined(index.parent, line.clip)

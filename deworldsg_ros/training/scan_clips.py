@@ -82,7 +82,7 @@ def read_boxes(path: Path) -> dict[int, Float64]:
     boxes: dict[int, Float64] = {}
     if not path.exists():
         return boxes
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         words = line.split()
         try:
             if words:

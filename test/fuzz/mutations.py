@@ -38,10 +38,17 @@ VALUES: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+MAX_PLACES = 10_000
+# Later mutations of a case see no more of it.
+MAX_CASE_BYTES = 4_000_000
+
+
 def mutate(name: str, content: bytes, rng: random.Random) -> bytes:
     """Damaged content of a file; its name says which kind of file it is."""
     kinds = BY_SUFFIX.get(Path(name).suffix.lower(), (words,))
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        if len(content) > MAX_CASE_BYTES:
+            break
         mutation = rng.choice((raw_bytes, *kinds, *kinds, *kinds))
         try:
             content = mutation(content, rng)
@@ -112,6 +119,8 @@ def yaml_tree(content: bytes, rng: random.Random) -> bytes:
         return (
             content + "\n".join(["", *rows, "b: &b [*b]"][: rng.choice((-1, levels + 2))]).encode()
         )
+    if b"&a0" in content:  # written out, the aliases would fill the memory
+        return raw_bytes(content, rng)
     return yaml.safe_dump(_tree(yaml.safe_load(content), rng), allow_unicode=True).encode(
         errors="surrogatepass"
     )
@@ -120,7 +129,8 @@ def yaml_tree(content: bytes, rng: random.Random) -> bytes:
 def _tree(tree: Any, rng: random.Random) -> Any:
     places: list[tuple[Any, Any]] = []
     pending = [tree]
-    while pending:
+    # Aliases of YAML may stand for any number of places.
+    while pending and len(places) < MAX_PLACES:
         node = pending.pop()
         keys = (
             node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()

@@ -6,7 +6,6 @@ state, is spread evenly over the other classes or predicates. Relation probabili
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from deworldsg_ros.evaluation.front_ends.assembly import (
     spread,
 )
 from deworldsg_ros.evaluation.front_ends.injection import Injection
+from deworldsg_ros.parsing import parse_any_json
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
 from deworldsg_ros.scene.arrays import UInt16
@@ -78,7 +78,7 @@ class RecordedFrontEnd:
         number = self._frame_numbers[frame.stamp_ns]
         path = self._sequence / f"frame-{number:06d}{self._suffix}"
         try:
-            seen = self._read(frame, json.loads(read_file(path)))
+            seen = self._read(frame, parse_any_json(read_file(path)))
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise EvaluationError(
                 f"{path} is not a recording of version {VERSION}: {type(error).__name__}: {error}"

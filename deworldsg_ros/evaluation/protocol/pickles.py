@@ -10,12 +10,18 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import pickletools
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.evaluation.errors import EvaluationError
 
+# An array takes about 20 operations, and an item of a list one.
+MAX_OPERATIONS = 10_000_000
+# Numbers in all arrays and lists, as often as they are reached: 10^5 points of a thousand segments.
+MAX_ITEMS = 300_000_000
 _KINDS = frozenset("?biuf")
 
 
@@ -228,7 +234,8 @@ def load_pickle(content: bytes, source: str) -> Any:
         EvaluationError: the pickle names anything but plain data, or is damaged.
     """
     try:
-        return _resolve(_Unpickler(io.BytesIO(content)).load(), {})
+        _check_operations(content)
+        return _Resolver().resolve(_Unpickler(io.BytesIO(content)).load())
     except EvaluationError as error:
         raise EvaluationError(f"{source}: {error}") from error
     # A damaged pickle raises nearly anything.
@@ -238,18 +245,62 @@ def load_pickle(content: bytes, source: str) -> Any:
         ) from error
 
 
-def _resolve(value: Any, seen: dict[int, Any]) -> Any:
-    """`value` with its placeholders replaced by arrays."""
-    if isinstance(value, _Array):
-        if id(value) not in seen:
-            seen[id(value)] = value.array()
-        return seen[id(value)]
-    if isinstance(value, list):
-        return [_resolve(item, seen) for item in value]
-    if isinstance(value, tuple):
-        return tuple(_resolve(item, seen) for item in value)
-    if isinstance(value, dict):
-        return {_resolve(key, seen): _resolve(item, seen) for key, item in value.items()}
-    if value is None or isinstance(value, str | bytes | bool | int | float):
-        return value
-    raise EvaluationError(f"pickle holds a {type(value).__name__}: refused")
+def _check_operations(content: bytes) -> None:
+    """Refuse programs whose cost is out of proportion to their length.
+
+    The unpickler makes a table as long as the largest memo index: 5 bytes may ask for gigabytes.
+    """
+    for count, (operation, argument, _) in enumerate(pickletools.genops(content)):
+        if count > MAX_OPERATIONS:
+            raise EvaluationError(f"pickle has more than {MAX_OPERATIONS} operations")
+        is_index = operation.name in ("PUT", "BINPUT", "LONG_BINPUT")
+        # Programs that pickle writes count from 0 and store at most one value an operation.
+        if is_index and isinstance(argument, int) and argument > count:
+            raise EvaluationError(f"pickle has the memo index {argument}")
+
+
+class _Resolver:
+    """Replaces placeholders by arrays. Shared containers stay shared.
+
+    A few lists that contain each other stand for any number of items, and every later step would
+    visit them all. So the items are counted as often as they are reached.
+    """
+
+    def __init__(self) -> None:
+        # By the id of a value: its result, and its number of items; None while it is made.
+        self._made: dict[int, tuple[Any, int] | None] = {}
+
+    def resolve(self, value: Any) -> Any:
+        """The value with arrays; raises EvaluationError for anything but plain data."""
+        return self._resolve(value)[0]
+
+    def _resolve(self, value: Any) -> tuple[Any, int]:
+        if value is None or isinstance(value, str | bytes | bool | int | float):
+            return value, 1
+        if id(value) not in self._made:
+            self._made[id(value)] = None
+            self._made[id(value)] = self._make(value)
+        made = self._made[id(value)]
+        if made is None:
+            raise EvaluationError("pickle has a container that contains itself")
+        return made
+
+    def _make(self, value: Any) -> tuple[Any, int]:
+        if isinstance(value, _Array):
+            array = value.array()
+            return array, 1 + array.size
+        if isinstance(value, dict):
+            keys, key_size = self._each(value)
+            items, item_size = self._each(value.values())
+            return dict(zip(keys, items)), key_size + item_size
+        if isinstance(value, list | tuple):
+            items, size = self._each(value)
+            return type(value)(items), size
+        raise EvaluationError(f"pickle holds a {type(value).__name__}: refused")
+
+    def _each(self, values: Iterable[Any]) -> tuple[list[Any], int]:
+        made = [self._resolve(item) for item in values]
+        size = 1 + sum(size for _, size in made)
+        if size > MAX_ITEMS:
+            raise EvaluationError(f"pickle stands for more than {MAX_ITEMS} items")
+        return [item for item, _ in made], size

@@ -5,19 +5,25 @@ The open format (JSON) and the official pickle are described in docs/evaluation/
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.protocol.pickles import load_pickle
+from deworldsg_ros.files import read_regular
+from deworldsg_ros.parsing import parse_any_json, parse_json
 from deworldsg_ros.scene.arrays import Float64, Int64
+
+MAX_FILE_BYTES = 2 << 30
+# Large detectors know 1200 classes.
+MAX_NAMES = 10_000
+# Of one scan: 400 MB. A scan with a thousand nodes and a million edges has 26 million.
+MAX_SCORES = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,7 @@ def read_predictions(path: Path) -> dict[str, ScanPrediction]:
         EvaluationError: the file cannot be read or has another format.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path, MAX_FILE_BYTES)
     except OSError as error:
         raise EvaluationError(f"predictions {path} cannot be read ({error.strerror})") from error
     if path.suffix.lower() in (".pkl", ".pickle"):
@@ -71,12 +77,12 @@ def read_predictions(path: Path) -> dict[str, ScanPrediction]:
 
 def _parse_json(content: bytes, path: Path) -> Any:
     try:
-        return msgspec.json.decode(content)
-    except msgspec.DecodeError:
+        return parse_json(content, object)
+    except ValueError:
         pass
     try:
         # Slower, but it reads NaN and Infinity, which Python's json module writes.
-        return json.loads(content)
+        return parse_any_json(content)
     except ValueError as error:
         raise EvaluationError(f"predictions {path} are not JSON: {error}") from error
 
@@ -85,15 +91,20 @@ def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
     try:
         class_count, predicate_count = int(content["num_classes"]), int(content["num_predicates"])
         scans = dict(content["scans"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise EvaluationError(
             f"predictions {path}: expected num_classes, num_predicates and scans at the top"
         ) from error
+    if not (0 <= class_count <= MAX_NAMES and 0 <= predicate_count <= MAX_NAMES):
+        raise EvaluationError(
+            f"predictions {path}: {class_count} classes and {predicate_count} predicates: expected "
+            f"0 to {MAX_NAMES}"
+        )
     predictions = {}
     for scan, graph in scans.items():
         try:
             predictions[scan] = _open_scan(graph, class_count, predicate_count)
-        except (KeyError, IndexError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise EvaluationError(
                 f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; expected nodes "
                 "with class_index or class_probabilities and points, and edges with subject, "
@@ -107,6 +118,9 @@ def _from_open(content: Any, path: Path) -> dict[str, ScanPrediction]:
 def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPrediction:
     nodes, edges = list(graph["nodes"]), list(graph.get("edges", []))
     notes: list[str] = []
+    size = len(nodes) * class_count + len(edges) * predicate_count
+    if size > MAX_SCORES:
+        raise EvaluationError(f"it has {size} scores: expected at most {MAX_SCORES}")
     class_scores = np.zeros((len(nodes), class_count))
     indices: dict[int, int] = {}
     for row, node in enumerate(nodes):
@@ -137,7 +151,9 @@ def _open_scan(graph: Any, class_count: int, predicate_count: int) -> ScanPredic
 def _one_hot(index: Any, count: int) -> Float64:
     if not isinstance(index, int) or not 0 <= index < count:
         raise EvaluationError(f"index {index!r}: expected a whole number from 0 to {count - 1}")
-    return np.eye(count)[index]
+    row = np.zeros(count)
+    row[index] = 1.0
+    return row
 
 
 def _vector(values: Any, count: int) -> Float64:
@@ -165,7 +181,7 @@ def _from_official(content: Any, path: Path) -> dict[str, ScanPrediction]:
     for scan, graph in content.items():
         try:
             predictions[str(scan)] = _official_scan(graph)
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
             raise EvaluationError(
                 f"predictions {path}, scan {scan}: {type(error).__name__}: {error}; expected pcd, "
                 "cls, edge_index and edge_cls"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+from deworldsg_ros.recordings.bags.chunks import decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
@@ -112,7 +112,7 @@ def _chunk_messages(content: bytes, tables: _Tables, is_cut: bool) -> list[Messa
     packed = content[offset + 8 : offset + 8 + packed_size]
     if is_cut and compression:
         return []
-    raw = DECOMPRESSORS[compression](packed, raw_size)
+    raw = decompress(compression, packed, raw_size)
     if not is_cut and (len(raw) != raw_size or (crc and zlib.crc32(raw) != crc)):
         raise ValueError("checksum or length of the chunk is wrong")
     messages: list[Message] = []

@@ -15,15 +15,22 @@ from typing import NamedTuple
 
 from rosbags.rosbag2 import Reader, ReaderError
 
-from deworldsg_ros.files import confined
+from deworldsg_ros.files import confined, read_regular
+from deworldsg_ros.parsing import check_yaml
+from deworldsg_ros.recordings.bags.chunks import bound_chunks
 from deworldsg_ros.recordings.bags.salvage_mcap import salvage_mcap
 from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
 from deworldsg_ros.recordings.errors import RecordingError
 
+METADATA = "metadata.yaml"
+# A topic takes about 1 kB, with its quality of service.
+MAX_METADATA_BYTES = 32_000_000
 SALVAGERS: dict[str, Callable[..., Iterator[tuple[str, str, int, bytes]]]] = {
     ".mcap": salvage_mcap,
     ".db3": salvage_sqlite,
 }
+
+bound_chunks()
 
 
 @dataclass(frozen=True, order=True)
@@ -62,10 +69,13 @@ class RawBag:
         self._reader: Reader | None = None
         _check_links(path)
         try:
+            _check_files(path)
             reader = Reader(path)
             reader.open()
         except FileNotFoundError:
             self._open_damaged(None if path.is_dir() else f"{path} does not exist")
+        except RecordingError:
+            raise
         except Exception as error:  # rosbags passes struct, yaml and index errors on
             self._open_damaged(_one_line(error))
         else:
@@ -150,6 +160,18 @@ class RawBag:
         if self._reader is not None:
             self._reader.close()
             self._reader = None
+
+
+def _check_files(path: Path) -> None:
+    """Refuse what rosbags would wait for, or could not end: pipes, devices, deep YAML."""
+    for file in [path] if path.is_file() else path.glob("*"):
+        if not (file.is_file() or file.is_dir()):
+            raise RecordingError(
+                f"recording {path}: {file.name} is a pipe or a device: expected a regular file"
+            )
+    if (path / METADATA).is_file():
+        content = read_regular(path / METADATA, MAX_METADATA_BYTES)
+        check_yaml(content)
 
 
 def storage_files(folder: Path) -> list[Path]:

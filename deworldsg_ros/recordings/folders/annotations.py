@@ -5,7 +5,6 @@ docs/evaluation/protocol.md lists the rules of the official evaluation program f
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.folders.dataset import read_json, read_text
 from deworldsg_ros.recordings.folders.ply import read_vertices
 from deworldsg_ros.recordings.folders.rooms import read_ground_truth
 from deworldsg_ros.scene.arrays import Float64, Int64
@@ -144,7 +143,7 @@ class Annotations:
         """Ids of the scans of a split, in file order, with repetitions."""
         if split not in SPLIT_FILES:
             raise RecordingError(f"split '{split}' is unknown: expected {', '.join(SPLIT_FILES)}")
-        text = self._read(f"{self.layout.lists}/{SPLIT_FILES[split]}").decode()
+        text = read_text(self._existing(f"{self.layout.lists}/{SPLIT_FILES[split]}"))
         return [line.strip() for line in text.splitlines() if line.strip()]
 
     def scan(self, scan: str) -> ScanAnnotation:
@@ -165,6 +164,8 @@ class Annotations:
             raise RecordingError(f"{path} is missing; {self.layout.how_to_get}")
         columns = read_vertices(path, ("x", "y", "z", "objectId"))
         points = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        if not np.isfinite(points).all():
+            raise RecordingError(f"{path}: a coordinate is no number: expected metres")
         return ScanPoints(points, columns["objectId"].astype(np.int64))
 
     def ply_path(self, scan: str, *, aligned: bool = False) -> Path:
@@ -246,19 +247,16 @@ class Annotations:
         return entries
 
     def _read_json(self, name: str) -> Any:
-        try:
-            return json.loads(self._read(name))
-        except ValueError as error:
-            raise RecordingError(f"{self.root / name}: {error}; expected JSON") from error
+        return read_json(self._existing(name))
 
-    def _read(self, name: str) -> bytes:
+    def _existing(self, name: str) -> Path:
         path = self.root / name
         if not path.exists():
             raise RecordingError(
                 f"data set {self.root} in the layout {self.layout.name}: {path} is missing; "
                 f"{self.layout.how_to_get}"
             )
-        return read_file(path)
+        return path
 
 
 def _indices(names: tuple[str, ...]) -> dict[str, int]:

@@ -11,17 +11,20 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.files import confined
+from deworldsg_ros.files import confined, read_regular
+from deworldsg_ros.parsing import parse_any_json
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import UInt8, UInt16
+from deworldsg_ros.streams.encoded import decode, encoded_size
 
 CAMERA_FRAME = "camera_rgb_optical_frame"
 WORLD_FRAME = "world"
+# Each file is read whole. The largest is the annotated surface of a scan, some hundred MB.
+MAX_FILE_BYTES = 2 << 30
 DEPTH_SOURCES = ("auto", "rendered", "sensor")
 
 
@@ -116,22 +119,43 @@ def read_file(path: Path, folder: Path | None = None) -> bytes:
         RecordingError: if it cannot be read, or lies elsewhere.
     """
     try:
-        return confined(folder or path.parent, path.absolute()).read_bytes()
+        return read_regular(confined(folder or path.parent, path.absolute()), MAX_FILE_BYTES)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
 
 
+def read_text(path: Path) -> str:
+    """Content of a text file; raises RecordingError if it cannot be read or is not UTF-8."""
+    try:
+        return read_file(path).decode()
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path} is no UTF-8 text: {error}") from error
+
+
+def read_json(path: Path) -> Any:
+    """Content of a JSON file; raises RecordingError."""
+    try:
+        return parse_any_json(read_file(path))
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}; expected JSON") from error
+
+
 def image_size(path: Path, folder: Path | None = None) -> tuple[int, int]:
     """Width and height of an image file; arguments and errors as `read_file`."""
-    return decode_image(read_file(path, folder), cv2.IMREAD_COLOR, path).shape[1::-1]
+    try:
+        return encoded_size(read_file(path, folder))
+    except ValueError as error:
+        raise RecordingError(f"{path} cannot be decoded: {error}") from error
 
 
 def decode_image(content: bytes, flags: int, path: Path) -> NDArray[Any]:
     """Pixels of an image file's content; raises RecordingError if it cannot be decoded."""
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    if pixels is None:
-        raise RecordingError(f"{path} cannot be decoded: expected a JPEG or PNG image")
-    return pixels
+    try:
+        return decode(content, flags)
+    except ValueError as error:
+        raise RecordingError(
+            f"{path} cannot be decoded: {error}; expected a JPEG or PNG image"
+        ) from error
 
 
 def encode_png(pixels: UInt8 | UInt16, *, stored: bool = False) -> bytes:

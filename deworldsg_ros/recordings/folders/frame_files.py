@@ -15,7 +15,7 @@ import numpy as np
 
 from deworldsg_ros.recordings import messages as ros
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, read_file
+from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, read_text
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
@@ -26,6 +26,7 @@ from deworldsg_ros.scene.camera import (
     quaternion_from_rotation,
 )
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.stamps import MAX_STAMP_S
 
 # Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9
@@ -56,6 +57,11 @@ class FrameFiles(Dataset):
             stamps_ns: stamp of each of them.
             camera_info_name: origin of the intrinsics, e.g. a file name.
         """
+        if stamps_ns and max(stamps_ns) >= MAX_STAMP_S * 10**9:
+            raise RecordingError(
+                f"{self.path}: the stamp of frame {max(colors)} is {max(stamps_ns) // 10**9} s: "
+                "expected less than 2^31 s"
+            )
         self._colors = colors
         self.frame_numbers = dict(zip(stamps_ns, colors))
         self.frame_count = len(colors)
@@ -140,7 +146,7 @@ def color_files(folder: Path) -> dict[int, Path]:
 def read_pose(path: Path) -> Float64:
     """The (4, 4) matrix of a pose file; raises RefusedInput ``invalid_pose``."""
     try:
-        T = np.array(read_file(path).decode().split(), np.float64).reshape(4, 4)
+        T = np.array(read_text(path).split(), np.float64).reshape(4, 4)
     except (RecordingError, ValueError) as error:
         raise RefusedInput("invalid_pose", f"{path}: {error}; expected a 4x4 matrix") from error
     check_pose(T)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.scene.arrays import Float64
 
 Columns = dict[str, NDArray[Any]]
 
@@ -138,7 +139,19 @@ def _ascii_vertices(body: bytes, order: str, elements: list[_Element], path: Pat
         raise RecordingError(
             f"{path}: a vertex does not have {len(properties)} numbers, as its header declares"
         ) from error
-    return {item.name: table[:, i].astype(item.dtype) for i, item in enumerate(properties)}
+    return {item.name: _typed(table[:, i], item, path) for i, item in enumerate(properties)}
+
+
+def _typed(values: Float64, item: _Property, path: Path) -> NDArray[Any]:
+    dtype = np.dtype(item.dtype)
+    if dtype.kind in "iu" and len(values):
+        limits = np.iinfo(dtype)
+        if not (values.min() >= limits.min and values.max() <= limits.max):
+            raise RecordingError(
+                f"{path}: {item.name} is {values.min():g} to {values.max():g}: expected {dtype}"
+            )
+    with np.errstate(over="ignore"):
+        return values.astype(dtype)
 
 
 def _binary_vertices(body: bytes, order: str, elements: list[_Element], path: Path) -> Columns:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.dataset import read_file
+from deworldsg_ros.recordings.folders.dataset import read_json
 from deworldsg_ros.recordings.folders.sequence import (
     SequenceDataset,
     has_frames,
@@ -45,10 +44,7 @@ def read_ground_truth(scan_folder: Path) -> dict[str, Any] | None:
     path = sequence_folder(scan_folder).parent / GROUND_TRUTH_NAME
     if not path.exists():
         return None
-    try:
-        content = json.loads(read_file(path))
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}; expected JSON") from error
+    content = read_json(path)
     if not isinstance(content, dict) or "objects" not in content:
         raise RecordingError(f"{path}: there is no key objects; expected one")
     return content

@@ -227,8 +227,9 @@ def read_info(path: Path) -> SensorInfo:
         raise RecordingError(f"{path} has no {error.args[0]}: expected one") from error
     except (ValueError, RefusedInput) as error:
         raise RecordingError(f"{path}: {error}") from error
-    if not units_per_m > 0:
-        raise RecordingError(f"{path}: m_depthShift is {units_per_m}: expected > 0")
+    # 16 bits: between one unit a kilometre and a thousand a millimetre.
+    if not 1e-3 <= units_per_m <= 1e6:
+        raise RecordingError(f"{path}: m_depthShift is {units_per_m}: expected > 0, 1e-3 to 1e6")
     return SensorInfo(color, depth, units_per_m)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import heapq
 import re
 from collections.abc import Callable, Iterator
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +31,7 @@ from deworldsg_ros.recordings.folders.dataset import (
 from deworldsg_ros.recordings.messages import Role, RoleMessage
 from deworldsg_ros.recordings.source import UsedTopic
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.stamps import stamp_ns_from_text
 
 # Factory-calibrated colour cameras, from the data set's documentation.
 INTRINSICS = {
@@ -140,10 +140,10 @@ def _read_index(path: Path, value_count: int) -> list[Entry]:
         if not words:
             continue
         try:
-            stamp_ns = int(Decimal(words[0]) * 10**9)
+            stamp_ns = stamp_ns_from_text(words[0])
             if value_count > 1:
                 [float(word) for word in words[1:]]
-        except (InvalidOperation, ValueError, OverflowError) as error:
+        except ValueError as error:
             raise RecordingError(f"{path}, line {number}: '{line}': expected numbers") from error
         if len(words) <= value_count:
             raise RecordingError(
