@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 
 from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED
@@ -9,6 +10,10 @@ from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED
 
 def main() -> None:
     """Run the program; exit code 0, 2 for an error of the user, 130 after Ctrl-C."""
+    # Names of files may be no text: print them escaped rather than fail.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         # The import takes a second: Ctrl-C may come during it, too.
         from deworldsg_ros.cli.app import app

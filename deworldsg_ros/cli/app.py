@@ -9,7 +9,7 @@ from typing import Annotated, Optional
 
 import typer
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from deworldsg_ros import __version__
 from deworldsg_ros.cli import ask, exchange, mcp, probe
@@ -147,7 +147,7 @@ def _reporting_errors() -> Iterator[None]:
         yield
     except DeWorldSGError as error:
         console = Console(stderr=True, highlight=False, soft_wrap=True)
-        console.print(f"[bold red]error:[/] {escape(str(error))}")
+        console.print(Text.assemble(("error:", "bold red"), f" {error}"))
         raise typer.Exit(EXIT_USAGE) from error
     except OSError as error:
         # Of a file that could not be written: a full disk, a read-only place.
@@ -220,7 +220,7 @@ def run(
                 temporal=temporal,
                 timings=timings,
             ),
-            Console(),
+            Console(markup=False),
         )
 
 
@@ -272,7 +272,7 @@ def demo(
                 intrinsics=parse_intrinsics(intrinsics),
                 odometry=odometry,
             ),
-            console=Console(),
+            console=Console(markup=False),
         )
 
 
@@ -305,7 +305,7 @@ def convert(
             output,
             topics=TopicChoice(rgb, depth, camera_info, pose),
             options=DatasetOptions(rate, parse_intrinsics(intrinsics), depth_source),
-            console=Console(),
+            console=Console(markup=False),
         )
 
 
@@ -315,7 +315,7 @@ def info(recording: RecordingPath) -> None:
     with _reporting_errors():
         from deworldsg_ros.cli.info import show_recording
 
-        show_recording(recording, Console())
+        show_recording(recording, Console(markup=False))
 
 
 @app.command("compile")

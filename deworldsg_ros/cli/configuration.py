@@ -40,6 +40,10 @@ def effective_config(path: Path | None, settings: Sequence[str] | None = None) -
 
 
 def _set(config: Config, setting: str) -> Config:
+    try:
+        setting.encode()
+    except UnicodeEncodeError as error:  # bytes of the command line that are no text
+        raise ConfigurationError(f"--set {setting!a}: expected UTF-8 text") from error
     name, equals, text = setting.partition("=")
     section, dot, field = name.strip().partition(".")
     mapping = to_mapping(config)

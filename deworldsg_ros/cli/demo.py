@@ -257,11 +257,11 @@ def _drops(finished: events.Finished) -> dict[str, dict[str, int]]:
 def _print_summary(out: Path, finished: events.Finished, console: Console) -> None:
     outputs.print_drops(console, finished.losses, _drops(finished), {})
     if finished.without_result or not finished.drained:
-        console.print(
-            f"[yellow]warning:[/] no result for {finished.without_result} frames; see the logs of "
-            f"the nodes in {out / 'logs'}",
-            highlight=False,
-            soft_wrap=True,
+        outputs.print_noted(
+            console,
+            "warning:",
+            f"no result for {finished.without_result} frames; see the logs of the nodes in "
+            f"{out / 'logs'}",
         )
     console.print(
         f"{finished.published} frames published, {finished.processed} merged into the graph",

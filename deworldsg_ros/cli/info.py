@@ -7,7 +7,9 @@ from pathlib import Path
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from deworldsg_ros.cli.outputs import print_noted
 from deworldsg_ros.recordings.bags.storage import RawBag
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import Role
@@ -44,14 +46,14 @@ def show_recording(path: Path, console: Console) -> None:
     table.add_column("messages", justify="right")
     table.add_column("used as")
     for name, msgtype, count in rows:
-        table.add_row(name, msgtype.split("/")[-1], str(count), used.get(name, ""))
+        kind_of = Text(msgtype.split("/")[-1])
+        table.add_row(Text(name), kind_of, str(count), used.get(name, ""))
     console.print(table)
     if used and Role.POSE.value not in used.values():
-        console.print(
-            "[yellow]no poses:[/] use run or demo with --odometry, or run with --poses FILE",
-            highlight=False,
+        print_noted(
+            console, "no poses:", "use run or demo with --odometry, or run with --poses FILE"
         )
     for loss in losses:
-        console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
+        print_noted(console, "lost:", loss)
     if problem:
         raise RecordingError(problem)

@@ -105,7 +105,7 @@ def import_fross(
     ] = None,
 ) -> None:
     """Convert a checkpoint of FROSS (RT-DETR with EGTR) to a folder for perception."""
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False)
     errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
     try:
         made = _import(checkpoint, out, names, frequency_bias)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 from deworldsg_ros.config import Config, to_yaml
 from deworldsg_ros.files import check_writable, together, write_atomically
@@ -111,7 +112,8 @@ def print_files(console: Console, out: Path) -> None:
         (REPORT_FILE, "frames, drops by reason, times"),
     ):
         if (out / name).exists():
-            console.print(f"  {out / name}  [dim]{meaning}[/]", highlight=False, soft_wrap=True)
+            line = Text.assemble(f"  {out / name}  ", (meaning, "dim"))
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def print_drops(
@@ -130,16 +132,18 @@ def print_drops(
     """
     shown = list(dict.fromkeys(losses))
     for loss in shown[:MOST_LOSSES]:
-        console.print(f"[yellow]lost:[/] {loss}", highlight=False, soft_wrap=True)
+        print_noted(console, "lost:", loss)
     if len(shown) > MOST_LOSSES:
-        console.print(f"[yellow]lost:[/] … and {len(shown) - MOST_LOSSES} more")
+        print_noted(console, "lost:", f"… and {len(shown) - MOST_LOSSES} more")
     for owner, counts in drops.items():
         for reason, count in sorted(counts.items()):
             if reason.startswith(UNMATCHED_PREFIX):
                 continue
             example = f" ({reasons[reason]})" if reason in reasons else ""
-            console.print(
-                f"[yellow]left out[/] by {owner}: {count} {reason}{example}",
-                highlight=False,
-                soft_wrap=True,
-            )
+            print_noted(console, "left out", f"by {owner}: {count} {reason}{example}")
+
+
+def print_noted(console: Console, note: str, text: str) -> None:
+    """Print a line that begins with a yellow note. Its text comes from files: no markup in it."""
+    line = Text.assemble((note, "yellow"), f" {text}")
+    console.print(line, highlight=False, soft_wrap=True)

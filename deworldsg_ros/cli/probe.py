@@ -183,7 +183,7 @@ def train_probe(
         cache=cache,
     )
     with _needing_torch():
-        run_training(options, Console(highlight=False, soft_wrap=True))
+        run_training(options, Console(highlight=False, soft_wrap=True, markup=False))
 
 
 def run_training(options: ProbeTraining, console: Console) -> None:
@@ -250,7 +250,7 @@ def import_probe(
 
         probe = import_published(checkpoint, names)
         save_probe(out, probe)
-    Console(highlight=False, soft_wrap=True).print(
+    Console(highlight=False, soft_wrap=True, markup=False).print(
         f"{out}: probe of {probe.card.backbone}, {len(names)} predicates", markup=False
     )
     Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(

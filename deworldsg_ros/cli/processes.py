@@ -119,7 +119,8 @@ def ending(console: Console) -> Iterator[list[LoggedProcess]]:
         for name, code in codes.items():
             # A node that is still loading has no handler: SIGINT itself ends it.
             if code not in (0, -signal.SIGINT):
-                console.print(f"[yellow]{name} ended with exit code {code}[/]", highlight=False)
+                line = f"{name} ended with exit code {code}"
+                console.print(line, style="yellow", highlight=False)
 
 
 @contextlib.contextmanager

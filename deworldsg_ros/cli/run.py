@@ -16,6 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from deworldsg_ros import __version__
 from deworldsg_ros.cli import outputs
@@ -112,7 +113,7 @@ def run_recording(options: RunOptions, console: Console) -> None:
 def _run(options: RunOptions, console: Console) -> None:
     config = effective_config(options.config_path, options.settings)
     if options.poses.odometry and not HAS_ODOMETRY:
-        console.print(f"[yellow]warning:[/] {WITHOUT_ODOMETRY}", highlight=False, soft_wrap=True)
+        outputs.print_noted(console, "warning:", WITHOUT_ODOMETRY)
     source = open_source(
         options.recording,
         topics=options.topics,
@@ -276,7 +277,8 @@ def _print_summary(
         _print_timings(console, pipeline.times_s, frames, processed.wall_s)
     outputs.print_files(console, options.out)
     if options.map_path is not None:
-        console.print(f"  {options.map_path}  [dim]the map[/]", highlight=False, soft_wrap=True)
+        line = Text.assemble(f"  {options.map_path}  ", ("the map", "dim"))
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _times_ms(times_s: dict[str, Times]) -> dict[str, Any]:

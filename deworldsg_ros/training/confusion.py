@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -17,6 +18,7 @@ INCHES_PER_PREDICATE = 0.45
 MARGIN_INCHES = 2.0
 
 
+@rc_context({"text.parse_math": False})  # a name may contain $
 def write_confusion(path: Path, confusion: Int64, names: Sequence[str]) -> None:
     """Write the confusion matrix as PNG; only predicates that occur are shown.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -50,13 +51,14 @@ def write(
     low, high = bounds(figure)
     figure.update_layout(layout(low, high))
     html = TEMPLATE.read_text(encoding="utf-8")
-    for name, text in {
+    parts = {
         "__TITLE__": f"Scene graph: {len(graph.nodes)} objects, {len(graph.edges)} relations",
         "__FIGURE__": _script_safe(figure.to_json()),
         "__GRAPH__": _script_safe(json.dumps(_details(graph, axes_of_view, low, high))),
         "__PLOTLY__": get_plotlyjs(),
-    }.items():
-        html = html.replace(name, text, 1)
+    }
+    # In one pass: a label may contain one of these names.
+    html = re.sub("|".join(parts), lambda match: parts[match[0]], html)
     write_atomically(Path(path), html)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.patches import Ellipse, FancyArrowPatch
 
 from deworldsg_ros.files import write_atomically
@@ -33,6 +34,7 @@ from deworldsg_ros.view.top_view import BACKGROUND, DPI, FAINT, Drawing, drawing
 POINTS_DRAWN = 30_000
 
 
+@rc_context({"text.parse_math": False})  # a label may contain $
 def draw(
     graph: wire.SceneGraphMessage,
     path: str | Path,

@@ -25,8 +25,10 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
     """Objects, most observed first; the size is that of the 2σ ellipsoid."""
     table = Table(
         title=_title("object", len(graph.nodes), most),
-        caption=f"p: class probability; position in frame {graph.frame_id!r}; "
-        f"size: axes of the {SIGMAS:g}σ ellipsoid; obs.: observations",
+        caption=Text(
+            f"p: class probability; position in frame {graph.frame_id!r}; "
+            f"size: axes of the {SIGMAS:g}σ ellipsoid; obs.: observations"
+        ),
     )
     table.add_column("object", no_wrap=True)
     table.add_column("p", justify="right")

@@ -51,7 +51,8 @@ class Report:
     def __str__(self) -> str:
         lines = [f"{sum(self.cases.values())} cases, {len(self.failures)} failures"]
         lines += [
-            f"  {key[0]} ({self.failures[key][0]}): {text}" for key, text in self.texts.items()
+            f"  {key[0]} ({self.failures[key][0]}): {text!a}"[:300]
+            for key, text in self.texts.items()
         ]
         return "\n".join(lines)
 
@@ -170,7 +171,19 @@ def keep(report: Report, corpus: Path = CORPUS) -> list[Path]:
     return kept
 
 
-def corpus_cases(target: str) -> list[tuple[str, bytes]]:
+def replay(names: Iterable[str], corpus: Path = CORPUS) -> Report:
+    """Run the cases that failed once."""
+    report, worker = Report(), Worker()
+    try:
+        for name in names:
+            for member, content in corpus_cases(name, corpus):
+                report.add(name, member, content, worker.run(name, member, content))
+    finally:
+        worker.close()
+    return report
+
+
+def corpus_cases(target: str, corpus: Path = CORPUS) -> list[tuple[str, bytes]]:
     """Cases of a target that failed once, as file name and content."""
-    found = sorted((CORPUS / target).glob("*"))
+    found = sorted((corpus / target).glob("*"))
     return [(unquote(path.name.rpartition(".")[0]), path.read_bytes()) for path in found]

@@ -144,7 +144,7 @@ def _answer(target, place: Path) -> str | None:  # type: ignore[no-untyped-def]
         return f"{type(error).__name__}: {_where(error)}: {str(error)[:200]}"
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-        _set_limit(resource.RLIM_INFINITY)
+        _set_limit(resource.getrlimit(resource.RLIMIT_AS)[1])
     return None
 
 

@@ -40,7 +40,7 @@ def score(
     """Score predictions or scene graphs against annotations with the official protocol."""
     from deworldsg_ros.cli.evaluate.score import score_files
 
-    score_files(data, scoring, predictions, graphs, out, json_file, Console())
+    score_files(data, scoring, predictions, graphs, out, json_file, Console(markup=False))
 
 
 @with_option_groups
@@ -55,7 +55,7 @@ def run(
     """Run the pipeline on every scan of a data set and score its graphs."""
     from deworldsg_ros.cli.evaluate.run import run_scans
 
-    run_scans(data, detections, running, scoring, out, json_file, Console())
+    run_scans(data, detections, running, scoring, out, json_file, Console(markup=False))
 
 
 @with_option_groups
@@ -77,4 +77,6 @@ def table(
     """Compare methods or configurations in a table, with the numbers of the paper."""
     from deworldsg_ros.cli.evaluate.table import make_table
 
-    make_table(kind, data, detections, running, comparing, scoring, out, json_file, Console())
+    make_table(
+        kind, data, detections, running, comparing, scoring, out, json_file, Console(markup=False)
+    )

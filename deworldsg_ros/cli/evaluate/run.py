@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.evaluate.options import (
@@ -61,7 +61,8 @@ def run_scans(
     ]
     outcomes, failures = _run(tasks, console)
     for scan, reason in failures.items():
-        console.print(f"[red]failed:[/] {scan}: {escape(reason)}", highlight=False, soft_wrap=True)
+        line = Text.assemble(("failed:", "red"), f" {scan}: {reason}")
+        console.print(line, highlight=False, soft_wrap=True)
     if not outcomes:
         raise typer.Exit(EXIT_NOTHING_DONE)
     front_end = tasks[0].front_end.describe()

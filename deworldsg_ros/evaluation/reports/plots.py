@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -25,8 +26,11 @@ DPI = 130
 RIGHT, ALL = "#2f6f8f", "#d5dde3"
 COLOURS = ("#2f6f8f", "#b8562f", "#5c8a3a")
 MAX_CLASSES = 40
+# The name of a class may contain $.
+_plain_text = rc_context({"text.parse_math": False})
 
 
+@_plain_text
 def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
     """Bars of items and of right items by class, most items first."""
     items = class_items(counts)[:MAX_CLASSES]
@@ -46,6 +50,7 @@ def plot_classes(path: Path, counts: Mapping[str, Count], title: str) -> None:
     _save(figure, path)
 
 
+@_plain_text
 def plot_confusion(path: Path, pairs: Sequence[tuple[str, str]], title: str) -> None:
     """Confusion matrix of annotated and predicted classes of nodes; each row sums to one."""
     counts = Counter(pairs)
@@ -68,6 +73,7 @@ def plot_confusion(path: Path, pairs: Sequence[tuple[str, str]], title: str) -> 
     _save(figure, path)
 
 
+@_plain_text
 def plot_reliability(path: Path, beliefs: Mapping[str, Sequence[Calibrated]], title: str) -> None:
     """Right part of the edges over their probability, a line per name; on the diagonal if honest.
 
@@ -106,6 +112,7 @@ def plot_reliability(path: Path, beliefs: Mapping[str, Sequence[Calibrated]], ti
     _save(figure, path)
 
 
+@_plain_text
 def plot_over_time(path: Path, runs: Mapping[str, Sequence[Checkpoint]], title: str) -> None:
     """Recall of each scan over the time of the recording."""
     figure, axes = _figure(9.0, 5.0)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
@@ -27,7 +28,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
     """Print the five scores, the scores by class, and the notes."""
-    table = Table(title=title)
+    table = Table(title=Text(title))
     for heading in ("recall at 1, %", "items", "right", "recall", "mean over classes"):
         table.add_column(heading, justify="left" if heading.startswith("recall at") else "right")
     rows = (
@@ -41,7 +42,8 @@ def print_protocol(console: Console, result: ProtocolResult, title: str) -> None
     _print_classes(console, "objects by class", result.object_classes)
     _print_classes(console, "predicates", result.predicate_classes)
     for note in dict.fromkeys(result.notes):
-        console.print(f"[yellow]note:[/] {note}", highlight=False, soft_wrap=True)
+        line = Text.assemble(("note:", "yellow"), f" {note}")
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 # Printed measures: heading, name, factor (0 = a count).
@@ -81,7 +83,7 @@ def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
     table = Table(title="precision, geometry, edges")
     table.add_column("")
     for name in shown:
-        table.add_column(name, justify="right", overflow="fold")
+        table.add_column(Text(name), justify="right", overflow="fold")
     numbers = [item.numbers() for item in shown.values()]
     for heading, key, factor in MEASURE_ROWS:
         table.add_row(heading, *(_cell(item[key], factor) for item in numbers))
@@ -101,7 +103,7 @@ def print_edges(console: Console, measures: Measures) -> None:
         cells = [_cell(numbers[key], factor) for _, key, factor in EDGE_COLUMNS]
         # A line separates the predicates from the sums.
         last = list(scores).index(name) == len(scores) - 3
-        table.add_row(name, *cells, f"{item.sure_wrong}/{item.sure}", end_section=last)
+        table.add_row(Text(name), *cells, f"{item.sure_wrong}/{item.sure}", end_section=last)
     console.print(table)
 
 
@@ -115,5 +117,5 @@ def _print_classes(console: Console, title: str, counts: Mapping[str, Count]) ->
     for heading in ("items", "right", "recall, %"):
         table.add_column(heading, justify="right")
     for name, count in counts.items():
-        table.add_row(name, str(count.total), str(count.hits), percent(count.recall))
+        table.add_row(Text(name), str(count.total), str(count.hits), percent(count.recall))
     console.print(table)

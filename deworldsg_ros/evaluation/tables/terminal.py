@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from deworldsg_ros.evaluation.tables.row_results import RowResult, total_ms
 from deworldsg_ros.timing import STAGES
@@ -40,7 +40,9 @@ def print_table(
     printed = [row for row in rows if row.printed]
     table = _table(title, RECALL_COLUMNS)
     for row in rows:
-        name = f"{row.title} [dim]\\[printed, {row.dataset}][/]" if row.printed else row.title
+        name = Text(row.title)
+        if row.printed:
+            name.append(f" [printed, {row.dataset}]", "dim")
         last = bool(printed) and row is printed[-1]
         table.add_row(name, *_numbers(row, RECALL_COLUMNS), end_section=last)
     console.print(table)
@@ -50,7 +52,7 @@ def print_table(
     for row in rows:
         if not row.printed:
             times = [_ms(row.times_ms.get("merging"))] if timed else []
-            beside.add_row(row.title, *_numbers(row, BESIDE_COLUMNS), *times)
+            beside.add_row(Text(row.title), *_numbers(row, BESIDE_COLUMNS), *times)
     console.print(beside)
     print_failures(console, rows)
 
@@ -73,7 +75,7 @@ def print_runtime(console: Console, rows: Sequence[RowResult], title: str) -> No
     table.add_column("stage")
     timed = [row for row in rows if row.times_ms]
     for row in timed:
-        table.add_column(escape(f"{row.title}\n{row.device}"), justify="right", overflow="fold")
+        table.add_column(Text(f"{row.title}\n{row.device}"), justify="right", overflow="fold")
     if not all(row.printed or "detection" in row.times_ms for row in timed):
         table.add_row("perception", *(_ms(row.times_ms.get("perception")) for row in timed))
     for stage in STAGES:
@@ -92,7 +94,8 @@ def print_failures(console: Console, rows: Sequence[RowResult]) -> None:
             reasons.setdefault((row.name, reason), []).append(scan)
     for (name, reason), scans in reasons.items():
         text = f"{name}, {', '.join(scans)}: {reason}"
-        console.print(f"[red]failed:[/] {escape(text)}", highlight=False, soft_wrap=True)
+        line = Text.assemble(("failed:", "red"), f" {text}")
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _number(value: float, decimals: int) -> str:
