@@ -92,9 +92,8 @@ class ProbeCard(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def seen_groups(self) -> frozenset[str]:
         """Scans or rooms that decided the weights, in the training or by stopping it."""
         groups = self.training.get("groups_by_part", {})
-        return frozenset(
-            str(group) for part in ("train", "validation") for group in groups.get(part, ())
-        )
+        parts = [groups.get(part, ()) for part in ("train", "validation")]
+        return frozenset(str(group) for part in parts for group in part)
 
     def require_backbone(self, backbone: BackboneIdentity) -> None:
         """Raise ConfigurationError unless the probe was trained on this backbone.
@@ -147,6 +146,12 @@ def read_card(folder: Path) -> ProbeCard:
         card = parse_json(read_regular(path, MAX_CARD_BYTES), ProbeCard)
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"probe {path}: {error}") from error
+    try:
+        card.seen_groups  # noqa: B018  the record of the training has any values
+    except (AttributeError, TypeError) as error:
+        raise ConfigurationError(
+            f"probe {path}: training.groups_by_part is no record of scans by part ({error})"
+        ) from error
     if not card.predicates or len(set(card.predicates)) != len(card.predicates):
         raise ConfigurationError(f"probe {path}: expected predicates, each name once")
     return card

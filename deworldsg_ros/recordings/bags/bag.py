@@ -89,9 +89,15 @@ class BagSource:
             poses = _TfPoses(self._bag, self._inputs)
         for raw in self._bag.messages(roles):
             role = roles[raw.topic]
-            stamp_ns = stamp_ns_of_cdr(raw.data)
+            try:
+                stamp_ns = stamp_ns_of_cdr(raw.data)
+                needs_pose = role is Role.RGB and poses is not None
+                frame_id = decode(raw.data, raw.msgtype).header.frame_id if needs_pose else ""
+            except Exception:  # rosbags raises errors of many types
+                self.drops["invalid_message"] += 1
+                continue
             if role is Role.RGB and poses is not None:
-                pose = poses.at(stamp_ns, decode(raw.data, raw.msgtype).header.frame_id)
+                pose = poses.at(stamp_ns, frame_id)
                 if pose is not None:
                     yield serialize(pose, raw.log_time_ns)
             if role is Role.POSE and self._T_child_camera is not None:

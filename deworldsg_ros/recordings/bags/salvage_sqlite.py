@@ -27,6 +27,7 @@ def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]
         topics = {
             key: (name, msgtype)
             for key, name, msgtype in database.execute("SELECT id, name, type FROM topics")
+            if isinstance(name, str) and isinstance(msgtype, str)
         }
         yield from _rows(database, topics, path, note)
     except sqlite3.DatabaseError as error:
@@ -51,7 +52,7 @@ def _rows(
                 if key <= row_id:
                     raise sqlite3.DatabaseError("rows are out of order")
                 row_id, lost, broken = key, lost + broken, 0
-                if topic in topics:
+                if topic in topics and isinstance(time_ns, int) and isinstance(data, bytes):
                     yield (*topics[topic], time_ns, data)
             break
         except sqlite3.DatabaseError:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
 from deworldsg_ros.files import confined, read_regular
@@ -72,6 +73,7 @@ class RawBag:
             _check_files(path)
             reader = Reader(path)
             reader.open()
+            topics = [_topic(connection) for connection in reader.connections]
         except FileNotFoundError:
             self._open_damaged(None if path.is_dir() else f"{path} does not exist")
         except RecordingError:
@@ -80,10 +82,7 @@ class RawBag:
             self._open_damaged(_one_line(error))
         else:
             self._reader = reader
-            self.topics = sorted(
-                Topic(connection.topic, connection.msgtype, connection.msgcount)
-                for connection in reader.connections
-            )
+            self.topics = sorted(topics)
 
     def _open_damaged(self, cause: str | None) -> None:
         """Count the readable messages; `cause`: error of rosbags, None = no metadata.yaml."""
@@ -126,6 +125,8 @@ class RawBag:
         last_time_ns, topics_at_last_time = -1, set[str]()
         try:
             for connection, time_ns, data in self._reader.messages(connections):
+                if not (isinstance(time_ns, int) and isinstance(data, bytes)):
+                    raise ReaderError(f"a message of {connection.topic} is no message")
                 yield RawMessage(connection.topic, connection.msgtype, time_ns, data)
                 if time_ns != last_time_ns:
                     last_time_ns, topics_at_last_time = time_ns, set()
@@ -172,6 +173,16 @@ def _check_files(path: Path) -> None:
     if (path / METADATA).is_file():
         content = read_regular(path / METADATA, MAX_METADATA_BYTES)
         check_yaml(content)
+
+
+def _topic(connection: Connection) -> Topic:
+    """The topic of a connection, whose values metadata.yaml may give any type."""
+    topic = Topic(connection.topic, connection.msgtype, connection.msgcount)
+    if not (isinstance(topic.name, str) and isinstance(topic.msgtype, str)):
+        raise ReaderError(f"topic {topic.name!r} of type {topic.msgtype!r}: expected names")
+    if not (isinstance(topic.count, int) and 0 <= topic.count < 2**63):
+        raise ReaderError(f"topic {topic.name} has {topic.count!r} messages: expected a number")
+    return topic
 
 
 def storage_files(folder: Path) -> list[Path]:
