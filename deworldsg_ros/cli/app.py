@@ -151,10 +151,9 @@ def _reporting_errors() -> Iterator[None]:
         raise typer.Exit(EXIT_USAGE) from error
     except OSError as error:
         # Of a file that could not be written: a full disk, a read-only place.
-        Console(stderr=True, highlight=False, soft_wrap=True).print(
-            f"[bold red]error:[/] {escape(f'{error.filename}: ' if error.filename else '')}"
-            f"{escape(error.strerror or str(error))}"
-        )
+        where = f"{error.filename}: " if error.filename else ""
+        text = Text.assemble(("error:", "bold red"), f" {where}{error.strerror or error}")
+        Console(stderr=True, highlight=False, soft_wrap=True).print(text)
         raise typer.Exit(EXIT_USAGE) from error
     except KeyboardInterrupt as interrupt:
         Console(stderr=True).print("interrupted")
