@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -156,8 +155,10 @@ def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> 
         continued = continue_map(config, map_path)
         if continued is not None:
             pipeline.go_on_with(continued.builder)
-            warning = "" if continued.newest else "[yellow]warning:[/] "
-            console.print(warning + escape(continued.message), highlight=False, soft_wrap=True)
+            if continued.newest:
+                console.print(continued.message, highlight=False, soft_wrap=True)
+            else:
+                outputs.print_noted(console, "warning:", continued.message)
     return pipeline
 
 

@@ -13,6 +13,7 @@ from deworldsg_ros.merging.joint import JointEvidence
 from deworldsg_ros.merging.memory_checks import check_memory
 from deworldsg_ros.merging.node_grid import NodeGrid
 from deworldsg_ros.merging.voxel_map import VoxelMap
+from deworldsg_ros.scene.array_checks import checked
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -183,7 +184,7 @@ class NodeRecords:
         }
         self.place(graph, list(owner_of.values()))
         # The paper's rule and older releases have no records; cells of another size are useless.
-        if "records" not in memory or memory["cell_m"] != self.map.cell_m:
+        if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
             _rebuild(self, graph, list(owner_of.values()))
             return
         check_memory(memory, RECORD, len(graph.vocabulary.classes))

@@ -131,6 +131,9 @@ class Annotations:
             self.vocabulary = Vocabulary(
                 tuple(mapping[self.layout.classes]), tuple(mapping[self.layout.predicates])
             )
+            names = (*self.vocabulary.classes, *self.vocabulary.predicates)
+            if not all(isinstance(name, str) for name in (*names, *self.class_of_label.values())):
+                raise TypeError("a name is no text")
         except (KeyError, TypeError, ValueError) as error:
             raise RecordingError(
                 f"{root / self.layout.mapping}: expected the keys {self.layout.label_map}, "
