@@ -15,6 +15,6 @@ def stamp_ns_from_text(text: str) -> int:
     except InvalidOperation as error:
         raise ValueError(f"stamp '{text[:40]}': expected seconds") from error
     # Compared first: as an integer, 1e9999999 has ten million digits.
-    if not (seconds.is_finite() and abs(seconds) < MAX_STAMP_S):
+    if not (seconds.is_finite() and seconds.copy_abs() < MAX_STAMP_S):
         raise ValueError(f"stamp '{text[:40]}': expected seconds below 2^31")
     return int(seconds * 10**9)

@@ -1,0 +1,118 @@
+"""Sizes, depths, numbers and text of files from outside are checked before work is done."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import pytest
+
+from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation.protocol.pickles import load_pickle
+from deworldsg_ros.evaluation.protocol.predictions import read_predictions
+from deworldsg_ros.files import read_regular
+from deworldsg_ros.parsing import parse_any_json, parse_yaml
+from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES, bound_chunks, decompress
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.stamps import stamp_ns_from_text
+from deworldsg_ros.streams.encoded import decode, encoded_size
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45",
+     "x: " + "1" * 5000, "\udcff", "a: b: c"],
+)  # fmt: skip
+def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
+    content = text.encode(errors="surrogateescape")
+    with pytest.raises(ValueError, match=r"\w"):
+        parse_yaml(content)
+    (tmp_path / "config.yaml").write_bytes(content)
+    with pytest.raises(ConfigurationError, match=r"config\.yaml: \w"):
+        effective_config(tmp_path / "config.yaml")
+
+
+@pytest.mark.parametrize("value", [".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff"])
+def test_options_are_finite_numbers(value: str) -> None:
+    with pytest.raises(ConfigurationError, match="--set"):
+        effective_config(None, [f"inputs.max_depth_m={value}"])
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '"\\ud800"', "{", "1" * 5000])
+def test_json_has_one_error(text: str) -> None:
+    with pytest.raises(ValueError):
+        parse_any_json(text.encode())
+
+
+@pytest.mark.parametrize("text", ["1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x"])
+def test_stamps_have_32_bit_seconds(text: str) -> None:
+    with pytest.raises(ValueError, match="expected seconds"):
+        stamp_ns_from_text(text)
+    assert stamp_ns_from_text("1305031102.175304") == 1305031102175304000
+
+
+def png(width: int, height: int) -> bytes:
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))]
+    chunks += [(b"IDAT", zlib.compress(bytes(1 << 20))), (b"IEND", b"")]
+    packed = b"\x89PNG\r\n\x1a\n"
+    for kind, data in chunks:
+        packed += struct.pack(">I", len(data)) + kind + data
+        packed += struct.pack(">I", zlib.crc32(kind + data))
+    return packed
+
+
+def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
+    content = png(65535, 65535)
+    assert encoded_size(content) == (65535, 65535) and len(content) < 5000
+    with pytest.raises(ValueError, match="65535x65535 pixels: expected at most"):
+        decode(content, cv2.IMREAD_UNCHANGED)
+    for other in (b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
+        with pytest.raises(ValueError):
+            decode(other, cv2.IMREAD_UNCHANGED)
+
+
+def test_pickles_of_shared_lists_and_large_memos_are_refused() -> None:
+    item: list = []
+    for _ in range(60):
+        item = [item, item]
+    with pytest.raises(EvaluationError, match="stands for more than"):
+        load_pickle(pickle.dumps(item), "x.pkl")
+    itself: list = []
+    itself.append(itself)
+    with pytest.raises(EvaluationError, match="contains itself"):
+        load_pickle(pickle.dumps(itself), "x.pkl")
+    with pytest.raises(EvaluationError, match="memo index"):
+        load_pickle(b"]r\xff\xff\xff\x7f.", "x.pkl")
+
+
+def test_predictions_of_many_classes_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "predictions.json"
+    path.write_text('{"num_classes": 1000000000000, "num_predicates": 1, "scans": {}}')
+    with pytest.raises(EvaluationError, match="expected 0 to 10000"):
+        read_predictions(path)
+
+
+def test_chunks_unpack_to_what_they_declare() -> None:
+    import lz4.frame
+
+    bound_chunks()
+    packed = lz4.frame.compress(bytes(1 << 24))
+    assert decompress("lz4", packed, 1 << 24) == bytes(1 << 24)
+    for size in (1, (1 << 24) + 1, MAX_CHUNK_BYTES + 1):
+        with pytest.raises(ValueError, match="a chunk"):
+            decompress("lz4", packed, size)
+
+
+def test_only_regular_files_of_a_size_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "large").write_bytes(bytes(9))
+    (tmp_path / "good").write_bytes(b"12345678")
+    for path in (tmp_path / "pipe", tmp_path / "large", tmp_path, Path("/dev/zero"), Path("\0")):
+        with pytest.raises(OSError):
+            read_regular(path, 8)
+    assert read_regular(tmp_path / "good", 8) == b"12345678"
