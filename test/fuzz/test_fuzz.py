@@ -33,7 +33,6 @@ def test_the_corpus_has_cases_of_known_targets_only():
     assert {path.name for path in CORPUS.iterdir() if path.is_dir()} <= set(TARGETS)
 
 
-@pytest.mark.xfail(reason="the readers are being mended one by one", strict=False)
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_no_case_fails():

@@ -6,6 +6,7 @@ reader reads the intact part, and `losses` states in words that data was lost.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import re
 from collections.abc import Callable, Collection, Iterator
@@ -159,7 +160,9 @@ class RawBag:
     def close(self) -> None:
         """Close the files."""
         if self._reader is not None:
-            self._reader.close()
+            # rosbags fails here on metadata with values of other types.
+            with contextlib.suppress(AttributeError, TypeError):
+                self._reader.close()
             self._reader = None
 
 
