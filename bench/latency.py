@@ -236,9 +236,11 @@ def run_recorded_node(name: str, path: Path, arguments: list[str]) -> int:
     """In the process of a node: run it with recorded perception."""
     import importlib
 
+    from deworldsg_ros.ros import perceiving
+
     module = importlib.import_module(f"deworldsg_ros.nodes.{name}")
     perceived = pickle.loads(path.read_bytes())
-    module.build_perception = lambda *_, **__: RecordedPerceiver(perceived)
+    perceiving.build_perception = lambda *_, **__: RecordedPerceiver(perceived)
     return int(module.main([name, *arguments]))
 
 

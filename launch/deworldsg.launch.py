@@ -2,6 +2,8 @@
 
 ros2 launch deworldsg_ros deworldsg.launch.py rgb:=/my/rgb depth:=/my/depth_registered ...
 
+With one_process:=true, one process runs all four stages (deworldsg_node).
+
 For a robot without SLAM or odometry, add odometry:=true: odometry_node then computes the poses.
 """
 
@@ -9,7 +11,7 @@ from __future__ import annotations
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, SetEnvironmentVariable
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import (
     EnvironmentVariable,
     LaunchConfiguration,
@@ -56,6 +58,12 @@ def generate_launch_description() -> LaunchDescription:
             choices=["true", "false"],
             description="start odometry_node, which computes poses from the images",
         ),
+        DeclareLaunchArgument(
+            "one_process",
+            default_value="false",
+            choices=["true", "false"],
+            description="start deworldsg_node, which runs all four stages, in place of four nodes",
+        ),
         *(
             DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {content}")
             for name, topic, content in INPUTS
@@ -63,20 +71,26 @@ def generate_launch_description() -> LaunchDescription:
     ]
     use_sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
 
-    def node(name: str, **options: IfCondition) -> Node:
+    def node(name: str, condition: IfCondition | UnlessCondition) -> Node:
         return Node(
             package=PACKAGE,
             executable=name,
             name=name,
             namespace=LaunchConfiguration("namespace"),
             output="screen",
-            parameters=[LaunchConfiguration("params_file"), {"use_sim_time": use_sim_time}],
+            parameters=[{"use_sim_time": use_sim_time}],
+            # Given to the node itself, which refuses a missing file; launch would ignore it.
+            arguments=["--ros-args", "--params-file", LaunchConfiguration("params_file")],
             remappings=[(topic, LaunchConfiguration(argument)) for argument, topic, _ in INPUTS],
-            **options,
+            condition=condition,
         )
 
-    nodes = [node(name) for name in NODES]
-    nodes.append(node("odometry_node", condition=IfCondition(LaunchConfiguration("odometry"))))
+    one_process = LaunchConfiguration("one_process")
+    nodes = [
+        *(node(name, UnlessCondition(one_process)) for name in NODES),
+        node("deworldsg_node", IfCondition(one_process)),
+        node("odometry_node", IfCondition(LaunchConfiguration("odometry"))),
+    ]
     # Images between processes need its larger shared-memory segment. A profile of the user is kept.
     profile = SetEnvironmentVariable(
         "FASTRTPS_DEFAULT_PROFILES_FILE",

@@ -26,7 +26,9 @@ class GraphNode(StageNode):
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
-        self.graph = GraphKeeper(self, markers)
+        self.graph = GraphKeeper(
+            self, markers, lambda _, latency_s: self.health.published(latency_s)
+        )
         self._received_s = time.monotonic()
         self.listen_json(
             "deworldsg/local_graph", wire.LocalGraphMessage, self._integrate, 50, self._receive

@@ -49,7 +49,8 @@ class GraphKeeper:
     Args:
         node: publishes the graph, and counts.
         markers: the markers of a snapshot (`view.markers`).
-        on_update: called with each update, in the graph's thread.
+        on_update: called in the graph's thread with each update, and the seconds since the first
+            of its messages arrived.
 
     Attributes:
         newest_ns: stamp of the newest merged frame; 0 = none.
@@ -62,7 +63,7 @@ class GraphKeeper:
         self,
         node: StageNode,
         markers: MakeMarkers,
-        on_update: Callable[[wire.SceneGraphUpdateMessage], None] = lambda update: None,
+        on_update: Callable[[wire.SceneGraphUpdateMessage, float], None],
     ) -> None:
         self._node = node
         self._parameters = node.parameters
@@ -118,7 +119,7 @@ class GraphKeeper:
             return {}
         return {
             **self._values,
-            "queue": str(self._worker.waiting),
+            "graph queue": str(self._worker.waiting),
             "evidence waiting": str(len(self._pending)),
             "pose corrections": str(self._corrections),
             "nodes moved by corrections": str(self._corrected_nodes),
@@ -213,10 +214,9 @@ class GraphKeeper:
             return
         update.session = self._session
         self._publish_update(update)
-        self._node.health.published(time.monotonic() - changed_s)
         self._whole.changed()
         self._files.changed()
-        self._on_update(update)
+        self._on_update(update, time.monotonic() - changed_s)
 
     def _publish_whole(self) -> None:
         assert self._builder is not None

@@ -17,7 +17,8 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 # Parameters that rclpy reads itself.
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
-RCLPY_PREFIXES = ("qos_overrides.",)
+# rclpy reads these only where a node allows them, and ignores the others.
+QOS_PREFIX = "qos_overrides."
 
 P = TypeVar("P", bound=msgspec.Struct)
 
@@ -71,7 +72,7 @@ def declare(node: Node, kind: type[P]) -> P:
     overrides = {
         name: parameter.value
         for name, parameter in node._parameter_overrides.items()
-        if name not in RCLPY_NAMES and not name.startswith(RCLPY_PREFIXES)
+        if name not in RCLPY_NAMES
     }
     parameters = resolve(overrides, node.get_name(), kind)
     for field in fields(kind):
@@ -95,6 +96,11 @@ def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
     content: dict[str, dict[str, Any]] = {}
     for name, value in overrides.items():
         field = known.get(name)
+        if name.startswith(QOS_PREFIX):
+            raise ConfigurationError(
+                f"{source}: parameter {name} has no effect: the QoS of a topic follows its "
+                "publishers, or inputs.reliability"
+            )
         if field is None:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
             hint = f" (did you mean {near[0]}?)" if near else ""

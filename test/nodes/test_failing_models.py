@@ -9,9 +9,9 @@ from support.failing_backend import Backend
 from support.nodes_bench import CAMERA, Bench, bench, send_frame, works
 
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.nodes import segmentation_node
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.perception import Perception
+from deworldsg_ros.ros import perceiving
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def segmentation(backend: Backend) -> Iterator[Bench]:
         return Perception(backend, backend, backend, config, world_up=world_up)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(segmentation_node, "build_perception", build)
+        patch.setattr(perceiving, "build_perception", build)
         yield from bench(SegmentationNode, CAMERA)
 
 

@@ -32,12 +32,11 @@ from support.nodes_bench import (
     works,
 )
 
-from deworldsg_ros.nodes import segmentation_node
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
-from deworldsg_ros.ros import joining
+from deworldsg_ros.ros import joining, perceiving
 from deworldsg_ros.ros.joining import MAX_QUEUE_S, TAKE_PERIOD_S
 from deworldsg_ros.scene import wire
 from deworldsg_ros.streams import frame_assemblers
@@ -48,7 +47,7 @@ from deworldsg_ros.streams.poses import stamp_ns_of
 def segmentation() -> Iterator[Bench]:
     with pytest.MonkeyPatch.context() as patch:
         # A busy machine delays the worker for longer. One test below is about this wait.
-        patch.setattr(segmentation_node, "MAX_QUEUE_S", LIMIT_S)
+        patch.setattr(perceiving, "MAX_QUEUE_S", LIMIT_S)
         yield from bench(SegmentationNode, CAMERA)
 
 

@@ -14,9 +14,9 @@ from std_msgs.msg import String
 from support.nodes_bench import Bench, changed, local_graph, rgb
 
 from deworldsg_ros.checkpoints.card import CheckpointCard, write_card
-from deworldsg_ros.nodes import relation_node
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.ros import relating
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -166,7 +166,7 @@ def test_predicates_of_an_imported_checkpoint_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The relation node runs no perception, and may run where its checkpoint is not."""
-    monkeypatch.setattr(relation_node, "build_world_model", lambda config, device: Bound(4))
+    monkeypatch.setattr(relating, "build_world_model", lambda config, device: Bound(4))
     chosen = {"perception__predicate_set": "checkpoint"}
     for predicates in (("on", "under"), ("on", "near"), ()):
         write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))

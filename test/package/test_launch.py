@@ -31,7 +31,7 @@ CLASSES = {
         "IncludeLaunchDescription",
         "SetEnvironmentVariable",
     ),
-    "launch.conditions": ("IfCondition",),
+    "launch.conditions": ("IfCondition", "UnlessCondition"),
     "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
     "launch.substitutions": ("EnvironmentVariable", "LaunchConfiguration", "PathJoinSubstitution"),
     "launch_ros": (),
@@ -66,15 +66,21 @@ def test_every_node_has_the_parameter_file_and_the_remappings(
     nodes = describe(path, launch_classes, "Node")
     names = [node.kwargs["executable"] for node in nodes]
     always = ["segmentation_node", "lifting_node", "relation_node", "graph_node"]
-    assert names == [*always, "odometry_node"]
-    conditions = [node.kwargs.get("condition") for node in nodes]
-    assert conditions[:4] == [None] * 4
-    assert conditions[4].args[0].args == ("odometry",)
+    assert names == [*always, "deworldsg_node", "odometry_node"]
+    conditions = [node.kwargs["condition"] for node in nodes]
+    assert [(type(item).__name__, *item.args[0].args) for item in conditions] == [
+        *[("UnlessCondition", "one_process")] * 4,
+        ("IfCondition", "one_process"),
+        ("IfCondition", "odometry"),
+    ]
     assert all((root_dir / "scripts" / "ros" / name).is_file() for name in names)
     for node in nodes:
         assert node.kwargs["package"] == "deworldsg_ros"
-        file, extra = node.kwargs["parameters"]
+        # The node itself reads the file, so that a missing one ends its start.
+        *options, file = node.kwargs["arguments"]
+        assert options == ["--ros-args", "--params-file"]
         assert file.args == ("params_file",)
+        (extra,) = node.kwargs["parameters"]
         assert list(extra) == ["use_sim_time"]
         assert {topic: value.args[0] for topic, value in node.kwargs["remappings"]} == {
             "rgb/image_raw": "rgb",
@@ -92,7 +98,7 @@ def test_every_launch_configuration_is_a_declared_argument(
         entity.args[0] for entity in describe(path, launch_classes, "DeclareLaunchArgument")
     }
     assert declared == {
-        *("params_file", "use_sim_time", "namespace", "odometry"),
+        *("params_file", "use_sim_time", "namespace", "odometry", "one_process"),
         *("rgb", "camera_info", "depth", "pose"),
     }
 

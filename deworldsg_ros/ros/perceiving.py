@@ -1,0 +1,50 @@
+"""A node that takes the camera's frames and runs perception on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from deworldsg_ros.checkpoints.required import require_checkpoints
+from deworldsg_ros.perception.registry import build_perception
+from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
+from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
+from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.streams.frame_assemblers import FrameAssembler
+
+
+class PerceivingNode(JoiningNode[RgbdFrame]):
+    """Stage a on the frames of the camera, for segmentation_node and deworldsg_node.
+
+    Args:
+        name: node name.
+        product: name of the output in /diagnostics.
+        options: arguments of rclpy's Node.
+    """
+
+    def __init__(self, name: str, product: str, **options: Any) -> None:
+        super().__init__(name, product, max_queue_s=MAX_QUEUE_S, **options)
+        inputs = self.parameters.inputs
+        require_checkpoints(self.parameters.perception)
+        self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
+        self._frames = FrameAssembler(inputs, **self.assembler_options())
+
+    def listen_to_camera(self, work: Callable[[RgbdFrame], None]) -> None:
+        """Subscribe to the camera, and call `work` with each complete frame."""
+        frames = self._frames
+        self.join(frames, work)
+        listen_camera_info(self, self.taking(frames.add_camera_info))
+        listen_pose(self, frames)
+        listen_depth(self, self.taking(frames.add_depth), self.wants_images)
+        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images)
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
+        """The results of a frame, in the camera's frame; failures and drops are counted."""
+        perceived = self._perception.perceive(frame)
+        self.health.left_out(perceived.drops)
+        for reason, message in perceived.failures.items():
+            self.drop(reason, message)
+        graph = replace(perceived.frame_graph, frame_id=self._frames.camera_frame)
+        return replace(perceived, frame_graph=graph)

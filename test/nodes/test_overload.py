@@ -1,0 +1,139 @@
+"""What hangs, stalls or floods does not stop a node: queues are bounded, losses counted."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from support.failing_backend import Backend
+from support.nodes_bench import CAMERA, LIMIT_S, Bench, local_graph, rgb, send_frame, works
+
+from deworldsg_ros.config import PerceptionConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
+from deworldsg_ros.nodes.graph_node import GraphNode
+from deworldsg_ros.nodes.relation_node import RelationNode
+from deworldsg_ros.perception.stage import Perception
+from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.ros import perceiving, relating
+from deworldsg_ros.ros.graph_keeper import QUEUE_JOBS
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene import wire
+
+# A first start compiles.
+pytestmark = pytest.mark.timeout(300)
+
+PAPER = [Parameter("merging.association", value="paper")]
+
+
+@pytest.fixture
+def graph() -> Iterator[Bench]:
+    made = Bench(GraphNode, {"deworldsg/local_graph": String}, parameter_overrides=PAPER)
+    yield made
+    made.close()
+
+
+def test_diagnostics_continue_while_the_graph_hangs(
+    graph: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin = threading.Event()
+    integrate = GraphBuilder.integrate
+    merged: list[int] = []
+
+    def hang(builder: GraphBuilder, local: Any) -> list[int]:
+        assert begin.wait(4 * LIMIT_S)
+        merged.append(local.stamp_ns)
+        return integrate(builder, local)
+
+    statuses: list[DiagnosticArray] = []
+    graph.peer.node.create_subscription(DiagnosticArray, "/diagnostics", statuses.append, 10)
+    monkeypatch.setattr(GraphBuilder, "integrate", hang)
+    sent = QUEUE_JOBS + 20
+
+    def flood() -> None:
+        for _ in range(sent):
+            graph.send(deworldsg__local_graph=local_graph(graph.next_stamp()))
+            graph.peer.spin_for(0.05)
+
+    graph.refuses("overrun", flood, 10)
+    seen = len(statuses)
+    graph.expect(lambda: len(statuses) > seen + 1, "diagnostics")
+    assert graph.node.graph._worker.waiting <= QUEUE_JOBS
+    begin.set()
+    graph.expect(lambda: graph.node.graph.newest_ns == graph.stamp_ns, "the newest frame")
+    assert len(merged) + graph.node.health.drops["overrun"] == sent
+
+
+def test_a_stalled_subscriber_does_not_delay_the_graph(graph: Bench) -> None:
+    """It is reliable, and never takes a message."""
+    stalled = graph.peer.node.create_subscription(
+        String, "/scene_graph/updates", print, reliable(1)
+    )
+    graph.peer._executor.remove_node(graph.peer.node)
+    for _ in range(60):
+        graph.send(deworldsg__local_graph=local_graph(graph.next_stamp()))
+        graph.peer.spin_for(0.05)
+    graph.expect(lambda: graph.node.graph.newest_ns == graph.stamp_ns, "the newest frame")
+    assert graph.node.health.products > 0
+    assert graph.node.health.drops == {}
+    graph.peer.node.destroy_subscription(stalled)
+
+
+class Hanging(FakeWorldModel):
+    """A world model that does not return before it is released."""
+
+    release = threading.Event()
+
+    def predict(self, request: Any) -> Any:
+        assert self.release.wait(4 * LIMIT_S)
+        return super().predict(request)
+
+
+def test_evidence_continues_while_the_world_model_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relating, "build_world_model", lambda config, device: Hanging(2))
+    options = {"relations.clip_length": 2, "relations.max_clips_per_s": 0.0}
+    at = Bench(
+        RelationNode,
+        {"rgb/image_raw": CAMERA["rgb/image_raw"], "deworldsg/local_graph": String},
+        parameter_overrides=[Parameter(name, value=value) for name, value in options.items()],
+    )
+
+    def send() -> None:
+        stamp_ns = at.next_stamp()
+        at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=local_graph(stamp_ns))
+
+    try:
+        for _ in range(10):
+            works(at, send)
+    finally:
+        Hanging.release.set()
+        at.close()
+
+
+@pytest.fixture
+def whole() -> Iterator[Bench]:
+    def build(config: PerceptionConfig, *, world_up: str) -> Perception:
+        backend = Backend()
+        return Perception(backend, backend, backend, config, world_up=world_up)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perceiving, "build_perception", build)
+        made = Bench(DeworldsgNode, CAMERA, parameter_overrides=PAPER)
+        yield made
+        made.close()
+
+
+def test_one_process_builds_and_publishes_the_graph(whole: Bench) -> None:
+    updates = whole.peer.collect("/scene_graph/updates")
+    for _ in range(3):
+        works(whole, lambda: send_frame(whole))
+    whole.expect(lambda: whole.node.graph.newest_ns == whole.stamp_ns, "the newest frame")
+    whole.expect(lambda: "edges" in whole.node.more_values(), "the whole graph")
+    for text in updates:
+        assert wire.decode(text, wire.SceneGraphUpdateMessage).associations
+    assert whole.node.health.drops == {}
