@@ -85,20 +85,26 @@ class RoomMap:
         builder.merging.restore(graph, {})
         return builder
 
-    def frames(self, count: int, rooms: int | None = None, seed: int = 2) -> list[LocalGraph]:
+    def frames(
+        self, count: int, rooms: int | None = None, seed: int = 2, stay: int = 1
+    ) -> list[LocalGraph]:
         """Frames of random rooms, with millimetre noise.
 
         Args:
             count: number of frames.
             rooms: only the first of all rooms; None = all.
             seed: of the random numbers.
+            stay: frames in a row of each room.
         """
         rng = np.random.default_rng(seed)
         # The last room may have fewer objects.
         rooms = rooms or max(1, len(self.means) // OBJECTS_PER_ROOM)
-        return [
-            self._frame(int(rng.integers(rooms)), k * 33_000_000, rng) for k in range(1, count + 1)
-        ]
+        found = []
+        for k in range(1, count + 1):
+            if (k - 1) % stay == 0:
+                room = int(rng.integers(rooms))
+            found.append(self._frame(room, k * 33_000_000, rng))
+        return found
 
     def _frame(self, room: int, stamp_ns: int, rng: np.random.Generator) -> LocalGraph:
         corner, n = self.corners[room], LOCAL_NODES

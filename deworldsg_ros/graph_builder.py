@@ -148,9 +148,18 @@ class GraphBuilder:
         return node_ids
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
-        """The changes since the last call; None if there are none."""
+        """The changes since the last call; None if there are none.
+
+        It costs as much as what changed, however large the graph is. Of many pairs whose evidence
+        changed, some are left for the next calls: see `waiting`.
+        """
         self._publication.set_up(self.up.up_world())
         return self._publication.update()
+
+    @property
+    def waiting(self) -> int:
+        """Number of pairs of nodes that the next updates judge; `full` leaves none."""
+        return self._edges.waiting
 
     def snapshot(self) -> wire.SceneGraphMessage:
         """The graph after the last `update`."""

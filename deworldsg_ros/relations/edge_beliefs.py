@@ -38,6 +38,8 @@ MIN_PROBABILITY = 0.2
 JUDGED_A_CALL = 32
 # A symmetric relation is sent once a pair if its probabilities in both directions differ by less.
 SAME_PROBABILITY = 0.01
+# If more wait than this many calls judge, a call judges more: edges lag by a second at 30 Hz.
+MAX_CALLS = 32
 # Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
 
@@ -76,6 +78,7 @@ class EdgeBeliefs:
         self.states: dict[Pair, wire.EdgeState] = {} if self._robust else self._paper_beliefs.states
         names = graph.vocabulary.predicates
         self._symmetric = np.array([plain(name) in SYMMETRIC for name in names], np.bool_)
+        self._begun = False
         # What each message was made from, beside the evidence of its edge.
         self._basis: dict[Pair, tuple[bytes, wire.Provenance, bool]] = {}
 
@@ -129,15 +132,23 @@ class EdgeBeliefs:
         for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
             self._graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
 
+    @property
+    def waiting(self) -> int:
+        """Number of pairs that wait to be judged."""
+        return self._table.waiting
+
     def refresh(self, whole: bool = True) -> list[Pair]:
         """Bring `states` up to date; returns the pairs with another message, or none.
 
         Args:
-            whole: judge all pairs that wait. False: at most `JUDGED_A_CALL`.
+            whole: judge all pairs that wait, as the first call does. False: about `JUDGED_A_CALL`.
         """
         prior: Prior = self.prior
         if self._robust or self._has_predictions:
-            self._table.refresh(self.up.up_world(), None if whole else JUDGED_A_CALL)
+            some = max(JUDGED_A_CALL, self._table.waiting // MAX_CALLS)
+            everything = whole or not self._begun
+            self._table.refresh(self.up.up_world(), None if everything else some)
+            self._begun = True
         if self._has_predictions:
             self._predicted.follow(self._table, self._table.changed_pairs)
             prior = self._predicted

@@ -210,6 +210,10 @@ class GraphKeeper:
         changed_s = self._times.published(time.monotonic())
         assert self._builder is not None
         update = self._builder.update()
+        if self._builder.waiting:
+            # The next update brings the edges that wait, also if no frame comes.
+            now_s = time.monotonic()
+            self._times.changed(now_s, now_s, can_wait=True)
         if update is None:
             return
         update.session = self._session

@@ -152,17 +152,31 @@ def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
     return mean, (covariance + covariance.T) / 2
 
 
-@kernel
 def _neighbours(points: Float32, radius: float) -> Float64:
     """Number of points within a radius of each point, itself included."""
-    counts = np.ones(len(points))
-    for a in range(len(points)):
-        for b in range(a + 1, len(points)):
-            squared = 0.0
-            for axis in range(3):
-                step = np.float64(points[a, axis]) - np.float64(points[b, axis])
-                squared += step * step
-            if squared <= radius * radius:
-                counts[a] += 1.0
-                counts[b] += 1.0
+    widest = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
+    order = np.argsort(points[:, widest])
+    # Points in the order of one coordinate: only those that follow closely can be near.
+    columns = np.ascontiguousarray(points[order].T, np.float64)
+    counts = np.empty(len(points))
+    counts[order] = _count_near(columns, widest, radius)
+    return counts
+
+
+@kernel
+def _count_near(columns: Float64, widest: int, radius: float) -> Float64:
+    """Number of points within a radius; columns (3, n) ascend along axis `widest`."""
+    x, y, z = columns[0], columns[1], columns[2]
+    along = columns[widest]
+    count = len(along)
+    counts = np.ones(count)
+    last = 0
+    for a in range(count):
+        while last < count and along[last] - along[a] <= radius:
+            last += 1
+        for b in range(a + 1, last):
+            step_x, step_y, step_z = x[a] - x[b], y[a] - y[b], z[a] - z[b]
+            near = step_x * step_x + step_y * step_y + step_z * step_z <= radius * radius
+            counts[a] += near
+            counts[b] += near
     return counts
