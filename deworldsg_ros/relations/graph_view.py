@@ -13,6 +13,7 @@ from deworldsg_ros.relations.evidence import entropy_nats, visual_distribution
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import DECIMALS
 from deworldsg_ros.scene.replica import GraphReplica
 
 # Frames whose nodes are remembered: 34 s at 30 frames/s. Clips wait for a few seconds.
@@ -89,7 +90,7 @@ class LiveGraph:
         edges = [self._graph.edges.get(pair) for pair in ((a_id, b_id), (b_id, a_id))]
         return max(
             (
-                float(entropy_nats(visual_distribution(edge.visual_logits)))
+                round(float(entropy_nats(visual_distribution(edge.visual_logits))), DECIMALS)
                 for edge in edges
                 if edge is not None and edge.frames
             ),

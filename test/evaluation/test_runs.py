@@ -68,7 +68,7 @@ def test_tasks_and_outcomes_can_be_pickled(tmp_path: Path) -> None:
     assert result == outcome.result
     assert measures == outcome.measures
     path = tmp_path / "p.json"
-    prediction = to_prediction(graph, annotations.vocabulary)
+    prediction = to_prediction(translate(graph, annotations), annotations.vocabulary)
     write_predictions(path, {"room_0": prediction}, 3, 3)
     again = evaluate_predictions(annotations, read_predictions(path))
     assert again.scans[0].matching == outcome.result.matching
@@ -112,7 +112,7 @@ def test_labels_of_a_detector_become_classes(tmp_path: Path) -> None:
     scores = to_prediction(translated, annotations.vocabulary).class_scores
     # book, chair, table; the rest is spread over what is not stated.
     assert scores[0].tolist() == pytest.approx([0.1, 0.5, 0.1])
-    assert translate(graph, annotations) is graph
+    assert translate(graph, annotations).nodes is graph.nodes
 
 
 def test_rotated_images_of_3rscan_are_evaluated(tmp_path: Path) -> None:

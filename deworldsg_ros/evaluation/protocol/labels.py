@@ -47,7 +47,8 @@ def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.S
 
     Mutual edges are in both directions, as in the ground truth.
     """
-    graph = msgspec.structs.replace(graph, edges=_both_directions(graph.edges))
+    if any(edge.mutual is True for edge in graph.edges):
+        graph = msgspec.structs.replace(graph, edges=_both_directions(graph.edges))
     names = translation(annotations)
     if not any(belief.label in names for node in graph.nodes for belief in node.classes):
         return graph
