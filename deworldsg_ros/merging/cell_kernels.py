@@ -332,11 +332,11 @@ def overlaps(
             owner_count, marked_count = _meet(
                 table, blocks[at], set_masks[at], on_block, block_owners, marked, marked_count
             )
+            while total + owner_count > len(found):
+                found = np.concatenate((found, found))
             for position in range(owner_count):
                 owner = block_owners[position]
                 if on_block[owner] != 0 and on_owner[owner] == 0:
-                    if total == len(found):
-                        found = np.concatenate((found, found))
                     found[total, 0], found[total, 1] = index, owner
                     total += 1
                 on_owner[owner] += _bit_count(on_block[owner])

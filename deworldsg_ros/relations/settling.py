@@ -1,8 +1,8 @@
 """What relations of different pairs exclude, settled around the objects that changed.
 
-`exclusions` states the rules for all pairs at once: one support an object, no circles, and what is
-near. These kernels apply the same rules, but only where something changed. Objects and pairs are
-rows of arrays; `ends`, `links` and `first_links` are those of `pair_links`.
+An object has one support at most, supports make no circles, and what is near is decided by its
+neighbours (`exclusions`). These kernels apply the rules only where something changed. Objects and
+pairs are rows of arrays; `ends`, `links` and `first_links` are those of `pair_links`.
 """
 
 from __future__ import annotations

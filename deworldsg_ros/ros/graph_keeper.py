@@ -18,18 +18,16 @@ from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.graph_files import GraphFiles
 from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.pose_corrections import CORRECTION_TOPIC, PoseCorrections
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.update_times import UpdateTimes
 from deworldsg_ros.ros.whole_graph import MakeMarkers, WholeGraph
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
 from deworldsg_ros.streams.clock_gate import ClockGate, jump_text
 from deworldsg_ros.streams.pending import PendingEvidence
-from deworldsg_ros.streams.poses import pose_from_message, stamp_ns_of
 
-CORRECTION_TOPIC = "deworldsg/pose_correction"
 # Local graphs and evidence that may wait: a second of both at 30 Hz. A graph takes milliseconds a
 # frame, so they wait only while kernels are compiled or a file is written.
 QUEUE_JOBS = 60
@@ -74,7 +72,7 @@ class GraphKeeper:
         self._clock: ClockGate[LocalGraph] = ClockGate()
         # A continued map is a new session, too: its sequence numbers start again.
         self._session = secrets.token_hex(8)
-        self._corrections = self._corrected_nodes = 0
+        self._corrections = PoseCorrections()
         self._values: dict[str, str] = {}
         self._times = UpdateTimes(self._parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
@@ -121,8 +119,7 @@ class GraphKeeper:
             **self._values,
             "graph queue": str(self._worker.waiting),
             "evidence waiting": str(len(self._pending)),
-            "pose corrections": str(self._corrections),
-            "nodes moved by corrections": str(self._corrected_nodes),
+            **self._corrections.values(),
         }
 
     def _announce(self, continued: Continued) -> None:
@@ -168,21 +165,7 @@ class GraphKeeper:
         self._times.changed(self._running_s, time.monotonic(), can_wait=True)
 
     def _correct(self, message: Any) -> None:
-        """Move the nodes first observed at the stamp or later; the pose is the rigid transform."""
-        T_correction, frame_id = pose_from_message(message)
-        if self._builder is None:
-            raise RefusedInput(
-                "no_graph", "pose correction before the first local graph: no node to correct"
-            )
-        if frame_id != self._builder.graph.frame_id:
-            raise RefusedInput(
-                "wrong_frame",
-                f"pose correction is in frame '{frame_id}', expected "
-                f"'{self._builder.graph.frame_id}'",
-            )
-        moved = self._builder.apply_correction(T_correction, stamp_ns_of(message))
-        self._corrections += 1
-        self._corrected_nodes += len(moved)
+        self._corrections.apply(message, self._builder)
         self._times.changed(self._running_s, time.monotonic())
 
     def _run(self, job: _Job) -> None:
@@ -227,12 +210,7 @@ class GraphKeeper:
         snapshot = self._builder.snapshot()
         snapshot.session = self._session
         self._whole.publish(snapshot, time.monotonic())
-        self._values = {
-            "nodes": str(len(snapshot.nodes)),
-            **{f"hidden, {why}": str(count) for why, count in self._builder.hidden.items()},
-            "edges": str(len(snapshot.edges)),
-            "sequence": str(snapshot.sequence),
-        }
+        self._values = _sizes(snapshot, self._builder.hidden)
 
     # The methods below run in the executor's thread.
 
@@ -246,15 +224,12 @@ class GraphKeeper:
                 result = self._files.save(self._builder)
             finally:
                 done.set_result(result)
-                self._wake()
+                if self._node.executor is not None:
+                    self._node.executor.wake()
 
         self.submit(save, lambda: done.set_result((False, "too many messages wait: try again")))
         response.success, response.message = await done
         return response
-
-    def _wake(self) -> None:
-        if self._node.executor is not None:
-            self._node.executor.wake()
 
     def _receive_correction(self, message: Any) -> None:
         self._node.health.received(CORRECTION_TOPIC)
@@ -269,3 +244,13 @@ class GraphKeeper:
 
 def _drop(job: _Job) -> None:
     job.dropped()
+
+
+def _sizes(snapshot: wire.SceneGraphMessage, hidden: dict[str, int]) -> dict[str, str]:
+    """The size of the graph, for /diagnostics."""
+    return {
+        "nodes": str(len(snapshot.nodes)),
+        **{f"hidden, {why}": str(count) for why, count in hidden.items()},
+        "edges": str(len(snapshot.edges)),
+        "sequence": str(snapshot.sequence),
+    }

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
+from support.reference_near import near_probabilities
 
 from deworldsg_ros.relations.exclusions import (
     CARRIED_FIRST,
@@ -18,7 +19,6 @@ from deworldsg_ros.relations.exclusions import (
     NEAR_LEVEL_M,
     NEAR_SUPPORT_M,
     SEAT_GAP_M,
-    near_probabilities,
     one_support,
 )
 from deworldsg_ros.relations.physical_states import RELATIONS_OF_STATE, STATE_COUNT, SUPPORTS

@@ -6,13 +6,13 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit, logit
+from support.reference_near import near_probabilities
 
 from deworldsg_ros.relations.exclusions import (
     CARRIED_FIRST,
     CARRIED_SECOND,
     MOST,
     NEAR_CERTAINTY,
-    near_probabilities,
     one_support,
 )
 from deworldsg_ros.relations.pair_links import link
