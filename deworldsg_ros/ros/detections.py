@@ -13,7 +13,7 @@ VISION_MSGS: Any = None
 with suppress(ImportError):
     VISION_MSGS = import_module("vision_msgs.msg")
 
-TOPIC = "/scene_graph/detections"
+TOPIC = "scene_graph/detections"
 
 
 def detection_array(graph: wire.SceneGraphMessage, stamp: Any, messages: Any = VISION_MSGS) -> Any:
