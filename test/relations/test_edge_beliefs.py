@@ -36,6 +36,7 @@ from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.relations.robust_beliefs import RobustBeliefs, fuse_prior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Relations
+from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.scene.votes import frame_votes
 
 seeds = st.integers(0, 10_000)
@@ -520,3 +521,30 @@ def _moved(item: Thing, x: float) -> Thing:
         return (corner[0] + x, corner[1], corner[2])
 
     return Thing(item.label, [type(part)(*map(shift, part)) for part in item.parts])
+
+
+def test_many_changes_are_told_in_several_updates() -> None:
+    """All things move at once. Updates go on until no pair waits, and then say what a file says."""
+    things = {
+        f"{row} {column}": thing("cup", 0.25 * row, 0.25 * column, 0.74, 0.09, 0.09, 0.1)
+        for row in range(4)
+        for column in range(4)
+    }
+    builder, ids = room({"table": table(0.4, 0.4, 1.2, 1.2), **things}, config())
+    replica = GraphReplica()
+    replica.apply(builder.update())
+    assert builder.waiting == 0  # the first update is whole
+    T = np.eye(4)
+    T[:3, 3] = [0.0, 0.0, 0.5]
+    for name in list(things)[::2]:
+        builder.graph.move_node(ids[name], T)
+    updates = 0
+    while updates == 0 or builder.waiting:
+        update = builder.update()
+        updates += 1
+        if update is not None:
+            replica.apply(update)
+    assert 2 <= updates <= 10
+    whole = builder.full()
+    assert replica.edges == {(edge.subject, edge.object): edge for edge in whole.edges}
+    assert builder.update() is None
