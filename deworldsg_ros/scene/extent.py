@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -34,16 +36,16 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         points_world: metres.
         up: unit vector against gravity.
     """
-    axes = horizontal_axes(up)
+    axes, quat_axes = _frame_of(tuple(up))
     points = np.ascontiguousarray(points_world[:MOST_POINTS], np.float64) @ axes.T
     low, high, heading = _bounds(points)
-    cos, sin = np.cos(heading), np.sin(heading)
+    cos, sin = math.cos(heading), math.sin(heading)
     turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     rotation = turn @ axes  # rows: axes of the box in the world
     return wire.GravityBox(
         center_m=rounded((low + high) / 2 @ rotation, 3),
         size_m=rounded(high - low, 3),
-        orientation_xyzw=rounded(quaternion_from_rotation(rotation.T), 4),
+        orientation_xyzw=rounded(_turned(quat_axes, heading), 4),
     )
 
 
@@ -54,6 +56,21 @@ def horizontal_axes(up: Sequence[float]) -> Float64:
     first = first - third * (first @ third)
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(third, first), third])
+
+
+@lru_cache(maxsize=4)
+def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
+    """`horizontal_axes`, and their quaternion: every box needs them, and up changes seldom."""
+    axes = horizontal_axes(up)
+    return axes, quaternion_from_rotation(axes.T)
+
+
+def _turned(quat_xyzw: Float64, heading: float) -> Float64:
+    """A quaternion after a turn about its own third axis; w >= 0."""
+    x, y, z, w = quat_xyzw.tolist()
+    cos, sin = math.cos(heading / 2), math.sin(heading / 2)
+    turned = np.array([x * cos + y * sin, y * cos - x * sin, z * cos + w * sin, w * cos - z * sin])
+    return -turned if turned[3] < 0 else turned
 
 
 def rounded(values: Float64, decimals: int) -> list[float]:

@@ -154,10 +154,11 @@ def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
 
 def _neighbours(points: Float32, radius: float) -> Float64:
     """Number of points within a radius of each point, itself included."""
-    widest = int(np.argmax(points.max(axis=0) - points.min(axis=0)))
-    order = np.argsort(points[:, widest])
+    columns = np.ascontiguousarray(points.T, np.float64)
+    widest = int(np.argmax(columns.max(axis=1) - columns.min(axis=1)))
     # Points in the order of one coordinate: only those that follow closely can be near.
-    columns = np.ascontiguousarray(points[order].T, np.float64)
+    order = np.argsort(columns[widest])
+    columns = columns[:, order]
     counts = np.empty(len(points))
     counts[order] = _count_near(columns, widest, radius)
     return counts
