@@ -37,8 +37,8 @@ TOPICS = {
     Role.CAMERA_INFO: "rgb/camera_info",
     Role.POSE: "camera/pose",
 }
-# Number of the nodes that subscribe to each topic.
-SUBSCRIBERS = {Role.RGB: 2, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
+# Number of the nodes that subscribe to each topic. relation_node takes images for clips only.
+SUBSCRIBERS = {Role.RGB: 1, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
 
 
 class NodeProcess:
