@@ -126,7 +126,7 @@ def test_a_recording_without_ground_truth_is_refused_with_the_missing_file(tmp_p
         open_annotations(tmp_path / "room", "recording")
     truth = {"objects": [], "relations": [], "first_stamp_ns": 0, "rate_hz": 0, "frames": 1}
     (tmp_path / "room.gt.json").write_text(json.dumps(truth))
-    with pytest.raises(RecordingError, match=r"rate_hz is 0.0: expected more than 0"):
+    with pytest.raises(RecordingError, match=r"1 frames at 0.0 Hz: expected at most"):
         open_annotations(tmp_path / "room", "recording")
 
 

@@ -74,7 +74,10 @@ def imported_modules(root: Path) -> set[str]:
 
 
 def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
-    known = {*requirements(root_dir), *requirements(root_dir, "models", "cluster")}
+    known = {
+        *requirements(root_dir),
+        *requirements(root_dir, "models", "cluster", "mcp", "networkx"),
+    }
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
         for name in imported_modules(root_dir)
