@@ -283,14 +283,15 @@ def test_warm_up_compiles_everything_that_a_frame_needs():
         moments._back_project,
         moments._camera_moments,
     )
-    for kernel in entry_points:
-        assert len(kernel.signatures) == 1
+    # Other tests of this process may have compiled more.
+    known = {kernel: len(kernel.signatures) for kernel in entry_points}
+    assert min(known.values()) >= 1
     instances, depth_m, intrinsics, T = make_scene(11)
     for array in (depth_m, instances):
         array.flags.writeable = False
     lift((instances, depth_m, intrinsics, T))
     for kernel in entry_points:
-        assert len(kernel.signatures) == 1, kernel
+        assert len(kernel.signatures) == known[kernel], kernel
 
 
 @pytest.mark.slow
