@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from contextlib import closing
 from pathlib import Path
@@ -96,19 +97,21 @@ def test_a_kill_leaves_no_half_recording(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
 
+    numbers = itertools.count()
+
     def convert() -> None:
-        (out / "a.mcap").unlink(missing_ok=True)
-        write_mcap(messages, out / "a.mcap")
+        write_mcap(messages, out / f"{next(numbers)}.mcap")
 
     whole = 0
     for moment_s in moments_s(50, 0.2):
         killed(convert, 0.005 + moment_s)
-        if (out / "a.mcap").exists():
-            whole += 1
-            with closing(open_source(out / "a.mcap")) as converted:
-                assert len(list(converted.raw_messages())) == len(messages)
         remove_left_overs(out)
-        assert set(names(out)) <= {"a.mcap"}
+        for path in out.iterdir():
+            assert path.suffix == ".mcap"
+            with closing(open_source(path)) as converted:
+                assert len(list(converted.raw_messages())) == len(messages)
+            path.unlink()
+            whole += 1
     assert whole
 
 

@@ -19,7 +19,8 @@ from endurance.rig import NODES, Rig
 # A node is restarted at once. The graph has to be updated again within this time after the node is
 # ready, in most cases: on a busy machine a single frame can take longer.
 WHOLE_WITHIN_S = 5.0
-PATIENCE_S = 30.0
+# A replay whose frames were lost with a node waits for them for 30 s (`STALL_S` of replay_node).
+PATIENCE_S = 60.0
 # Importing, compiled kernels from their cache, weights: on a busy machine with two cores.
 START_LIMIT_S = 120.0
 FIRST_GRAPH_S = 60.0

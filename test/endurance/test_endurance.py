@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from endurance.crash import WHOLE_WITHIN_S, crash
+from endurance.crash import crash
 from endurance.soak import MAX_SLOWER, ROOM_FRAMES, Series, merge, replay, rooms, still
 
 
@@ -39,7 +39,6 @@ def test_many_rooms_cost_memory_and_no_time():
 def test_killed_nodes_come_back_with_their_graph(tmp_path):
     recoveries = crash(5, tmp_path)
     assert not [item for item in recoveries if item.problem]
-    assert np.median([item.whole_s for item in recoveries]) < WHOLE_WITHIN_S
 
 
 @pytest.mark.slow
