@@ -148,6 +148,19 @@ def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> Non
     assert builder.update() is None
 
 
+@pytest.mark.parametrize("points", [False, True])
+def test_a_snapshot_is_that_of_the_last_update_whatever_came_since(points: bool) -> None:
+    config = msgspec.structs.replace(PAPER, output=OutputConfig(include_surface_points=points))
+    builder = GraphBuilder(config, VOCABULARY, "map")
+    replica = GraphReplica()
+    builder.integrate(local_graph(0))
+    replica.apply(builder.update())
+    builder.integrate(local_graph(1))
+    builder.graph.remove_node(1)
+    builder.full()
+    assert replica.message() == builder.snapshot()
+
+
 def test_a_late_update_contains_the_remembered_frames_only() -> None:
     builder = GraphBuilder(PAPER, VOCABULARY, "map")
     seen = local_graph(0)

@@ -6,6 +6,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
+import msgspec
+
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.delta import empty_scene_graph
@@ -53,8 +55,8 @@ class Publication:
         self._known_edges: dict[Pair, wire.EdgeState] = {}
         self._touched_nodes: set[int] = set()
         self._touched_edges: set[Pair] = set()
-        self._sequence = 0
-        self._snapshot = empty_scene_graph(graph.frame_id)
+        # The head of the last update; the snapshot gets its nodes and edges when it is asked for.
+        self._updated = self._snapshot = empty_scene_graph(graph.frame_id)
 
     def note_frame(self, stamp_ns: int, node_ids: Sequence[int]) -> None:
         """Note a merged frame, and the node of each row of its local graph."""
@@ -71,7 +73,7 @@ class Publication:
         It costs as much as what changed, however large the graph is.
         """
         self._refresh(whole=False)
-        nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._nodes.states)
+        nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._touched_states())
         edges, gone_edges = _take(self._touched_edges, self._known_edges, self._edges)
         removed = self._graph.take_removals()
         if not (nodes or edges or gone_nodes or gone_edges or removed):
@@ -79,56 +81,64 @@ class Publication:
         # A live node that was hidden is removed from the snapshot. Clients know ids that no
         # snapshot contained from associations.
         left = {**dict.fromkeys(gone_nodes), **removed}
-        self._sequence += 1
+        self._updated = self._message(self._updated.sequence + 1, [], [])
         message = wire.SceneGraphUpdateMessage(
             schema=wire.schema_of(wire.SceneGraphUpdateMessage),
-            stamp=wire.stamp_from_ns(self._stamp_ns),
-            frame_id=self._graph.frame_id,
-            sequence=self._sequence,
+            stamp=self._updated.stamp,
+            frame_id=self._updated.frame_id,
+            sequence=self._updated.sequence,
             removed_nodes=[wire.RemovedNode(node, left[node]) for node in sorted(left)],
             removed_edges=[wire.RemovedEdge(*pair) for pair in gone_edges],
-            nodes=self._shown(nodes, self._include_surface_points),
+            nodes=nodes,
             edges=edges,
             associations=list(self._associations),
-            up=list(self._nodes.up),
+            up=self._updated.up,
         )
         self._associations.clear()
         return message
 
     def snapshot(self) -> wire.SceneGraphMessage:
-        """The graph after the last `update`."""
-        if self._snapshot.sequence != self._sequence:
-            points = self._include_surface_points
-            self._snapshot = self._message(self._known_nodes, self._known_edges, points)
+        """The graph after the last `update`, whatever was merged since."""
+        if self._snapshot.sequence != self._updated.sequence:
+            self._snapshot = msgspec.structs.replace(
+                self._updated, nodes=_ordered(self._known_nodes), edges=_ordered(self._known_edges)
+            )
         return self._snapshot
 
     def full(self) -> wire.SceneGraphMessage:
         """The present graph with surface points; the next `update` is unaffected."""
         self._refresh(whole=True)
-        return self._message(self._nodes.states, self._edges, with_points=True)
+        nodes = [self._nodes.with_points(node) for node in _ordered(self._nodes.states)]
+        return self._message(self._updated.sequence, nodes, _ordered(self._edges))
 
     def _refresh(self, whole: bool) -> None:
         self._touched_nodes.update(self._nodes.refresh())
         self._touched_edges.update(self._refresh_edges(whole))
 
+    def _touched_states(self) -> dict[int, wire.NodeState]:
+        """Messages of the touched nodes as they are published."""
+        states = self._nodes.states
+        found = {node: states[node] for node in self._touched_nodes if node in states}
+        if not self._include_surface_points:
+            return found
+        return {node: self._nodes.with_points(state) for node, state in found.items()}
+
     def _message(
-        self,
-        nodes: Mapping[int, wire.NodeState],
-        edges: Mapping[Pair, wire.EdgeState],
-        with_points: bool,
+        self, sequence: int, nodes: list[wire.NodeState], edges: list[wire.EdgeState]
     ) -> wire.SceneGraphMessage:
         return wire.SceneGraphMessage(
             schema=wire.schema_of(wire.SceneGraphMessage),
             stamp=wire.stamp_from_ns(self._stamp_ns),
             frame_id=self._graph.frame_id,
-            sequence=self._sequence,
-            nodes=self._shown([nodes[node_id] for node_id in sorted(nodes)], with_points),
-            edges=[edges[pair] for pair in sorted(edges)],
+            sequence=sequence,
+            nodes=nodes,
+            edges=edges,
             up=list(self._nodes.up),
         )
 
-    def _shown(self, nodes: list[wire.NodeState], with_points: bool) -> list[wire.NodeState]:
-        return [self._nodes.with_points(node) for node in nodes] if with_points else nodes
+
+def _ordered(states: Mapping[Key, Message]) -> list[Message]:
+    return [states[key] for key in sorted(states)]
 
 
 def _take(
