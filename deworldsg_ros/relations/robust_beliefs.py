@@ -8,6 +8,7 @@ around the pairs that changed.
 
 from __future__ import annotations
 
+from collections.abc import Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,7 +75,7 @@ class RobustBeliefs:
         self._with = predicates.index("with") if "with" in predicates else -1
         # Keys of the pairs into which a prior may enter, by class pair; and the reverse.
         self._by_classes: dict[ClassPair, set[int]] = {}
-        self._classes_of: dict[int, list[ClassPair]] = {}
+        self._classes_of: dict[int, Set[ClassPair]] = {}
 
     def refresh(self, prior: Prior) -> ChangedBeliefs:
         """Compute the beliefs that may have changed since the last call.
@@ -88,7 +89,7 @@ class RobustBeliefs:
         gone = [one for one in keys if one not in table]
         changed = np.union1d(rows, self._settled.settle(rows))
         for pair_key in gone:
-            self._index(pair_key, [])
+            self._index(pair_key, set())
         again = set().union(*(self._by_classes.get(pair, ()) for pair in prior.changed))
         changed = np.union1d(changed, np.array([table.row(one) for one in again], np.int64))
         table.changed_pairs.clear()
@@ -102,7 +103,7 @@ class RobustBeliefs:
         related = t.relations[rows, :, NONE].min(axis=1) < 1.0 - MIN_RELATED
         related |= t.other_votes[rows] >= MIN_OTHER_VOTES
         for pair_key in t.ids[rows[~related]].tolist():
-            self._index(pair_key, [])
+            self._index(pair_key, set())
             gone.append(pair_key)
         rows = rows[related]
         votes = self._votes(rows)
@@ -145,7 +146,8 @@ class RobustBeliefs:
         for index, pair_key in enumerate(table.ids[rows].tolist()):
             first, second = best[index].tolist()
             pairs = [(first, second), (second, first)]
-            self._index(pair_key, [pairs[end] for end in (0, 1) if open_[index, end]])
+            # Two objects of one class have the same class pair in both directions.
+            self._index(pair_key, {pairs[end] for end in (0, 1) if open_[index, end]})
         places, ends = np.nonzero(open_)
         if not len(places):
             return
@@ -161,7 +163,7 @@ class RobustBeliefs:
         probabilities[places, ends] = fused
         judged[places, ends] |= active
 
-    def _index(self, pair_key: int, classes: list[ClassPair]) -> None:
+    def _index(self, pair_key: int, classes: Set[ClassPair]) -> None:
         """Note the class pairs whose prior may enter a pair."""
         for known in self._classes_of.pop(pair_key, ()):
             self._by_classes[known].discard(pair_key)

@@ -334,6 +334,19 @@ def test_a_prior_of_clips_enters_where_the_predicate_is_open() -> None:
     assert back[PREDICATES.index("of")] < 0.01  # a prior has a direction
 
 
+def test_both_directions_of_two_objects_of_one_class_may_be_open_again_and_again() -> None:
+    twins = {"cup": DESK["cup"], "other": thing("cup", 0.42, 0.1, 0.74, 0.09, 0.09, 0.1)}
+    frames_alone = config(world_model="none")
+    builder, ids = room(twins, frames_alone)
+    pair = (ids["cup"], ids["other"])
+    for _ in range(3):
+        for name in ("wearing", "holding", "using", "carrying"):
+            for direction in (pair, pair[::-1]):
+                vote(builder, *direction, name, 5, share=0.9)
+        builder.update()
+    assert set(beliefs_of(builder, frames_alone)) == {pair, pair[::-1]}
+
+
 @pytest.mark.filterwarnings("ignore:invalid value")  # of pairs that are surely not related
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds, alpha=st.sampled_from([0.0, 0.5, 10.0]))
