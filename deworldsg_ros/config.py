@@ -17,6 +17,7 @@ import msgspec
 from deworldsg_ros.files import read_regular
 from deworldsg_ros.parsing import MAX_YAML_BYTES, parse_yaml
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.words import suggestion
 
 
 def option(description: str, **limits: Any) -> Any:
@@ -313,6 +314,8 @@ def load_config(path: Union[str, Path]) -> Config:
 
 def from_mapping(content: Any, source: str = "configuration") -> Config:
     """Check nested plain values and convert them to a Config; raises ConfigurationError."""
+    if isinstance(content, dict):
+        _check_names(content, source)
     try:
         config = msgspec.convert(content, Config)
     except msgspec.ValidationError as error:
@@ -324,6 +327,23 @@ def from_mapping(content: Any, source: str = "configuration") -> Config:
                     f"{source}: {section}.{name} is {value}: expected a finite number"
                 )
     return config
+
+
+def _check_names(content: dict[Any, Any], source: str) -> None:
+    known = to_mapping(Config())
+    options = [f"{section}.{name}" for section, fields in known.items() for name in fields]
+    for section, fields in content.items():
+        if section not in known:
+            expected = ", ".join(known)
+            raise ConfigurationError(
+                f"{source}: there is no section {section}{suggestion(str(section), known)}; "
+                f"expected {expected}"
+            )
+        for name in fields if isinstance(fields, dict) else ():
+            if (option := f"{section}.{name}") not in options:
+                raise ConfigurationError(
+                    f"{source}: there is no option {option}{suggestion(option, options)}"
+                )
 
 
 def to_mapping(config: Config) -> dict[str, Any]:

@@ -13,6 +13,9 @@ from numpy.typing import DTypeLike, NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+# For people who wait: a cache on disk keeps the kernels for the next start.
+COMPILING = "compiling the kernels, for the first run on this machine …"
+
 
 def kernel(function: F) -> F:
     """Compile with numba: strict IEEE arithmetic, without the GIL, cached on disk if possible.

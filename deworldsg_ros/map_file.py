@@ -23,6 +23,7 @@ from deworldsg_ros.scene.array_checks import checked
 from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.words import counted
 
 # Before the names of the arrays of merging.
 _MERGING = "merging."
@@ -110,7 +111,7 @@ def continue_map(config: Config, path: Path) -> Continued | None:
 
 
 def _size(builder: GraphBuilder) -> str:
-    return f"{len(builder.graph)} nodes in frame '{builder.graph.frame_id}'"
+    return f"{counted(len(builder.graph), 'node')} in frame '{builder.graph.frame_id}'"
 
 
 def read_map(config: Config, path: Path) -> GraphBuilder:

@@ -78,7 +78,9 @@ FrameRate = Annotated[
 CameraIntrinsics = Annotated[
     str,
     typer.Option(
-        "--intrinsics", metavar="FX,FY,CX,CY", help="intrinsics of a folder without calibration"
+        "--intrinsics",
+        metavar="FX,FY,CX,CY",
+        help="intrinsics in pixels, in place of those of the recording",
     ),
 ]
 DepthSource = Annotated[
@@ -309,12 +311,24 @@ def convert(
 
 
 @app.command()
-def info(recording: RecordingPath) -> None:
+def info(
+    recording: RecordingPath,
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+    intrinsics: CameraIntrinsics = "",
+) -> None:
     """Show the topics of a recording and their use."""
     with _reporting_errors():
         from deworldsg_ros.cli.info import show_recording
 
-        show_recording(recording, Console(markup=False))
+        show_recording(
+            recording,
+            TopicChoice(rgb, depth, camera_info, pose),
+            DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
+            Console(markup=False),
+        )
 
 
 @app.command("compile")

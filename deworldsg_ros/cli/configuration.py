@@ -12,6 +12,7 @@ import msgspec
 from deworldsg_ros.config import Config, from_mapping, load_config, to_mapping
 from deworldsg_ros.parsing import parse_yaml
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.words import suggestion
 
 HEADER = """\
 # Configuration of deworldsg_ros: each option with its description, its range in brackets, and its
@@ -45,13 +46,16 @@ def _set(config: Config, setting: str) -> Config:
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
         raise ConfigurationError(f"--set {setting!a}: expected UTF-8 text") from error
     name, equals, text = setting.partition("=")
-    section, dot, field = name.strip().partition(".")
+    section, _, field = name.strip().partition(".")
     mapping = to_mapping(config)
-    if not equals or not dot:
+    if not equals:
         raise ConfigurationError(f"--set {setting}: expected section.field=value")
     if field not in mapping.get(section, {}):
+        hint = suggestion(name, (".".join(path) for path, _ in _described_fields()))
         known = ", ".join(mapping.get(section, mapping))
-        raise ConfigurationError(f"--set {setting}: there is no {name}; expected one of {known}")
+        raise ConfigurationError(
+            f"--set {setting}: there is no {name}{hint}; expected one of {known}"
+        )
     mapping[section][field] = _value(text, mapping[section][field])
     try:
         return from_mapping(mapping)

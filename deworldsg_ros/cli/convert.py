@@ -16,6 +16,7 @@ from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.recordings.source import RawRoleMessage, Source
 from deworldsg_ros.recordings.writer import check_output, write_mcap
+from deworldsg_ros.words import counted
 
 
 def convert_recording(
@@ -39,7 +40,9 @@ def convert_recording(
         source.close()
     print_drops(console, source.losses, {"recording": source.drops}, {})
     size_mb = output.stat().st_size / 1e6
-    console.print(f"{output}: {count} messages, {size_mb:.1f} MB", highlight=False, soft_wrap=True)
+    console.print(
+        f"{output}: {counted(count, 'message')}, {size_mb:.1f} MB", highlight=False, soft_wrap=True
+    )
 
 
 def _counted(source: Source, progress: Progress, task: TaskID) -> Iterator[RawRoleMessage]:

@@ -31,6 +31,7 @@ from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
+from deworldsg_ros.words import counted
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 ODOMETRY_NODE = "odometry_node"
@@ -260,11 +261,12 @@ def _print_summary(out: Path, finished: events.Finished, console: Console) -> No
         outputs.print_noted(
             console,
             "warning:",
-            f"no result for {finished.without_result} frames; see the logs of the nodes in "
-            f"{out / 'logs'}",
+            f"no result for {counted(finished.without_result, 'frame')}; see the logs of the "
+            f"nodes in {out / 'logs'}",
         )
     console.print(
-        f"{finished.published} frames published, {finished.processed} merged into the graph",
+        f"{counted(finished.published, 'frame')} published, {finished.processed} merged into the "
+        "graph",
         highlight=False,
     )
     outputs.print_files(console, out)

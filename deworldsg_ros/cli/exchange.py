@@ -21,6 +21,7 @@ from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.rigid import rigid_motion
+from deworldsg_ros.words import counted
 
 # typer evaluates these annotations at run time.
 Graph = Annotated[Path, typer.Argument(metavar="GRAPH", help="file, or folder of a run")]
@@ -49,7 +50,7 @@ def diff(before: First, after: Second, as_json: AsJson = False) -> None:
         return
     for line in changes.lines:
         typer.echo(line)
-    typer.echo(f"{changes.same} objects are the same")
+    typer.echo(f"unchanged: {counted(changes.same, 'object')}")
 
 
 def merge(
@@ -83,7 +84,7 @@ def merge(
             f"transform found: {place} m, {angle:.1f} degrees; confidence {combined.confidence:.2f}"
         )
     console.print(
-        f"{output}: {len(combined.message.nodes)} objects; {len(combined.pairs)} of the "
+        f"{output}: {counted(len(combined.message.nodes), 'object')}; {len(combined.pairs)} of the "
         f"{len(a)} and {len(b)} objects are in both"
     )
 

@@ -11,20 +11,32 @@ from rich.text import Text
 
 from deworldsg_ros.cli.outputs import print_noted
 from deworldsg_ros.recordings.bags.storage import RawBag
+from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import detect_kind, open_source
+from deworldsg_ros.words import counted
 
 
-def show_recording(path: Path, console: Console) -> None:
-    """Print the kind, the topics and their use, and the lost data; raises RecordingError."""
+def show_recording(
+    path: Path, topics: TopicChoice, options: DatasetOptions, console: Console
+) -> None:
+    """Print the kind, the topics and their use, and the lost data; raises RecordingError.
+
+    Args:
+        path: of the recording.
+        topics: topics of a bag that the user named.
+        options: intrinsics that the user gave.
+        console: terminal.
+    """
     kind = detect_kind(path)
     used: dict[str, str] = {}
     problem = None
     losses: list[str] = []
     frames = 0
     try:
-        source = open_source(path, kind=kind, need_poses=False)
+        source = open_source(path, kind=kind, topics=topics, options=options, need_poses=False)
     except RecordingError as error:
         if kind != "rosbag2":
             raise
@@ -39,7 +51,9 @@ def show_recording(path: Path, console: Console) -> None:
         rows = [(topic.name, topic.msgtype, topic.count) for topic in bag.topics]
         losses = bag.losses
         bag.close()
-    console.print(f"{path}: {kind}, {frames} RGB images", highlight=False, soft_wrap=True)
+    console.print(
+        f"{path}: {kind}, {counted(frames, 'RGB image')}", highlight=False, soft_wrap=True
+    )
     table = Table(box=box.SIMPLE)
     table.add_column("topic" if kind == "rosbag2" else "files", overflow="fold")
     table.add_column("type", overflow="fold")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import queue
 import threading
-import time
 from collections.abc import Sequence
 
 import msgspec
@@ -12,13 +11,13 @@ from rich.console import Console
 
 from deworldsg_ros.cli.processes import LoggedProcess
 from deworldsg_ros.cli.progress import frame_progress, working
+from deworldsg_ros.kernels import COMPILING
 from deworldsg_ros.recordings import events
 from deworldsg_ros.ros.health import DROPPED
 from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.words import counted
 
 STARTING = "starting the nodes …"
-# A start with compiled kernels takes less: no explanation before this.
-EXPLAIN_AFTER_S = 8.0
 
 
 class DemoFailed(DeWorldSGError):
@@ -42,7 +41,6 @@ class ReplayProgress:
         self._nodes = nodes
         self._frames = frames
         self._lines: queue.Queue[bytes | None] = queue.Queue()
-        self._started_s = time.monotonic()
         self._status = working(console, STARTING)
         self._progress = frame_progress(console)
         self._task = self._progress.add_task("replaying", total=frames, start=False, note="")
@@ -91,13 +89,15 @@ class ReplayProgress:
 
     def _show(self, event: events.Event | None) -> None:
         if isinstance(event, events.Waiting):
-            self._status.update(_waiting_text(event, time.monotonic() - self._started_s))
+            compiling = any(COMPILING in node.last_lines() for node in self._nodes)
+            self._status.update(_waiting_text(event, compiling))
         elif isinstance(event, events.Started):
             self._status.stop()
             self._progress.start_task(self._task)
             self._progress.start()
         elif isinstance(event, events.Progress):
-            note = f"{event.nodes} nodes" if event.published < self._frames else "finishing …"
+            finishing = event.published >= self._frames
+            note = "finishing …" if finishing else counted(event.nodes, "node")
             self._progress.update(self._task, completed=event.published, note=note)
         elif isinstance(event, events.Saved):
             self._saved = event
@@ -114,12 +114,12 @@ class ReplayProgress:
             raise DemoFailed(_early_end(self._replay))
 
 
-def _waiting_text(event: events.Waiting, since_s: float) -> str:
+def _waiting_text(event: events.Waiting, compiling: bool) -> str:
     words = [words[0] for item in event.missing if (words := item.split())[0].endswith("_node")]
     names = ", ".join(dict.fromkeys(words)) or event.missing[0]
     text = f"{STARTING} waiting for {names}"
-    if since_s > EXPLAIN_AFTER_S:
-        text += "\n  (the first start compiles the kernels, which takes a minute or two)"
+    if compiling:
+        text += f"\n  {COMPILING}"
     return text
 
 

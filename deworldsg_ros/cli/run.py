@@ -24,7 +24,7 @@ from deworldsg_ros.cli.progress import frame_progress, say_instead, working
 from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import warm_up
-from deworldsg_ros.kernels import on_compilation
+from deworldsg_ros.kernels import COMPILING, on_compilation
 from deworldsg_ros.map_file import claim_map, continue_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
@@ -40,11 +40,11 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
+from deworldsg_ros.words import counted
 
 # Clips that the world model lost.
 FAILURES = ("world_model_error", "nan_features")
 LOADING = "loading the models …"
-COMPILING = "compiling the kernels, for the first run on this machine …"
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def _note_update(
 
 
 def _node_count(pipeline: Pipeline) -> str:
-    return "" if pipeline.builder is None else f"{pipeline.builder.confirmed} nodes"
+    return "" if pipeline.builder is None else counted(pipeline.builder.confirmed, "node")
 
 
 def _write_results(
@@ -269,8 +269,11 @@ def _print_summary(
     options: RunOptions, pipeline: Pipeline, processed: _Processed, console: Console
 ) -> None:
     frames = len(processed.poses)
-    speed = f"{frames} frames in {processed.wall_s:.1f} s ({processed.frames_per_s:.1f} per second)"
-    console.print(speed, highlight=False)
+    console.print(
+        f"{counted(frames, 'frame')} in {processed.wall_s:.1f} s "
+        f"({processed.frames_per_s:.1f} per second)",
+        highlight=False,
+    )
     if pipeline.builder is not None and (hidden := pipeline.builder.hidden):
         reasons = ", ".join(f"{count} {reason}" for reason, count in hidden.items())
         console.print(f"hidden nodes (output.min_existence): {reasons}", highlight=False)

@@ -17,6 +17,7 @@ from deworldsg_ros.client.patterns import (
     absence_notes,
     parse,
 )
+from deworldsg_ros.words import counted
 
 # Part of an answer: probability, relation or None, words.
 _Part = tuple[float, Relation | None, str]
@@ -70,7 +71,7 @@ def _seen_since(graph: SceneGraph, question: str, since: Since) -> Answers:
             item.probability,
             (),
             f"first seen {(graph.stamp_ns - item.first_seen_ns) / 1e9:.1f} s before the newest "
-            f"frame, in {item.observations} frames so far",
+            f"frame, in {counted(item.observations, 'frame')} so far",
         )
         for item in sorted(new, key=lambda item: (item.first_seen_ns, item.id))
     ]
@@ -88,7 +89,7 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
     if chance < MIN_PROBABILITY:
         return None
     what = item.label if pattern.thing is None else pattern.thing
-    words = [f"{what} {chance:.0%} in {item.observations} frames"]
+    words = [f"{what} {chance:.0%} in {counted(item.observations, 'frame')}"]
     relations = []
     for condition in pattern.conditions:
         part = _best_part(graph, item, condition)

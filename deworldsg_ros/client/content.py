@@ -19,6 +19,7 @@ from deworldsg_ros.client.words import is_class, predicate_names
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.extent import DEFAULT_UP
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
+from deworldsg_ros.words import counted
 
 # What an argument of a question may be: an object, its id, or the name of a class.
 Which = SceneObject | int | str
@@ -42,7 +43,9 @@ class GraphContent:
         return len(self._nodes)
 
     def __repr__(self) -> str:
-        return f"SceneGraph({len(self._nodes)} objects, {len(self._edges)} relations)"
+        return (
+            f"SceneGraph({counted(len(self), 'object')}, {counted(len(self._edges), 'relation')})"
+        )
 
     def __getitem__(self, node_id: int) -> SceneObject:
         """The object with an id; raises ClientError if it is not in the graph."""

@@ -14,6 +14,7 @@ from deworldsg_ros.client.objects import (
     odds_of,
 )
 from deworldsg_ros.client.words import is_class
+from deworldsg_ros.words import counted
 
 # Two boxes are in contact below this gap: the error of a measured extent.
 CONTACT_M = 0.04
@@ -45,7 +46,7 @@ def explain_object(item: SceneObject, relations: Sequence[Relation]) -> Explanat
         relations: all relations of the object.
     """
     frames, seconds = item.observations, (item.last_seen_ns - item.first_seen_ns) / 1e9
-    lines = [f"detected in {frames} frames over {seconds:.1f} s"]
+    lines = [f"detected in {counted(frames, 'frame')} over {seconds:.1f} s"]
     if item.existence is not None:
         lines.append(f"exists with {item.existence:.0%} ({odds_of(item.existence)})")
     names = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])

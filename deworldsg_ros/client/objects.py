@@ -14,6 +14,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.extent import box_of, surface_points
 from deworldsg_ros.scene.predicates import plain
+from deworldsg_ros.words import counted
 
 Point = tuple[float, float, float]
 
@@ -184,7 +185,7 @@ class Relation:
             "fused": "seen, and judged by the world model",
         }[self.provenance]
         of = f" of {self.shown} that show both" if self.shown else ""
-        frames = f" in {self.observations} frames{of}" if self.observations else ""
+        frames = f" in {counted(self.observations, 'frame')}{of}" if self.observations else ""
         return source + (frames if self.provenance != "prior" else "")
 
     def to_dict(self) -> dict[str, Any]:

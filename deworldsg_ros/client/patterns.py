@@ -28,6 +28,7 @@ from deworldsg_ros.client.objects import (
 )
 from deworldsg_ros.client.words import is_class
 from deworldsg_ros.scene.predicates import PREDICATES, plain
+from deworldsg_ros.words import counted
 
 SKIPPED = frozenset(
     {"a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that", "there"}
@@ -271,7 +272,8 @@ def absence_notes(
     """Why there is no object of a class: hidden ones, or the classes that there are."""
     found = [item for item in hidden or () if is_class(thing, item.label)]
     notes = [
-        f"a {item.label} was detected in {item.observations} frames and is hidden: {item.reason}"
+        f"a {item.label} was detected in {counted(item.observations, 'frame')} and is hidden: "
+        f"{item.reason}"
         for item in found
     ]
     if not any(is_class(thing, label) for label in labels):

@@ -35,6 +35,7 @@ from deworldsg_ros.ros.parameters import declare
 from deworldsg_ros.ros.process import refuse, run_process
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+from deworldsg_ros.words import counted
 
 CLASSES = {
     messages.IMAGE: Image,
@@ -238,7 +239,7 @@ class ReplayNode(Node):
                 poses=self._monitor.poses,
             )
         )
-        self.get_logger().info(f"done: {self._published} frames published")
+        self.get_logger().info(f"done: {counted(self._published, 'frame')} published")
 
     def _emit_progress(self, *, at_once: bool = False) -> None:
         now_s = time.monotonic()

@@ -104,7 +104,7 @@ def open_source(
         kind: name of a data set or ``rosbag2``; ``auto`` = detect.
         topics: topics of a bag that the user named; the others are found by type and name.
         inputs: transport, pose source, and for TF the world frame and pose slop.
-        options: of a data set folder.
+        options: of a data set folder; for a bag, the intrinsics replace its CameraInfo.
         need_poses: whether a bag without poses is refused, and a frame without a pose left out;
             False if the poses come from elsewhere.
 
@@ -114,7 +114,8 @@ def open_source(
     if kind == "auto":
         kind = detect_kind(path)
     if kind == "rosbag2":
-        return BagSource(path, topics, inputs, need_pose=need_poses)
+        intrinsics = options.intrinsics if options else None
+        return BagSource(path, topics, inputs, need_pose=need_poses, intrinsics=intrinsics)
     if not need_poses:
         options = replace(options or DatasetOptions(), poses_needed=False)
     return open_dataset(kind, path, options)

@@ -10,6 +10,7 @@ from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.map_keeper import MapKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
+from deworldsg_ros.words import counted
 
 
 class GraphFiles:
@@ -51,7 +52,8 @@ class GraphFiles:
             write_atomically(self._save_path, wire.encode(message))
         except OSError as error:
             return False, f"{self._save_path}: {error}"
-        said = f"{self._save_path}: {len(message.nodes)} nodes, {len(message.edges)} edges"
+        nodes, edges = counted(len(message.nodes), "node"), counted(len(message.edges), "edge")
+        said = f"{self._save_path}: {nodes}, {edges}"
         if self.map is None:
             return True, said
         saved, about_map = self.map.save(builder)

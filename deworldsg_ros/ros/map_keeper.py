@@ -19,6 +19,7 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.words import counted
 
 # Of the graph's thread: 34 nodes take 5 ms, so a large graph is copied less often.
 MAX_SHARE = 0.02
@@ -87,7 +88,7 @@ class MapKeeper:
         except ConfigurationError as error:
             return False, str(error)
         self._due_s = None
-        return True, f"map {self.path}: {builder.confirmed} nodes"
+        return True, f"map {self.path}: {counted(builder.confirmed, 'node')}"
 
     def close(self) -> None:
         """End the thread, and let other processes write the map."""

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
+from deworldsg_ros.kernels import COMPILING, on_compilation
 from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, UNMATCHED_PREFIX, Health
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import declare
@@ -63,9 +64,8 @@ class StageNode(Node):
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.parameters = declare(self, Parameters)
-        self.get_logger().info(
-            "loading; the first start compiles kernels, which takes up to a minute"
-        )
+        self.get_logger().info("loading")
+        on_compilation(lambda: self.get_logger().info(COMPILING))
         self.health = Health(product)
         self._logged_s: dict[str, float] = {}
         self._log_lock = threading.Lock()

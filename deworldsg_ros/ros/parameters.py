@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from rclpy.node import Node
 
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.words import suggestion
 
 # Parameters that rclpy reads itself.
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
@@ -102,8 +102,7 @@ def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
                 "publishers, or inputs.reliability"
             )
         if field is None:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            hint = f" (did you mean {near[0]}?)" if near else ""
+            hint = suggestion(name, known)
             raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
         section, key = field.path
         try:

@@ -13,6 +13,8 @@ REASONS: dict[str, str] = {
     "driver.",
     "decode_failed": "A compressed image is damaged, or is neither JPEG nor PNG. Check the camera "
     "driver and the network.",
+    "not_depth": "The depth topic carries pictures: colour images, or depth drawn for people. Name "
+    "the topic of the depth images, with 16UC1 or 32FC1, also as compressedDepth.",
     "grid_mismatch": "RGB, depth and camera_info differ in size. Publish depth that is registered "
     "to RGB.",
     "invalid_intrinsics": "camera_info contains zeros, NaN or absurd values. Calibrate the camera.",

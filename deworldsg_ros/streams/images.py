@@ -113,9 +113,14 @@ def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float
         max_depth_m: largest valid depth.
 
     Raises:
-        RefusedInput: as `image_view`, or ``decode_failed``.
+        RefusedInput: as `image_view`, ``not_depth`` or ``decode_failed``.
     """
-    raw = _decode_depth(message) if is_compressed(message) else image_view(message, DEPTH_ENCODINGS)
+    if is_compressed(message):
+        raw = _decode_depth(message)
+    elif message.encoding in RGB_ENCODINGS:
+        raise _not_depth(str(message.encoding))
+    else:
+        raw = image_view(message, DEPTH_ENCODINGS)
     depth_m: Float32 = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         depth_m *= np.float32(depth_scale_m)
@@ -169,7 +174,10 @@ def _decode_depth(message: Any) -> NDArray[Any]:
     description = str(message.format)
     data = memoryview(message.data).cast("B")
     if "compressedDepth" not in description:
-        return _grey16(_decode(data, cv2.IMREAD_UNCHANGED, description), description)
+        pixels = _decode(data, cv2.IMREAD_UNCHANGED, description)
+        if pixels.dtype == np.uint8:
+            raise _not_depth(f"{description}, 8 bits")
+        return _grey16(pixels, description)
     encoding = description.split(";")[0].strip()
     if encoding not in DEPTH_ENCODINGS or "rvl" in description.lower():
         raise RefusedInput(
@@ -192,6 +200,13 @@ def _decode_depth(message: Any) -> NDArray[Any]:
     with np.errstate(divide="ignore"):
         depth_m = factor / (counts.astype(np.float32) - offset)
     return np.where(counts == 0, np.float32(0), depth_m)
+
+
+def _not_depth(seen: str) -> RefusedInput:
+    return RefusedInput(
+        "not_depth",
+        f"an image on the depth topic is a picture ({seen}): expected distances, 16UC1 or 32FC1",
+    )
 
 
 def _grey16(pixels: NDArray[Any], description: str) -> NDArray[Any]:

@@ -62,7 +62,10 @@ def test_version_and_help(tmp_path):
             ["convert", "auto", ".", "x.mcap", "--depth-source", "laser"],
             "expected auto, rendered, sensor",
         ),
-        (["config", "--set", "lifting.tauu=1"], "lifting.tauu"),
+        (["config", "--set", "lifting.tauu=1"], "did you mean lifting.tau?"),
+        (["config", "--set", "tau=0.1"], "did you mean lifting.tau?"),
+        (["config", "--set", "score_treshold=0.1"], "did you mean perception.score_threshold?"),
+        (["config", "--set", "lifting.min_existence=0"], "did you mean output.min_existence?"),
         (["config", "--set", "lifting.tau=2"], "expected for lifting.tau: relative tolerance"),
         (["config", "--set", "lifting.tau=wide"], "[>= 0, <= 1]"),
         (["config", "--set", "tau"], "section.field=value"),
@@ -116,6 +119,29 @@ def test_info_explains_how_to_use_a_recording_without_poses(invoke, tmp_path):
     assert re.search(r"/camera/color/camera_info +CameraInfo +2 +camera_info", result.stdout)
     assert "--odometry" in result.stdout
     assert "--odometry" in invoke("convert", "auto", "bag", "out.mcap").stderr
+
+
+def test_info_takes_the_options_of_run(invoke, tmp_path):
+    items = [item for item in camera_items(1, compressed=False) if "info" not in item[0]]
+    renamed = [(topic.replace("depth", "range"), *rest) for topic, *rest in items]
+    write_bag(tmp_path / "bag", renamed)
+    assert "no depth topic" in invoke("info", "bag", "--intrinsics", "60,61,31.5,23.5").stderr
+    given = ("--depth", "/camera/range/image_raw", "--intrinsics", "60,61,31.5,23.5")
+    result = invoke("info", "bag", *given)
+    assert result.exit_code == 0, result.stderr
+    assert "1 RGB image\n" in result.stdout
+    assert re.search(r"/camera/range/image_raw .* depth", result.stdout)
+
+
+def test_a_misspelt_option_of_a_file_is_named_with_the_one_that_is_meant(invoke, tmp_path):
+    for content, words in (
+        ("perception: {treshold: 1}", "perception.treshold (did you mean perception.score_thresh"),
+        ("percepton: {threads: 1}", "no section percepton (did you mean perception?)"),
+    ):
+        (tmp_path / "c.yaml").write_text(content)
+        result = invoke("config", "--config", "c.yaml")
+        assert result.exit_code == 2
+        assert words in result.stderr
 
 
 def test_info_reports_lost_data(invoke, tmp_path):

@@ -193,7 +193,7 @@ def test_the_commands(demo_out: Path, tmp_path: Path, room: SceneGraph) -> None:
     assert "34 of the 34 and 34" in given_.stdout, given_.stderr
     assert run("merge", demo_out, other, "x", "--transform", "1,2").exit_code == 2
 
-    assert run("diff", demo_out, tmp_path / "both.json").stdout == "34 objects are the same\n"
+    assert run("diff", demo_out, tmp_path / "both.json").stdout == "unchanged: 34 objects\n"
     changes = json.loads(run("diff", demo_out, other, "--json").stdout)
     assert changes["moved"] or changes["gone"]
     assert "graph.csv" in run("export", "csv", demo_out, tmp_path / "graph.csv").stdout

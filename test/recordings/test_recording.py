@@ -21,11 +21,13 @@ from support.recordings import (
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings import messages as ros
+from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.writer import write_mcap
-from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 COUNT = 6
@@ -64,6 +66,29 @@ def test_a_bag_without_poses_is_refused(tmp_path):
     bag = write_bag(tmp_path / "bag", camera_items(2, with_pose=False))
     with pytest.raises(RecordingError, match="no pose topic"):
         open_recording(bag)
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_given_intrinsics_replace_those_of_a_bag(tmp_path, compressed):
+    items = camera_items(COUNT, compressed=compressed)
+    bare = [item for item in items if "camera_info" not in item[0]]
+    for name, kept in (("with", items), ("without", bare)):
+        bag = write_bag(tmp_path / name, kept)
+        frames, recording = frames_of(
+            bag, options=DatasetOptions(intrinsics=(50.0, 51.0, 3.0, 4.0))
+        )
+        assert len(frames) == COUNT
+        assert not recording.drops
+        size = INTRINSICS.width, INTRINSICS.height
+        assert {frame.intrinsics for frame in frames} == {Intrinsics(50.0, 51.0, 3.0, 4.0, *size)}
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_a_colour_topic_is_no_depth_topic(tmp_path, compressed):
+    bag = write_bag(tmp_path / "bag", camera_items(2, compressed=compressed))
+    color = "/camera/color/image_raw" + "/compressed" * compressed
+    with pytest.raises(RecordingError, match=f"{color}: .* picture .*--depth"):
+        open_recording(bag, topics=TopicChoice(depth=color))
 
 
 def test_poses_from_odometry(tmp_path):

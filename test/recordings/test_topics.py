@@ -92,6 +92,15 @@ def test_a_named_topic_wins():
     assert found[Role.POSE].name == "/tf"
 
 
+def test_a_topic_may_be_named_without_the_suffix_of_its_transport():
+    raw = "/kinect/depth_registered/image_raw"
+    found = find_topics(KINECT, TopicChoice(rgb="/kinect/rgb/image_raw", depth=raw), "bag")
+    assert found[Role.RGB].name == "/kinect/rgb/image_raw/compressed"
+    assert found[Role.DEPTH].name == f"{raw}/compressedDepth"
+    both = [*KINECT, Topic(raw, IMAGE, 10)]
+    assert find_topics(both, TopicChoice(depth=raw), "bag")[Role.DEPTH].name == raw
+
+
 @pytest.mark.parametrize(
     ("missing", "words"),
     [

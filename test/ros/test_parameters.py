@@ -86,6 +86,7 @@ def test_a_whole_number_is_a_number() -> None:
     [
         ({"lifting.tua": 0.1}, "there is no parameter lifting.tua (did you mean lifting.tau?)"),
         ({"savepath": "m"}, "did you mean save_path?"),
+        ({"score_treshold": 0.1}, "did you mean perception.score_threshold?"),
         ({"xyzzy": 1}, "there is no parameter xyzzy"),
         ({"lifting.tau": 7.0}, "parameter lifting.tau is 7.0, expected float >= 0 and <= 1"),
         ({"inputs.max_depth_m": 0.0}, "expected float > 0"),

@@ -174,7 +174,7 @@ def test_refused_colour(changes: dict, reason: str, says: str) -> None:
 
 
 def test_refused_depth() -> None:
-    assert refusal(depth_from_message, image(RGB, "rgb8"), **DEPTH).reason == "unknown_encoding"
+    assert refusal(depth_from_message, image(RGB, "rgb8"), **DEPTH).reason == "not_depth"
     odd = image(COUNTS, "16UC1", step=15, data=np.zeros(75, np.uint8))
     refused = refusal(depth_from_message, odd, **DEPTH)
     assert refused.reason == "bad_step"
@@ -200,7 +200,7 @@ def test_refused_compressed_colour(data: bytes, description: str, reason: str) -
         (bytes(40), "16UC1; compressedDepth png", "decode_failed"),
         (bytes(40), "16UC1; compressedDepth rvl", "unknown_encoding"),
         (bytes(40), "8UC1; compressedDepth png", "unknown_encoding"),
-        (png(RGB), "png", "decode_failed"),
+        (png(RGB), "png", "not_depth"),
         (bytes(12) + png(RGB[:, :, 0]), "16UC1; compressedDepth png", "decode_failed"),
     ],
 )

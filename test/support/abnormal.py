@@ -83,6 +83,7 @@ def _camera(node: str) -> list[Case]:
     """Inputs from the camera that lifting and perception share."""
     cases = [
         ("depth__image_raw", "encoding 8UC1", changed(depth, encoding="8UC1"), "unknown_encoding"),
+        ("depth__image_raw", "a colour image", rgb, "not_depth"),
         ("depth__image_raw", "step shorter than a row", changed(depth, step=5), "bad_step"),
         ("depth__image_raw", "10 bytes of data", changed(depth, data=bytes(10)), "short_buffer"),
         ("depth__image_raw", "no pixels", changed(depth, height=0), "empty_image"),

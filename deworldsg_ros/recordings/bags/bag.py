@@ -13,18 +13,22 @@ from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, Topic
 from deworldsg_ros.recordings.bags.topics import TopicChoice, find_topics
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.messages import (
+    CAMERA_INFO,
     ODOMETRY,
     POSE_STAMPED,
     TF_MESSAGE,
     Role,
     RoleMessage,
+    camera_info,
     decode,
     pose_stamped_from_matrix,
     stamp_ns_of_cdr,
 )
 from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.streams.images import depth_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import pose_from_message
 from deworldsg_ros.streams.transforms import TransformTree
 
@@ -43,9 +47,11 @@ class BagSource:
         choice: topics that the user named.
         inputs: transport, pose source, and for TF the world frame and pose slop.
         need_pose: whether a bag without poses is refused.
+        intrinsics: fx, fy, cx, cy of the RGB image in pixels, in place of the bag's CameraInfo.
 
     Raises:
-        RecordingError: for a bag that cannot be read, or without a topic for a role.
+        RecordingError: for a bag that cannot be read, without a topic for a role, or with pictures
+            on the depth topic.
     """
 
     kind: ClassVar[str] = "rosbag2"
@@ -57,6 +63,7 @@ class BagSource:
         inputs: InputsConfig | None = None,
         *,
         need_pose: bool = True,
+        intrinsics: tuple[float, float, float, float] | None = None,
     ) -> None:
         choice = choice or TopicChoice()
         self.name = path.name
@@ -66,9 +73,16 @@ class BagSource:
         self.drops: Counter[str] = Counter()
         try:
             found = find_topics(
-                self._bag.topics, choice, str(path), self._inputs, need_pose=need_pose
+                self._bag.topics,
+                choice,
+                str(path),
+                self._inputs,
+                need_pose=need_pose,
+                need_camera_info=intrinsics is None,
             )
+            self._check_depth(found[Role.DEPTH])
             self._T_child_camera = self._mounting(found, choice)
+            self._intrinsics = self._with_size(intrinsics, found[Role.RGB])
         except RecordingError:
             self._bag.close()
             raise
@@ -79,6 +93,8 @@ class BagSource:
             odometry = found[Role.POSE]
             self.topics[Role.POSE] = UsedTopic(odometry.name, POSE_STAMPED, odometry.count)
         self.frame_count = found[Role.RGB].count
+        if self._intrinsics is not None:
+            self.topics[Role.CAMERA_INFO] = UsedTopic("--intrinsics", CAMERA_INFO, self.frame_count)
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """Serialized messages in the order in which they were recorded."""
@@ -91,11 +107,13 @@ class BagSource:
             role = roles[raw.topic]
             try:
                 stamp_ns = stamp_ns_of_cdr(raw.data)
-                needs_pose = role is Role.RGB and poses is not None
-                frame_id = decode(raw.data, raw.msgtype).header.frame_id if needs_pose else ""
+                needs_frame = role is Role.RGB and (poses is not None or self._intrinsics)
+                frame_id = decode(raw.data, raw.msgtype).header.frame_id if needs_frame else ""
             except Exception:  # rosbags raises errors of many types
                 self.drops["invalid_message"] += 1
                 continue
+            if role is Role.RGB and self._intrinsics is not None:
+                yield serialize(camera_info(stamp_ns, frame_id, self._intrinsics), raw.log_time_ns)
             if role is Role.RGB and poses is not None:
                 pose = poses.at(stamp_ns, frame_id)
                 if pose is not None:
@@ -158,6 +176,33 @@ class BagSource:
         T = T_world_child @ T_child_camera
         pose = pose_stamped_from_matrix(stamp_ns_of_cdr(raw.data), frame_id, T)
         yield serialize(pose, raw.log_time_ns)
+
+    def _check_depth(self, topic: Topic) -> None:
+        """Raise RecordingError if the first image of the depth topic is a picture."""
+        image = self._first(topic)
+        try:
+            if image is not None:
+                depth_from_message(image, depth_scale_m=1e-3, max_depth_m=1.0)
+        except RefusedInput as refusal:
+            if refusal.reason == "not_depth":
+                raise RecordingError(
+                    f"recording {self.name}: {topic.name}: {refusal}; name a topic with --depth"
+                ) from refusal
+
+    def _with_size(
+        self, intrinsics: tuple[float, float, float, float] | None, topic: Topic
+    ) -> Intrinsics | None:
+        """Intrinsics with the size of the first RGB image; None without intrinsics."""
+        if intrinsics is None:
+            return None
+        try:
+            height, width, _ = rgb_from_message(self._first(topic)).shape
+            return Intrinsics(*intrinsics, width, height)
+        except (RefusedInput, AttributeError) as error:
+            raise RecordingError(
+                f"recording {self.name}: --intrinsics needs the size of the images, and the first "
+                f"on {topic.name} cannot be read ({error})"
+            ) from error
 
     def _first(self, topic: Topic) -> Any:
         """The first message that can be decoded; None if there is none."""

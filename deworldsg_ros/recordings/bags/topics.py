@@ -23,6 +23,8 @@ Types = tuple[str, ...]
 Score = Callable[[Topic], "tuple[float, ...] | None"]
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
+# Suffixes of image_transport: the user may name a topic without them, as for ROS nodes.
+TRANSPORT_SUFFIXES = {Role.RGB: ("", "/compressed"), Role.DEPTH: ("", "/compressedDepth")}
 # In order of preference.
 POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
 # Names of images that are neither colour nor depth.
@@ -48,7 +50,7 @@ POSE_SOURCES: dict[str, Types] = {
 EXPECTED = {
     Role.RGB: "an Image or CompressedImage with rgb, color or image in its name",
     Role.DEPTH: "an Image or CompressedImage with depth in its name",
-    Role.CAMERA_INFO: "a CameraInfo beside the RGB image",
+    Role.CAMERA_INFO: "a CameraInfo beside the RGB image (or use --intrinsics FX,FY,CX,CY)",
     Role.POSE: "a PoseStamped, an Odometry or /tf (or use --odometry, or run with --poses FILE)",
 }
 
@@ -88,6 +90,7 @@ def find_topics(
     inputs: InputsConfig | None = None,
     *,
     need_pose: bool = True,
+    need_camera_info: bool = True,
 ) -> dict[Role, Topic]:
     """The topic of each role.
 
@@ -97,6 +100,7 @@ def find_topics(
         recording: name of the bag, for errors.
         inputs: ``transport`` and ``pose_source`` select the types.
         need_pose: whether a bag without poses is refused; if not, the role may be missing.
+        need_camera_info: whether the role is looked for.
 
     Raises:
         RecordingError: names the role, the topics seen and the expected type and name.
@@ -112,13 +116,14 @@ def find_topics(
     found = {
         Role.RGB: rgb,
         Role.DEPTH: find(Role.DEPTH, choice.depth, images, _depth_score),
-        Role.CAMERA_INFO: find(
+    }
+    if need_camera_info:
+        found[Role.CAMERA_INFO] = find(
             Role.CAMERA_INFO,
             choice.camera_info,
             (CAMERA_INFO,),
             lambda topic: _camera_info_score(topic, rgb.name),
-        ),
-    }
+        )
     types = POSE_SOURCES[inputs.pose_source]
     posed = any(topic.msgtype in types and _pose_score(topic) is not None for topic in filled)
     if need_pose or posed or choice.pose:
@@ -136,9 +141,10 @@ def _find(
 ) -> Topic:
     option = "--" + role.value.replace("_", "-")
     if chosen:
-        for topic in topics:
-            if topic.name == chosen and topic.msgtype in TYPES[role]:
-                return topic
+        usable = {topic.name: topic for topic in topics if topic.msgtype in TYPES[role]}
+        for suffix in TRANSPORT_SUFFIXES.get(role, ("",)):
+            if chosen + suffix in usable:
+                return usable[chosen + suffix]
         problem = f"{option} {chosen} is no topic with messages of a type for {role.value}"
     else:
         scored = [

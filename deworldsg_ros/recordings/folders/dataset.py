@@ -34,7 +34,7 @@ class DatasetOptions:
 
     Attributes:
         rate_hz: frames per second; 0 = the rate of the data set.
-        intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = those of the data set.
+        intrinsics: fx, fy, cx, cy of the RGB image in pixels; None = those of the recording.
         depth_source: ``rendered`` from the mesh or from the ``sensor``, if a data set has both;
             ``auto`` = the depth of published results.
         poses_needed: whether a frame without a valid pose file is left out; if not, it has no

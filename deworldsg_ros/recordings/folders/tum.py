@@ -65,7 +65,9 @@ class TumRgbd(Dataset):
             raise RecordingError("--rate: TUM RGB-D has stamps; expected no --rate")
         self._rgb = _read_index(path / "rgb.txt", 1)
         self._depth = _read_index(path / "depth.txt", 1)
-        self._poses = _read_index(path / "groundtruth.txt", 7)
+        poses = path / "groundtruth.txt"
+        is_posed = options.poses_needed or poses.exists()
+        self._poses = _read_index(poses, 7) if is_posed else []
         size = image_size(path / self._rgb[0].values[0], path)
         self.intrinsics = Intrinsics(*(options.intrinsics or self._known_intrinsics()), *size)
         self.frame_count = len(self._rgb)
@@ -73,8 +75,9 @@ class TumRgbd(Dataset):
             Role.RGB: UsedTopic("rgb.txt", ros.COMPRESSED_IMAGE, len(self._rgb)),
             Role.DEPTH: UsedTopic("depth.txt", ros.COMPRESSED_IMAGE, len(self._depth)),
             Role.CAMERA_INFO: UsedTopic("(by name)", ros.CAMERA_INFO, len(self._rgb)),
-            Role.POSE: UsedTopic("groundtruth.txt", ros.POSE_STAMPED, len(self._poses)),
         }
+        if is_posed:
+            self.topics[Role.POSE] = UsedTopic(poses.name, ros.POSE_STAMPED, len(self._poses))
 
     @staticmethod
     def looks_like(path: Path) -> bool:

@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 from support.recordings import HEIGHT, WIDTH, encoded, pose, rgb_pixels
 
-from deworldsg_ros.config import InputsConfig
+from deworldsg_ros.config import Config, InputsConfig
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.recording import detect_kind, open_recording
+from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.recordings.posing import PoseChoice, choose_poses
+from deworldsg_ros.recordings.recording import (
+    Recording,
+    detect_kind,
+    open_recording,
+    open_source,
+)
 from deworldsg_ros.scene.camera import interpolate_pose, quaternion_from_rotation
 
 COUNT = 4
@@ -111,6 +118,17 @@ def test_the_missing_file_is_named(tmp_path, name):
     (folder / name).unlink()
     with pytest.raises(RecordingError, match=name.replace(".", r"\.")):
         open_recording(folder, kind="tum")
+
+
+@pytest.mark.parametrize("with_poses", [True, False])
+def test_the_ground_truth_is_needed_only_for_its_poses(tmp_path, with_poses):
+    folder = write_tum(tmp_path / "fr1")
+    if not with_poses:
+        (folder / "groundtruth.txt").unlink()
+    source = open_source(folder, need_poses=False)
+    assert (Role.POSE in source.topics) is with_poses
+    recording = Recording(choose_poses(source, PoseChoice(odometry=True), Config()))
+    assert len(list(recording.frames())) == COUNT
 
 
 @pytest.mark.parametrize(
