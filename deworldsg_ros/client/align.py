@@ -52,6 +52,10 @@ def align(a: Sequence[SceneObject], b: Sequence[SceneObject]) -> Alignment:
         ClientError: if no two objects of B can be two objects of A.
     """
     places_a, places_b = _places(a), _places(b)
+    # Motions are around the middle of B. Around a far origin, two motions that put the objects to
+    # the same places would differ by the translation.
+    middle = places_b.mean(axis=0) if len(b) else np.zeros(3)
+    places_b = places_b - middle
     rarity = _rarity(a, b)
     same = np.array([[i.label == j.label for j in b] for i in a], np.bool_).reshape(len(a), len(b))
     tried = _hypotheses(places_a, places_b, same, rarity)
@@ -72,7 +76,7 @@ def align(a: Sequence[SceneObject], b: Sequence[SceneObject]) -> Alignment:
     axes_a, axes_b = horizontal_axes(a[0].up), horizontal_axes(b[0].up)
     turn = _turn(best)
     T_a_b[:3, :3] = axes_a.T @ turn @ axes_b
-    T_a_b[:3, 3] = axes_a.T @ best[1:]
+    T_a_b[:3, 3] = axes_a.T @ (best[1:] - turn @ middle)
     confidence = float(min(1.0, score / max(float(most), 1e-9))) * lead
     return Alignment(T_a_b, confidence, len(_matches(best, places_a, places_b, same)))
 

@@ -37,12 +37,14 @@ class Combined:
         T_a_b: (4, 4), from the world frame of the second graph to that of the first.
         confidence: of the transform; 1 if it was given.
         pairs: the objects of both that became one, before the merge.
+        ids: the id of each object of the second graph in the message.
     """
 
     message: wire.SceneGraphMessage
     T_a_b: Float64
     confidence: float
     pairs: tuple[Pairing, ...]
+    ids: dict[int, int]
 
 
 def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combined:
@@ -72,7 +74,7 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
     check_pose(T_a_b)
     if np.dot(T_a_b[:3, :3] @ b.up, a.up) < np.cos(MAX_TILT_RAD):
         raise ClientError(f"the transform turns up {b.up} away from {a.up}: expected the same up")
-    moved = {item.id: _moved(item, T_a_b, a) for item in b}
+    moved = {item.id: moved_object(item, T_a_b, a.frame_id, a.up) for item in b}
     pairs = matched(list(a), list(moved.values()), place_cost)
     merged = {pair.after.id: pair.before.id for pair in pairs}
     first_free = max([*(item.id for item in a), 0]) + 1
@@ -92,11 +94,20 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
         edges=_edges(a.message.edges, b.message.edges, ids),
         up=list(a.up),
     )
-    return Combined(message, T_a_b, confidence, tuple(pairs))
+    return Combined(message, T_a_b, confidence, tuple(pairs), ids)
 
 
-def _moved(item: SceneObject, T: Float64, into: SceneGraph) -> SceneObject:
-    """An object of B in the world frame of A."""
+def moved_object(
+    item: SceneObject, T: Float64, frame_id: str, up: tuple[float, float, float]
+) -> SceneObject:
+    """An object in another world frame.
+
+    Args:
+        item: the object.
+        T: (4, 4), from its world frame to the other one.
+        frame_id: of the other frame.
+        up: against gravity in the other frame.
+    """
     state = item.state
     mean, covariance = np.array(state.mean_m), np.array(item.covariance_m2)
     means, covariances = transform(mean[None], covariance[None], T)
@@ -109,7 +120,7 @@ def _moved(item: SceneObject, T: Float64, into: SceneGraph) -> SceneObject:
         **_geometry(means[0], covariances[0], points),
         box=wire.GravityBox(place, list(item.size_m), turned),
     )
-    return scene_object(new, into.frame_id, into.up)
+    return scene_object(new, frame_id, up)
 
 
 def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:

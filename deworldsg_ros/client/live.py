@@ -94,6 +94,11 @@ class SceneGraphClient:
             self._context.try_shutdown()
 
     @property
+    def newest(self) -> SceneGraph | None:
+        """The newest graph; None before the first one."""
+        return self._graph
+
+    @property
     def graph(self) -> SceneGraph:
         """The newest graph; waits up to 10 s for the first one.
 

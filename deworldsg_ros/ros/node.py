@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import msgspec
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
@@ -61,9 +62,11 @@ class StageNode(Node):
         ConfigurationError: for an unknown parameter or a value out of range.
     """
 
+    PARAMETERS: type[msgspec.Struct] = Parameters
+
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.parameters = declare(self, Parameters)
+        self.parameters: Any = declare(self, self.PARAMETERS)
         self.get_logger().info("loading")
         on_compilation(lambda: self.get_logger().info(COMPILING))
         self.health = Health(product)

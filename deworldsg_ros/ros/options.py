@@ -77,3 +77,48 @@ class ReplayParameters(Config, frozen=True, forbid_unknown_fields=True):
     """
 
     node: ReplayOptions = ReplayOptions()
+
+
+class FleetOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The network of fleet_node and fleet_link_node."""
+
+    connect: Annotated[
+        str,
+        option("endpoints of Zenoh routers, separated by commas; empty = none, with listen"),
+    ] = ""
+    listen: Annotated[
+        str,
+        option(
+            "endpoints on which fleet_node is the router, e.g. tcp/0.0.0.0:7447 for robots on "
+            "other machines; not used with connect"
+        ),
+    ] = "tcp/127.0.0.1:7447"
+    period_s: Annotated[float, option("seconds between two questions for changes", gt=0, le=60)] = (
+        0.5
+    )
+
+
+class FleetParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of fleet_node."""
+
+    node: FleetOptions = FleetOptions()
+
+
+class FleetLinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One robot's link to the fleet."""
+
+    robot: Annotated[
+        str, option("name of this robot in the fleet, unique; letters, digits, _ and -")
+    ] = ""
+    connect: Annotated[str, option("endpoints of Zenoh routers, separated by commas")] = (
+        "tcp/127.0.0.1:7447"
+    )
+    period_s: Annotated[float, option("seconds between two questions for changes", gt=0, le=60)] = (
+        0.5
+    )
+
+
+class FleetLinkParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of fleet_link_node."""
+
+    node: FleetLinkOptions = FleetLinkOptions()

@@ -63,8 +63,9 @@ class GraphReplica:
             RefusedInput: ``lost_updates`` if updates in between are missing, ``other_session`` for
                 a later update of another session; the copy is unchanged and needs a `reset`.
         """
+        before = update.sequence - 1 if update.since is UNSET else update.since
         if update.session != self._session:
-            if update.sequence > 1:
+            if before > 0:
                 raise RefusedInput(
                     "other_session",
                     f"update {update.sequence} is of session {update.session!r}: expected "
@@ -74,12 +75,14 @@ class GraphReplica:
             self._session = update.session
         if update.sequence <= self._sequence:
             return False
-        if update.sequence > self._sequence + 1:
+        if before > self._sequence:
             raise RefusedInput(
                 "lost_updates",
                 f"update {update.sequence} after {self._sequence}: "
-                f"{update.sequence - self._sequence - 1} lost, reset from /scene_graph",
+                f"{before - self._sequence} lost, reset from /scene_graph",
             )
+        if update.since == 0:
+            self._nodes, self._edges = {}, {}
         for node in update.removed_nodes:
             self._nodes.pop(node.id, None)
         for edge in update.removed_edges:

@@ -392,6 +392,13 @@ class SceneGraphUpdateMessage(Message, kw_only=True):
 
     session: Session = msgspec.UNSET
     sequence: Positive
+    since: Annotated[
+        Union[NonNegative, msgspec.UnsetType],
+        msgspec.Meta(
+            description="the changes begin after this number; 0 = the whole graph; absent = "
+            "sequence - 1. Only between the robots of a fleet"
+        ),
+    ] = msgspec.UNSET
     removed_nodes: list[RemovedNode]
     removed_edges: list[RemovedEdge]
     nodes: list[NodeState]

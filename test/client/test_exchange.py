@@ -112,7 +112,7 @@ def test_spark_dsg_reads_its_json(room: SceneGraph, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("angle", "place"), [(0.0, (0, 0, 0)), (2.5, (5, -3, 1)), (-1.2, (-20, 7, -0.5))]
+    ("angle", "place"), [(0.0, (0, 0, 0)), (2.5, (5, -3, 1)), (-1.2, (-200, 70, -0.5))]
 )
 def test_the_transform_between_two_world_frames_is_found(angle: float, place: tuple) -> None:
     T = rigid_motion(np.array(place, float), angle * np.array([0.0, 0.0, 1.0]))
@@ -121,6 +121,7 @@ def test_the_transform_between_two_world_frames_is_found(angle: float, place: tu
     assert np.linalg.norm(rest[:3, 3]) < 0.05
     assert rotation_angle_deg(rest[:3, :3]) < 0.5
     assert found.matched >= 0.9 * len(FOLDER)
+    assert found.confidence == pytest.approx(align(list(FOLDER), list(FOLDER)).confidence, abs=0.01)
     assert 0.1 < found.confidence <= 1.0
 
 

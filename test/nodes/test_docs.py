@@ -14,7 +14,12 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 from support import abnormal  # noqa: E402
 
-from deworldsg_ros.ros.options import Parameters, ReplayParameters  # noqa: E402
+from deworldsg_ros.ros.options import (  # noqa: E402
+    FleetLinkParameters,
+    FleetParameters,
+    Parameters,
+    ReplayParameters,
+)
 from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
 from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
 
@@ -26,6 +31,7 @@ PAGES = (
 # Everything that runs in the nodes.
 PACKAGES = (
     "ros",
+    "fleet",
     "streams",
     "nodes",
     "poses",
@@ -58,6 +64,8 @@ def with_tables(text: str) -> str:
         "reasons": reasons_table(),
         "abnormal": abnormal.table(),
         "parameters": parameters_table(fields(Parameters)),
+        "fleet": parameters_table(fields(FleetParameters)),
+        "fleet_link": parameters_table(fields(FleetLinkParameters)),
         # The configuration is in the other table.
         "replay": parameters_table([f for f in fields(ReplayParameters) if f.path[0] == "node"]),
     }

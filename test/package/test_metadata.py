@@ -19,6 +19,7 @@ from deworldsg_ros.config import Config, load_config, to_mapping
 ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
 # Modules whose distribution has another name.
 DISTRIBUTIONS = {
+    "zenoh": "eclipse-zenoh",
     "cv2": "opencv-python-headless",
     "yaml": "pyyaml",
     "huggingface_hub": "huggingface-hub",
@@ -76,7 +77,7 @@ def imported_modules(root: Path) -> set[str]:
 def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
     known = {
         *requirements(root_dir),
-        *requirements(root_dir, "models", "cluster", "mcp", "networkx"),
+        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet"),
     }
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()

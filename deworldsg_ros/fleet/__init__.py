@@ -1,0 +1,1 @@
+"""Several robots: their graphs become one over Zenoh, whatever their world frames are."""

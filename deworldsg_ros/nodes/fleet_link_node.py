@@ -1,0 +1,92 @@
+"""fleet_link_node: a robot's link to the fleet. Its graph goes out, what concerns it comes back."""
+
+from __future__ import annotations
+
+import re
+import sys
+from typing import Any
+
+from deworldsg_ros.client.live import SceneGraphClient
+from deworldsg_ros.fleet.zenoh_link import Feed, Follower, open_session, part_key, robot_key
+from deworldsg_ros.ros.graph_topics import GraphTopics
+from deworldsg_ros.ros.node import StageNode, run
+from deworldsg_ros.ros.options import FleetLinkParameters
+from deworldsg_ros.ros.repeating import Repeating
+from deworldsg_ros.scene.change_log import ChangeLog
+from deworldsg_ros.scene.errors import ConfigurationError
+
+ROBOT_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+class FleetLinkNode(StageNode):
+    """Serves the graph of `/scene_graph` to the fleet; publishes the part that concerns the robot.
+
+    Raises:
+        ConfigurationError: without a name, without Zenoh, for an endpoint that cannot be read.
+    """
+
+    PARAMETERS = FleetLinkParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("fleet_link_node", "parts of the fleet's graph", **options)
+        settings = self.parameters.node
+        if not ROBOT_NAME.fullmatch(settings.robot):
+            raise ConfigurationError(
+                f"fleet_link_node: parameter robot is {settings.robot!r}: expected a name of "
+                "letters, digits, _ and -, unique in the fleet"
+            )
+        self._session = open_session(connect=settings.connect)
+        self._client = SceneGraphClient(self.get_namespace(), self.context).__enter__()
+        self._log = ChangeLog()
+        key = robot_key(settings.robot)
+        self._feed = Feed(self._session, key, self._log, self._refresh)
+        self._token = self._session.liveliness().declare_token(key)
+        self._follower = Follower(self._session, part_key(settings.robot))
+        self._others = GraphTopics(self, "others")
+        self._is_connected = False
+        self._loop = Repeating(self, self._ask, settings.period_s)
+
+    def close(self) -> None:
+        """End the thread and the connections."""
+        self._loop.stop()
+        self._client.close()
+        self._session.close()
+        super().close()
+
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """The graph of this robot, and the fleet."""
+        missing = []
+        if self._client.newest is None:
+            missing.append(f"no graph on {self.resolve_topic_name('scene_graph')}")
+        if not self._is_connected:
+            missing.append(f"no answer of fleet_node over {self.parameters.node.connect}")
+        return missing
+
+    def more_values(self) -> dict[str, str]:
+        """Bytes on the wire."""
+        return {
+            "bytes sent": str(self._feed.sent_bytes),
+            "bytes received": str(self._follower.received_bytes),
+            "objects of others": str(len(self._follower.replica.nodes)),
+        }
+
+    def _refresh(self) -> None:
+        graph = self._client.newest
+        if graph is not None:
+            self._log.set(graph.message)
+
+    def _ask(self) -> None:
+        changed = self._follower.ask(self.parameters.node.period_s + 1.0)
+        self._is_connected = changed is not None
+        if changed:
+            self._others.publish(self._follower.replica.message())
+            self.health.published()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(FleetLinkNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""fleet_node: the graphs of all robots → one graph, and to each robot what concerns it."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any
+
+from deworldsg_ros.fleet.fleet import Fleet
+from deworldsg_ros.fleet.zenoh_link import Feed, Robots, open_session, part_key
+from deworldsg_ros.ros.graph_topics import GraphTopics
+from deworldsg_ros.ros.node import StageNode, run
+from deworldsg_ros.ros.options import FleetParameters
+from deworldsg_ros.ros.repeating import Repeating
+from deworldsg_ros.scene.change_log import ChangeLog
+
+# A robot that did not answer for this time is reported.
+SILENCE_S = 5.0
+
+
+class FleetNode(StageNode):
+    """Asks every robot for its changes, combines the graphs, serves the parts.
+
+    Raises:
+        ConfigurationError: without Zenoh, for an endpoint that cannot be read or is in use.
+    """
+
+    PARAMETERS = FleetParameters
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("fleet_node", "graphs of the fleet", **options)
+        settings = self.parameters.node
+        listen = "" if settings.connect else settings.listen
+        self._session = open_session(connect=settings.connect, listen=listen)
+        self._robots = Robots(self._session)
+        self._fleet = Fleet()
+        self._topics = GraphTopics(self, "fleet")
+        self._publish_robots = self.text_publisher("fleet/robots", 1, latched=True)
+        self._feeds: dict[str, Feed] = {}
+        self._parts: dict[str, ChangeLog] = {}
+        self._answered_s: dict[str, float] = {}
+        self._loop = Repeating(self, self._step, settings.period_s)
+
+    def close(self) -> None:
+        """End the thread and the connections."""
+        self._loop.stop()
+        self._session.close()
+        super().close()
+
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """Robots that do not answer, and those that are not located."""
+        now_s = time.monotonic()
+        missing = [
+            f"{name} has not answered for {now_s - last_s:.0f} s"
+            for name, last_s in sorted(self._answered_s.items())
+            if now_s - last_s > SILENCE_S
+        ]
+        missing += [
+            f"{name} is not located: {member.reason}"
+            for name, member in sorted(self._fleet.members.items())
+            if member.T_fleet_world is None
+        ]
+        return missing or ([] if self._answered_s else ["no robot: start fleet_link_node on each"])
+
+    def more_values(self) -> dict[str, str]:
+        """Robots and bytes on the wire."""
+        received = sum(item.received_bytes for item in self._robots.followers.values())
+        return {
+            "robots": str(len(self._answered_s)),
+            "bytes received": str(received),
+            "bytes sent": str(sum(feed.sent_bytes for feed in self._feeds.values())),
+        }
+
+    def _step(self) -> None:
+        answers = self._robots.ask(self.parameters.node.period_s + 1.0)
+        for refusal in self._robots.take_refused():
+            self.drop(refusal.reason, str(refusal))
+        for name, changed in answers.items():
+            if changed is not None:
+                self._answered_s[name] = time.monotonic()
+            if changed:
+                self._fleet.update(name, self._robots.followers[name].replica.message())
+        if not any(answers.values()):
+            return
+        self._topics.publish(self._fleet.combine())
+        for name in self._fleet.members:
+            self._serve(name)
+        self._publish_robots(json.dumps(self._fleet.status()))
+        self.health.published()
+
+    def _serve(self, name: str) -> None:
+        """Bring a robot's part of the graph up to date."""
+        part = self._fleet.part_for(name)
+        if name not in self._feeds:
+            self._parts[name] = ChangeLog()
+            self._feeds[name] = Feed(self._session, part_key(name), self._parts[name])
+        if part is not None:
+            self._parts[name].set(part)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(FleetNode, args)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

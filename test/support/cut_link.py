@@ -1,0 +1,55 @@
+"""A TCP link that can be cut: what is sent meanwhile is neither delivered nor refused."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import threading
+
+CHUNK_BYTES = 1 << 16
+
+
+class CutLink:
+    """Forwards connections to a port of this machine.
+
+    Attributes:
+        port: where to connect to.
+        is_cut: nothing is forwarded while this is set.
+    """
+
+    def __init__(self, to_port: int) -> None:
+        self._to_port = to_port
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self.is_cut = threading.Event()
+        self._closed = threading.Event()
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        """End all connections."""
+        self._closed.set()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while not self._closed.is_set():
+                near, _ = self._listener.accept()
+                threading.Thread(target=self._forward, args=(near,), daemon=True).start()
+
+    def _forward(self, near: socket.socket) -> None:
+        with near, contextlib.suppress(OSError):
+            while self.is_cut.is_set() and not self._closed.wait(0.1):
+                pass
+            far = socket.create_connection(("127.0.0.1", self._to_port), timeout=5)
+            with far:
+                other = {near: far, far: near}
+                while not self._closed.is_set():
+                    if self.is_cut.is_set():
+                        self._closed.wait(0.1)
+                        continue
+                    for ready in select.select([near, far], [], [], 0.1)[0]:
+                        data = ready.recv(CHUNK_BYTES)
+                        if not data:
+                            return
+                        other[ready].sendall(data)
