@@ -80,7 +80,7 @@ def show_graph(
         T_world_cameras: poses (4, 4) of the processed frames.
         world_up: `inputs.world_up`: auto, z, y or -y.
     """
-    # Imported here because matplotlib and plotly take a second to load.
+    # Imported here because matplotlib takes a second to load.
     from deworldsg_ros.view import page, picture, table
 
     up = UpEstimator(world_up)

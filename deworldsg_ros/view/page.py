@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plotly.offline import get_plotlyjs
 
+from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.view.colours import class_colours
-from deworldsg_ros.view.geometry import (
-    SIGMAS,
-    covariances_of,
-    means_of,
-    principal_axes,
-    view_axes,
-)
-from deworldsg_ros.view.page_figure import bounds, figure_of, layout
+from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.view.colours import class_colours, predicate_colours
+from deworldsg_ros.view.geometry import drawable_edges, view_axes
 
-TEMPLATE = Path(__file__).with_name("assets") / "page.html"
+ASSETS = Path(__file__).with_name("assets")
+# More add megabytes, not detail.
+MOST_POINTS = 20_000
+MOST_PATH_POINTS = 1_000
 
 
 def write(
@@ -46,17 +46,14 @@ def write(
         ValueError: for an up direction of zero length.
         OSError: if the page cannot be written.
     """
-    axes_of_view = view_axes(up_world)
-    figure = figure_of(graph, axes_of_view, camera_path_world)
-    low, high = bounds(figure)
-    figure.update_layout(layout(low, high))
-    html = TEMPLATE.read_text(encoding="utf-8")
+    content = content_of(graph, view_axes(up_world), camera_path_world)
     parts = {
-        "__TITLE__": f"Scene graph: {len(graph.nodes)} objects, {len(graph.edges)} relations",
-        "__FIGURE__": _script_safe(figure.to_json()),
-        "__GRAPH__": _script_safe(json.dumps(_details(graph, axes_of_view, low, high))),
-        "__PLOTLY__": get_plotlyjs(),
+        "__TITLE__": f"Scene graph of {len(graph.nodes)} objects",
+        "__GRAPH__": _script_safe(json.dumps(content)),
+        "__THREE__": (ASSETS / "three.min.js").read_text(encoding="utf-8"),
+        "__PAGE__": (ASSETS / "page.js").read_text(encoding="utf-8"),
     }
+    html = (ASSETS / "page.html").read_text(encoding="utf-8")
     # In one pass: a label may contain one of these names.
     html = re.sub("|".join(parts), lambda match: parts[match[0]], html)
     write_atomically(Path(path), html)
@@ -67,37 +64,76 @@ def _script_safe(text: str) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _details(
-    graph: wire.SceneGraphMessage, axes_of_view: Float64, low: Float64, high: Float64
+def content_of(
+    graph: wire.SceneGraphMessage, axes_of_view: Float64, camera_path_world: Float64 | None
 ) -> dict[str, Any]:
-    """The list beside the 3D view: objects with their camera targets, and edges."""
+    """Everything that the page shows, as plain values.
+
+    Args:
+        graph: the graph, with or without surface points.
+        axes_of_view: (3, 3), rows right, forward and up in the world frame. Positions in the page
+            are in these axes, but for those that it prints.
+        camera_path_world: (n, 3) positions of the camera, metres; None = not drawn.
+    """
     colours = class_colours(node.label for node in graph.nodes)
-    middle, largest = (low + high) / 2, float((high - low).max())
-    shown = means_of(graph) @ axes_of_view.T
+    up = axes_of_view[2].tolist()
+    items = [scene_object(node, graph.frame_id, (up[0], up[1], up[2])) for node in graph.nodes]
+    edges = sorted(drawable_edges(graph), key=lambda edge: -edge.probability)
+    hidden = graph.hidden if isinstance(graph.hidden, list) else []
+    path = np.zeros((0, 3)) if camera_path_world is None else np.asarray(camera_path_world)
+    path = path[:: max(1, -(-len(path) // MOST_PATH_POINTS))].reshape(-1, 3)
     return {
         "frame_id": graph.frame_id,
-        "nodes": [
-            {
-                "id": node.id,
-                "label": node.label,
-                "colour": colours[node.label],
-                "classes": [[item.label, round(item.probability, 3)] for item in node.classes],
-                "position": [round(value, 3) for value in node.mean_m],
-                "size": np.round(2 * SIGMAS * principal_axes(covariance)[0], 3).tolist(),
-                "observations": node.observations,
-                "shown": np.round(point, 4).tolist(),
-                "centre": np.round((point - middle) / largest, 4).tolist(),
-            }
-            for node, point, covariance in zip(graph.nodes, shown, covariances_of(graph))
-        ],
-        "edges": [
-            {
-                "subject": edge.subject,
-                "object": edge.object,
-                "predicate": edge.predicate,
-                "probability": round(edge.probability, 3),
-                "provenance": edge.provenance,
-            }
-            for edge in sorted(graph.edges, key=lambda edge: -edge.probability)
-        ],
+        "nodes": [_node(item, colours[item.label], axes_of_view) for item in items],
+        "edges": [_edge(edge) for edge in edges],
+        "tints": predicate_colours(Counter(edge.predicate for edge in edges)),
+        "hidden": Counter(node.reason for node in hidden),
+        "points": _points(graph, axes_of_view),
+        "path": np.round(path @ axes_of_view.T, 3).tolist(),
+    }
+
+
+def _node(item: SceneObject, colour: str, axes_of_view: Float64) -> dict[str, Any]:
+    rotation = pose_from_quaternion(np.zeros(3), np.array(item.orientation_xyzw))[:3, :3]
+    return {
+        "id": item.id,
+        "label": item.label,
+        "colour": colour,
+        "classes": [[belief.label, round(belief.probability, 3)] for belief in item.classes],
+        "other": round(item.other_classes, 3),
+        "existence": None if item.existence is None else round(item.existence, 3),
+        "observations": item.observations,
+        "position": np.round(item.position_m, 3).tolist(),
+        "size": np.round(item.size_m, 3).tolist(),
+        "centre": np.round(axes_of_view @ item.position_m, 4).tolist(),
+        # Columns of the rotation, one after the other.
+        "axes": np.round((axes_of_view @ rotation).T, 4).ravel().tolist(),
+    }
+
+
+def _edge(edge: wire.EdgeState) -> dict[str, Any]:
+    return {
+        "subject": edge.subject,
+        "object": edge.object,
+        "predicate": edge.predicate,
+        "probability": round(edge.probability, 3),
+        "provenance": edge.provenance,
+        "observations": edge.observations,
+    }
+
+
+def _points(graph: wire.SceneGraphMessage, axes_of_view: Float64) -> dict[str, Any]:
+    """The surface points: int16 steps from a corner, base64, and how many each node has."""
+    clouds = [surface_points(node) for node in graph.nodes]
+    stride = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
+    clouds = [cloud[::stride] @ axes_of_view.T for cloud in clouds]
+    points = np.concatenate([*clouds, np.zeros((0, 3))])
+    low = points.min(axis=0) if len(points) else np.zeros(3)
+    step = max(float((points - low).max(initial=0.0)) / np.iinfo(np.uint16).max, 1e-6)
+    steps = np.round((points - low) / step).astype("<u2")
+    return {
+        "low": low.tolist(),
+        "step": step,
+        "counts": [len(cloud) for cloud in clouds],
+        "xyz": base64.b64encode(steps.tobytes()).decode(),
     }

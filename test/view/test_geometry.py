@@ -12,7 +12,6 @@ from deworldsg_ros.scene.boxes import shared_areas
 from deworldsg_ros.view.colours import PALETTE, class_colours, predicate_colours, shade, to_rgb
 from deworldsg_ros.view.geometry import drawable_edges, principal_axes, view_axes
 from deworldsg_ros.view.labelling import place, place_if_free
-from deworldsg_ros.view.solids import arrow_head, ellipsoid, joined, unit_sphere
 
 
 def random_covariance(seed):
@@ -58,40 +57,6 @@ def test_view_axes_are_a_rotation_whose_last_row_is_up(seed):
 def test_view_axes_refuse_an_invalid_direction(up):
     with pytest.raises(ValueError, match="up direction"):
         view_axes(up)
-
-
-@pytest.mark.parametrize("subdivisions", [0, 1, 2])
-def test_sphere_is_closed_and_faces_out(subdivisions):
-    vertices, triangles = unit_sphere(subdivisions)
-    assert len(triangles) == 20 * 4**subdivisions
-    assert len(vertices) == 10 * 4**subdivisions + 2
-    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0)
-    a, b, c = vertices[triangles.T]
-    volume = np.einsum("fi,fi->", a, np.cross(b, c)) / 6
-    assert 2.5 < volume < 4 / 3 * np.pi
-    assert (np.einsum("fi,fi->f", np.cross(b - a, c - a), a) > 0).all()
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_ellipsoid_lies_at_two_sigma(seed):
-    covariance, mean = random_covariance(seed) + 0.01 * np.eye(3), np.array([3.0, -2.0, 1.0])
-    vertices, _ = ellipsoid(mean, covariance, 1)
-    offsets = vertices - mean
-    squared = np.einsum("vi,ij,vj->v", offsets, np.linalg.inv(covariance), offsets)
-    np.testing.assert_allclose(squared, 4.0, rtol=1e-6)
-
-
-def test_arrow_head_ends_at_its_tip():
-    vertices, triangles = arrow_head(np.array([1.0, 2, 3]), np.array([0.0, 0, 5]), 0.5)
-    np.testing.assert_allclose(vertices[0], [1, 2, 3])
-    np.testing.assert_allclose(vertices[1:, 2], 2.5)
-    assert triangles.max() == len(vertices) - 1
-
-
-def test_joined_meshes_keep_their_triangles():
-    parts = [unit_sphere(0), unit_sphere(1)]
-    vertices, triangles = joined(parts)
-    np.testing.assert_array_equal(vertices[triangles[20:]], parts[1][0][parts[1][1]])
 
 
 def test_a_new_label_changes_no_class_colour():

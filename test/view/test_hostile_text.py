@@ -16,7 +16,7 @@ from deworldsg_ros.evaluation.reports.plots import plot_classes
 from deworldsg_ros.view import page, picture, table
 
 LABELS = [
-    "$\\foo$", "$", "$$x^{$", "__PLOTLY__", "__GRAPH__", "__FIGURE__", "[/foo]", "[bold]",
+    "$\\foo$", "$", "$$x^{$", "__THREE__", "__GRAPH__", "__PAGE__", "[/foo]", "[bold]",
     "[link=x]",
     "</script><script>alert(1)</script>", "\\u003c", "%s {0}", "a\nb", "\x1b[31m", "\u202e", "",
     "é" * 90,

@@ -1,0 +1,129 @@
+"""The page of a graph in a real browser: what is drawn, and what clicks, keys and filters do."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from PIL import Image
+from support.browser import browser, opened_page
+from support.view import make_edge, make_graph, make_node, make_room
+
+from deworldsg_ros.client import SceneGraph
+from deworldsg_ros.scene import wire
+from deworldsg_ros.view import page
+
+pytestmark = pytest.mark.slow
+SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    with browser() as opened:
+        yield opened
+
+
+def url_of(graph: wire.SceneGraphMessage, folder: Path) -> str:
+    path = folder / "graph.html"
+    page.write(graph, path, camera_path_world=np.array([[0, 0, 1.0], [1, 0, 1.0]]))
+    return path.as_uri()
+
+
+def pixels(shown: Any) -> np.ndarray:
+    """The 3D view (H, W, 3)."""
+    shown.wait_for_timeout(300)
+    picture = Image.open(io.BytesIO(shown.locator("#view").screenshot())).convert("RGB")
+    return np.asarray(picture).astype(int)
+
+
+def drawn(image: np.ndarray) -> float:
+    """Share of pixels that are not the background."""
+    return float((np.abs(image - image[-1, -1]).sum(axis=2) > 30).mean())
+
+
+def visible_arrows(shown: Any) -> list[str]:
+    return shown.evaluate("arrows.filter(a => a.group.visible).map(a => a.edge.predicate)")
+
+
+def test_a_room_is_drawn_with_boxes_labels_and_relations_but_not_near(
+    chromium: Any, tmp_path: Path
+) -> None:
+    room = SceneGraph.load(SAVED)
+    with opened_page(chromium, url_of(room.message, tmp_path)) as shown:
+        assert drawn(pixels(shown)) > 0.05
+        assert shown.locator("#title").inner_text().startswith("34 objects")
+        labels = shown.locator("#labels span").all_inner_texts()
+        assert len(labels) > 10 and any(text.startswith("dining table") for text in labels)
+        predicates = set(visible_arrows(shown))
+        assert "on" in predicates and "near" not in predicates
+        shown.locator("#predicates label", has_text="near").click()
+        assert "near" in visible_arrows(shown)
+
+
+def test_a_click_shows_an_object_and_escape_lets_go(chromium: Any, tmp_path: Path) -> None:
+    nodes = [make_node(1, "cup", (0, 0, 1)), make_node(2, "table", (1, 0, 0))]
+    edges = [make_edge(1, 2, "on", 0.8), make_edge(2, 1, "under", 0.9)]
+    with opened_page(chromium, url_of(make_graph(nodes, edges), tmp_path)) as shown:
+        middles = shown.evaluate("arrows.map(a => a.middle.toArray())")
+        assert np.linalg.norm(np.subtract(*middles)) > 0.1, "opposite edges are apart"
+        shown.locator("#list li.object", has_text="cup 1").click()
+        card = shown.locator("#card").inner_text()
+        assert "cup 1 on table 2" in card and "80" in card and "seen in" in card
+        # A predicate that is hidden stays hidden, whatever is selected.
+        shown.locator("#predicates label", has_text="on").click()
+        assert visible_arrows(shown) == ["under"]
+        assert "cup 1 on table 2" not in shown.locator("#card").inner_text()
+        shown.keyboard.press("Escape")
+        assert "Esc" in shown.locator("#card").inner_text()
+        place = shown.evaluate(
+            "(() => { const v = boxes[1].group.getWorldPosition ? new THREE.Vector3("
+            "...nodes.get(2).centre).project(camera) : null;"
+            "return [(v.x + 1) / 2 * view.clientWidth, (1 - v.y) / 2 * view.clientHeight]; })()"
+        )
+        shown.mouse.click(*place)
+        assert shown.locator("#card h2").inner_text() == "table 2"
+
+
+def test_the_sliders_hide_what_is_less_probable(chromium: Any, tmp_path: Path) -> None:
+    nodes = [make_node(i, "cup", (i, 0, 0)) for i in (1, 2, 3)]
+    nodes[2] = msgspec.structs.replace(nodes[2], existence=0.4)
+    edges = [make_edge(1, 2, "on", 0.55), make_edge(2, 3, "on", 0.95)]
+    with opened_page(chromium, url_of(make_graph(nodes, edges), tmp_path)) as shown:
+        assert len(visible_arrows(shown)) == 2
+        shown.locator("#least-relation").fill("60")
+        assert len(visible_arrows(shown)) == 1
+        shown.locator("#least-object").fill("50")
+        assert visible_arrows(shown) == []
+        assert shown.evaluate("boxes.filter(b => b.group.visible).length") == 2
+
+
+@pytest.mark.parametrize(("width", "dark"), [(390, False), (1200, True)])
+def test_a_phone_and_a_dark_screen(chromium: Any, tmp_path: Path, width: int, dark: bool) -> None:
+    url = url_of(SceneGraph.load(SAVED).message, tmp_path)
+    with opened_page(chromium, url, width, dark=dark) as shown:
+        image = pixels(shown)
+        assert drawn(image) > 0.05
+        assert (image[-1, -1].sum() < 200) == dark
+        assert shown.evaluate("document.documentElement.scrollWidth") <= width
+        side = shown.locator("#side").bounding_box()
+        assert side["x"] + side["width"] <= width and side["height"] > 200
+
+
+def test_an_empty_graph_says_why(chromium: Any, tmp_path: Path) -> None:
+    with opened_page(chromium, url_of(make_graph(), tmp_path)) as shown:
+        assert "Nothing was detected" in shown.locator("#empty").inner_text()
+    hidden = [wire.HiddenNode("cup", [0, 0, 0], 0.2, 1, "seen in too few frames")] * 3
+    graph = msgspec.structs.replace(make_graph(), hidden=hidden)
+    with opened_page(chromium, url_of(graph, tmp_path)) as shown:
+        assert "3: seen in too few frames" in shown.locator("#empty").inner_text()
+
+
+def test_a_thousand_objects(chromium: Any, tmp_path: Path) -> None:
+    with opened_page(chromium, url_of(make_room(1000), tmp_path)) as shown:
+        assert drawn(pixels(shown)) > 0.02
+        assert shown.locator("#list li.object").count() == 1000
