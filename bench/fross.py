@@ -174,14 +174,7 @@ class Ours:
     def process(self, recorded: Recorded) -> None:
         """Lift a frame and merge it."""
         frame, perceived = recorded
-        local = self._lifting.lift(
-            perceived.frame_graph,
-            perceived.instances,
-            frame.depth_m,
-            frame.intrinsics,
-            frame.T_world_camera,
-            frame.frame_id,
-        )
+        local = self._lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
         self._merging.merge(self.graph, local)
 
     def fill(self, count: int) -> None:

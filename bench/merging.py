@@ -13,9 +13,9 @@ import statistics
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
@@ -92,6 +92,60 @@ def graph_of(world: World) -> SceneGraph:
     return graph
 
 
+class Objects(Protocol):
+    """Objects of a map: means (n, 3), covariances (n, 3, 3), and class distributions."""
+
+    means: np.ndarray
+    covariances: np.ndarray
+
+    def probabilities(self, rows: np.ndarray) -> np.ndarray:
+        """Class distributions (k, C) of observations of k objects."""
+        ...
+
+
+def local_graph(
+    world: Objects,
+    rows: np.ndarray,
+    stamp_ns: int,
+    T_world_camera: np.ndarray,
+    surfaces: Sequence[np.ndarray],
+    grid: DepthGrid,
+    rng: np.random.Generator,
+) -> LocalGraph:
+    """A frame of some objects with millimetre noise, and relations of the first with the next 10.
+
+    Args:
+        world: the map.
+        rows: (n,) of the objects in the map.
+        stamp_ns: of the frame.
+        T_world_camera: (4, 4).
+        surfaces: surface points (k, 3) float32 of each object.
+        grid: what the camera shows.
+        rng: of the noise.
+    """
+    n = len(rows)
+    pairs = np.array([[0, 1 + index] for index in range(min(10, n - 1))])
+    return LocalGraph(
+        stamp_ns=stamp_ns,
+        frame_id="world",
+        width=CAMERA.width,
+        height=CAMERA.height,
+        T_world_camera=T_world_camera,
+        vocabulary=VOCABULARY,
+        instance_ids=np.arange(1, n + 1),
+        boxes_xyxy=np.zeros((n, 4)),
+        class_probabilities=world.probabilities(rows),
+        scores=np.ones(n),
+        means_world=world.means[rows] + rng.normal(0, 0.002, (n, 3)),
+        covariances_world=world.covariances[rows],
+        depths_m=np.ones(n),
+        pixel_counts=np.full(n, 1000),
+        surface_points_world=tuple(surfaces),
+        depth_grid=grid,
+        relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(len(pairs))),
+    )
+
+
 def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
     """Frames of 12 neighbouring objects with millimetre noise."""
     rng = np.random.default_rng(seed)
@@ -99,32 +153,11 @@ def frames_of(world: World, count: int, seed: int = 2) -> list[LocalGraph]:
     for stamp_ns in range(1, count + 1):
         centre = world.means[rng.integers(len(world.means))]
         rows = np.argsort(np.linalg.norm(world.means - centre, axis=1))[:LOCAL_NODES]
-        n = len(rows)
         T_world_camera = np.eye(4)
         T_world_camera[:3, 3] = world.means[rows].mean(axis=0) - [0.0, 0.0, DISTANCE_M]
         surfaces = tuple(world.surface_points(row, rng) for row in rows)
-        pairs = np.array([[0, 1 + index] for index in range(min(10, n - 1))])
-        frames.append(
-            LocalGraph(
-                stamp_ns=stamp_ns,
-                frame_id="world",
-                width=640,
-                height=480,
-                T_world_camera=T_world_camera,
-                vocabulary=VOCABULARY,
-                instance_ids=np.arange(1, n + 1),
-                boxes_xyxy=np.zeros((n, 4)),
-                class_probabilities=world.probabilities(rows),
-                scores=np.ones(n),
-                means_world=world.means[rows] + rng.normal(0, 0.002, (n, 3)),
-                covariances_world=world.covariances[rows],
-                depths_m=np.ones(n),
-                pixel_counts=np.full(n, 1000),
-                surface_points_world=surfaces,
-                depth_grid=depth_grid(surfaces, T_world_camera[:3, 3]),
-                relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(10)),
-            )
-        )
+        grid = depth_grid(surfaces, T_world_camera[:3, 3])
+        frames.append(local_graph(world, rows, stamp_ns, T_world_camera, surfaces, grid, rng))
     return frames
 
 

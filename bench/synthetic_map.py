@@ -8,13 +8,22 @@ seen from its near side, before its far wall.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from bench.merging import CAMERA, CLASSES, LOCAL_NODES, PREDICATES, STRIDE_PX, VOCABULARY
+from bench.merging import (
+    CAMERA,
+    CLASSES,
+    LOCAL_NODES,
+    PREDICATES,
+    STRIDE_PX,
+    VOCABULARY,
+    local_graph,
+)
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
 ROOM_M = np.array([5.0, 2.5, 4.0])
@@ -107,51 +116,56 @@ class RoomMap:
         return found
 
     def _frame(self, room: int, stamp_ns: int, rng: np.random.Generator) -> LocalGraph:
-        corner, n = self.corners[room], LOCAL_NODES
+        view = self.view(room, rng)
+        depth_mm, instances = view.render(STRIDE_PX)
+        grid = DepthGrid(depth_mm, STRIDE_PX, CAMERA, instances)
+        return local_graph(
+            self, view.rows, stamp_ns, view.T_world_camera, tuple(view.surfaces), grid, rng
+        )
+
+    def view(self, room: int, rng: np.random.Generator) -> View:
+        """The camera before a room, and new surface points of its objects."""
+        corner = self.corners[room]
         in_room = np.arange(room * OBJECTS_PER_ROOM, (room + 1) * OBJECTS_PER_ROOM)
         offsets = self.means[in_room] - (corner + ROOM_M / 2)
-        rows = in_room[np.argsort(np.linalg.norm(offsets, axis=1))[:n]]
+        rows = in_room[np.argsort(np.linalg.norm(offsets, axis=1))[:LOCAL_NODES]]
         T_world_camera = np.eye(4)
         T_world_camera[:3, 3] = corner + [ROOM_M[0] / 2, ROOM_M[1] / 2, -BACK_M]
         surfaces = self.surfaces(rows, rng)
         others = self.surfaces(np.setdiff1d(in_room, rows), rng)
-        pairs = np.array([[0, 1 + index] for index in range(10)])
-        return LocalGraph(
-            stamp_ns=stamp_ns,
-            frame_id="world",
-            width=CAMERA.width,
-            height=CAMERA.height,
-            T_world_camera=T_world_camera,
-            vocabulary=VOCABULARY,
-            instance_ids=np.arange(1, n + 1),
-            boxes_xyxy=np.zeros((n, 4)),
-            class_probabilities=self.probabilities(rows),
-            scores=np.ones(n),
-            means_world=self.means[rows] + rng.normal(0, 0.002, (n, 3)),
-            covariances_world=self.covariances[rows],
-            depths_m=np.ones(n),
-            pixel_counts=np.full(n, 1000),
-            surface_points_world=tuple(surfaces),
-            depth_grid=_depth_grid(surfaces, others, T_world_camera[:3, 3]),
-            relations=Relations(pairs, rng.normal(size=(len(pairs), PREDICATES)), np.ones(10)),
-        )
+        return View(rows, T_world_camera, surfaces, others)
 
 
-def _depth_grid(surfaces: np.ndarray, others: np.ndarray, camera_world: np.ndarray) -> DepthGrid:
-    """Depth of the wall and of surfaces (n, k, 3), each in the box of its points.
+class View(NamedTuple):
+    """A camera, and the objects before it.
 
-    The others are not detected.
+    Attributes:
+        rows: (n,) of the detected objects in the map.
+        T_world_camera: (4, 4).
+        surfaces: (n, k, 3) surface points of the detected objects, world frame, metres.
+        others: (m, k, 3) of the objects that are not detected.
     """
-    shape = (CAMERA.height // STRIDE_PX, CAMERA.width // STRIDE_PX)
-    depth_mm = np.full(shape, 1000 * (BACK_M + ROOM_M[2]), np.uint16)
-    instances = np.zeros(shape, np.uint16)
-    detected, surfaces = len(surfaces), np.concatenate((surfaces, others))
-    for index in np.argsort(-surfaces[:, :, 2].mean(axis=1)).tolist():  # the nearest last
-        x, y, z = (surfaces[index] - camera_world).T
-        columns = (CAMERA.fx * x / z + CAMERA.cx) / STRIDE_PX
-        rows = (CAMERA.fy * y / z + CAMERA.cy) / STRIDE_PX
-        top, bottom = (max(int(end), 0) for end in (rows.min(), rows.max() + 1))
-        left, right = (max(int(end), 0) for end in (columns.min(), columns.max() + 1))
-        depth_mm[top:bottom, left:right] = 1000 * z.mean()
-        instances[top:bottom, left:right] = index + 1 if index < detected else 0
-    return DepthGrid(depth_mm, STRIDE_PX, CAMERA, instances)
+
+    rows: np.ndarray
+    T_world_camera: np.ndarray
+    surfaces: np.ndarray
+    others: np.ndarray
+
+    def render(self, stride_px: int) -> tuple[np.ndarray, np.ndarray]:
+        """Depth in millimetres and instances on every N-th pixel, both uint16.
+
+        There is a wall, and before it each surface in the box of its points.
+        """
+        shape = (CAMERA.height // stride_px, CAMERA.width // stride_px)
+        depth_mm = np.full(shape, 1000 * (BACK_M + ROOM_M[2]), np.uint16)
+        instances = np.zeros(shape, np.uint16)
+        surfaces = np.concatenate((self.surfaces, self.others))
+        for index in np.argsort(-surfaces[:, :, 2].mean(axis=1)).tolist():  # the nearest last
+            x, y, z = (surfaces[index] - self.T_world_camera[:3, 3]).T
+            columns = (CAMERA.fx * x / z + CAMERA.cx) / stride_px
+            rows = (CAMERA.fy * y / z + CAMERA.cy) / stride_px
+            top, bottom = (max(int(end), 0) for end in (rows.min(), rows.max() + 1))
+            left, right = (max(int(end), 0) for end in (columns.min(), columns.max() + 1))
+            depth_mm[top:bottom, left:right] = 1000 * z.mean()
+            instances[top:bottom, left:right] = index + 1 if index < len(self.rows) else 0
+        return depth_mm, instances

@@ -151,14 +151,7 @@ class Pipeline:
 
     def _add(self, frame: RgbdFrame, perceived: Perceived) -> FrameResult:
         with timed(self.times_s["lifting"]):
-            local = self.lifting.lift(
-                perceived.frame_graph,
-                perceived.instances,
-                frame.depth_m,
-                frame.intrinsics,
-                frame.T_world_camera,
-                frame.frame_id,
-            )
+            local = self.lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
         if self.builder is None:
             self.go_on_with(GraphBuilder(self.config, local.vocabulary, local.frame_id))
         assert self.builder is not None

@@ -202,8 +202,8 @@ def _mean_between(depths: Float32, low: float, high: float, unit: float) -> floa
 def _unit(count: int, lowest: float, highest: float) -> float:
     """The last binary place of the lowest depth, a unit of all depths.
 
-    It is coarser if the sum of so many depths would have more than 62 bits: with 640 x 480 depths,
-    if the highest is more than 2^20 times the lowest.
+    The sum of `count` depths must fit into 62 bits, so a very large range of depths takes a coarser
+    unit. With 640 x 480 depths, this begins where the highest is 2^20 times the lowest.
     """
     finest = math.floor(math.log2(lowest)) - 23
     return float(2.0 ** max(finest, math.ceil(math.log2(highest * count)) - 62))

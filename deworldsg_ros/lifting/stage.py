@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import accumulate
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,6 +31,30 @@ from deworldsg_ros.scene.frame_graph import (
     Vocabulary,
 )
 from deworldsg_ros.scene.gaussian import transform
+
+
+class PosedDepth(Protocol):
+    """A depth image with its camera and its pose, as `Lifting.lift` takes them."""
+
+    @property
+    def depth_m(self) -> Float32:
+        """(H, W) float32, metres."""
+        ...
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the image."""
+        ...
+
+    @property
+    def T_world_camera(self) -> Float64:  # noqa: N802, the name of the frames' field
+        """(4, 4) float64."""
+        ...
+
+    @property
+    def frame_id(self) -> str:
+        """Name of the world frame."""
+        ...
 
 
 class Lifting:
@@ -103,6 +127,19 @@ class Lifting:
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
             depth_grid=_depth_grid(depth_m, instances, intrinsics),
+        )
+
+    def lift_frame(
+        self, frame_graph: FrameGraph, instances: UInt16, frame: PosedDepth
+    ) -> LocalGraph:
+        """`lift` with the depth, the camera and the pose of a frame."""
+        return self.lift(
+            frame_graph,
+            instances,
+            frame.depth_m,
+            frame.intrinsics,
+            frame.T_world_camera,
+            frame.frame_id,
         )
 
     def warm_up(self) -> None:

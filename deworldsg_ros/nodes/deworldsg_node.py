@@ -38,14 +38,7 @@ class DeworldsgNode(PerceivingNode):
 
     def _process(self, frame: RgbdFrame) -> None:
         perceived = self.perceive(frame)
-        local = self._lifting.lift(
-            perceived.frame_graph,
-            perceived.instances,
-            frame.depth_m,
-            frame.intrinsics,
-            frame.T_world_camera,
-            frame.frame_id,
-        )
+        local = self._lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
         self.health.left_out(local.drops)
         self.graph.submit(lambda: self.graph.integrate(local))
         self._relating.relate(PairingFrame(local, frame.rgb))

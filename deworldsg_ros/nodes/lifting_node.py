@@ -45,14 +45,7 @@ class LiftingNode(JoiningNode[LiftingFrame]):
         self._frames.add_frame_graph(frame_graph_from_message(message))
 
     def _lift(self, frame: LiftingFrame) -> None:
-        local = self._lifting.lift(
-            frame.frame_graph,
-            frame.instances,
-            frame.depth_m,
-            frame.intrinsics,
-            frame.T_world_camera,
-            frame.frame_id,
-        )
+        local = self._lifting.lift_frame(frame.frame_graph, frame.instances, frame)
         self._publish(local_graph_to_message(local))
         self.health.left_out(local.drops)
 

@@ -6,8 +6,8 @@ import itertools
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 
-# Removed ids, before those that nobody can ask for are forgotten: kilobytes, and far more than are
-# removed while a frame is remembered.
+# With more removed ids than this, those that no remembered frame has are forgotten. So many ids are
+# a few kilobytes, and far more than are removed while a frame is remembered.
 PRUNE_ABOVE = 4096
 
 

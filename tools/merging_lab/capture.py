@@ -171,14 +171,7 @@ def _lifted(
     for frame in frames:
         try:
             perceived = front_end.perceive(frame)
-            local = lifting.lift(
-                perceived.frame_graph,
-                perceived.instances,
-                frame.depth_m,
-                frame.intrinsics,
-                frame.T_world_camera,
-                frame.frame_id,
-            )
+            local = lifting.lift_frame(perceived.frame_graph, perceived.instances, frame)
         except RefusedInput:
             continue
         true_ids = truth(frame)
