@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.client.objects import SceneObject
 
@@ -131,6 +130,8 @@ def changes_by_place(before: Iterable[SceneObject], after: Iterable[SceneObject]
 
 def matched(before: list[SceneObject], after: list[SceneObject], cost: Any) -> list[Pairing]:
     """The assignment of least total cost; pairs of infinite cost are left out."""
+    from scipy.optimize import linear_sum_assignment  # slow to import, and only for changes
+
     if not before or not after:
         return []
     costs = np.array([[cost(a, b) for b in after] for a in before])

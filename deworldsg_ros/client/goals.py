@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from deworldsg_ros.client.boxes import Footprint, point_gaps_m, polygon_gap_m
 from deworldsg_ros.client.errors import ClientError
@@ -253,6 +252,8 @@ def _spot(box: Footprint, ray: Float64, distance: float) -> Float64:
 
 def _hull(points: Float64) -> Float64:
     """The corners (k, 2) of the convex hull of points (n, 2), n >= 3 not on one line."""
+    from scipy.spatial import ConvexHull  # slow to import, and only for goals
+
     return np.asarray(points[ConvexHull(points).vertices])
 
 

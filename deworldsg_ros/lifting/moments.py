@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
+from deworldsg_ros.lifting.constants import LARGE_SURFACE_FACTOR, POINT_AREA_M2
 from deworldsg_ros.lifting.pixels import Pixels
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32
 from deworldsg_ros.scene.camera import Intrinsics
@@ -13,60 +16,96 @@ from deworldsg_ros.scene.camera import Intrinsics
 CHUNK = 256
 
 
-def back_project(pixels: Pixels, intrinsics: Intrinsics, T_world_camera: Float64) -> Float64:
-    """Points of pixels in the world frame (Eq. 3): x~ = z K⁻¹ [u v 1]ᵀ, x = R x~ + t.
+class Estimate(NamedTuple):
+    """An object in the camera frame.
 
-    Returns:
-        (N, 3) float64, metres.
+    Attributes:
+        pixel_count: number of its inliers. With fewer than the minimum, the rest is empty.
+        mean: (3,) float64, metres.
+        covariance: (3, 3) float64, square metres, N - 1 in the denominator, without the ridge εI.
+        points: (k, 3) float64, metres, a sample of the inliers: evenly spaced in row order.
     """
-    camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
-    points_camera = _back_project(pixels.columns, pixels.rows, pixels.depths_m, *camera)
-    return points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
+    pixel_count: int
+    mean: Float64
+    covariance: Float64
+    points: Float64
 
 
-def estimate_gaussian(pixels: Pixels, intrinsics: Intrinsics) -> tuple[Float64, Float64]:
-    """Sample mean and covariance of an object's points, camera frame (Eq. 4).
+def estimate_gaussian(
+    pixels: Pixels,
+    layer_m: tuple[float, float],
+    intrinsics: Intrinsics,
+    min_pixels: int,
+    surface_points: int,
+) -> Estimate:
+    """Sample mean and covariance of an object's points, camera frame (Eq. 4), and some points.
 
     The Gaussian of the points in the world frame follows by `scene.gaussian.transform`: μ → Rμ + t,
-    Σ → RΣRᵀ. The points themselves are never stored.
+    Σ → RΣRᵀ. All points together are never stored.
 
     Args:
-        pixels: the final inliers of the object, two or more.
+        pixels: of the object.
+        layer_m: lowest and highest depth of its inliers, metres (Eq. 2).
         intrinsics: of the depth image.
-
-    Returns:
-        mean (3,) float64 metres, and covariance (3, 3) float64 square metres with N - 1 in the
-        denominator, without the ridge εI.
+        min_pixels: an object with fewer inliers is not estimated; at least 2.
+        surface_points: usual size of the sample. A large surface gets more points, see
+            `POINT_AREA_M2`; no object gets more than it has inliers.
     """
     camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
-    mean, covariance = _camera_moments(pixels.columns, pixels.rows, pixels.depths_m, *camera)
-    return mean, covariance
+    arrays = pixels.columns, pixels.rows, pixels.depths_m
+    return Estimate(*_estimate(*arrays, *layer_m, *camera, min_pixels, surface_points))
 
 
 @kernel
-def _back_project(
-    columns: Int32, rows: Int32, depths_m: Float32, fx: float, fy: float, cx: float, cy: float
-) -> Float64:
-    """`Intrinsics.back_project`, with the same operations, in one pass."""
-    points = np.empty((depths_m.size, 3))
-    for index in range(depths_m.size):
-        depth = np.float64(depths_m[index])
-        points[index, 0] = (columns[index] - cx) / fx * depth
-        points[index, 1] = (rows[index] - cy) / fy * depth
-        points[index, 2] = depth
-    return points
+def back_project(
+    column: int, row: int, depth_m: float, fx: float, fy: float, cx: float, cy: float
+) -> tuple[float, float, float]:
+    """`Intrinsics.back_project` of one pixel, with the same operations (Eq. 3)."""
+    return (column - cx) / fx * depth_m, (row - cy) / fy * depth_m, depth_m
 
 
 @kernel
-def _camera_moments(
-    columns: Int32,
-    rows: Int32,
-    depths_m: Float32,
+def _estimate(
+    all_columns: Int32,
+    all_rows: Int32,
+    all_depths_m: Float32,
+    lowest_m: float,
+    highest_m: float,
     fx: float,
     fy: float,
     cx: float,
     cy: float,
+    min_pixels: int,
+    surface_points: int,
+) -> tuple[int, Float64, Float64, Float64]:
+    columns, rows = np.empty_like(all_columns), np.empty_like(all_rows)
+    depths_m = np.empty_like(all_depths_m)
+    count = 0
+    for index in range(all_depths_m.size):
+        z = all_depths_m[index]
+        columns[count], rows[count], depths_m[count] = all_columns[index], all_rows[index], z
+        count += (z >= lowest_m) & (z <= highest_m)
+    if count < min_pixels:
+        return count, np.empty(0), np.empty((0, 0)), np.empty((0, 0))
+    mean, covariance = _moments(columns[:count], rows[:count], depths_m[:count], fx, fy, cx, cy)
+    area_m2 = count * mean[2] ** 2 / (fx * fy)
+    by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * surface_points)
+    points = np.empty((min(max(by_area, surface_points), count), 3))
+    for index in range(len(points)):
+        place = index * count // len(points)
+        x, y, z = back_project(
+            columns[place], rows[place], np.float64(depths_m[place]), fx, fy, cx, cy
+        )
+        points[index, 0], points[index, 1], points[index, 2] = x, y, z
+    return count, mean, covariance, points
+
+
+@kernel
+def _moments(
+    columns: Int32, rows: Int32, depths_m: Float32, fx: float, fy: float, cx: float, cy: float
 ) -> tuple[Float64, Float64]:
+    """Sample mean and covariance of the points of pixels."""
     count = depths_m.size
     # The sums are taken about a point of the object, not about the origin. A covariance of square
     # centimetres at a distance of metres would lose its digits otherwise.

@@ -27,14 +27,6 @@ class Pixels:
     def __len__(self) -> int:
         return len(self.depths_m)
 
-    def within(self, lowest_m: float, highest_m: float) -> Pixels:
-        """The pixels with depth in [lowest_m, highest_m], metres."""
-        return Pixels(*_within(self.columns, self.rows, self.depths_m, lowest_m, highest_m))
-
-    def sample(self, count: int) -> Pixels:
-        """`count` of the pixels, evenly spaced; at most as many as there are."""
-        return Pixels(*_sample(self.columns, self.rows, self.depths_m, count))
-
 
 def valid_depth(depth_m: Float32) -> Float32:
     """Depth image (H, W) float32, metres; NaN, infinity and negative values become 0.
@@ -63,33 +55,3 @@ def _valid_depth(depth_m: Float32) -> Float32:
         depth = flat_in[index]
         flat_out[index] = depth if (depth > zero) & (depth < infinity) else zero
     return valid
-
-
-@kernel
-def _within(
-    columns: Int32, rows: Int32, depths_m: Float32, lowest_m: float, highest_m: float
-) -> tuple[Int32, Int32, Float32]:
-    kept_columns = np.empty_like(columns)
-    kept_rows = np.empty_like(rows)
-    kept_depths = np.empty_like(depths_m)
-    kept = 0
-    for index in range(depths_m.size):
-        depth = depths_m[index]
-        kept_columns[kept] = columns[index]
-        kept_rows[kept] = rows[index]
-        kept_depths[kept] = depth
-        kept += (depth >= lowest_m) & (depth <= highest_m)
-    return kept_columns[:kept], kept_rows[:kept], kept_depths[:kept]
-
-
-@kernel
-def _sample(
-    columns: Int32, rows: Int32, depths_m: Float32, count: int
-) -> tuple[Int32, Int32, Float32]:
-    some_columns, some_rows = np.empty(count, np.int32), np.empty(count, np.int32)
-    some_depths = np.empty(count, np.float32)
-    for index in range(count):
-        place = index * depths_m.size // count
-        some_columns[index], some_rows[index] = columns[place], rows[place]
-        some_depths[index] = depths_m[place]
-    return some_columns, some_rows, some_depths

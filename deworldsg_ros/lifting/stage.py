@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from itertools import accumulate
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from deworldsg_ros.config import LiftingConfig
 from deworldsg_ros.lifting.constants import (
     DEPTH_GRID_STRIDE_PX,
-    LARGE_SURFACE_FACTOR,
-    POINT_AREA_M2,
     LiftingConstants,
 )
 from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.moments import back_project, estimate_gaussian
-from deworldsg_ros.lifting.pixels import Pixels, valid_depth
+from deworldsg_ros.lifting.moments import Estimate, estimate_gaussian
+from deworldsg_ros.lifting.pixels import valid_depth
 from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
 from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32, Int64, UInt16
@@ -104,9 +102,10 @@ class Lifting:
         depth_m = valid_depth(depth_m)
         objects, drops = self._objects(depth_m, instances, frame_graph, intrinsics)
 
-        rows = np.array([item.row for item in objects], np.int64)
-        means_camera = np.array([item.mean_camera for item in objects]).reshape(-1, 3)
-        covariances = np.array([item.covariance_camera for item in objects]).reshape(-1, 3, 3)
+        found = list(objects.values())
+        rows = np.array(list(objects), np.int64)
+        means_camera = np.array([item.mean for item in found]).reshape(-1, 3)
+        covariances = np.array([item.covariance for item in found]).reshape(-1, 3, 3)
         means, covariances = transform(means_camera, covariances, T_world_camera)
         return LocalGraph(
             stamp_ns=frame_graph.stamp_ns,
@@ -122,8 +121,8 @@ class Lifting:
             means_world=means,
             covariances_world=covariances + self._config.covariance_ridge_m2 * np.eye(3),
             depths_m=means_camera[:, 2].copy(),
-            pixel_counts=np.array([item.pixel_count for item in objects], np.int64),
-            surface_points_world=_surface_points(objects, intrinsics, T_world_camera),
+            pixel_counts=np.array([item.pixel_count for item in found], np.int64),
+            surface_points_world=_surface_points(found, T_world_camera),
             relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
             depth_grid=_depth_grid(depth_m, instances, intrinsics),
@@ -163,8 +162,8 @@ class Lifting:
         instances: UInt16,
         frame_graph: FrameGraph,
         intrinsics: Intrinsics,
-    ) -> tuple[list[_Object], dict[str, int]]:
-        """The objects with enough pixels, and the drops by reason.
+    ) -> tuple[dict[int, Estimate], dict[str, int]]:
+        """The objects with enough pixels, by their row, and the drops by reason.
 
         One object after the other: its pixels stay in the cache until they are reduced.
         """
@@ -176,20 +175,20 @@ class Lifting:
                 f"{len(frame_graph)}, up to {instances.max()}: expected at most "
                 f"{len(frame_graph)}, the number of objects in the frame graph",
             )
-        objects: list[_Object] = []
+        objects: dict[int, Estimate] = {}
         drops: Counter[str] = Counter()
         for row, box_xyxy in enumerate(frame_graph.boxes_xyxy):
-            pixels = self._pixels(depth_m, masks.runs_of(row), box_xyxy)
-            if isinstance(pixels, str):
-                drops[pixels] += 1
-                continue
-            mean, covariance = estimate_gaussian(pixels, intrinsics)
-            sample = pixels.sample(self._point_count(len(pixels), float(mean[2]), intrinsics))
-            objects.append(_Object(row, len(pixels), mean, covariance, sample))
+            item = self._object(depth_m, masks.runs_of(row), box_xyxy, intrinsics)
+            if isinstance(item, str):
+                drops[item] += 1
+            else:
+                objects[row] = item
         return objects, dict(drops)
 
-    def _pixels(self, depth_m: Float32, runs: Int32, box_xyxy: Float64) -> Pixels | str:
-        """Final pixels of an object by its mask or box; the reason if there are too few."""
+    def _object(
+        self, depth_m: Float32, runs: Int32, box_xyxy: Float64, intrinsics: Intrinsics
+    ) -> Estimate | str:
+        """An object by the pixels of its mask or box; the reason if there are too few."""
         config, constants = self._config, self._constants
         if config.pixels == "box":
             pixels = box_pixels(depth_m, box_xyxy)
@@ -197,42 +196,17 @@ class Lifting:
             pixels = mask_pixels(depth_m, runs)
         else:
             pixels = spatial_inliers(depth_m, runs, config.tau, constants.epsilon_m)
-        if len(pixels) < constants.min_pixels:
-            had_few = (
-                config.pixels != "refined"
-                or valid_pixel_count(depth_m, runs) < constants.min_pixels
-            )
+        least = constants.min_pixels
+        if len(pixels) < least:
+            had_few = config.pixels != "refined" or valid_pixel_count(depth_m, runs) < least
             return "few_mask_pixels" if had_few else "few_spatial_inliers"
+        layer_m = 0.0, np.inf
         if config.pixels == "refined":
             layer_m = dominant_layer(
                 pixels.depths_m, config.gamma_base_m, constants.alpha, constants.beta
             )
-            pixels = pixels.within(*layer_m)
-        return pixels if len(pixels) >= constants.min_pixels else "few_depth_inliers"
-
-    def _point_count(self, pixel_count: int, depth_m: float, intrinsics: Intrinsics) -> int:
-        """Number of surface points of an object: more for a large surface, at most its pixels."""
-        usual = self._constants.surface_points
-        area_m2 = pixel_count * depth_m**2 / (intrinsics.fx * intrinsics.fy)
-        by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * usual)
-        return min(max(by_area, usual), pixel_count)
-
-
-class _Object(NamedTuple):
-    """An object of a frame in the camera frame.
-
-    Attributes:
-        row: in the frame graph.
-        pixel_count: number of its final pixels.
-        mean_camera, covariance_camera: (3,) and (3, 3), metres and square metres.
-        sample: some of the pixels.
-    """
-
-    row: int
-    pixel_count: int
-    mean_camera: Float64
-    covariance_camera: Float64
-    sample: Pixels
+        item = estimate_gaussian(pixels, layer_m, intrinsics, least, constants.surface_points)
+        return item if item.pixel_count >= least else "few_depth_inliers"
 
 
 def _check_grids(
@@ -255,20 +229,13 @@ def _check_grids(
             )
 
 
-def _surface_points(
-    objects: list[_Object], intrinsics: Intrinsics, T_world_camera: Float64
-) -> tuple[Float32, ...]:
-    """Sample of each object's pixels as points (k, 3), world frame, metres."""
+def _surface_points(objects: list[Estimate], T_world_camera: Float64) -> tuple[Float32, ...]:
+    """Sample of each object's points (k, 3), world frame, metres."""
     if not objects:
         return ()
-    samples = [item.sample for item in objects]
-    sample = Pixels(
-        np.concatenate([pixels.columns for pixels in samples]),
-        np.concatenate([pixels.rows for pixels in samples]),
-        np.concatenate([pixels.depths_m for pixels in samples]),
-    )
-    points = back_project(sample, intrinsics, T_world_camera).astype(np.float32)
-    ends = [*accumulate(map(len, samples))]
+    points_camera = np.concatenate([item.points for item in objects])
+    points = (points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32)
+    ends = [*accumulate(len(item.points) for item in objects)]
     return tuple(points[start:end] for start, end in zip([0, *ends], ends))
 
 

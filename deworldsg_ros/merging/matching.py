@@ -6,9 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from deworldsg_ros.kernels import kernel
+from deworldsg_ros.merging.assignment import assign
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.nodes import NodeTable
@@ -96,11 +96,8 @@ def match(
 
 def one_to_one(scores: Float64) -> list[int]:
     """One-to-one assignment with the greatest total score: column of each row, -1 = none."""
-    matched = [-1] * len(scores)
-    for row, column in zip(*(ends.tolist() for ends in linear_sum_assignment(scores, True))):
-        if scores[row, column] > 0:
-            matched[row] = column
-    return matched
+    columns: list[int] = assign(scores).tolist()
+    return [c if c >= 0 and scores[row, c] > 0 else -1 for row, c in enumerate(columns)]
 
 
 @kernel

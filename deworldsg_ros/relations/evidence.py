@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import softmax
 
 from deworldsg_ros.scene.arrays import Bool, Float64, Int8
+from deworldsg_ros.scene.softmax import softmax
 from deworldsg_ros.scene.wire import Provenance
 
 PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
@@ -51,7 +51,7 @@ def visual_distribution(summed_logits: Float64) -> Float64:
     Returns:
         (..., R) float64, rows sum to one.
     """
-    distribution: Float64 = softmax(summed_logits, axis=-1)
+    distribution: Float64 = softmax(summed_logits)
     return distribution
 
 

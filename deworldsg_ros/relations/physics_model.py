@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy.special import log_softmax
 
 from deworldsg_ros.relations.evidence import entropy_nats
 from deworldsg_ros.relations.pair_geometry import FEATURES
@@ -22,6 +21,7 @@ from deworldsg_ros.relations.vote_model import VoteScales
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.softmax import log_softmax
 
 PATH = Path(__file__).with_name("weights") / "physics.npz"
 
@@ -115,7 +115,7 @@ def believed_logits(
     judged = (geometry != 0).any(axis=1)[:, None]
     sound = np.where(judged, by_geometry * geometry, prior)
     mixed = np.logaddexp(
-        np.log1p(-broken) + log_softmax(sound, axis=1),
+        np.log1p(-broken) + log_softmax(sound),
         np.log(broken) + log_softmax(prior),
     )
     return np.asarray(mixed + np.where(independent, by_independent, 1.0)[:, None] * votes)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from scipy.special import softmax
 
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physical_states import NONE, RELATIONS_OF_STATE, canonical_predicates
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.softmax import softmax
 
 # A prediction of a pair enters the prior of its classes if the model says, with this probability,
 # that the pair is related in this direction. Otherwise it abstains.
@@ -50,11 +50,11 @@ class PredictedPrior:
     def follow(self, table: PairTable, keys: Collection[int]) -> None:
         """Take in the pairs with these keys as they are now, in place of what they said before."""
         for pair_key in keys:
-            for classes, values in self._told.pop(pair_key, ()):
-                self._add(classes, -values, -1)
+            for pair, values in self._told.pop(pair_key, ()):
+                self._add(pair, -values, -1)
         rows = np.array([table.row(pair_key) for pair_key in keys if pair_key in table], np.int64)
         rows = rows[table.judged[rows]]
-        states = softmax(table.state_logits[rows], axis=1)
+        states = softmax(table.state_logits[rows])
         related = states[:, 0] < 1.0 - MIN_RELATED
         rows, states = rows[related], states[related]
         classes = table.shapes.best_classes[table.ends[rows]]

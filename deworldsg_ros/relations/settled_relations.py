@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import softmax
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.relations.exclusions import CARRIED_FIRST, CARRIED_SECOND, MOST, SEAT_GAP_M
@@ -22,6 +21,7 @@ from deworldsg_ros.relations.vote_model import near_logits, vote_logits
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.class_kinds import SEATS, TABLES
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.softmax import softmax
 
 
 class SettledRelations:
@@ -108,7 +108,7 @@ class SettledRelations:
         geometry = np.where(judged[:, None], table.state_logits[rows], 0.0)
         votes = vote_logits(counts, frames, model.votes)
         independent = ~judged | (not self._own_head)
-        states = softmax(believed_logits(model, geometry, votes, independent), axis=1)
+        states = softmax(believed_logits(model, geometry, votes, independent))
         table.states[rows] = states
         carried = [states[:, CARRIED_FIRST].sum(1), states[:, CARRIED_SECOND].sum(1)]
         table.carried[rows] = np.minimum(np.column_stack(carried), MOST)

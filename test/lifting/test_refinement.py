@@ -27,9 +27,11 @@ def kept_by_kernels(instances, depth_m, count):
         pixels = spatial_inliers(depth_m, objects.runs_of(k), PAPER.tau, PRINTED.epsilon_m)
         mask = np.zeros(depth_m.shape, bool)
         if len(pixels):
-            layer = dominant_layer(pixels.depths_m, PAPER.gamma_base_m, PRINTED.alpha, PRINTED.beta)
-            kept = pixels.within(*layer)
-            mask[kept.rows, kept.columns] = True
+            low, high = dominant_layer(
+                pixels.depths_m, PAPER.gamma_base_m, PRINTED.alpha, PRINTED.beta
+            )
+            kept = (pixels.depths_m >= low) & (pixels.depths_m <= high)
+            mask[pixels.rows[kept], pixels.columns[kept]] = True
         masks.append(mask)
     return masks
 

@@ -275,13 +275,10 @@ def test_warm_up_compiles_everything_that_a_frame_needs():
     entry_points = (
         pixels._valid_depth,
         pixels._is_valid,
-        pixels._within,
-        pixels._sample,
         spatial._masks_of,
         spatial._spatial_inliers,
         depth_layer._dominant_layer,
-        moments._back_project,
-        moments._camera_moments,
+        moments._estimate,
     )
     # Other tests of this process may have compiled more.
     known = {kernel: len(kernel.signatures) for kernel in entry_points}

@@ -7,9 +7,12 @@ import itertools
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
 from support.merging import local_graph, random_classes, random_covariances, seeds
 
+from deworldsg_ros.merging.assignment import assign
 from deworldsg_ros.merging.joint import (
     NESTED_FRACTION,
     OVERLAPPING_WEIGHT,
@@ -101,6 +104,19 @@ def test_the_assignment_has_the_greatest_total(seed: int) -> None:
         scores[range(3), list(columns)].sum() for columns in itertools.permutations(range(4), 3)
     )
     assert total == pytest.approx(best)
+
+
+@given(seeds, st.integers(0, 9), st.integers(0, 9), st.sampled_from([3, 10**6]))
+@settings(max_examples=200)
+def test_the_assignment_is_that_of_scipy_ties_too(
+    seed: int, count: int, width: int, levels: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    scores = rng.integers(levels, size=(count, width)) / 7.0
+    rows, columns = linear_sum_assignment(scores, maximize=True)
+    expected = np.full(count, -1)
+    expected[rows] = columns
+    assert assign(scores).tolist() == expected.tolist()
 
 
 def add_frame(

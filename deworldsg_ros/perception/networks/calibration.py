@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import softmax
 
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.softmax import softmax
 
 # Keeps the logit finite. The network's scores of absent classes are far higher.
 SCORE_FLOOR = 1e-6
@@ -35,4 +35,4 @@ class SoftmaxCalibration:
         """Distributions (n, C), rows sum to one, of sigmoid scores (n, C)."""
         clipped = np.clip(np.asarray(scores, dtype=np.float64), SCORE_FLOOR, 1 - SCORE_FLOOR)
         logits = np.log(clipped / (1 - clipped)) / self.temperature
-        return np.asarray(softmax(logits, axis=1))
+        return np.asarray(softmax(logits))

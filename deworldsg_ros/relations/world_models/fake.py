@@ -11,11 +11,11 @@ import hashlib
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import softmax
 
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.softmax import softmax
 
 # Ranges of the logits that a class pair and a clip contribute.
 CLASS_PAIR_LOGIT = 4.0
