@@ -18,7 +18,7 @@ from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
-from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 app = typer.Typer(
     name="deworldsg",
@@ -274,6 +274,63 @@ def demo(
                 odometry=odometry,
             ),
             console=Console(markup=False),
+        )
+
+
+@app.command()
+def view(
+    graph: Annotated[
+        Optional[Path],
+        typer.Argument(
+            metavar="[FILE|RECORDING]",
+            help="graph (file, or folder of a run), or a recording that is processed while it is "
+            "shown",
+        ),
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="follow the running graph_node instead of a file")
+    ] = False,
+    namespace: ask.Namespace = "",
+    host: Annotated[
+        str,
+        typer.Option(
+            "--host", help="address of the page; 0.0.0.0 lets other machines see the images, too"
+        ),
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", min=1, max=65535, help="of the page; the next free one is used")
+    ] = 8080,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+    intrinsics: CameraIntrinsics = "",
+    odometry: OdometryPoses = False,
+) -> None:
+    """Show a graph in the browser, in 3D, while it grows.
+
+    Needs the package viser: pip install 'deworldsg_ros[view]'.
+    """
+    with _reporting_errors():
+        from deworldsg_ros.cli.view import ViewOptions, view_graph
+
+        if live == (graph is not None):
+            raise ConfigurationError("view: expected a graph, a recording or --live")
+        view_graph(
+            ViewOptions(
+                path=graph,
+                host=host,
+                port=port,
+                namespace=namespace,
+                config_path=config,
+                settings=tuple(settings or ()),
+                topics=TopicChoice(rgb, depth, camera_info, pose),
+                dataset=DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
+                odometry=odometry,
+            ),
+            Console(markup=False),
         )
 
 

@@ -123,7 +123,7 @@ def _run(options: RunOptions, console: Console) -> None:
     try:
         recording = Recording(choose_poses(source, options.poses, config), config.inputs)
         outputs.check_folder(options.out)
-        pipeline = _build_pipeline(config, options.map_path, console)
+        pipeline = build_pipeline(config, options.map_path, console)
         processed = _process(recording, pipeline, options, console)
     finally:
         source.close()
@@ -142,7 +142,7 @@ def _run(options: RunOptions, console: Console) -> None:
     _print_summary(options, pipeline, processed, console)
 
 
-def _build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
+def build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
     """A pipeline with its models loaded, and with the map's graph if the map file exists."""
     with working(console, LOADING) as status:
         on_compilation(lambda: say_instead(console, status, COMPILING))

@@ -46,6 +46,21 @@ class GraphReplica:
         """The edges by subject and object, read only."""
         return MappingProxyType(self._edges)
 
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the last update, nanoseconds."""
+        return wire.ns_from_stamp(self._stamp)
+
+    @property
+    def frame_id(self) -> str:
+        """The world frame; empty before the first message."""
+        return self._frame_id
+
+    @property
+    def up(self) -> list[float] | None:
+        """Unit vector (3,) against gravity; None = the messages do not tell it."""
+        return self._up if isinstance(self._up, list) else None
+
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Replace the copy by a snapshot."""
         self._stamp = snapshot.stamp

@@ -1,0 +1,244 @@
+"""What the scene shows, as arrays: boxes or ellipsoids, outlines, relations, labels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from deworldsg_ros.client.objects import SceneObject
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float64, Int64, UInt8
+from deworldsg_ros.scene.edges import Pair
+from deworldsg_ros.view.colours import GREY, class_colours, predicate_colours, to_rgb
+from deworldsg_ros.view.geometry import MUTUAL
+from deworldsg_ros.view.live.filters import Filter
+from deworldsg_ros.view.live.tables import ObjectTable
+
+Shape = Literal["boxes", "ellipsoids"]
+
+# Unsure objects are fainter.
+OPACITIES = (0.16, 0.34, 0.62)  # not sure, sure, selected
+# Arrows end where the box of the object begins, but are not shorter than this fraction.
+SHORTEST_ARROW = 0.7
+# Two relations in opposite directions are drawn so far apart, metres.
+APART_M = 0.03
+# Labels of relations are shown if there are not more.
+MOST_PREDICATE_LABELS = 120
+
+# Of the unit cube, and pairs of corners that share a side.
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_SIDES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1])
+
+
+class Label(NamedTuple):
+    """A text in the scene.
+
+    Attributes:
+        key: stable identity.
+        text: what it says.
+        position: (3,) world, metres.
+        weight: labels of more weight are placed first.
+    """
+
+    key: str
+    text: str
+    position: Float64
+    weight: float
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Everything that depends on the graph; n objects, of which some may be filtered out.
+
+    Attributes:
+        ids: (n,) of the shown objects.
+        positions, wxyzs, scales: (n, 3), (n, 4), (n, 3) of unit cubes or unit spheres.
+        colours: (n, 3) uint8.
+        opacities: (n,).
+        outlines, outline_colours: (12 n, 2, 3) edges of the boxes; none for ellipsoids.
+        arrows, arrow_colours: (a, 2, 3) directed relations, tail and tip.
+        lines, line_colours: (l, 2, 3) symmetric relations.
+        labels: of objects and relations.
+    """
+
+    ids: Int64
+    positions: Float64
+    wxyzs: Float64
+    scales: Float64
+    colours: UInt8
+    opacities: Float64
+    outlines: Float64
+    outline_colours: UInt8
+    arrows: Float64
+    arrow_colours: UInt8
+    lines: Float64
+    line_colours: UInt8
+    labels: tuple[Label, ...]
+
+
+def node_colours(table: ObjectTable) -> dict[int, str]:
+    """#rrggbb of each object, by its class."""
+    labels = {node_id: table.objects[node_id].label for node_id in sorted(table.objects)}
+    colours = class_colours(labels.values())
+    return {node_id: colours[label] for node_id, label in labels.items()}
+
+
+def draw(
+    table: ObjectTable,
+    edges: Mapping[Pair, wire.EdgeState],
+    chosen: Filter,
+    shape: Shape = "boxes",
+    selected: int | None = None,
+) -> Drawing:
+    """The drawing of a graph.
+
+    Args:
+        table: its objects.
+        edges: its relations.
+        chosen: what is shown.
+        shape: of the objects.
+        selected: id of the object that is emphasised; relations of others are grey.
+    """
+    rows = _shown(table, chosen)
+    ids = table.ids[rows].tolist()
+    by_id = node_colours(table)
+    colours = _rgb([by_id[node_id] for node_id in ids])
+    centres, sizes, wxyzs = table.centres[rows], table.sizes[rows], table.wxyzs[rows]
+    items = [table.objects[node_id] for node_id in ids]
+    outlines = np.zeros((0, 2, 3)) if shape == "ellipsoids" else outlines_of(centres, sizes, wxyzs)
+    shown_edges = _edges_between(set(ids), edges, chosen)
+    counts = Counter(edge.predicate for edge in shown_edges)
+    tints = predicate_colours(counts)
+    edge_colours = _rgb(
+        [
+            tints[edge.predicate]
+            if selected is None or selected in (edge.subject, edge.object)
+            else GREY
+            for edge in shown_edges
+        ]
+    )
+    segments = _segments(table, shown_edges)
+    both_ways = np.array([_is_mutual(edge) for edge in shown_edges], bool)
+    return Drawing(
+        ids=table.ids[rows],
+        positions=table.means[rows] if shape == "ellipsoids" else centres,
+        wxyzs=table.ellipsoid_wxyzs[rows] if shape == "ellipsoids" else wxyzs,
+        scales=table.diameters[rows] if shape == "ellipsoids" else sizes,
+        colours=colours,
+        opacities=np.array([_opacity(item, selected) for item in items]),
+        outlines=outlines,
+        outline_colours=np.repeat(colours, len(outlines) // max(len(rows), 1), axis=0),
+        arrows=segments[~both_ways],
+        arrow_colours=edge_colours[~both_ways],
+        lines=segments[both_ways],
+        line_colours=edge_colours[both_ways],
+        labels=(*_object_labels(items, selected), *_edge_labels(shown_edges, segments)),
+    )
+
+
+def rotations(wxyzs: Float64) -> Float64:
+    """Rotation matrices (n, 3, 3) of unit quaternions (n, 4)."""
+    w, x, y, z = wxyzs.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.array(rows).transpose(2, 0, 1)
+
+
+def outlines_of(centres: Float64, sizes: Float64, wxyzs: Float64) -> Float64:
+    """The 12 edges of each of n boxes, (12 n, 2, 3)."""
+    corners = (CORNERS * sizes[:, None]) @ rotations(wxyzs).transpose(0, 2, 1) + centres[:, None]
+    return corners[:, _SIDES].reshape(-1, 2, 3)
+
+
+def _shown(table: ObjectTable, chosen: Filter) -> Int64:
+    visible = table.probabilities >= chosen.min_probability
+    if chosen.hidden_classes:
+        visible &= np.array([label not in chosen.hidden_classes for label in table.labels], bool)
+    return np.flatnonzero(visible)
+
+
+def _is_mutual(edge: wire.EdgeState) -> bool:
+    return edge.mutual is True or edge.predicate in MUTUAL
+
+
+def _edges_between(
+    shown: Collection[int], edges: Mapping[Pair, wire.EdgeState], chosen: Filter
+) -> list[wire.EdgeState]:
+    """Relations between shown objects; of two opposite symmetric ones the first."""
+    found: dict[tuple[int, int, str], wire.EdgeState] = {}
+    for edge in edges.values():
+        if (
+            edge.predicate in chosen.hidden_predicates
+            or edge.probability < chosen.min_relation
+            or edge.subject not in shown
+            or edge.object not in shown
+        ):
+            continue
+        ends = edge.subject, edge.object
+        if _is_mutual(edge):
+            ends = min(ends), max(ends)
+        found.setdefault((*ends, edge.predicate), edge)
+    return list(found.values())
+
+
+def _segments(table: ObjectTable, edges: list[wire.EdgeState]) -> Float64:
+    """Tail and tip of each relation (m, 2, 3): from the centre to the box of the other object."""
+    if not edges:
+        return np.zeros((0, 2, 3))
+    subjects = [table.row(edge.subject) for edge in edges]
+    objects = [table.row(edge.object) for edge in edges]
+    tails, tips = table.centres[subjects], table.centres[objects]
+    along = tips - tails
+    in_box = np.abs(np.einsum("nij,ni->nj", rotations(table.wxyzs[objects]), along))
+    exits = (table.sizes[objects] / 2 / np.maximum(in_box, 1e-9)).min(axis=1)
+    tips = tips - along * np.minimum(exits, 1 - SHORTEST_ARROW)[:, None]
+    pairs = {(edge.subject, edge.object) for edge in edges}
+    both = np.array([(edge.object, edge.subject) in pairs for edge in edges])
+    aside = np.cross(along, [0.0, 0.0, 1.0])
+    aside /= np.maximum(np.linalg.norm(aside, axis=1, keepdims=True), 1e-9)
+    shift = APART_M * both[:, None] * aside
+    return np.stack([tails + shift, tips + shift], axis=1)
+
+
+def _opacity(item: SceneObject, selected: int | None) -> float:
+    if item.id == selected:
+        return OPACITIES[2]
+    return OPACITIES[item.is_sure]
+
+
+def _object_labels(items: list[SceneObject], selected: int | None) -> list[Label]:
+    labels = []
+    for item in items:
+        top = np.array(item.position_m) + item.size_m[2] / 2 * np.array(item.up)
+        weight = 1e9 if item.id == selected else float(np.prod(item.size_m))
+        text = f"{item.label} {item.id}" if item.is_sure else f"{item.label}? {item.id}"
+        labels.append(Label(f"object {item.id}", text, top, weight))
+    return labels
+
+
+def _edge_labels(edges: list[wire.EdgeState], segments: Float64) -> list[Label]:
+    """After all objects, the most probable first."""
+    if len(edges) > MOST_PREDICATE_LABELS:
+        return []
+    return [
+        Label(
+            f"relation {edge.subject} {edge.object}",
+            edge.predicate,
+            segment.mean(axis=0),
+            edge.probability - 2.0,
+        )
+        for edge, segment in zip(edges, segments)
+    ]
+
+
+def _rgb(colours: list[str]) -> UInt8:
+    """(n, 3) uint8 of n #rrggbb."""
+    known = {colour: [round(255 * value) for value in to_rgb(colour)] for colour in set(colours)}
+    return np.array([known[colour] for colour in colours], np.uint8).reshape(-1, 3)

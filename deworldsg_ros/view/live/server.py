@@ -1,0 +1,179 @@
+"""The live viewer: a page on this machine that follows a graph. Needs the package viser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.extent import horizontal_axes
+from deworldsg_ros.view.live.camera import CameraView
+from deworldsg_ros.view.live.client_labels import ClientLabels, overview
+from deworldsg_ros.view.live.details import object_html
+from deworldsg_ros.view.live.panel import Panel, set_theme
+from deworldsg_ros.view.live.scene import ViserScene
+from deworldsg_ros.view.live.state import LiveState, up_of
+
+# Updates come at up to 30 Hz; a browser shows them at this rate, and surface points more seldom.
+PERIOD_S = 0.1
+POINTS_PERIOD_S = 1.0
+# Of the view; viser's own 75 degrees distort what is near.
+FOV_RAD = 0.85
+# Frames of the camera that wait to be shown; older ones are left out.
+WAITING_VIEWS = 2
+
+
+class Viewer:
+    """Shows a graph on a web page. Its methods may be called from any thread.
+
+    Args:
+        host: address to listen on; 127.0.0.1 = only this machine.
+        port: the next free port from this one on is taken.
+        why_empty: shown while there are no objects.
+
+    Attributes:
+        url: of the page.
+    """
+
+    def __init__(self, host: str, port: int, why_empty: str) -> None:
+        with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
+            self._server = viser.ViserServer(host, port, label="DeWorldSG", verbose=False)
+        self.url = f"http://{'localhost' if host == '0.0.0.0' else host}:{self._server.get_port()}"
+        self._lock = threading.RLock()
+        self._state = LiveState(why_empty=why_empty)
+        self._views: deque[CameraView] = deque(maxlen=WAITING_VIEWS)
+        self._labels: dict[int, ClientLabels] = {}
+        self._fitted: dict[int, Any] = {}
+        self._changed = threading.Event()
+        self._closed = False
+        self._points_s = 0.0
+        set_theme(self._server, dark=False)
+        self._server.gui.main_panel.dock_right()
+        self._server.initial_camera.fov = FOV_RAD
+        self._scene = ViserScene(self._server, self._select)
+        self._panel = Panel(self._server, self._change, self._fit)
+        self._drawing = self._state.draw()
+        self._changed.set()
+        self._server.on_client_connect(lambda _: self._changed.set())
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        """Continue with a snapshot."""
+        self._change(lambda state: state.reset(snapshot))
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
+        """Apply the next update.
+
+        Raises:
+            RefusedInput: ``lost_updates`` or ``other_session``: a snapshot has to come first.
+        """
+        self._change(lambda state: state.apply(update))
+
+    def look(self, view: CameraView) -> None:
+        """Show a frame of the camera; under load, frames are left out."""
+        self._views.append(view)
+        self._changed.set()
+
+    def say(self, why_empty: str) -> None:
+        """Change the reason why there are no objects."""
+        self._change(lambda state: setattr(state, "why_empty", why_empty))
+
+    def close(self) -> None:
+        """End the thread and the page."""
+        self._closed = True
+        self._changed.set()
+        self._thread.join(timeout=5.0)
+        self._server.stop()
+
+    def _change(self, function: Callable[[LiveState], object]) -> None:
+        with self._lock:
+            function(self._state)
+        self._changed.set()
+
+    def _select(self, node_id: int) -> None:
+        self._change(lambda state: setattr(state, "selected", node_id))
+
+    def _run(self) -> None:
+        while not self._closed:
+            began_s = time.monotonic()
+            # Without a change, only the labels follow the cameras of the browsers.
+            if self._changed.wait(timeout=PERIOD_S):
+                self._changed.clear()
+                self._redraw()
+            self._place_labels()
+            time.sleep(max(began_s + PERIOD_S - time.monotonic(), 0.0))
+
+    def _redraw(self) -> None:
+        with self._lock, self._server.atomic():
+            state = self._state
+            while self._views:
+                state.look(self._views.popleft())
+            self._drawing = state.draw()
+            self._scene.show(self._drawing, state.shape)
+            self._draw_surroundings(state)
+            self._draw_points(state)
+            self._panel.show(state, state.summary(self._drawing), self._selected_html(state))
+
+    def _draw_surroundings(self, state: LiveState) -> None:
+        frames = state.frames() if self._panel.camera.value else []
+        self._scene.show_camera(frames)
+        self._panel.show_image(frames[-1].image if frames else b"")
+        bounds = state.bounds()
+        if bounds is not None:
+            self._scene.show_floor(*bounds, state.floor_m(), up_of(state.shown))
+        self._scene.switch_floor(self._panel.floor.value)
+
+    def _draw_points(self, state: LiveState) -> None:
+        """Surface points are large: they follow once a second."""
+        if not self._panel.points.value:
+            self._scene.show_points(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+        elif time.monotonic() - self._points_s > POINTS_PERIOD_S:
+            self._points_s = time.monotonic()
+            self._scene.show_points(*state.points())
+
+    def _selected_html(self, state: LiveState) -> str:
+        if state.selected is None:
+            return ""
+        crop = state.crops[state.selected]
+        return object_html(
+            state.table.objects[state.selected],
+            state.relations_of(state.selected),
+            None if crop is None else crop.image,
+        )
+
+    def _place_labels(self) -> None:
+        clients = self._server.get_clients()
+        self._labels = {key: item for key, item in self._labels.items() if key in clients}
+        labels = self._drawing.labels if self._panel.labels.value else ()
+        for key, client in clients.items():
+            self._follow_growth(key, client)
+            self._labels.setdefault(key, ClientLabels(client)).show(labels)
+
+    def _follow_growth(self, key: int, client: Any) -> None:
+        """Keep everything in view until the user moves the camera."""
+        fitted = self._fitted.get(key)
+        if fitted is None or np.allclose(client.camera.position, fitted[0], atol=1e-3):
+            bounds = self._state.bounds()
+            if bounds is not None and (fitted is None or not np.allclose(bounds, fitted[1])):
+                self._fit(client)
+
+    def _fit(self, client: Any) -> None:
+        with self._lock:
+            bounds, up = self._state.bounds(), up_of(self._state.shown)
+        if bounds is None:
+            return
+        camera = client.camera
+        position, target = overview(*bounds, horizontal_axes(up), camera.fov, camera.aspect)
+        with client.atomic():
+            camera.up_direction = up
+            camera.position, camera.look_at = position, target
+        self._fitted[client.client_id] = (position, bounds)

@@ -1,0 +1,164 @@
+"""The state of a viewer, without a browser: what was recorded, and what of it is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from deworldsg_ros.client.objects import Point, Relation, relation
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
+from deworldsg_ros.scene.edges import Pair
+from deworldsg_ros.scene.extent import DEFAULT_UP
+from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.view.colours import to_rgb
+from deworldsg_ros.view.live.camera import CameraView, Shot, Shots, jpeg, with_masks
+from deworldsg_ros.view.live.crops import BestViews
+from deworldsg_ros.view.live.details import counted
+from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours
+from deworldsg_ros.view.live.filters import Filter
+from deworldsg_ros.view.live.history import History
+from deworldsg_ros.view.live.tables import ObjectTable
+
+# Points of an object that are collected from the frames, if the messages of the graph have none.
+POINTS_OF_OBJECT = 256
+# Points of the scene: more slow down a phone.
+MOST_POINTS = 100_000
+# The floor is drawn below the lowest objects, of which a few may be wrong.
+FLOOR_PERCENTILE = 5.0
+
+
+@dataclass
+class LiveState:
+    """Applies updates and camera views, and draws the moment that is chosen.
+
+    Attributes:
+        history: the graph after each update.
+        crops: the best photo of each object.
+        shots: the frames of the camera.
+        filter, shape, selected: what the user chose.
+        moment: number of the shown moment; None = the newest one.
+        why_empty: shown while there are no objects.
+    """
+
+    history: History = field(default_factory=History)
+    crops: BestViews = field(default_factory=BestViews)
+    shots: Shots = field(default_factory=Shots)
+    filter: Filter = Filter()
+    shape: Shape = "boxes"
+    selected: int | None = None
+    moment: int | None = None
+    why_empty: str = "waiting for the graph"
+
+    def __post_init__(self) -> None:
+        self.table = ObjectTable()
+        self.edges: dict[Pair, wire.EdgeState] = {}
+        self.shown = self.history.newest
+        self._points: dict[int, Float32] = {}
+        self._colours: dict[int, str] = {}
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        """Continue with a snapshot."""
+        self.history.reset(snapshot)
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        """Apply the next update; as `History.apply`."""
+        applied = self.history.apply(update)
+        if applied:
+            self.crops.merge(update.removed_nodes)
+            for node in update.removed_nodes:
+                self._points.pop(node.id, None)
+        return applied
+
+    def look(self, view: CameraView) -> None:
+        """Take a frame of the camera: its way, its image, photos and points of its objects."""
+        self.crops.add(view)
+        image = with_masks(view, self._colours)
+        self.shots.add(
+            Shot(
+                view.stamp_ns,
+                view.T_world_camera,
+                view.fov_rad,
+                view.aspect,
+                b"" if image is None else jpeg(image),
+            )
+        )
+        if view.local is not None:
+            for node_id, points in zip(view.node_ids, view.local.surface_points_world):
+                known = self._points.get(node_id, np.zeros((0, 3), np.float32))
+                self._points[node_id] = np.concatenate([known, points])[-POINTS_OF_OBJECT:]
+
+    def draw(self) -> Drawing:
+        """The drawing of the chosen moment; only what changed is computed again."""
+        newest = self.history.newest
+        self.shown = newest if self.moment is None else self.history.at(self.moment)
+        if self.table.sync(self.shown.nodes, self.shown.frame_id, up_of(self.shown)):
+            self._colours = node_colours(self.table)
+        self.edges = dict(self.shown.edges)
+        if self.selected not in self.table:
+            self.selected = None
+        return draw(self.table, self.edges, self.filter, self.shape, self.selected)
+
+    def points(self) -> tuple[Float32, UInt8]:
+        """Surface points (n, 3) of the drawn objects, and their colours (n, 3)."""
+        parts, tints = [], []
+        for node_id, item in self.table.objects.items():
+            points = item.surface_m if len(item.surface_m) else self._points.get(node_id)
+            if points is not None and len(points) and item.label not in self.filter.hidden_classes:
+                parts.append(np.asarray(points, np.float32))
+                tints.append([255 * value for value in to_rgb(self._colours[node_id])])
+        if not parts:
+            return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+        points = np.concatenate(parts)
+        colours = np.repeat(np.array(tints, np.uint8), [len(part) for part in parts], axis=0)
+        stride = -(-len(points) // MOST_POINTS)
+        return points[::stride], colours[::stride]
+
+    def frames(self) -> list[Shot]:
+        """Frames of the camera up to the shown moment."""
+        return self.shots.until(None if self.moment is None else self.shown.stamp_ns)
+
+    def relations_of(self, node_id: int) -> list[Relation]:
+        """Relations of an object that is drawn, the most probable first."""
+        objects = self.table.objects
+        found = [
+            relation(edge, objects[edge.subject], objects[edge.object], None)
+            for pair, edge in self.edges.items()
+            if node_id in pair and pair[0] in objects and pair[1] in objects
+        ]
+        return sorted(found, key=lambda item: -item.probability)
+
+    def summary(self, drawing: Drawing) -> list[str]:
+        """The size of the graph, and the moment; why it is empty."""
+        objects, relations = len(self.table), len(self.edges)
+        if not objects:
+            return ["no objects", self.why_empty]
+        shown = len(drawing.arrows) + len(drawing.lines)
+        lines = [
+            f"{counted(objects, 'object')}, {counted(relations, 'relation')}",
+            f"shown: {len(drawing.ids)} and {shown}; world frame {self.shown.frame_id!r}",
+        ]
+        if self.moment is not None:
+            late_s = (self.history.newest.stamp_ns - self.shown.stamp_ns) / 1e9
+            lines.append(f"update {self.shown.sequence}, {late_s:.1f} s before the newest")
+        return lines
+
+    def bounds(self) -> tuple[Float64, Float64] | None:
+        """Lower and upper corner (3,) of what is drawn; None = nothing."""
+        if not len(self.table):
+            return None
+        half = np.linalg.norm(self.table.sizes, axis=1, keepdims=True) / 2
+        return (self.table.centres - half).min(axis=0), (self.table.centres + half).max(axis=0)
+
+    def floor_m(self) -> float:
+        """Height along up below which few objects reach."""
+        up = np.array(up_of(self.shown))
+        bottoms = self.table.centres @ up - self.table.sizes[:, 2] / 2
+        return float(np.percentile(bottoms, FLOOR_PERCENTILE))
+
+
+def up_of(replica: GraphReplica) -> Point:
+    """Unit vector against gravity; +z if the messages do not tell it."""
+    up = replica.up
+    return DEFAULT_UP if up is None else (up[0], up[1], up[2])
