@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 import time
@@ -26,11 +27,13 @@ from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import ODOMETRY, Role
-from deworldsg_ros.recordings.recording import open_source
+from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
+from deworldsg_ros.view.photos import Album
 from deworldsg_ros.words import counted
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -39,6 +42,8 @@ REPLAY = "replay_node"
 SHIPPED = ("bags/demo_room.mcap", "bags/demo_room")
 # Loading models and compiling kernels for the first time takes minutes on a small machine.
 START_LIMIT_S = 900.0
+# Reading them takes a few seconds, however long the recording is.
+MOST_PHOTO_FRAMES = 600
 
 
 @dataclass(frozen=True)
@@ -104,9 +109,25 @@ def run_demo(
         wall_s = time.perf_counter() - started_s
         graph = read_graph(staged)
         poses = [np.array(values).reshape(4, 4) for values in finished.poses]
-        outputs.show_graph(staged, graph, console, poses, config.inputs.world_up)
+        frames = _frames(recording.path, config, options)
+        outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
         _write_report(staged, recording, graph, finished, wall_s)
     _print_summary(out, finished, console)
+
+
+def _frames(path: Path, config: Config, options: DemoOptions) -> list[RgbdFrame]:
+    """Some frames of the recording, for photos; none if its poses were not used."""
+    if options.odometry:
+        return []
+    dataset = DatasetOptions(intrinsics=options.intrinsics)
+    source = open_source(path, topics=options.topics, inputs=config.inputs, options=dataset)
+    album = Album()
+    try:
+        for frame in itertools.islice(Recording(source, config.inputs).frames(), MOST_PHOTO_FRAMES):
+            album.add(frame)
+    finally:
+        source.close()
+    return album.frames
 
 
 def configuration_of(models: str, config_path: Path | None) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from deworldsg_ros.files import check_writable, together, write_atomically
 from deworldsg_ros.ros.health import UNMATCHED_PREFIX
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.scene.up import UpEstimator
@@ -28,6 +29,8 @@ REPORT_FILE = "run.json"
 RESULTS = (CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE)
 # Rows of each printed table, to fit a screen; the page shows everything.
 MOST_ROWS = 25
+# Side of the photos in the picture.
+PHOTO_PX = 160
 # Printed losses of a recording; run.json has all.
 MOST_LOSSES = 5
 
@@ -70,6 +73,7 @@ def show_graph(
     console: Console,
     T_world_cameras: Sequence[Float64],
     world_up: str,
+    frames: Iterable[RgbdFrame] = (),
 ) -> None:
     """Print the tables, draw the picture and write the page.
 
@@ -79,9 +83,10 @@ def show_graph(
         console: terminal.
         T_world_cameras: poses (4, 4) of the processed frames.
         world_up: `inputs.world_up`: auto, z, y or -y.
+        frames: some frames of the recording, for photos of the objects.
     """
     # Imported here because matplotlib takes a second to load.
-    from deworldsg_ros.view import page, picture, table
+    from deworldsg_ros.view import page, photos, picture, table
 
     up = UpEstimator(world_up)
     for T_world_camera in T_world_cameras:
@@ -90,7 +95,11 @@ def show_graph(
     table.print_graph(console, graph, MOST_ROWS)
     with console.status("drawing …"):
         picture.draw(
-            graph, out / PICTURE_FILE, up_world=up.up_world(), camera_path_world=path_world
+            graph,
+            out / PICTURE_FILE,
+            up_world=up.up_world(),
+            camera_path_world=path_world,
+            photos=photos.photos_of(graph, frames, PHOTO_PX),
         )
         page.write(graph, out / PAGE_FILE, up_world=up.up_world(), camera_path_world=path_world)
 

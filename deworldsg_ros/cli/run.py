@@ -40,6 +40,7 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
+from deworldsg_ros.view.photos import Album
 from deworldsg_ros.words import counted
 
 # Clips that the world model lost.
@@ -88,12 +89,14 @@ class _Processed:
         poses: T_world_camera (4, 4) of each processed frame by its stamp in nanoseconds.
         refused: frames that the pipeline or the odometry refused, by reason.
         updates: log of the graph's updates; None without `RunOptions.temporal`.
+        album: some of the frames.
         wall_s: seconds for all frames.
     """
 
     poses: dict[int, Float64]
     refused: Counter[str]
     updates: UpdateLog | None
+    album: Album
     wall_s: float
 
     @property
@@ -168,6 +171,7 @@ def _process(
     """Process the frames of a recording, with a progress bar."""
     started_s = time.perf_counter()
     poses: dict[int, Float64] = {}
+    album = Album()
     refused: Counter[str] = Counter()
     updates = UpdateLog(pipeline.config.output.rate_hz) if options.temporal else None
 
@@ -188,13 +192,14 @@ def _process(
                 refuse(result)
             else:
                 poses[frame.stamp_ns] = frame.T_world_camera
+                album.add(frame)
                 _note_update(updates, recording, pipeline, result)
             progress.advance(task)
             # Counting the nodes takes time: not in every frame.
             if len(poses) % 5 == 0:
                 progress.update(task, note=_node_count(pipeline))
         progress.update(task, note=_node_count(pipeline), total=len(poses) + refused.total())
-    return _Processed(poses, refused, updates, time.perf_counter() - started_s)
+    return _Processed(poses, refused, updates, album, time.perf_counter() - started_s)
 
 
 def _note_update(
@@ -225,7 +230,8 @@ def _write_results(
     with outputs.writing(options.out, pipeline.config) as staged:
         write_graph(staged, graph)
         world_up = pipeline.config.inputs.world_up
-        outputs.show_graph(staged, graph, console, T_world_cameras, world_up)
+        frames = processed.album.frames
+        outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)
         outputs.write_report(staged, _report(recording, pipeline, graph, processed, drops))
         # Last: each of these two is in place at once, and must not be if the results failed.
         if options.trajectory_out is not None:

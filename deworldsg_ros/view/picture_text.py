@@ -1,7 +1,8 @@
-"""Texts of the picture: labels of objects and relations, title, scale bar, axes, legend."""
+"""Texts of the picture: labels of objects and relations, title, scale, legend; and the photos."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
@@ -11,12 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.view.colours import shade
-from deworldsg_ros.view.geometry import SIGMAS
+from deworldsg_ros.scene.arrays import Float64, UInt8
+from deworldsg_ros.view.colours import QUIET, shade
 from deworldsg_ros.view.labelling import Placement, boxes_at, nearest_on_box, place, place_if_free
 from deworldsg_ros.view.top_view import BACKGROUND, FAINT, INK, Drawing
 
+# Side of a photo, and the line below it.
+PHOTO_IN, CAPTION_IN = 1.1, 0.3
 # More labels leave no free space on a page.
 MOST_LABELS = 90
 # Nodes that are objects with a smaller probability are pale and have a small label.
@@ -81,20 +83,52 @@ def draw_predicates(drawing: Drawing, labels: Placement) -> None:
         _write(axes, to_data.transform(centre), edge.predicate, color=colour, **style)
 
 
-def draw_frame(drawing: Drawing) -> None:
-    """Write title, scale bar, world axes, and the legend of predicates."""
+def draw_frame(drawing: Drawing, strip_in: float = 0.0) -> None:
+    """Write title, scale bar, world axes, and the legend of predicates, above a strip."""
     figure = drawing.figure
+    height_in = figure.get_figheight()
     pad = 0.25 / figure.get_figwidth()
-    top, bottom = 1 - 0.27 / figure.get_figheight(), 0.27 / figure.get_figheight()
+    top, bottom = 1 - 0.27 / height_in, (0.27 + strip_in) / height_in
     graph = drawing.graph
-    title = f"{len(graph.nodes)} objects, {len(graph.edges)} relations"
+    title = f"{_counted(len(graph.nodes), 'object')}, {_counted(len(graph.edges), 'relation')}"
     figure.text(pad, top, title, fontsize=12, fontweight="bold", color=INK, va="center")
-    note = f"seen from above, frame {graph.frame_id!r}; ellipses: {SIGMAS:g}σ"
+    note = "seen from above"
+    if any(edge.predicate in QUIET for edge in graph.edges):
+        note += "; relations “near” are left out"
     if len(drawing.view.path):
-        note += "; dotted: camera path, ● start, ○ end"
+        note += "; dotted line: the camera, from ● to ○"
     figure.text(1 - pad, top, note, fontsize=8.5, color=FAINT, va="center", ha="right")
     _draw_scale(drawing, pad, bottom)
     _draw_legend(drawing, pad, bottom)
+
+
+def draw_photos(drawing: Drawing, photos: Mapping[int, UInt8]) -> None:
+    """A row of photos below the view, those of the most observed objects, with their names."""
+    figure, nodes = drawing.figure, drawing.graph.nodes
+    width_in, height_in = figure.get_figwidth(), figure.get_figheight()
+    gap_in = 0.1
+    shown = sorted(
+        (node for node in nodes if node.id in photos), key=lambda node: -node.observations
+    )[: int((width_in - gap_in) / (PHOTO_IN + gap_in))]
+    for index, node in enumerate(shown):
+        left = (gap_in + index * (PHOTO_IN + gap_in)) / width_in
+        place = (left, CAPTION_IN / height_in, PHOTO_IN / width_in, PHOTO_IN / height_in)
+        axes = figure.add_axes(place)
+        axes.imshow(photos[node.id], interpolation="none")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set(color=drawing.colours[node.label], linewidth=2.0)
+        text = f"{node.label} {node.id}"
+        # The photos are narrow.
+        text = text if len(text) <= 17 else f"{node.label[: 15 - len(str(node.id))]}… {node.id}"
+        middle = left + PHOTO_IN / 2 / width_in
+        style: dict[str, Any] = {"fontsize": 8, "color": INK, "ha": "center", "va": "center"}
+        figure.text(middle, CAPTION_IN / 2 / height_in, text, **style)
+
+
+def _counted(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def _draw_scale(drawing: Drawing, pad: float, bottom: float) -> None:
@@ -106,7 +140,8 @@ def _draw_scale(drawing: Drawing, pad: float, bottom: float) -> None:
     style: dict[str, Any] = {"fontsize": 9, "va": "center"}
     figure.text(end + pad / 3, bottom, f"{length_m:g} m", color=INK, **style)
     right, forward = map(_axis_name, drawing.view.axes[:2])
-    figure.text(end + pad * 3, bottom, f"→ {right} ↑ {forward}", color=FAINT, **style)
+    axes = f"world frame {drawing.graph.frame_id!r}: {right} →, {forward} ↑"
+    figure.text(end + pad * 3, bottom, axes, color=FAINT, **style)
 
 
 def _draw_legend(drawing: Drawing, pad: float, bottom: float) -> None:

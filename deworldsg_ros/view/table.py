@@ -7,9 +7,10 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
+from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.objects import scene_object
 from deworldsg_ros.scene import wire
 from deworldsg_ros.view.colours import class_colours
-from deworldsg_ros.view.geometry import SIGMAS, covariances_of, principal_axes
 
 MOST_ROWS = 60
 PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}
@@ -22,30 +23,28 @@ def print_graph(console: Console, graph: wire.SceneGraphMessage, most: int = MOS
 
 
 def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
-    """Objects, most observed first; the size is that of the 2σ ellipsoid."""
+    """Objects, most observed first, with the sides of their boxes."""
     table = Table(
         title=_title("object", len(graph.nodes), most),
         caption=Text(
-            f"p: class probability; position in frame {graph.frame_id!r}; "
-            f"size: axes of the {SIGMAS:g}σ ellipsoid; obs.: observations"
+            f"p: probability of the class; position in frame {graph.frame_id!r}; "
+            "size: length, width and height; seen: number of frames"
         ),
     )
     table.add_column("object", no_wrap=True)
     table.add_column("p", justify="right")
     table.add_column("x, y, z (m)", justify="right", no_wrap=True)
     table.add_column("size (cm)", justify="right", no_wrap=True)
-    table.add_column("obs.", justify="right")
+    table.add_column("seen", justify="right")
     colours = class_colours(node.label for node in graph.nodes)
-    rows = sorted(
-        zip(graph.nodes, covariances_of(graph)), key=lambda row: (-row[0].observations, row[0].id)
-    )
-    for node, covariance in rows[:most]:
-        size_m = 2 * SIGMAS * principal_axes(covariance)[0]
+    up = SceneGraph(graph).up
+    for node in sorted(graph.nodes, key=lambda node: (-node.observations, node.id))[:most]:
+        item = scene_object(node, graph.frame_id, up)
         table.add_row(
             Text.assemble((node.label, Style(color=colours[node.label])), (f" #{node.id}", "dim")),
             _percent(node.classes[0].probability) if node.classes else "",
-            " ".join(f"{value:6.2f}" for value in node.mean_m),
-            " × ".join(f"{100 * value:.0f}" for value in size_m),
+            " ".join(f"{value:6.2f}" for value in item.position_m),
+            " × ".join(f"{100 * value:.0f}" for value in item.size_m),
             str(node.observations),
         )
     return table
@@ -58,7 +57,7 @@ def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Tabl
         table.add_column(name, no_wrap=True)
     table.add_column("p", justify="right")
     table.add_column("provenance", no_wrap=True)
-    table.add_column("obs.", justify="right")
+    table.add_column("seen", justify="right")
     names = {node.id: _name(node.label, node.id) for node in graph.nodes}
     edges = sorted(
         graph.edges,

@@ -11,17 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from deworldsg_ros.client.objects import SceneObject, scene_object
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.view.colours import class_colours, predicate_colours
-from deworldsg_ros.view.geometry import (
-    SIGMAS,
-    covariances_of,
-    drawable_edges,
-    means_of,
-    view_axes,
-)
+from deworldsg_ros.view.colours import QUIET, class_colours, predicate_colours
+from deworldsg_ros.view.geometry import drawable_edges, view_axes
 
 DPI = 130
 # A picture for a page: the longer side of a room, and enough for the title of a small graph.
@@ -40,8 +36,8 @@ class TopView:
 
     Attributes:
         axes: (3, 3) right, forward and up in the world frame.
-        means: (n, 2).
-        covariances: (n, 2, 2), square metres.
+        means: (n, 2) centres of the boxes.
+        corners: (n, 4, 2) of the boxes.
         heights: (n,) along up.
         points: (k, 2) surface points of each node.
         path: (m, 2) camera positions.
@@ -49,18 +45,18 @@ class TopView:
 
     axes: Float64
     means: Float64
-    covariances: Float64
+    corners: Float64
     heights: Float64
     points: tuple[Float64, ...]
     path: Float64
 
     @property
     def bounds(self) -> tuple[Float64, Float64]:
-        """Lower left and upper right corner of ellipses and camera path, with a margin."""
-        reach = SIGMAS * np.sqrt(np.stack([np.diag(c) for c in self.covariances] or [np.zeros(2)]))
-        means = self.means if len(self.means) else np.zeros((1, 2))
-        low = np.vstack([means - reach, self.path.reshape(-1, 2)]).min(axis=0)
-        high = np.vstack([means + reach, self.path.reshape(-1, 2)]).max(axis=0)
+        """Lower left and upper right corner of boxes and camera path, with a margin."""
+        places = np.vstack([self.corners.reshape(-1, 2), self.path])
+        if not len(places):
+            places = np.zeros((1, 2))
+        low, high = places.min(axis=0), places.max(axis=0)
         return low - MARGIN_M, high + MARGIN_M
 
 
@@ -96,10 +92,11 @@ def drawing_of(
     graph: wire.SceneGraphMessage,
     up_world: Sequence[float] | Float64,
     camera_path_world: Float64 | None,
+    strip_in: float = 0.0,
 ) -> Drawing:
-    """The empty canvas of a graph; arguments as of `picture.draw`."""
+    """The empty canvas of a graph, with a strip below; other arguments as of `picture.draw`."""
     view = _project(graph, view_axes(up_world), camera_path_world)
-    figure, axes = _canvas(view)
+    figure, axes = _canvas(view, strip_in)
     edges = _strongest_edges(graph)
     return Drawing(
         figure,
@@ -115,27 +112,37 @@ def drawing_of(
 def _project(
     graph: wire.SceneGraphMessage, axes_of_view: Float64, camera_path: Float64 | None
 ) -> TopView:
-    plane = axes_of_view[:2]
-    means = means_of(graph)
+    plane, up = axes_of_view[:2], axes_of_view[2].tolist()
+    items = [scene_object(node, graph.frame_id, (up[0], up[1], up[2])) for node in graph.nodes]
+    centres = np.array([item.position_m for item in items], np.float64).reshape(-1, 3)
     path = np.zeros((0, 3)) if camera_path is None else np.asarray(camera_path, np.float64)
     return TopView(
         axes_of_view,
-        means @ plane.T,
-        plane @ covariances_of(graph) @ plane.T,
-        means @ axes_of_view[2],
+        centres @ plane.T,
+        np.array([_corners(item, plane) for item in items], np.float64).reshape(-1, 4, 2),
+        centres @ axes_of_view[2],
         tuple(surface_points(node) @ plane.T for node in graph.nodes),
         path.reshape(-1, 3) @ plane.T,
     )
 
 
-def _canvas(view: TopView) -> tuple[Figure, Axes]:
+def _corners(item: SceneObject, plane: Float64) -> Float64:
+    """Corners (4, 2) of a box seen from above; its third axis is up."""
+    rotation = pose_from_quaternion(np.zeros(3), np.array(item.orientation_xyzw))[:3, :3]
+    signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+    offsets = signs * np.array(item.size_m[:2]) / 2 @ rotation[:, :2].T
+    return np.asarray((np.array(item.position_m) + offsets) @ plane.T)
+
+
+def _canvas(view: TopView, strip_in: float) -> tuple[Figure, Axes]:
     low, high = view.bounds
     extent = high - low
     size_in = np.maximum(extent * (LONG_SIDE_IN / extent.max()), LEAST_SIDE_IN)
-    figure = Figure(figsize=(size_in[0], size_in[1] + HEAD_IN), dpi=DPI)
+    height_in = size_in[1] + HEAD_IN + strip_in
+    figure = Figure(figsize=(size_in[0], height_in), dpi=DPI)
     FigureCanvasAgg(figure)
-    head = HEAD_IN / 2 / (size_in[1] + HEAD_IN)
-    axes = figure.add_axes((0.0, head, 1.0, 1.0 - 2 * head))
+    foot = (HEAD_IN / 2 + strip_in) / height_in
+    axes = figure.add_axes((0.0, foot, 1.0, size_in[1] / height_in))
     axes.set_axis_off()
     middle, half = (low + high) / 2, extent / 2
     half = np.max(half / size_in) * size_in
@@ -146,8 +153,9 @@ def _canvas(view: TopView) -> tuple[Figure, Axes]:
 
 
 def _strongest_edges(graph: wire.SceneGraphMessage) -> list[wire.EdgeState]:
-    """The strongest edges, strongest last, so that they are drawn on top."""
-    edges = sorted(drawable_edges(graph), key=_strength, reverse=True)
+    """The strongest edges but QUIET ones, strongest last, so that they are drawn on top."""
+    loud = [edge for edge in drawable_edges(graph) if edge.predicate not in QUIET]
+    edges = sorted(loud, key=_strength, reverse=True)
     return edges[: int(EDGES_PER_NODE * len(graph.nodes))][::-1]
 
 

@@ -1,0 +1,96 @@
+"""Photos of objects, cut from the frames that show them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from support.view import make_graph, make_node
+
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.view import photos, picture
+from deworldsg_ros.view.photos import Album, photos_of
+
+CAMERA = Intrinsics(100.0, 100.0, 59.5, 39.5, 120, 80)
+RED, GREEN = (200, 30, 30), (20, 160, 40)
+
+
+def frame(stamp_ns: int = 1, depth_m: float = 2.0) -> RgbdFrame:
+    """A red patch of 20 x 20 pixels, 2 m in front of the camera, on a green wall."""
+    rgb = np.full((80, 120, 3), GREEN, np.uint8)
+    rgb[30:50, 50:70] = RED
+    depth = np.full((80, 120), 4.0, np.float32)
+    depth[30:50, 50:70] = depth_m
+    return RgbdFrame(stamp_ns, rgb, depth, CAMERA, np.eye(4))
+
+
+def patch(node_id: int = 1, z_m: float = 2.0):
+    side = np.linspace(-0.19, 0.19, 15)
+    x, y = (values.ravel() for values in np.meshgrid(side, side))
+    return make_node(node_id, "cup", (0, 0, z_m), points=np.column_stack([x, y, np.full(225, z_m)]))
+
+
+def test_a_photo_shows_its_object_in_the_middle() -> None:
+    (photo,) = photos_of(make_graph([patch()]), [frame()], 64).values()
+    assert photo.shape == (64, 64, 3)
+    assert np.abs(photo[20:44, 20:44].astype(int) - RED).max() < 20
+    assert np.abs(photo[:4, :4].astype(int) - GREEN).max() < 20
+
+
+def test_the_best_of_several_frames_is_taken() -> None:
+    far = frame()
+    far.T_world_camera[2, 3] = -1.0
+    far.depth_m[far.depth_m < 3] = 3.0
+    near = frame()
+    near.rgb[30:50, 50:70] = (10, 10, 250)
+    (photo,) = photos_of(make_graph([patch()]), [far, near], 64).values()
+    assert photo[32, 32, 2] > 200
+
+
+@pytest.mark.parametrize("what", ["covered", "behind", "outside", "no points"])
+def test_there_is_no_photo_of_what_no_frame_shows(what: str) -> None:
+    shown, node = frame(), patch()
+    if what == "covered":
+        shown = frame(depth_m=1.0)
+    elif what == "behind":
+        node = patch(z_m=-2.0)
+    elif what == "outside":
+        shown.T_world_camera[0, 3] = 5.0
+    else:
+        node = make_node(1, "cup")
+    assert photos_of(make_graph([node]), [shown], 64) == {}
+
+
+def test_an_object_as_large_as_the_image_has_a_square_photo() -> None:
+    wide = frame(depth_m=0.35)
+    wide.depth_m[:] = 0.35
+    (photo,) = photos_of(make_graph([patch(z_m=0.35)]), [wide], 50).values()
+    assert photo.shape == (50, 50, 3)
+
+
+def test_an_album_keeps_evenly_spaced_frames_of_any_length(monkeypatch) -> None:
+    monkeypatch.setattr(photos, "LEAST_FRAMES", 8)
+    monkeypatch.setattr(photos, "MOST_BYTES", 0)
+    for count in (3, 8, 9, 100, 1000):
+        album = Album()
+        one = frame()
+        for index in range(count):
+            album.add(replace(one, stamp_ns=index))
+        kept = [item.stamp_ns for item in album.frames]
+        assert min(count, 4) <= len(kept) <= 8
+        assert len(set(np.diff(kept))) <= 1
+        assert kept[0] == 0 and kept[-1] >= count / 2
+
+
+def test_the_picture_has_a_strip_of_photos(tmp_path) -> None:
+    graph = make_graph([patch(), make_node(2, "a very long name of a class", (1, 0, 0))])
+    picture.draw(graph, tmp_path / "plain.png")
+    shots = {1: np.full((64, 64, 3), RED, np.uint8), 2: np.full((64, 64, 3), GREEN, np.uint8)}
+    picture.draw(graph, tmp_path / "strip.png", photos=shots)
+    plain, strip = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("plain", "strip"))
+    assert strip.shape[1] == plain.shape[1]
+    below = strip[plain.shape[0] :].astype(int)
+    for colour in (RED, GREEN):
+        assert (np.abs(below - colour[::-1]).sum(axis=2) < 10).sum() > 10_000
