@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,9 +32,11 @@ from bench.figures import Figure, Setup
 from deworldsg_ros.cli.demo import dds_environment
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
 from deworldsg_ros.config import Config
+from deworldsg_ros.memory import keep_freed_memory
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.recording import open_recording
+from deworldsg_ros.ros.health import DROPPED, LOST_PREFIX, UNMATCHED_PREFIX, counts_in
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 
@@ -45,6 +47,8 @@ START_LIMIT_S = 120.0
 WARM_UP_S = 3.0
 # After the last image: longer than the latency of any frame.
 DRAIN_S = 2.0
+# A message of these streams that is lost is a frame that is lost.
+LOST_FRAMES = {f"{LOST_PREFIX}{name}" for name in ("rgb", "frame_graph", "local_graph")}
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -59,6 +63,7 @@ class Result:
         diagnostics: last values of each node, by its name.
         cpu_ms: processor time of each process per published frame.
         hops_ms: median time from the stamp to each topic in between, by topic.
+        uncounted: frames that never reached the graph and that no node counted, warm-up included.
     """
 
     latencies_ms: np.ndarray
@@ -67,6 +72,7 @@ class Result:
     diagnostics: dict[str, dict[str, str]]
     cpu_ms: dict[str, float]
     hops_ms: dict[str, float] = field(default_factory=dict)
+    uncounted: int = 0
 
     @property
     def lost(self) -> int:
@@ -75,19 +81,29 @@ class Result:
 
     @property
     def counted(self) -> int:
-        """Frames and messages that the nodes counted as dropped."""
-        return sum(
-            int(count)
-            for values in self.diagnostics.values()
-            for key, count in values.items()
-            if key.startswith("dropped ") and not key.startswith("dropped unmatched")
-        )
+        """Frames that the nodes counted as dropped, warm-up included."""
+        return counted_frames(self.diagnostics)
 
     def percentile_ms(self, percent: float) -> float:
         """Percentile of the latencies; infinite without any."""
         return (
             float(np.percentile(self.latencies_ms, percent)) if self.latencies_ms.size else np.inf
         )
+
+
+def counted_frames(diagnostics: Mapping[str, Mapping[str, str]]) -> int:
+    """Frames that the nodes counted as dropped.
+
+    A lost depth image, pose or camera_info is no frame: the frame that misses it is counted. An
+    image is lost in the first node; without evidence, a frame is in the graph.
+    """
+    return sum(
+        count
+        for name, values in diagnostics.items()
+        if name != "relation_node"
+        for reason, count in counts_in(values, DROPPED).items()
+        if not reason.startswith((UNMATCHED_PREFIX, LOST_PREFIX)) or reason in LOST_FRAMES
+    )
 
 
 class RecordedPerceiver:
@@ -310,6 +326,7 @@ def measure(
         max_frames: distinct frames of the recording; None = all.
     """
     os.environ.update(dds_environment())
+    keep_freed_memory()
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
@@ -350,6 +367,8 @@ def measure(
             executor.shutdown(timeout_sec=1.0)
             node.destroy_node()
             rclpy.try_shutdown(context=context)
+    everything = [*warm, *stamps_ns]
+    lost = len(everything) - len(listener.latencies_ms(everything))
     in_time = sum(stamps_ns[0] <= at_ns <= stamps_ns[-1] for at_ns, _ in listener.updates)
     return Result(
         latencies_ms=listener.latencies_ms(stamps_ns),
@@ -358,6 +377,7 @@ def measure(
         diagnostics=listener.diagnostics,
         cpu_ms={name: 1e3 * value / len(stamps_ns) for name, value in cpu_s.items()},
         hops_ms=listener.hops_ms(stamps_ns[0]),
+        uncounted=lost - counted_frames(listener.diagnostics),
     )
 
 
@@ -406,7 +426,7 @@ def show(result: Result) -> None:
     """Print a result."""
     percentiles = ", ".join(f"p{p} {result.percentile_ms(p):.1f}" for p in (5, 50, 95, 99, 100))
     print(f"latency ms: {percentiles}")
-    print(f"frames {result.published}, lost {result.lost}, counted {result.counted}")
+    print(f"frames {result.published}, lost {result.lost}, uncounted {result.uncounted}")
     print(f"updates per second {result.updates_per_s:.1f}")
     print("processor ms per frame:", {k: round(v, 1) for k, v in result.cpu_ms.items()})
     if result.hops_ms:

@@ -6,6 +6,7 @@ receives, and /diagnostics.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,12 +36,13 @@ LISTENERS = {
     Role.CAMERA_INFO: {SEGMENTATION, LIFTING},
     Role.POSE: {SEGMENTATION, LIFTING},
 }
+LOCAL_GRAPH, EVIDENCE = "deworldsg/local_graph", "deworldsg/relation_evidence"
 # Topic: its publishers, its subscribers.
 BETWEEN = {
     "deworldsg/frame_graph": ({SEGMENTATION}, {LIFTING}),
     "deworldsg/instances": ({SEGMENTATION}, {LIFTING}),
-    "deworldsg/local_graph": ({LIFTING}, {RELATION, GRAPH}),
-    "deworldsg/relation_evidence": ({RELATION}, {GRAPH}),
+    LOCAL_GRAPH: ({LIFTING}, {RELATION, GRAPH}),
+    EVIDENCE: ({RELATION}, {GRAPH}),
 }
 ODOMETRY_LISTENS_TO = (Role.RGB, Role.DEPTH, Role.CAMERA_INFO)
 POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
@@ -52,6 +54,8 @@ WINDOW_FRAMES = 2
 SETTLE_S = 0.3
 # Longest delay of evidence after the last local graph.
 EVIDENCE_QUIET_S = 3.0
+# The frames of these nodes have no result if the node is killed.
+BEFORE_RESULTS = {SEGMENTATION, LIFTING, ODOMETRY}
 # Between two looks at which nodes are there; a look takes milliseconds.
 LOOK_PERIOD_S = 1.0
 # Compiling the kernels for the first frame takes minutes on a small machine.
@@ -71,6 +75,34 @@ class Endpoint:
 
     topic: str
     publisher: Any
+
+
+class Restarts:
+    """Notices restarted nodes by their new endpoints; those of a killed node stay for seconds.
+
+    Args:
+        node: node of the replay.
+        topics: of the endpoints.
+    """
+
+    def __init__(self, node: Node, topics: Collection[str]) -> None:
+        self._node = node
+        self._topics = topics
+        self._known: set[tuple[str, bytes]] = set()
+
+    def look(self) -> list[str]:
+        """The nodes of `BEFORE_RESULTS` that were restarted since the last call."""
+        found = {
+            (info.node_name, bytes(info.endpoint_gid))
+            for topic in map(self._node.resolve_topic_name, self._topics)
+            for info in (
+                *self._node.get_publishers_info_by_topic(topic),
+                *self._node.get_subscriptions_info_by_topic(topic),
+            )
+            if info.node_name in BEFORE_RESULTS
+        }
+        known, self._known = self._known, found
+        return sorted({name for name, _ in found - known}) if known else []
 
 
 class PipelineMonitor:
@@ -98,15 +130,17 @@ class PipelineMonitor:
         self.diagnostics: dict[str, dict[str, str]] = {}
         self.poses: list[list[float]] = []
         self._local_graphs = self._evidence = 0
-        self._refused_frames = 0
+        self._refused: dict[str, int] = {}
+        # Messages that graph_node did not receive because it was restarted, by topic.
+        self._missed: dict[str, int] = {}
         self._complete_since_s: float | None = None
         self._progress_s: float | None = None
         self._own_pace = False
         self._looked_s = 0.0
-        node.create_subscription(String, "deworldsg/local_graph", self._on_local, reliable(50))
-        node.create_subscription(
-            String, "deworldsg/relation_evidence", self._on_evidence, reliable(50)
-        )
+        self._restarts = Restarts(node, self._between)
+        self._restarted_s: float | None = None
+        node.create_subscription(String, LOCAL_GRAPH, self._on_local, reliable(50))
+        node.create_subscription(String, EVIDENCE, self._on_evidence, reliable(50))
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
         self._save = node.create_client(Trigger, f"{GRAPH}/save")
 
@@ -128,14 +162,19 @@ class PipelineMonitor:
     def has_to_wait(self, stall_s: float, now_s: float) -> bool:
         """Whether the next frame waits for results of the frames in flight.
 
-        If a node has gone, or there was no result for `stall_s`, the replay keeps its own pace and
+        A node that is restarted has lost its frames: the replay goes on when it is connected. If a
+        node has gone, or there was no result for `stall_s`, the replay keeps its own pace and
         waits for nothing, until there is a result again.
         """
         if not self.window.is_full:
             return False
         if not self._own_pace:
             stall_s = stall_s if self.window.results else max(stall_s, FIRST_RESULT_S)
-            problem = self._gone(now_s)
+            problem = self._look(now_s)
+            if self._restarted_s is not None and now_s - self._restarted_s >= SETTLE_S:
+                self._restarted_s = self._progress_s = None
+                self.window.give_up()
+                return False
             if self.silent_for(now_s) > stall_s:
                 problem = f"no local graph for {stall_s:g} s"
             if not problem:
@@ -148,11 +187,18 @@ class PipelineMonitor:
         self.window.give_up()
         return False
 
-    def _gone(self, now_s: float) -> str:
-        """What a node that has ended leaves missing, in words; "" = nothing."""
+    def _look(self, now_s: float) -> str:
+        """Note restarted nodes; returns what a node that has ended leaves missing, "" = nothing."""
         if now_s < self._looked_s + LOOK_PERIOD_S:
             return ""
         self._looked_s = now_s
+        restarted = self._restarts.look()
+        if restarted:
+            self._restarted_s = now_s
+            self._node.get_logger().warning(
+                f"{' and '.join(restarted)} restarted: without the {self.window.in_flight} frames "
+                "in flight"
+            )
         missing = self._missing_between()
         return f"waiting for {missing[0]}" if missing else ""
 
@@ -173,8 +219,8 @@ class PipelineMonitor:
         if int(self.diagnostics.get(RELATION, {}).get("clips pending", 0)):
             return False
         return (
-            self._received("deworldsg/local_graph") >= self._local_graphs
-            and self._received("deworldsg/relation_evidence") >= self._evidence
+            self._received(LOCAL_GRAPH) >= self._local_graphs
+            and self._received(EVIDENCE) >= self._evidence
         )
 
     def request_save(self) -> Any:
@@ -226,12 +272,24 @@ class PipelineMonitor:
             # /diagnostics is shared: other robots have nodes of the same names.
             name, _, full_name = status.name.partition(": ")
             if status.hardware_id == "deworldsg_ros" and full_name == self._full_name(name):
-                self.diagnostics[name] = {item.key: item.value for item in status.values}
-        refused = self._drops(SEGMENTATION) + self._drops(LIFTING)
-        if refused > self._refused_frames:
-            self.window.excuse(refused - self._refused_frames)
-            self._refused_frames = refused
-            self._progress_s = None
+                self._take_values(name, {item.key: item.value for item in status.values})
+
+    def _take_values(self, name: str, values: dict[str, str]) -> None:
+        """Note the newest values of a node; the counts of a restarted node begin again."""
+        before, self.diagnostics[name] = self.diagnostics.get(name, {}), values
+        if name == GRAPH:
+            for topic, sent in ((LOCAL_GRAPH, self._local_graphs), (EVIDENCE, self._evidence)):
+                count = received_in(values, topic)
+                if count < received_in(before, topic):
+                    self._missed[topic] = sent - count
+        elif name in (SEGMENTATION, LIFTING):
+            refused = self._drops(name)
+            known = self._refused.get(name, 0)
+            new = refused - known if refused >= known else refused
+            self._refused[name] = refused
+            if new:
+                self.window.excuse(new)
+                self._progress_s = None
 
     def _full_name(self, name: str) -> str:
         """Full name of a node in the namespace of the replay."""
@@ -247,4 +305,6 @@ class PipelineMonitor:
         )
 
     def _received(self, topic: str) -> int:
-        return received_in(self.diagnostics.get(GRAPH, {}), topic)
+        """Messages that graph_node received, or missed because it was restarted."""
+        received = received_in(self.diagnostics.get(GRAPH, {}), topic)
+        return received + self._missed.get(topic, 0)

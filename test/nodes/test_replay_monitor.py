@@ -5,13 +5,16 @@ from __future__ import annotations
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import String
 from support.nodes_bench import local_graph
 
 from deworldsg_ros.nodes.replay_monitor import (
     BETWEEN,
+    EVIDENCE_QUIET_S,
     FIRST_RESULT_S,
     LISTENERS,
+    SETTLE_S,
     WINDOW_FRAMES,
     PipelineMonitor,
 )
@@ -24,12 +27,19 @@ class FakeNode(MagicMock):
     """Answers discovery: all nodes but `gone`."""
 
     gone: tuple[str, ...] = ()
+    starts = 1
 
     def resolve_topic_name(self, topic):
         return topic
 
     def _infos(self, names):
-        return [SimpleNamespace(node_name=name) for name in names if name not in self.gone]
+        gids = [[number] * 16 for number in range(self.starts)]
+        return [
+            SimpleNamespace(node_name=name, endpoint_gid=gid)
+            for name in names
+            if name not in self.gone
+            for gid in gids
+        ]
 
     def get_publishers_info_by_topic(self, topic):
         return self._infos(BETWEEN[topic][0])
@@ -90,3 +100,53 @@ def test_a_node_that_is_gone_is_not_waited_for():
     assert sentence.startswith(
         "waiting for lifting_node to listen to deworldsg/frame_graph: stopped"
     )
+
+
+def test_a_node_that_is_restarted_is_waited_for_without_its_frames():
+    node, monitor = monitor_with_full_window()
+    result(monitor, 1)
+    fill(monitor, 10)
+    assert monitor.has_to_wait(STALL_S, 100.0)
+    node.starts = 2  # the endpoints of the killed node are still known
+    assert monitor.has_to_wait(STALL_S, 101.5)
+    assert monitor.has_to_wait(STALL_S, 102.0)
+    assert not monitor.has_to_wait(STALL_S, 101.5 + SETTLE_S)
+    assert monitor.window.in_flight == 0
+    fill(monitor, 20)
+    assert monitor.has_to_wait(STALL_S, 104.0)
+    assert node.get_logger().warning.call_count == 1
+
+
+def diagnostics(monitor, name, **values):
+    status = DiagnosticStatus(name=f"{name}: /{name}", hardware_id="deworldsg_ros")
+    status.values = [
+        KeyValue(key=key.replace("__", " "), value=value) for key, value in values.items()
+    ]
+    monitor._on_diagnostics(DiagnosticArray(status=[status]))
+
+
+def test_counts_of_a_restarted_node_begin_again():
+    node, monitor = monitor_with_full_window()
+    node.get_namespace.return_value = "/"
+    diagnostics(monitor, "segmentation_node", dropped__overrun="2")
+    assert monitor.window.in_flight == 0
+    result(monitor, WINDOW_FRAMES)
+    diagnostics(monitor, "segmentation_node")
+    fill(monitor, 10)
+    diagnostics(monitor, "segmentation_node", dropped__overrun="1")
+    assert monitor.window.in_flight == WINDOW_FRAMES - 1
+
+
+def test_what_a_restarted_graph_node_missed_is_not_waited_for():
+    node, monitor = monitor_with_full_window()
+    node.get_namespace.return_value = "/"
+    received = "received__deworldsg/local_graph"
+    for stamp_ns in range(1, 6):
+        result(monitor, stamp_ns)
+    diagnostics(monitor, "graph_node", **{received: "1.0 per second, 5 in total"})
+    result(monitor, 6)
+    assert not monitor.drained(EVIDENCE_QUIET_S) and not monitor.drained(9 * EVIDENCE_QUIET_S)
+    diagnostics(monitor, "graph_node", **{received: "0.0 per second, 0 in total"})
+    assert monitor.drained(10 * EVIDENCE_QUIET_S)
+    result(monitor, 7)
+    assert not monitor.drained(20 * EVIDENCE_QUIET_S)

@@ -1,0 +1,25 @@
+"""Memory of a process that receives images."""
+
+from __future__ import annotations
+
+import ctypes
+
+# Parameters of glibc's mallopt.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+# The largest value that glibc accepts. Images and their copies are smaller.
+MMAP_THRESHOLD_BYTES = 1 << 25
+# Freed memory that a process keeps: some images of 1 MB in each stream.
+TRIM_THRESHOLD_BYTES = 1 << 27
+
+
+def keep_freed_memory() -> None:
+    """Use freed memory again, rather than return it to the operating system and ask for it again.
+
+    By default the memory of each image is new: the kernel fills its pages with zeros when they are
+    first written. On a virtual machine this made taking a 0.9 MB image from DDS four times as slow
+    (2.7 ms, 0.6 ms with this). It changes nothing without glibc.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, MMAP_THRESHOLD_BYTES)
+        mallopt(M_TRIM_THRESHOLD, TRIM_THRESHOLD_BYTES)
