@@ -49,6 +49,7 @@ WARM_UP_S = 3.0
 DRAIN_S = 2.0
 # A message of these streams that is lost is a frame that is lost.
 LOST_FRAMES = {f"{LOST_PREFIX}{name}" for name in ("rgb", "frame_graph", "local_graph")}
+USUAL_RATE_HZ = 30.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -302,7 +303,8 @@ def _play(camera: Camera, rate_hz: float, seconds: float, first: int = 0) -> lis
         while (wait_s := due_s - time.monotonic()) > 0:
             time.sleep(wait_s)
         stamps_ns.append(time.time_ns())
-        camera.publish(first + number, stamps_ns[-1])
+        # The camera moves as fast at each rate.
+        camera.publish(int((first + number) * USUAL_RATE_HZ / rate_hz), stamps_ns[-1])
     return stamps_ns
 
 

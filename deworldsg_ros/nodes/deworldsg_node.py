@@ -44,7 +44,7 @@ class DeworldsgNode(PerceivingNode):
         self._relating.relate(PairingFrame(local, frame.rgb))
 
     def _deliver(self, evidence: RelationEvidence) -> None:
-        self.graph.submit(lambda: self.graph.add_evidence(evidence))
+        self.graph.submit_evidence(lambda: self.graph.add_evidence(evidence))
 
     def _updated(self, update: wire.SceneGraphUpdateMessage, latency_s: float) -> None:
         if self._relating.follows_graph:

@@ -38,7 +38,7 @@ class GraphNode(StageNode):
             wire.RelationEvidenceMessage,
             self._add,
             50,
-            self.graph.submit,
+            self.graph.submit_evidence,
         )
 
     def close(self) -> None:

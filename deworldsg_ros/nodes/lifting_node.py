@@ -30,12 +30,13 @@ class LiftingNode(JoiningNode[LiftingFrame]):
         self.join(frames, self._lift)
         listen_camera_info(self, self.taking(frames.add_camera_info))
         listen_pose(self, frames)
-        listen_depth(self, self.taking(frames.add_depth))
+        listen_depth(self, self.taking(frames.add_depth), self.wants_rest)
         self.listen(
             "instances",
             [source("deworldsg/instances", Image)],
             self.taking(lambda message: frames.add_instances(message, stamp_ns_of(message))),
             "reliable",
+            is_wanted=self.wants_rest,
         )
         self.listen_json(
             "deworldsg/frame_graph", FrameGraphMessage, self.taking(self._add_frame_graph), 10

@@ -16,6 +16,7 @@ from deworldsg_ros.poses.odometry import (
 )
 from deworldsg_ros.ros.inputs import (
     POSE_DEPTH,
+    WANTED_DEPTH,
     listen_camera_info,
     listen_depth,
     listen_rgb,
@@ -47,8 +48,8 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         frames = self._frames = UnposedAssembler(self.parameters.inputs, **self.assembler_options())
         self.join(frames, self._track)
         listen_camera_info(self, self.taking(frames.add_camera_info))
-        listen_depth(self, self.taking(frames.add_depth), self.wants_images)
-        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images)
+        listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
+        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
     def _track(self, frame: UnposedFrame) -> None:
         if frame.stamp_ns < self._newest_ns:  # a recording was restarted

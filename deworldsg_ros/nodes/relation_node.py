@@ -39,7 +39,7 @@ class RelationNode(JoiningNode[PairingFrame]):
         self._frames = frames
         self.join(frames, self._relate)
         if with_rgb:
-            listen_rgb(self, self.taking(frames.add_rgb))
+            listen_rgb(self, self.taking(frames.add_rgb), self.wants_rest)
         self.listen_json(
             "deworldsg/local_graph", wire.LocalGraphMessage, self.taking(self._add_local_graph), 50
         )

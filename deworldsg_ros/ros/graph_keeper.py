@@ -101,6 +101,10 @@ class GraphKeeper:
         """
         self._worker.submit(_Job(job, time.monotonic(), dropped or self._count_overrun))
 
+    def submit_evidence(self, job: Callable[[], None]) -> None:
+        """The same for a job that adds evidence: a frame is in the graph without it."""
+        self.submit(job, lambda: self._count_overrun("evidence_overrun"))
+
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until all jobs are done; False on timeout."""
         return self._worker.wait_idle(timeout_s)
@@ -235,9 +239,9 @@ class GraphKeeper:
         self._node.health.received(CORRECTION_TOPIC)
         self.submit(lambda: self._correct(message))
 
-    def _count_overrun(self) -> None:
+    def _count_overrun(self, reason: str = "overrun") -> None:
         self._node.drop(
-            "overrun",
+            reason,
             f"the graph processes fewer messages than arrive: dropped the oldest of {QUEUE_JOBS}",
         )
 

@@ -24,7 +24,8 @@ except ImportError:
 
 # Takes a message and its stamp in nanoseconds.
 Taker = Callable[[Any, int], None]
-# Messages that DDS keeps: a third of a second of images at 30 Hz, half a second of poses at 200 Hz.
+# Messages that DDS keeps: a third of a second of images at 30 Hz; half a second of poses at 200 Hz,
+# and as much camera_info.
 IMAGE_DEPTH = 10
 POSE_DEPTH = 100
 # The same for images that a busy node leaves to DDS: the newest, and enough to find the depth image
@@ -50,41 +51,31 @@ def image_sources(topic: str, compressed_suffix: str, transport: str) -> list[So
     return {"raw": raw, "compressed": compressed, "auto": raw + compressed}[transport]
 
 
-def listen_rgb(node: StageNode, take: Taker, is_wanted: Callable[[], bool] | None = None) -> None:
-    """Subscribe to RGB images; `is_wanted` as in `AutoSubscription`."""
+def listen_rgb(
+    node: StageNode, take: Taker, is_wanted: Callable[[], bool], depth: int = IMAGE_DEPTH
+) -> None:
+    """Subscribe to RGB images; `is_wanted` and `depth` as in `AutoSubscription`."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("rgb/image_raw")
     sources = image_sources(topic, "/compressed", inputs.transport)
-    _listen_image(node, "rgb", sources, take, is_wanted)
+    node.listen("rgb", sources, _stamped(take), inputs.reliability, depth, is_wanted)
 
 
-def listen_depth(node: StageNode, take: Taker, is_wanted: Callable[[], bool] | None = None) -> None:
-    """Subscribe to depth images; `is_wanted` as in `AutoSubscription`."""
+def listen_depth(
+    node: StageNode, take: Taker, is_wanted: Callable[[], bool], depth: int = IMAGE_DEPTH
+) -> None:
+    """Subscribe to depth images; `is_wanted` and `depth` as in `AutoSubscription`."""
     inputs = node.parameters.inputs
     topic = node.resolve_topic_name("depth/image_raw")
     sources = image_sources(topic, "/compressedDepth", inputs.transport)
-    _listen_image(node, "depth", sources, take, is_wanted)
+    node.listen("depth", sources, _stamped(take), inputs.reliability, depth, is_wanted)
 
 
-def _listen_image(
-    node: StageNode,
-    name: str,
-    sources: list[Source],
-    take: Taker,
-    is_wanted: Callable[[], bool] | None,
-) -> None:
-    reliability = node.parameters.inputs.reliability
-    if is_wanted is None:
-        node.listen(name, sources, _stamped(take), reliability, IMAGE_DEPTH)
-    else:
-        node.listen(name, sources, _stamped(take), reliability, WANTED_DEPTH, is_wanted)
-
-
-def listen_camera_info(node: StageNode, take: Taker) -> None:
+def listen_camera_info(node: JoiningNode[Any], take: Taker) -> None:
     """Subscribe to camera_info."""
     sources = [source("rgb/camera_info", CameraInfo)]
     reliability = node.parameters.inputs.reliability
-    node.listen("camera_info", sources, _stamped(take), reliability, IMAGE_DEPTH)
+    node.listen("camera_info", sources, _stamped(take), reliability, POSE_DEPTH, node.wants_rest)
 
 
 def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> None:
@@ -109,7 +100,7 @@ def listen_pose(node: JoiningNode[Any], frames: PosedAssembler[Any, Any]) -> Non
 
     sources = [source("camera/pose", kind) for kind in kinds[pose_source]]
     reliability = node.parameters.inputs.reliability
-    poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH)
+    poses = node.listen("pose", sources, _stamped(take), reliability, POSE_DEPTH, node.wants_rest)
     if uses_tf:
         frames.expect_transforms()
         _fall_back_on_transforms(node, poses, transforms)

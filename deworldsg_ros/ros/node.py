@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from deworldsg_ros.kernels import COMPILING, on_compilation
@@ -24,7 +23,8 @@ from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, UNMATCHED_PREF
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import declare
 from deworldsg_ros.ros.process import run_process
-from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable
+from deworldsg_ros.ros.qos import AutoSubscription, LossCounter, Source, reliable
+from deworldsg_ros.ros.waiting import Waiting, take_waiting
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -34,10 +34,8 @@ CHECK_PERIOD_S = 0.25
 DIAGNOSTICS_PERIOD_S = 1.0
 # Minimum time between two log lines with the same reason.
 LOG_PERIOD_S = 10.0
-# Longest delay until a signal is noticed.
-SPIN_PERIOD_S = 0.2
-# Timers and services wait for at most so many messages of each topic.
-MAX_PASSES = 10
+# Longest delay until a signal is noticed, and until messages are taken that nothing waits for.
+SPIN_PERIOD_S = 0.05
 # A thread of Python code lets the others run after this time (Python's default is 5 ms), so that a
 # message does not wait for the stage's thread.
 SWITCH_S = 0.001
@@ -73,6 +71,8 @@ class StageNode(Node):
         self._logged_s: dict[str, float] = {}
         self._log_lock = threading.Lock()
         self._subscriptions_to_check: list[AutoSubscription] = []
+        self._json_losses: dict[str, LossCounter] = {}
+        self._woken = self.create_guard_condition(lambda: None)
         # Real time: with use_sim_time, timers on the node's clock would stop without /clock.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -86,6 +86,16 @@ class StageNode(Node):
     def more_values(self) -> dict[str, str]:
         """Further values of /diagnostics, by name; for subclasses."""
         return {}
+
+    def before_taking(self) -> None:
+        """Called before waiting messages are taken; for subclasses."""
+
+    def after_taking(self) -> None:
+        """Called when waiting messages were taken; for subclasses."""
+
+    def wake(self) -> None:
+        """Let the executor's thread look again which messages are wanted; from any thread."""
+        self._woken.trigger()
 
     def close(self) -> None:
         """End threads before the node is destroyed; for subclasses to extend."""
@@ -149,11 +159,6 @@ class StageNode(Node):
             self.health.received(name)
             callback(message)
 
-        def lost(number: int) -> None:
-            self.drop(
-                f"{LOST_PREFIX}{name}", f"{number} of {name} were published and not taken", number
-            )
-
         subscription = AutoSubscription(
             self,
             sources,
@@ -161,7 +166,7 @@ class StageNode(Node):
             reliability=reliability,
             depth=depth,
             is_wanted=is_wanted,
-            on_lost=lost,
+            on_lost=self._lost(name),
         )
         self._subscriptions_to_check.append(subscription)
         return subscription
@@ -184,15 +189,22 @@ class StageNode(Node):
             submit: queues a call for another thread, which then decodes the message. A message that
                 the queue drops thus costs nothing.
         """
+        losses = LossCounter(self._lost(topic.rsplit("/", 1)[-1]))
+        self._json_losses[topic] = losses
 
-        def received(message: Any) -> None:
+        def received(message: Any, info: dict[str, Any]) -> None:
+            losses.count(info)
             self.health.received(topic)
             if submit is None:
                 callback(wire.decode(message.data, kind))
             else:
                 submit(lambda: callback(wire.decode(message.data, kind)))
 
-        self.create_subscription(String, topic, self.guarded(received), reliable(depth))
+        guarded = self.guarded(received)
+        # rclpy gives the information to a callback of two arguments only.
+        self.create_subscription(
+            String, topic, lambda message, info: guarded(message, info), reliable(depth)
+        )
 
     def json_publisher(self, topic: str, depth: int) -> Callable[[wire.Message], None]:
         """A function that publishes JSON messages on a topic."""
@@ -206,7 +218,15 @@ class StageNode(Node):
         publisher = self.create_publisher(String, topic, reliable(depth, latched=latched))
         return lambda text: publisher.publish(String(data=text))
 
+    def _lost(self, name: str) -> Callable[[int], None]:
+        """A function that counts lost messages of a stream."""
+        return lambda number: self.drop(
+            f"{LOST_PREFIX}{name}", f"{number} of {name} were published and not taken", number
+        )
+
     def _check_publishers(self) -> None:
+        for topic, losses in self._json_losses.items():
+            losses.publishers = self.count_publishers(topic)
         for subscription in self._subscriptions_to_check:
             if subscription.check():
                 self.get_logger().info(f"listening to {subscription.describe()}")
@@ -234,25 +254,13 @@ class StageNode(Node):
         self._diagnostics.publish(message)
 
 
-def take_waiting(node: StageNode) -> None:
-    """Take the messages that wait, without rclpy's executor.
-
-    The executor makes a new wait set for every message, which takes 0.2 ms and more under load. The
-    messages of one frame arrive together.
-    """
-    for _ in range(MAX_PASSES):
-        taken = 0
-        for subscription in list(node.subscriptions):
-            with subscription.handle:
-                if not subscription.callback_group.can_execute(subscription):
-                    continue
-                message = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if message is not None:
-                taken += 1
-                has_info = subscription._callback_type is not Subscription.CallbackType.MessageOnly
-                subscription.callback(*message if has_info else message[:1])
-        if not taken:
-            return
+def serve(node: StageNode, waiting: Waiting) -> None:
+    """Wait for messages, timers and services, and serve them; at most `SPIN_PERIOD_S`."""
+    with node.refusing():
+        waiting.spin_once(SPIN_PERIOD_S)
+        node.before_taking()
+        take_waiting(node)
+        node.after_taking()
 
 
 def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> int:
@@ -264,11 +272,10 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
         try:
             executor = SingleThreadedExecutor()
             executor.add_node(node)
+            waiting = Waiting(node, executor)
             node.get_logger().info("ready")
             while not stop.is_set() and rclpy.ok():
-                with node.refusing():
-                    executor.spin_once(timeout_sec=SPIN_PERIOD_S)
-                    take_waiting(node)
+                serve(node, waiting)
             executor.shutdown(timeout_sec=1.0)
         finally:
             node.close()

@@ -9,7 +9,13 @@ from typing import Any
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
-from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose, listen_rgb
+from deworldsg_ros.ros.inputs import (
+    WANTED_DEPTH,
+    listen_camera_info,
+    listen_depth,
+    listen_pose,
+    listen_rgb,
+)
 from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.streams.frame_assemblers import FrameAssembler
@@ -37,8 +43,8 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         self.join(frames, work)
         listen_camera_info(self, self.taking(frames.add_camera_info))
         listen_pose(self, frames)
-        listen_depth(self, self.taking(frames.add_depth), self.wants_images)
-        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images)
+        listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
+        listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The results of a frame, in the camera's frame; failures and drops are counted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -103,6 +103,31 @@ class _WantedGroup(MutuallyExclusiveCallbackGroup):
         return self._is_wanted() and bool(super().can_execute(entity))
 
 
+class LossCounter:
+    """Counts the messages of one publisher that were published and not taken, by their numbers.
+
+    Args:
+        on_lost: called with the number of messages that are missing before one that arrived.
+    """
+
+    def __init__(self, on_lost: Callable[[int], None]) -> None:
+        self._on_lost = on_lost
+        self._before: int | None = None
+        # Each publisher counts its own messages, so gaps tell nothing of two.
+        self.publishers = 1
+
+    def restart(self) -> None:
+        """Forget the last number: the subscription is another one."""
+        self._before = None
+
+    def count(self, info: Mapping[str, Any]) -> None:
+        """Note the information on a message that arrived."""
+        number = info["publication_sequence_number"] if self.publishers == 1 else None
+        before, self._before = self._before, number
+        if before is not None and number is not None and number > before + 1:
+            self._on_lost(number - before - 1)
+
+
 class AutoSubscription:
     """A subscription that is recreated when the publishers change type or reliability.
 
@@ -132,9 +157,7 @@ class AutoSubscription:
     ) -> None:
         self._node = node
         self._group = _WantedGroup(is_wanted)
-        self._on_lost = on_lost
-        self._sequence: int | None = None
-        self._publishers = 0
+        self._losses = LossCounter(on_lost)
         self._sources = [
             Source(node.resolve_topic_name(item.topic), item.kind, item.type_name)
             for item in sources
@@ -156,7 +179,7 @@ class AutoSubscription:
     def check(self) -> bool:
         """Compare with the publishers; True if the subscription was recreated."""
         offers = self._offers()
-        self._publishers = len(offers)
+        self._losses.publishers = len(offers)
         self.was_published = self.was_published or bool(offers)
         choice = choose(self._sources, offers, self._reliability)
         # After the last publisher ends, keep the choice: the same publisher is likely to return.
@@ -172,7 +195,7 @@ class AutoSubscription:
             callback_group=self._group,
         )
         self._choice = choice
-        self._sequence = None
+        self._losses.restart()
         return True
 
     def describe(self) -> str:
@@ -182,14 +205,8 @@ class AutoSubscription:
         return f"{self.topic} [{kind}] {'reliable' if self._choice.reliable else 'best effort'}"
 
     def _receive(self, message: Any, info: dict[str, Any]) -> None:
-        self._count(info["publication_sequence_number"])
+        self._losses.count(info)
         self._callback(message)
-
-    def _count(self, sequence: int | None) -> None:
-        """Note a message's number. Each publisher counts its own, so gaps tell nothing of two."""
-        before, self._sequence = self._sequence, sequence if self._publishers == 1 else None
-        if before is not None and self._sequence is not None and self._sequence > before + 1:
-            self._on_lost(self._sequence - before - 1)
 
     def _offers(self) -> list[Offer]:
         return [

@@ -66,12 +66,17 @@ REASONS: dict[str, str] = {
     "at the new time: a recording was restarted, or a clock was set.",
     "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
     "queue. Lower the camera's frame rate, or choose a faster model.",
+    "evidence_overrun": "As `overrun`, for relation evidence. The graph has its frame without it.",
     "lost_rgb": "RGB images were overwritten by newer ones before the node took them, or lost on "
     "the way. If the node is as fast as the camera, use `config/fastdds.xml` in every process.",
     "lost_depth": "As `lost_rgb`, for depth images.",
     "lost_instances": "As `lost_rgb`, for instance images.",
     "lost_camera_info": "As `lost_rgb`, for camera_info.",
     "lost_pose": "As `lost_rgb`, for poses.",
+    "lost_frame_graph": "As `lost_rgb`, for frame graphs.",
+    "lost_local_graph": "As `lost_rgb`, for local graphs.",
+    "lost_relation_evidence": "As `lost_rgb`, for relation evidence.",
+    "lost_updates": "As `lost_rgb`, for updates of the graph. The next snapshot replaces them.",
     "unmatched_rgb": "An RGB image belongs to no local graph, because its frame was dropped "
     "before. See the other reasons.",
     "unmatched_depth": "A depth image belongs to no RGB image or frame graph. This is harmless if "

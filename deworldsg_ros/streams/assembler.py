@@ -76,6 +76,11 @@ class Assembler(ABC, Generic[T, Out]):
         self._waiting_since_ns.clear()
         self._drop("time_jump", f"stamps went back: {lost} buffered messages are dropped")
 
+    @property
+    def waiting(self) -> int:
+        """Number of items of the leading stream that wait for the others."""
+        return len(self._leader)
+
     def pop_ready(self, now_ns: int | None) -> list[Out]:
         """Complete outputs in stamp order, decoded; see `pop_joined`."""
         return self._decoded(self.pop_joined(now_ns))

@@ -13,7 +13,7 @@ from visualization_msgs.msg import Marker
 
 from deworldsg_ros.ros.inputs import image_sources
 from deworldsg_ros.ros.markers import marker_array
-from deworldsg_ros.ros.qos import Offer, choose
+from deworldsg_ros.ros.qos import LossCounter, Offer, choose
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Vocabulary
@@ -168,3 +168,24 @@ def test_a_marker_array_replaces_all_markers() -> None:
     assert (marker.pose.position.z, marker.scale.y, marker.color.a) == (3.0, 0.2, 0.5)
     assert marker.points[1].x == 1.0
     assert [m.action for m in marker_array([], "map", Time()).markers] == [Marker.DELETEALL]
+
+
+def test_losses_of_one_publisher_are_counted() -> None:
+    lost: list[int] = []
+    losses = LossCounter(lost.append)
+
+    def arrive(*numbers: int) -> None:
+        for number in numbers:
+            losses.count({"publication_sequence_number": number})
+
+    arrive(5, 6, 9)
+    assert lost == [2]
+    arrive(1, 2)  # the publisher was restarted
+    losses.publishers = 2
+    arrive(7, 3)
+    losses.publishers = 1
+    arrive(20)
+    assert lost == [2]
+    losses.restart()
+    arrive(30, 32)
+    assert lost == [2, 1]
