@@ -6,6 +6,7 @@ receives, and /diagnostics.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -138,7 +139,7 @@ class PipelineMonitor:
         self._own_pace = False
         self._looked_s = 0.0
         self._restarts = Restarts(node, self._between)
-        self._restarted_s: float | None = None
+        self._restarted_s = math.inf
         node.create_subscription(String, LOCAL_GRAPH, self._on_local, reliable(50))
         node.create_subscription(String, EVIDENCE, self._on_evidence, reliable(50))
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
@@ -171,8 +172,8 @@ class PipelineMonitor:
         if not self._own_pace:
             stall_s = stall_s if self.window.results else max(stall_s, FIRST_RESULT_S)
             problem = self._look(now_s)
-            if self._restarted_s is not None and now_s - self._restarted_s >= SETTLE_S:
-                self._restarted_s = self._progress_s = None
+            if now_s - self._restarted_s >= SETTLE_S:
+                self._restarted_s, self._progress_s = math.inf, None
                 self.window.give_up()
                 return False
             if self.silent_for(now_s) > stall_s:
@@ -195,10 +196,8 @@ class PipelineMonitor:
         restarted = self._restarts.look()
         if restarted:
             self._restarted_s = now_s
-            self._node.get_logger().warning(
-                f"{' and '.join(restarted)} restarted: without the {self.window.in_flight} frames "
-                "in flight"
-            )
+            names, lost = " and ".join(restarted), self.window.in_flight
+            self._node.get_logger().warning(f"{names} restarted: {lost} frames are lost")
         missing = self._missing_between()
         return f"waiting for {missing[0]}" if missing else ""
 
@@ -285,8 +284,8 @@ class PipelineMonitor:
         elif name in (SEGMENTATION, LIFTING):
             refused = self._drops(name)
             known = self._refused.get(name, 0)
-            new = refused - known if refused >= known else refused
             self._refused[name] = refused
+            new = refused - known if refused >= known else refused
             if new:
                 self.window.excuse(new)
                 self._progress_s = None
@@ -306,5 +305,4 @@ class PipelineMonitor:
 
     def _received(self, topic: str) -> int:
         """Messages that graph_node received, or missed because it was restarted."""
-        received = received_in(self.diagnostics.get(GRAPH, {}), topic)
-        return received + self._missed.get(topic, 0)
+        return received_in(self.diagnostics.get(GRAPH, {}), topic) + self._missed.get(topic, 0)

@@ -102,7 +102,7 @@ class GraphKeeper:
         self._worker.submit(_Job(job, time.monotonic(), dropped or self._count_overrun))
 
     def submit_evidence(self, job: Callable[[], None]) -> None:
-        """The same for a job that adds evidence: a frame is in the graph without it."""
+        """The same for evidence: the graph has its frame without it."""
         self.submit(job, lambda: self._count_overrun("evidence_overrun"))
 
     def wait_idle(self, timeout_s: float) -> bool:
@@ -240,10 +240,7 @@ class GraphKeeper:
         self.submit(lambda: self._correct(message))
 
     def _count_overrun(self, reason: str = "overrun") -> None:
-        self._node.drop(
-            reason,
-            f"the graph processes fewer messages than arrive: dropped the oldest of {QUEUE_JOBS}",
-        )
+        self._node.drop(reason, f"more messages arrive than are merged: {QUEUE_JOBS} waited")
 
 
 def _drop(job: _Job) -> None:

@@ -12,14 +12,15 @@ from typing import Any
 
 import msgspec
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import String
 
 from deworldsg_ros.kernels import COMPILING, on_compilation
-from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, UNMATCHED_PREFIX, Health
+from deworldsg_ros.ros.diagnosing import DropLog, diagnostic_array
+from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, Health
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import declare
 from deworldsg_ros.ros.process import run_process
@@ -32,8 +33,6 @@ from deworldsg_ros.scene.errors import RefusedInput
 CHECK_PERIOD_S = 0.25
 # The usual rate of /diagnostics; diagnostic_aggregator calls a status stale after 5 s.
 DIAGNOSTICS_PERIOD_S = 1.0
-# Minimum time between two log lines with the same reason.
-LOG_PERIOD_S = 10.0
 # Longest delay until a signal is noticed, and until messages are taken that nothing waits for.
 SPIN_PERIOD_S = 0.05
 # A thread of Python code lets the others run after this time (Python's default is 5 ms), so that a
@@ -68,8 +67,7 @@ class StageNode(Node):
         self.get_logger().info("loading")
         on_compilation(lambda: self.get_logger().info(COMPILING))
         self.health = Health(product)
-        self._logged_s: dict[str, float] = {}
-        self._log_lock = threading.Lock()
+        self._drop_log = DropLog(self.get_logger())
         self._subscriptions_to_check: list[AutoSubscription] = []
         self._json_losses: dict[str, LossCounter] = {}
         self._woken = self.create_guard_condition(lambda: None)
@@ -128,18 +126,7 @@ class StageNode(Node):
     def drop(self, reason: str, message: str, number: int = 1) -> None:
         """Count a drop and log it, each reason at most once per LOG_PERIOD_S."""
         self.health.dropped(reason, number, message)
-        now_s = time.monotonic()
-        with self._log_lock:
-            if now_s - self._logged_s.get(reason, -LOG_PERIOD_S) < LOG_PERIOD_S:
-                return
-            self._logged_s[reason] = now_s
-        log = self.get_logger()
-        if reason == INTERNAL_ERROR:
-            log.error(f"{reason}: {message}")
-        elif reason.startswith(UNMATCHED_PREFIX):
-            log.debug(f"{reason}: {message}")
-        else:
-            log.warning(f"{reason}: {message}")
+        self._drop_log.write(reason, message)
 
     def listen(
         self,
@@ -240,17 +227,8 @@ class StageNode(Node):
         report = self.health.report(
             now_ns / 1e9, self.waiting_for(now_ns), {**listening, **self.more_values()}
         )
-        message = DiagnosticArray()
+        message = diagnostic_array(report, self.get_name(), self.get_fully_qualified_name())
         message.header.stamp = self.get_clock().now().to_msg()
-        message.status = [
-            DiagnosticStatus(
-                level=bytes([report.level]),
-                name=f"{self.get_name()}: {self.get_fully_qualified_name()}",
-                message=report.message,
-                hardware_id="deworldsg_ros",
-                values=[KeyValue(key=key, value=value) for key, value in report.values.items()],
-            )
-        ]
         self._diagnostics.publish(message)
 
 
