@@ -90,7 +90,7 @@ def test_tables_list_objects_and_relations():
     cup = next(line for line in text.splitlines() if "cup [red] #1" in line)
     assert "90 %" in cup
     assert re.search(r"0\.50\s+-1\.25\s+2\.00", cup)
-    assert "35 × 17 × 3" in cup
+    assert "35 × 17 × 4" in cup
     assert cup.rstrip(" │").endswith("7")
     assert text.index("table #2") < text.index("cup [red] #1")  # most observed first
     relation = next(line for line in text.splitlines() if "83 %" in line)
