@@ -87,7 +87,7 @@ def _numba() -> ModuleType:
             pass
 
     event.register("numba:compile", Compilation())
-    return cast(ModuleType, numba)
+    return numba
 
 
 def _jit(function: Callable[..., Any]) -> Any:
