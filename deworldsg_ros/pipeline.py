@@ -17,6 +17,7 @@ from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
+from deworldsg_ros.perception.upright import UprightFrame
 from deworldsg_ros.relations.graph_view import LiveGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import build_world_model, require_predicates
@@ -130,24 +131,25 @@ class Pipeline:
             for frame in frames:
                 yield frame, _result_or_refusal(self.process, frame)
             return
-        for frame, detections in apply_ahead(self._detect, frames, perception.detectors):
-            yield frame, _result_or_refusal(self._process_detected, frame, detections)
+        upright = map(perception.turn_upright, frames)
+        for seen, detections in apply_ahead(self._detect, upright, perception.detectors):
+            yield seen.original, _result_or_refusal(self._process_detected, seen, detections)
 
-    def _detect(self, frame: RgbdFrame) -> tuple[Detections, float]:
+    def _detect(self, seen: UprightFrame) -> tuple[Detections, float]:
         """The detections of a frame, and the seconds that they took."""
         assert isinstance(self.perception, Perception)
         start = time.perf_counter()
-        return self.perception.detect(frame), time.perf_counter() - start
+        return self.perception.detect(seen.upright), time.perf_counter() - start
 
     def _process_detected(
-        self, frame: RgbdFrame, found: Future[tuple[Detections, float]]
+        self, seen: UprightFrame, found: Future[tuple[Detections, float]]
     ) -> FrameResult:
         assert isinstance(self.perception, Perception)
         wait([found])
         start = time.perf_counter()
-        perceived = self.perception.perceive(frame, lambda: found.result()[0])
+        perceived = self.perception.perceive_detected(seen, lambda: found.result()[0])
         self.times_s["perception"].append(time.perf_counter() - start + found.result()[1])
-        return self._add(frame, perceived)
+        return self._add(seen.original, perceived)
 
     def _add(self, frame: RgbdFrame, perceived: Perceived) -> FrameResult:
         with timed(self.times_s["lifting"]):

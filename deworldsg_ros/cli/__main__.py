@@ -2,5 +2,4 @@
 
 from deworldsg_ros.cli import main
 
-if __name__ == "__main__":  # the processes of `deworldsg compile` import it, too
-    main()
+main()

@@ -15,7 +15,7 @@ from deworldsg_ros import __version__
 from deworldsg_ros.cli import ask, exchange, mcp, probe
 from deworldsg_ros.cli import models as models_command
 from deworldsg_ros.cli.evaluate import commands as evaluate
-from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED, EXIT_USAGE
+from deworldsg_ros.cli.exit_codes import EXIT_FINDINGS, EXIT_INTERRUPTED, EXIT_USAGE
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
@@ -386,6 +386,53 @@ def info(
             DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
             Console(markup=False),
         )
+
+
+@app.command()
+def doctor(
+    recording: Annotated[
+        Optional[Path], typer.Argument(metavar="RECORDING", help="as for run")
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="examine the nodes that run now, in place of a recording")
+    ] = False,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=2, max=600, help="with --live: time to listen")
+    ] = 5.0,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    max_frames: MaxFrames = 200,
+    rgb: RgbTopic = "",
+    depth: DepthTopic = "",
+    camera_info: InfoTopic = "",
+    pose: PoseTopic = "",
+    intrinsics: CameraIntrinsics = "",
+    poses: Poses = None,
+    odometry: OdometryPoses = False,
+) -> None:
+    """Say what is off with a recording or nodes."""
+    with _reporting_errors():
+        from deworldsg_ros.cli.doctor import examine_nodes, examine_recording
+        from deworldsg_ros.cli.run import RunOptions
+        from deworldsg_ros.recordings.posing import PoseChoice
+
+        if (recording is None) is not live:
+            raise ConfigurationError("doctor: expected either a RECORDING or --live")
+        console = Console(markup=False)
+        if recording is None:
+            is_well = examine_nodes(seconds, console)
+        else:
+            options = RunOptions(
+                recording,
+                config_path=config,
+                settings=tuple(settings or ()),
+                max_frames=max_frames,
+                topics=TopicChoice(rgb, depth, camera_info, pose),
+                dataset=DatasetOptions(intrinsics=parse_intrinsics(intrinsics)),
+                poses=PoseChoice(poses, odometry=odometry),
+            )
+            is_well = examine_recording(options, console)
+    raise typer.Exit(0 if is_well else EXIT_FINDINGS)
 
 
 @app.command("compile")

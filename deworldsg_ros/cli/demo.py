@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +19,18 @@ from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.cli.installation import find_shared, node_command
+from deworldsg_ros.cli.observing import as_report, print_findings, sizes_of
 from deworldsg_ros.cli.processes import LoggedProcess, ending, one_interrupt
 from deworldsg_ros.cli.replay_progress import ReplayProgress
 from deworldsg_ros.config import Config
+from deworldsg_ros.doctor import Finding, find
 from deworldsg_ros.recordings import events
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import ODOMETRY, Role
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.ros.diagnosed import observations_of
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
@@ -111,8 +114,10 @@ def run_demo(
         poses = [np.array(values).reshape(4, 4) for values in finished.poses]
         frames = _frames(recording.path, config, options)
         outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
-        _write_report(staged, recording, graph, finished, wall_s)
+        findings = _findings(graph, finished)
+        _write_report(staged, recording, graph, finished, wall_s, findings)
     _print_summary(out, finished, console)
+    print_findings(console, findings)
 
 
 def _frames(path: Path, config: Config, options: DemoOptions) -> list[RgbdFrame]:
@@ -244,6 +249,7 @@ def _write_report(
     graph: wire.SceneGraphMessage,
     finished: events.Finished,
     wall_s: float,
+    findings: list[Finding],
 ) -> None:
     objects: Counter[str] = Counter()
     for values in finished.diagnostics.values():
@@ -260,12 +266,27 @@ def _write_report(
         },
         "drops": {**_drops(finished), "objects": dict(objects)},
         "losses": finished.losses,
+        "findings": as_report(findings),
         "nodes": len(graph.nodes),
         "edges": len(graph.edges),
         "wall_s": round(wall_s, 3),
         "diagnostics": finished.diagnostics,
     }
     outputs.write_report(out, report)
+
+
+def _findings(graph: wire.SceneGraphMessage, finished: events.Finished) -> list[Finding]:
+    """What is off, from the diagnostics of the nodes and the graph."""
+    seen = replace(
+        observations_of(finished.diagnostics),
+        images=finished.published,
+        frames=finished.processed,
+        nodes=len(graph.nodes),
+        hidden=Counter(node.reason for node in graph.hidden or ()),
+        sizes=sizes_of(graph),
+        missing=(),  # after the last frame, every input is missing
+    )
+    return find(seen)
 
 
 def _drops(finished: events.Finished) -> dict[str, dict[str, int]]:

@@ -6,3 +6,5 @@ EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130
 # An evaluation in which every scan failed.
 EXIT_NOTHING_DONE = 1
+# `deworldsg doctor` found something that has to be mended.
+EXIT_FINDINGS = 3

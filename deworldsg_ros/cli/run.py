@@ -20,8 +20,10 @@ from rich.text import Text
 from deworldsg_ros import __version__
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.cli.observing import RunObserver, as_report, print_findings
 from deworldsg_ros.cli.progress import frame_progress, say_instead, working
 from deworldsg_ros.config import Config
+from deworldsg_ros.doctor import Finding
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import warm_up
 from deworldsg_ros.kernels import COMPILING, on_compilation
@@ -68,17 +70,17 @@ class RunOptions:
     """
 
     recording: Path
-    out: Path
-    config_path: Path | None
-    settings: tuple[str, ...]
-    max_frames: int
-    topics: TopicChoice
-    dataset: DatasetOptions
-    poses: PoseChoice
-    trajectory_out: Path | None
-    map_path: Path | None
-    temporal: bool
-    timings: bool
+    out: Path = Path()
+    config_path: Path | None = None
+    settings: tuple[str, ...] = ()
+    max_frames: int = 0
+    topics: TopicChoice = TopicChoice()
+    dataset: DatasetOptions = DatasetOptions()
+    poses: PoseChoice = PoseChoice()
+    trajectory_out: Path | None = None
+    map_path: Path | None = None
+    temporal: bool = False
+    timings: bool = False
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class _Processed:
         refused: frames that the pipeline or the odometry refused, by reason.
         updates: log of the graph's updates; None without `RunOptions.temporal`.
         album: some of the frames.
+        observer: what the doctor has to know.
         wall_s: seconds for all frames.
     """
 
@@ -97,6 +100,7 @@ class _Processed:
     refused: Counter[str]
     updates: UpdateLog | None
     album: Album
+    observer: RunObserver
     wall_s: float
 
     @property
@@ -105,14 +109,36 @@ class _Processed:
         return len(self.poses) / self.wall_s
 
 
+@dataclass(frozen=True)
+class _Ran:
+    """A recording that was processed; `drops` are counts by owner and reason."""
+
+    recording: Recording
+    pipeline: Pipeline
+    processed: _Processed
+    drops: dict[str, dict[str, int]]
+    findings: list[Finding]
+
+
 def run_recording(options: RunOptions, console: Console) -> None:
     """Run, write the results and print a summary; raises DeWorldSGError."""
     # The map is ours from reading to writing: what another process adds to it would be lost.
     with claim_map(options.map_path) if options.map_path else nullcontext():
-        _run(options, console)
+        outputs.check_folder(options.out)
+        ran = _run(options, console)
+        _write_results(options, ran, console)
+    outputs.print_drops(console, ran.recording.losses, ran.drops, ran.recording.reasons)
+    _print_summary(options, ran.pipeline, ran.processed, console)
+    print_findings(console, ran.findings)
 
 
-def _run(options: RunOptions, console: Console) -> None:
+def examine(options: RunOptions, console: Console) -> list[Finding]:
+    """Run without results; what is off. Raises DeWorldSGError."""
+    return _run(options, console).findings
+
+
+def _run(options: RunOptions, console: Console) -> _Ran:
+    """Process a recording; raises RecordingError if no frame can be used."""
     config = effective_config(options.config_path, options.settings)
     if options.poses.odometry and not HAS_ODOMETRY:
         outputs.print_noted(console, "warning:", WITHOUT_ODOMETRY)
@@ -125,7 +151,6 @@ def _run(options: RunOptions, console: Console) -> None:
     )
     try:
         recording = Recording(choose_poses(source, options.poses, config), config.inputs)
-        outputs.check_folder(options.out)
         pipeline = build_pipeline(config, options.map_path, console)
         processed = _process(recording, pipeline, options, console)
     finally:
@@ -133,6 +158,7 @@ def _run(options: RunOptions, console: Console) -> None:
     drops = {"recording": dict(recording.drops), "pipeline": dict(processed.refused)}
     if not processed.poses:
         outputs.print_drops(console, recording.losses, drops, recording.reasons)
+        print_findings(console, processed.observer.findings(recording, pipeline, drops))
         raise RecordingError(
             f"recording {options.recording}: not one frame could be used; see the reasons above"
         )
@@ -140,9 +166,8 @@ def _run(options: RunOptions, console: Console) -> None:
     failed = {reason: dropped[reason] for reason in FAILURES if reason in dropped}
     if failed:
         drops["world model"] = failed
-    _write_results(options, recording, pipeline, processed, drops, console)
-    outputs.print_drops(console, recording.losses, drops, recording.reasons)
-    _print_summary(options, pipeline, processed, console)
+    findings = processed.observer.findings(recording, pipeline, drops)
+    return _Ran(recording, pipeline, processed, drops, findings)
 
 
 def build_pipeline(config: Config, map_path: Path | None, console: Console) -> Pipeline:
@@ -173,6 +198,7 @@ def _process(
     poses: dict[int, Float64] = {}
     album = Album()
     refused: Counter[str] = Counter()
+    observer = RunObserver()
     updates = UpdateLog(pipeline.config.output.rate_hz) if options.temporal else None
 
     lock = threading.Lock()
@@ -193,13 +219,15 @@ def _process(
             else:
                 poses[frame.stamp_ns] = frame.T_world_camera
                 album.add(frame)
+                observer.note(frame, result)
                 _note_update(updates, recording, pipeline, result)
             progress.advance(task)
             # Counting the nodes takes time: not in every frame.
             if len(poses) % 5 == 0:
                 progress.update(task, note=_node_count(pipeline))
         progress.update(task, note=_node_count(pipeline), total=len(poses) + refused.total())
-    return _Processed(poses, refused, updates, album, time.perf_counter() - started_s)
+    wall_s = time.perf_counter() - started_s
+    return _Processed(poses, refused, updates, album, observer, wall_s)
 
 
 def _note_update(
@@ -216,15 +244,9 @@ def _node_count(pipeline: Pipeline) -> str:
     return "" if pipeline.builder is None else counted(pipeline.builder.confirmed, "node")
 
 
-def _write_results(
-    options: RunOptions,
-    recording: Recording,
-    pipeline: Pipeline,
-    processed: _Processed,
-    drops: dict[str, dict[str, int]],
-    console: Console,
-) -> None:
+def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
     """Write the graph, its views, the report, the trajectory and the map; print the tables."""
+    pipeline, processed = ran.pipeline, ran.processed
     graph = pipeline.graph()
     T_world_cameras = list(processed.poses.values())
     with outputs.writing(options.out, pipeline.config) as staged:
@@ -232,7 +254,7 @@ def _write_results(
         world_up = pipeline.config.inputs.world_up
         frames = processed.album.frames
         outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)
-        outputs.write_report(staged, _report(recording, pipeline, graph, processed, drops))
+        outputs.write_report(staged, _report(ran, graph))
         # Last: each of these two is in place at once, and must not be if the results failed.
         if options.trajectory_out is not None:
             write_tum(options.trajectory_out, list(processed.poses), T_world_cameras)
@@ -240,22 +262,18 @@ def _write_results(
             write_map(pipeline.builder, options.map_path)
 
 
-def _report(
-    recording: Recording,
-    pipeline: Pipeline,
-    graph: wire.SceneGraphMessage,
-    processed: _Processed,
-    drops: dict[str, dict[str, int]],
-) -> dict[str, Any]:
+def _report(ran: _Ran, graph: wire.SceneGraphMessage) -> dict[str, Any]:
     """Content of run.json."""
+    recording, pipeline, processed = ran.recording, ran.pipeline, ran.processed
     report = {
         "program": f"deworldsg {__version__} run",
         "recording": recording.name,
         "kind": recording.source.kind,
         "poses": recording.source.topics[Role.POSE].name,
         "frames": {"images": recording.frame_count, "processed": len(processed.poses)},
-        "drops": {**drops, "objects": dict(pipeline.drops)},
+        "drops": {**ran.drops, "objects": dict(pipeline.drops)},
         "losses": recording.losses,
+        "findings": as_report(ran.findings),
         "nodes": len(graph.nodes),
         "hidden_nodes": {} if pipeline.builder is None else pipeline.builder.hidden,
         "edges": len(graph.edges),

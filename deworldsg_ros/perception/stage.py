@@ -6,7 +6,6 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from deworldsg_ros.perception.protocols import (
     SegmentedObjects,
     Segmenter,
 )
+from deworldsg_ros.perception.upright import Uprighter, UprightFrame, turned_back
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
@@ -53,12 +53,14 @@ class Perceived:
             (nested), ``segmenter_error`` (all of the frame). ``relation_head_error`` counts the
             objects that are passed on without relations.
         failures: error message of each backend that failed on this frame, by reason.
+        turns: quarter turns counter-clockwise after which perception saw the image.
     """
 
     frame_graph: FrameGraph
     instances: UInt16
     drops: dict[str, int] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
+    turns: int = 0
 
 
 class Perception:
@@ -95,6 +97,7 @@ class Perception:
         self._refine = config.refine_detections
         self._max_relations = config.max_relations
         self._up = UpEstimator(world_up)
+        self._uprighter = Uprighter(world_up) if config.refine_detections else None
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
         self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
@@ -104,15 +107,17 @@ class Perception:
             else config.score_threshold
         )
 
-    def watch(self, wrap: Callable[[str, Any], Any]) -> None:
-        """Replace each backend by the result of a function of its name and the backend."""
-        self._detector = wrap("detector", self._detector)
-        self._segmenter = wrap("segmenter", self._segmenter)
-        self._relation_head = wrap("relation_head", self._relation_head)
+    def turn_upright(self, frame: RgbdFrame) -> UprightFrame:
+        """A frame, turned upright if the camera is mounted on its side and detections are refined.
 
-    def perceive(
-        self, frame: RgbdFrame, detect: Callable[[], Detections] | None = None
-    ) -> Perceived:
+        Args:
+            frame: the frames come in order of time.
+        """
+        if self._uprighter is None:
+            return UprightFrame(frame, frame)
+        return self._uprighter.turn(frame)
+
+    def perceive(self, frame: RgbdFrame) -> Perceived:
         """The 2D scene graph and the instance image of `frame`.
 
         A segmenter or relation head that fails does not stop the run: `drops` counts the lost
@@ -120,15 +125,29 @@ class Perception:
 
         Args:
             frame: the frames come in order of time.
-            detect: gives the result of `detect` for the frame, or raises its error; None = now.
 
         Raises:
             RefusedInput: ``detector_error``.
         """
+        seen = self.turn_upright(frame)
+        return self.perceive_detected(seen, lambda: self.detect(seen.upright))
+
+    def perceive_detected(self, seen: UprightFrame, detect: Callable[[], Detections]) -> Perceived:
+        """`perceive` of a frame whose objects are detected elsewhere.
+
+        Args:
+            seen: of `turn_upright`; the frames come in order of time.
+            detect: gives the result of `detect` for the upright frame, or raises its error.
+        """
+        found = self._perceive(seen.upright, detect)
+        graph, instances = turned_back(found.frame_graph, found.instances, seen.turns)
+        return replace(found, frame_graph=graph, instances=instances, turns=seen.turns)
+
+    def _perceive(self, frame: RgbdFrame, detect: Callable[[], Detections]) -> Perceived:
         intrinsics = frame.intrinsics
         self._up.observe(frame.T_world_camera)
         self._failures = {}
-        found = self.detect(frame) if detect is None else detect()
+        found = detect()
         strong = found.scores >= self.score_threshold
         objects, drops = self._select(found.take(strong), intrinsics.width, intrinsics.height)
         weak, _ = self._select(found.take(~strong), intrinsics.width, intrinsics.height)
@@ -168,7 +187,11 @@ class Perception:
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
     def detect(self, frame: RgbdFrame) -> Detections:
-        """Objects and, if detections are refined, weak boxes; raises ``detector_error``."""
+        """Objects and, if detections are refined, weak boxes; raises ``detector_error``.
+
+        Args:
+            frame: upright.
+        """
         fraction = WEAK_SCORE_FRACTION if self._refine else 1.0
         try:
             return self._detector.detect(frame.rgb, fraction * self.score_threshold)

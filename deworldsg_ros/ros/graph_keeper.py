@@ -17,6 +17,7 @@ from std_srvs.srv import Trigger
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.graph_files import GraphFiles
+from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.pose_corrections import CORRECTION_TOPIC, PoseCorrections
 from deworldsg_ros.ros.qos import reliable
@@ -251,7 +252,7 @@ def _sizes(snapshot: wire.SceneGraphMessage, hidden: dict[str, int]) -> dict[str
     """The size of the graph, for /diagnostics."""
     return {
         "nodes": str(len(snapshot.nodes)),
-        **{f"hidden, {why}": str(count) for why, count in hidden.items()},
+        **{f"{HIDDEN}{why}": str(count) for why, count in hidden.items()},
         "edges": str(len(snapshot.edges)),
         "sequence": str(snapshot.sequence),
     }

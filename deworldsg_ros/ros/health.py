@@ -20,6 +20,8 @@ UNMATCHED_PREFIX = "unmatched_"
 # Reasons with this prefix count messages that the node never had.
 LOST_PREFIX = "lost_"
 DROPPED, LEFT_OUT, RECEIVED = "dropped ", "objects left out ", "received "
+# Nodes of the graph that are not published.
+HIDDEN = "hidden, "
 TOTAL = re.compile(r"(\d+) in total")
 
 
@@ -152,7 +154,7 @@ class Health:
 
 
 def counts_in(values: Mapping[str, str], prefix: str) -> dict[str, int]:
-    """Counts by reason in a report's values; `prefix` is DROPPED or LEFT_OUT."""
+    """Counts by reason in a report's values; `prefix` is DROPPED, LEFT_OUT or HIDDEN."""
     return {
         key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)
     }

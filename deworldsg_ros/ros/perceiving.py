@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import msgspec
-
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
+from deworldsg_ros.ros.diagnosed import TURNED
 from deworldsg_ros.ros.inputs import (
     WANTED_DEPTH,
     listen_camera_info,
@@ -19,7 +19,6 @@ from deworldsg_ros.ros.inputs import (
     listen_rgb,
 )
 from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
-from deworldsg_ros.ros.models import PERCEPTION_LIMIT_S, Supervised, parse_faults
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.streams.frame_assemblers import FrameAssembler
 
@@ -38,17 +37,8 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         inputs = self.parameters.inputs
         require_checkpoints(self.parameters.perception)
         self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
-        faults = parse_faults(self.parameters.debug.faults)
-        self._models: dict[str, Supervised] = {}
-
-        def supervise(part: str, backend: Any) -> Supervised:
-            self._models[part] = Supervised(
-                part.replace("_", " "), backend, PERCEPTION_LIMIT_S, self._reload, faults[part]
-            )
-            return self._models[part]
-
-        self._perception.watch(supervise)
         self._frames = FrameAssembler(inputs, **self.assembler_options())
+        self._turns: Counter[int] = Counter()
 
     def listen_to_camera(self, work: Callable[[RgbdFrame], None]) -> None:
         """Subscribe to the camera, and call `work` with each complete frame."""
@@ -59,23 +49,17 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
-    def waiting_for(self, now_ns: int) -> list[str]:
-        """Missing inputs, and models that fail or hang, in words."""
-        problems = [model.problem() for model in self._models.values()]
-        return [*super().waiting_for(now_ns), *filter(None, problems)]
-
-    def _reload(self) -> None:
-        """Load all models again, on the CPU: a GPU that failed once fails for this process."""
-        config = msgspec.structs.replace(self.parameters.perception, device="cpu")
-        self.get_logger().warning("loading the models again, on the CPU")
-        fresh = build_perception(config, world_up=self.parameters.inputs.world_up)
-        fresh.watch(lambda part, backend: self._models[part].replace(backend))
-
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The results of a frame, in the camera's frame; failures and drops are counted."""
         perceived = self._perception.perceive(frame)
+        self._turns[perceived.turns] += 1
         self.health.left_out(perceived.drops)
         for reason, message in perceived.failures.items():
             self.drop(reason, message)
         graph = replace(perceived.frame_graph, frame_id=self._frames.camera_frame)
         return replace(perceived, frame_graph=graph)
+
+    def more_values(self) -> dict[str, str]:
+        """Frames that were turned upright for the detector, by angle."""
+        turned = {f"{TURNED}{90 * n} degrees": str(k) for n, k in self._turns.items() if n}
+        return {**super().more_values(), **turned}

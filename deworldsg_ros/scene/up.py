@@ -15,14 +15,36 @@ MAX_POSES = 2**52
 # Hand-held cameras roll less than this. A world axis is vertical if the image rows are orthogonal
 # to it within this angle and it points up in the image.
 _LEVEL_RADIANS = np.radians(15.0)
+# A camera is on its side if up is within this angle of its image rows, and if at least this part of
+# up lies in the image plane. Nobody holds a camera so by chance.
+_SIDE_RADIANS = np.radians(30.0)
+_IN_PLANE = 0.7
+# The least mean of (x · z)² at which a camera that began on its side still is.
+_STILL_ON_SIDE = 0.6
+
+
+def quarter_turns(up_camera: Float64) -> int | None:
+    """Quarter turns counter-clockwise, 0 to 3, that bring up to the top of the image.
+
+    None if up points to no side of the image clearly: the camera looks down, or is tilted.
+
+    Args:
+        up_camera: (3,) unit vector in the optical frame: x right, y down.
+    """
+    x, y, _ = up_camera
+    roll = float(np.arctan2(x, -y))
+    turns = round(roll / (np.pi / 2))
+    clear = np.hypot(x, y) >= _IN_PLANE and abs(roll - turns * np.pi / 2) <= _SIDE_RADIANS
+    return turns % 4 if clear else None
 
 
 class UpEstimator:
     """Unit vector (3,) that points up in the world frame.
 
     A named axis is used as given. ``auto`` means +z (the ROS convention, REP 103) if the poses
-    agree with it. Otherwise it is the direction that is most orthogonal to the image rows, because
-    hands and mounts keep a camera level.
+    agree with it. They also agree if the camera is mounted on its side: it began so, and its image
+    rows are still vertical. Otherwise it is the direction that is most orthogonal to the image
+    rows, because hands and mounts keep a camera level.
 
     Args:
         axis: ``auto`` or a key of AXES.
@@ -38,32 +60,44 @@ class UpEstimator:
         self._count = 0
         self._rows = np.zeros((3, 3))  # sum of x xᵀ over the cameras' x axes
         self._image_up = np.zeros(3)  # sum of the cameras' -y axes
+        self._began_on_side = False
 
     def observe(self, T_world_camera: Float64) -> None:
         """Add a camera pose (4, 4)."""
         x_axis = T_world_camera[:3, 0]
+        if self._count == 0:
+            self._began_on_side = quarter_turns(T_world_camera[2, :3]) in (1, 3)
         self._rows += np.outer(x_axis, x_axis)
         self._image_up -= T_world_camera[:3, 1]
         self._count += 1
 
     def state(self) -> Float64:
-        """Everything that it knows, (13,) float64, for `restore`."""
-        return np.concatenate([[self._count], self._rows.ravel(), self._image_up])
+        """Everything that it knows, (14,) float64, for `restore`."""
+        began = float(self._began_on_side)
+        return np.concatenate([[self._count], self._rows.ravel(), self._image_up, [began]])
 
     def restore(self, state: Float64) -> None:
-        """Continue from a state; ValueError if it is none."""
-        if state.shape != (13,) or state.dtype != np.float64:
+        """Continue from a state, or from one of 13 numbers of an older release.
+
+        Raises:
+            ValueError: if it is none.
+        """
+        if state.shape == (13,):
+            state = np.append(state, 0.0)
+        if state.shape != (14,) or state.dtype != np.float64:
             raise ValueError(
                 f"state of the up direction has shape {state.shape} of {state.dtype}: expected "
-                "(13,) of float64"
+                "(14,) of float64"
             )
         # The other numbers are sums of products of unit vectors, one for each pose.
         holds("state of the up direction", 0 <= state[0] <= MAX_POSES, "0 to 2^52 poses")
         most = state[0] * (1 + 1e-6)
-        within("state of the up direction", state[1:], -most, most)
+        within("state of the up direction", state[1:13], -most, most)
+        holds("state of the up direction", state[13] in (0, 1), "0 or 1 at the end")
         self._count = int(state[0])
         self._rows = state[1:10].reshape(3, 3).copy()
-        self._image_up = state[10:].copy()
+        self._image_up = state[10:13].copy()
+        self._began_on_side = bool(state[13])
 
     def up_world(self) -> Float64:
         """Up, (3,) float64 unit vector; +z before the first pose."""
@@ -74,6 +108,8 @@ class UpEstimator:
             return z
         tilt = float(np.sqrt(z @ self._rows @ z / self._count))
         if tilt < np.sin(_LEVEL_RADIANS) and z @ self._image_up > 0.3 * self._count:
+            return z
+        if self._began_on_side and tilt**2 > _STILL_ON_SIDE:
             return z
         # With little rotation, the smallest eigenvector is not unique: prefer the image's up.
         mean_up = self._image_up / max(float(np.linalg.norm(self._image_up)), 1e-12)

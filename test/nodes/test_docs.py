@@ -27,6 +27,7 @@ PAGES = (
     ROOT / "docs" / "nodes.md",
     ROOT / "docs" / "recordings.md",
     ROOT / "docs" / "reliability.md",
+    ROOT / "docs" / "troubleshooting.md",
 )
 # Everything that runs in the nodes.
 PACKAGES = (

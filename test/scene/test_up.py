@@ -75,6 +75,8 @@ def test_up_is_found_from_level_cameras() -> None:
         np.zeros(0),
         np.zeros(12),
         np.zeros((13, 1)),
+        np.zeros(15),
+        np.full(14, 0.5),
         np.full(13, np.nan),
         np.array([-1.0] + [0] * 12),
     ],

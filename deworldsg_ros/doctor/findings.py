@@ -1,0 +1,411 @@
+"""Observations → findings: what is off, why, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from deworldsg_ros.doctor.frame_checks import BODY, FACTOR, GIVEN, INVERSE, LATE, STILL
+from deworldsg_ros.doctor.observations import Observations
+from deworldsg_ros.words import counted
+
+# Longest side of usual indoor objects, metres, of the classes that several detectors know.
+USUAL_SIZES_M = {
+    "chair": 0.9, "couch": 1.9, "sofa": 1.9, "bed": 2.0, "dining table": 1.4, "table": 1.3,
+    "desk": 1.4, "toilet": 0.7, "tv": 0.8, "laptop": 0.35, "keyboard": 0.42, "mouse": 0.11,
+    "remote": 0.18, "cell phone": 0.15, "microwave": 0.5, "oven": 0.7, "toaster": 0.3, "sink": 0.5,
+    "refrigerator": 1.7, "book": 0.24, "clock": 0.3, "vase": 0.25, "bottle": 0.25, "cup": 0.1,
+    "wine glass": 0.2, "bowl": 0.17, "potted plant": 0.5, "teddy bear": 0.4, "person": 1.7,
+    "backpack": 0.5, "suitcase": 0.65, "cabinet": 1.2, "bookshelf": 1.6, "bathtub": 1.6,
+}  # fmt: skip
+# Detectors confuse classes: only a median far off, of some objects, is a wrong unit.
+MIN_SIZED, MOST_SIZE_RATIO = 3, 2.5
+# Less than this is a camera that stands still, in metres and degrees.
+STILL_M, STILL_DEG = 0.1, 10.0
+FEW_FRAMES = 5
+MIN_VALID_DEPTH = 0.2
+# A shift of depth that its edges want by at least so much.
+MIN_SHIFT_PX, MIN_SHIFT_GAIN = 8.0, 0.15
+# Another assumption about the poses has to fit by so much better.
+MIN_FIT_GAIN = 0.1
+# Right poses give 0.95 and more, also with the noise of a Kinect; trembling ones above 0.8.
+MIN_FIT = 0.65
+FEW_DETECTIONS_PER_FRAME = 0.5
+# A reason that concerns fewer frames is not worth a sentence.
+MIN_PART = 0.05
+MOST_CLASSES = 12
+# Stamps of a live camera are at most a second old; a minute is another clock.
+MOST_BEHIND_S = 5.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is off.
+
+    Attributes:
+        code: a stable name, for programs.
+        problem: what is off, one sentence.
+        cause: the probable cause, one sentence.
+        remedy: what to do, one sentence.
+        harmless: whether nothing has to be done.
+    """
+
+    code: str
+    problem: str
+    cause: str
+    remedy: str
+    harmless: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.problem} {self.cause} {self.remedy}".strip()
+
+
+Check = Callable[[Observations], Iterator[Finding]]
+
+
+def find(seen: Observations) -> list[Finding]:
+    """All findings, the most basic ones first."""
+    return [finding for check in CHECKS for finding in check(seen)]
+
+
+def _nodes(seen: Observations) -> Iterator[Finding]:
+    if seen.found_nodes is False:
+        yield Finding(
+            "no_nodes",
+            "No node of deworldsg_ros publishes /diagnostics.",
+            "None runs, or it runs in another ROS domain or behind another discovery range.",
+            "Start one, and compare ROS_DOMAIN_ID and ROS_AUTOMATIC_DISCOVERY_RANGE of both "
+            "terminals.",
+        )
+
+
+def _topics(seen: Observations) -> Iterator[Finding]:
+    for topic, others in seen.silent.items():
+        if others:
+            cause = f"Messages of this type are published on {', '.join(others)}."
+            remedy = f"Start with that name: the launch argument, or `--ros-args -r {topic}:=NAME`."
+        else:
+            cause = "No topic of this type is published at all."
+            remedy = "Start the driver, in the same ROS domain (`ros2 topic list`)."
+        yield Finding("no_publisher", f"Nobody publishes {topic}.", cause, remedy)
+    for text in seen.incompatible:
+        yield Finding(
+            "qos",
+            f"{text}.",
+            "DDS never connects a reliable subscriber to a best-effort publisher.",
+            "Set `inputs.reliability` to auto.",
+        )
+
+
+def _clock(seen: Observations) -> Iterator[Finding]:
+    known = {topic: age for topic, age in seen.behind_s.items() if abs(age) > MOST_BEHIND_S}
+    for topic, age_s in known.items():
+        where = "behind" if age_s > 0 else "ahead of"
+        yield Finding(
+            "clock",
+            f"The stamps on {topic} are {abs(age_s):.0f} s {where} the clock of this machine.",
+            "It is a recording, a simulation, or a machine with another clock.",
+            "All inputs need one clock: synchronise the machines (chrony), or set use_sim_time "
+            "everywhere and publish /clock.",
+        )
+
+
+def _losses(seen: Observations) -> Iterator[Finding]:
+    lost = {reason[5:]: n for reason, n in seen.drops.items() if reason.startswith("lost_")}
+    total = sum(lost.values())
+    if total and total > MIN_PART * (seen.images or total):
+        names = ", ".join(f"{count} of {name}" for name, count in lost.items())
+        yield Finding(
+            "lost_images",
+            f"DDS lost messages: {names}.",
+            "Its buffers hold less than an image, or the node is slower than the camera.",
+            "Use config/fastdds.xml in every process (FASTRTPS_DEFAULT_PROFILES_FILE), allow "
+            "shared memory in a container (--shm-size=512m), or lower the rate of the camera.",
+        )
+
+
+# Reason of a drop → code, problem, cause and remedy.
+DROPS = {
+    "not_depth": (
+        "colour_as_depth",
+        "{n} images on the depth topic are pictures and no distances.",
+        "A colour topic, or depth drawn for people, was given as depth.",
+        "Name the topic of the depth images (--depth TOPIC, or depth:=TOPIC).",
+    ),
+    "no_depth": (
+        "no_depth",
+        "{n} colour images have no depth image within `inputs.slop_s`.",
+        "The two streams are not synchronised, or have different rates.",
+        "Synchronise them in the driver (enable_sync of a RealSense), or raise `inputs.slop_s`.",
+    ),
+    "grid_mismatch": (
+        "not_registered",
+        "{n} depth images have another size than the colour image or its camera_info.",
+        "Depth is not registered to colour, or the camera_info is that of another stream.",
+        "Publish registered depth (align_depth.enable:=true of a RealSense) and name its topic.",
+    ),
+    "no_pose": (
+        "late_poses",
+        "{n} images have no pose within `inputs.pose_slop_s`.",
+        "The poses come late, too rarely, or with stamps of another clock.",
+        "Compare the stamps of images and poses; raise `inputs.pose_slop_s` for slow poses; or use "
+        "--odometry.",
+    ),
+    "pose_jump": (
+        "pose_jumps",
+        "The pose jumped at {n} images.",
+        "The localisation jumps, or two sources publish on one topic.",
+        "Look for a second publisher of poses, and use smooth poses (odom instead of map), or "
+        "--odometry.",
+    ),
+    "wrong_frame": (
+        "other_frame",
+        "{n} poses are in another world frame than the first.",
+        "Two sources publish poses on one topic.",
+        "Publish poses in one frame, and set `inputs.world_frame` to it.",
+    ),
+    "no_transform": (
+        "no_transform",
+        "{n} poses are of a robot frame that TF does not connect to the camera.",
+        "The transform from the robot to the optical frame is not published.",
+        "Publish it (robot_state_publisher), or set `inputs.pose_source` to odometry if the poses "
+        "are those of the camera.",
+    ),
+    "no_camera_info": (
+        "no_camera_info",
+        "{n} images have no camera_info.",
+        "It is not published, or not valid.",
+        "Publish it, or give --intrinsics FX,FY,CX,CY.",
+    ),
+    "time_jump": (
+        "clock",
+        "The stamps jumped {n} times.",
+        "A clock was set, a recording was restarted, or two publishers use different clocks.",
+        "Use one clock for all inputs (chrony, or use_sim_time everywhere).",
+    ),
+    "overrun": (
+        "too_slow",
+        "{n} frames came faster than they could be processed, and were left out.",
+        "The machine is slower than the camera.",
+        "This costs looks, not correctness; lower the rate of the camera to 15 Hz or less.",
+    ),
+    "detector_error": (
+        "detector_error",
+        "The detector failed on {n} images.",
+        "{example}",
+        "Read the traceback in the log; if memory is short, choose a smaller model.",
+    ),
+}
+
+
+def _drops(seen: Observations) -> Iterator[Finding]:
+    for reason, (code, problem, cause, remedy) in DROPS.items():
+        count = seen.drops.get(reason, 0)
+        if count and count >= MIN_PART * (seen.images or count):
+            example = seen.examples.get(reason, "")
+            yield Finding(code, problem.format(n=count), cause.format(example=example), remedy)
+
+
+def _missing(seen: Observations) -> Iterator[Finding]:
+    for text in seen.missing:
+        lagging = " waits for " in text
+        yield Finding(
+            "late_input" if lagging else "no_input",
+            f"{text[0].upper()}{text[1:]}.",
+            "That input is slower, delayed, or has another clock." if lagging else "",
+            "Compare the stamps of the inputs (`ros2 topic echo TOPIC --field header.stamp`)."
+            if lagging
+            else "Check the name of the topic and its publisher.",
+        )
+
+
+def _depth(seen: Observations) -> Iterator[Finding]:
+    if seen.checks is not None and seen.checks.valid_depth < MIN_VALID_DEPTH:
+        yield Finding(
+            "little_depth",
+            f"Only {seen.checks.valid_depth:.0%} of the pixels have a depth.",
+            "Most values are zero, or beyond `inputs.max_depth_m`: often millimetres in a 32FC1 "
+            "image, or another unit in a 16UC1 image.",
+            "Set `inputs.depth_scale` to the metres per unit (0.001 = mm, 0.0002 = TUM), and "
+            "`inputs.max_depth_m` to the range of the camera.",
+        )
+    sized = [(name, size) for name, size in seen.sizes if name in USUAL_SIZES_M]
+    ratios = [size / USUAL_SIZES_M[name] for name, size in sized]
+    factors = _factors(seen)
+    ratio = float(np.median(ratios)) if len(ratios) >= MIN_SIZED else 1.0
+    if ratio > MOST_SIZE_RATIO or ratio < 1 / MOST_SIZE_RATIO or factors:
+        name, size = (
+            sorted(sized, key=lambda item: item[1] / USUAL_SIZES_M[item[0]])[len(sized) // 2]
+            if sized
+            else ("", 0.0)
+        )
+        example = f": a {name} of {size:.2g} m" if name else ""
+        times = f"{ratio:.2g} times as large as usual{example}"
+        problem = (
+            f"Objects are {times}."
+            if not factors
+            else (
+                f"Depth fits the motion of the camera only if it is multiplied by {factors[0]}"
+                + (f"; objects are {times}." if sized else ".")
+            )
+        )
+        yield Finding(
+            "depth_unit",
+            problem,
+            "Depth is in another unit than expected.",
+            "Set `inputs.depth_scale` to the metres per unit of the depth image (0.001 = mm, "
+            "0.0001 = 0.1 mm, 0.0002 = TUM).",
+        )
+
+
+def _factors(seen: Observations) -> list[str]:
+    """The factor of depth that fits the poses much better than the depth as it is, if there is."""
+    fits = {} if seen.checks is None else seen.checks.fits
+    found = [
+        (fit, name[len(FACTOR) :])
+        for name, fit in fits.items()
+        if name.startswith(FACTOR) and fit > max(fits[GIVEN], fits.get(STILL, 0.0)) + MIN_FIT_GAIN
+    ]
+    return [name for _, name in sorted(found, reverse=True)]
+
+
+def _registration(seen: Observations) -> Iterator[Finding]:
+    if seen.checks is None or seen.checks.shift_gain < MIN_SHIFT_GAIN:
+        return
+    u, v = seen.checks.depth_shift_px
+    if np.hypot(u, v) >= MIN_SHIFT_PX:
+        yield Finding(
+            "not_registered",
+            f"The edges of depth are about {np.hypot(u, v):.0f} pixels away from those of colour "
+            f"({u:+.0f} columns, {v:+.0f} rows).",
+            "Depth is not registered to colour, or the intrinsics are those of another stream.",
+            "Use the registered depth of the driver (aligned_depth_to_color of a RealSense, "
+            "depth_registered of OpenNI).",
+        )
+
+
+# Assumption that fits much better → code, problem, cause and remedy.
+POSES = {
+    STILL: (
+        "poses_do_not_fit",
+        "The depth images of two moments do not agree under the poses.",
+        "The poses are not those of this camera, or they tremble or jump.",
+        "Check the frame of the poses and their stamps, or use --odometry.",
+    ),
+    BODY: (
+        "poses_of_the_body",
+        "The images fit the poses much better if x is taken as forward.",
+        "The poses are those of the robot or of camera_link, and not of the optical frame.",
+        "Publish the transform to the optical frame in TF, or poses of the optical frame (z "
+        "forward, x right).",
+    ),
+    INVERSE: (
+        "poses_inverted",
+        "The images fit the inverse of the poses much better.",
+        "The poses take points of the world to the camera.",
+        "Publish their inverse: the pose of the camera in the world.",
+    ),
+}
+
+
+def _poses(seen: Observations) -> Iterator[Finding]:
+    fits = {} if seen.checks is None else seen.checks.fits
+    others = {name: fit for name, fit in fits.items() if name != GIVEN and FACTOR not in name}
+    if not others or _factors(seen):
+        return
+    best = max(others, key=lambda name: others[name])
+    if others[best] < fits[GIVEN] + MIN_FIT_GAIN:
+        if fits[GIVEN] < MIN_FIT:
+            yield Finding(*POSES[STILL])
+        return
+    if best in POSES:
+        yield Finding(*POSES[best])
+        return
+    delay_s = float(best[len(LATE) :])
+    yield Finding(
+        "late_poses",
+        f"The images fit the poses much better {abs(delay_s):g} s "
+        f"{'later' if delay_s > 0 else 'earlier'}.",
+        "The stamps of the poses are those of their arrival, or the clocks differ.",
+        "Stamp poses with the time at which the camera was there, and synchronise the clocks.",
+    )
+
+
+def _turned(seen: Observations) -> Iterator[Finding]:
+    side = {turns: count for turns, count in seen.turns.items() if turns}
+    if side:
+        turns = max(side, key=lambda key: side[key])
+        yield Finding(
+            "turned",
+            f"The camera is turned by {90 * min(turns, 4 - turns)} degrees in "
+            f"{counted(sum(side.values()), 'frame')}.",
+            "Up, which the poses give, is not at the top of the image.",
+            "The images were turned upright for the detector; nothing has to be done.",
+            harmless=True,
+        )
+
+
+def _detector(seen: Observations) -> Iterator[Finding]:
+    if seen.detections is None or not seen.frames:
+        return
+    if seen.detections < FEW_DETECTIONS_PER_FRAME * seen.frames:
+        names = ", ".join(seen.classes[:MOST_CLASSES])
+        more = len(seen.classes) - MOST_CLASSES
+        known = f"{len(seen.classes)} classes: {names}" + (f", and {more} more" if more > 0 else "")
+        yield Finding(
+            "few_detections",
+            f"The detector found {counted(seen.detections, 'object')} in "
+            f"{counted(seen.frames, 'frame')}.",
+            f"It knows {known}. Other things, dark or blurred images and far objects are missed.",
+            "Check the picture (exposure, a lens cap, colours swapped), go nearer, lower "
+            "`perception.score_threshold`, or use another detector.",
+        )
+
+
+def _looks(seen: Observations) -> Iterator[Finding]:
+    if not seen.frames:
+        return
+    hidden, checks = sum(seen.hidden.values()), seen.checks
+    here = f"{counted(seen.nodes or 0, 'object')} in the graph, {hidden} hidden"
+    if seen.frames < FEW_FRAMES:
+        yield Finding(
+            "few_frames",
+            f"Only {counted(seen.frames, 'frame')} reached the graph: {here}.",
+            "Existence, class and size of an object need several looks at it.",
+            "Record for some seconds.",
+        )
+    elif checks is not None and checks.travel_m < STILL_M and checks.turn_deg < STILL_DEG:
+        yield Finding(
+            "still_camera",
+            f"The camera stands still ({100 * checks.travel_m:.0f} cm, {checks.turn_deg:.0f} "
+            f"degrees): {here}.",
+            "Equal images count as one look, and sizes are those of the visible side.",
+            "Move the camera around the objects.",
+        )
+    elif hidden > (seen.nodes or 0):
+        reasons = ", ".join(f"{count} {reason}" for reason, count in seen.hidden.items())
+        yield Finding(
+            "few_looks",
+            f"More objects are hidden than published: {here} ({reasons}).",
+            "They were seen too rarely, or the detector missed them in most frames.",
+            "Look at them longer and from several sides, or set `output.min_existence` to 0 to see "
+            "all of them.",
+        )
+
+
+CHECKS: tuple[Check, ...] = (
+    _nodes,
+    _topics,
+    _clock,
+    _missing,
+    _losses,
+    _drops,
+    _depth,
+    _registration,
+    _poses,
+    _turned,
+    _detector,
+    _looks,
+)

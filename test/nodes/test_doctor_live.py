@@ -1,0 +1,94 @@
+"""`deworldsg doctor --live`: diagnostics, publishers and stamps of running nodes."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import CameraInfo, Image
+
+from deworldsg_ros.doctor import find
+from deworldsg_ros.ros.observing import observe_nodes
+from deworldsg_ros.ros.qos import best_effort, reliable
+from deworldsg_ros.streams.poses import set_stamp
+
+VALUES = {
+    "received rgb": "9.8 per second, 100 in total",
+    "dropped no_pose": "60",
+    "example no_pose": "frame at 7 s has no pose",
+    "frames turned by 90 degrees": "12",
+    "waiting for 1": "no rgb on /rgb/image_raw for 5 s",
+    "listening to 1": "/rgb/image_raw [sensor_msgs/msg/Image] reliable",
+    "listening to 2": "/depth/image_raw [sensor_msgs/msg/Image] reliable",
+    "listening to 3": "/rgb/camera_info [sensor_msgs/msg/CameraInfo] reliable",
+    "listening to 4": "/camera/pose [geometry_msgs/msg/PoseStamped] best effort",
+}
+
+
+@pytest.fixture
+def context():
+    context = Context()
+    rclpy.init(context=context)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+def test_a_running_system_is_examined(context):
+    """A camera under another name, best-effort depth, and poses of another clock."""
+    node = rclpy.create_node("a_robot", context=context)
+    diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+    node.create_publisher(Image, "/camera/color/image_raw", reliable(1))
+    node.create_publisher(Image, "/depth/image_raw", best_effort(1))
+    info = node.create_publisher(CameraInfo, "/rgb/camera_info", reliable(1))
+    poses = node.create_publisher(PoseStamped, "/camera/pose", reliable(1))
+
+    def publish():
+        status = DiagnosticStatus(
+            name="segmentation_node: /segmentation_node",
+            hardware_id="deworldsg_ros",
+            values=[KeyValue(key=key, value=value) for key, value in VALUES.items()],
+        )
+        other = DiagnosticStatus(name="motor", hardware_id="motor")
+        diagnostics.publish(DiagnosticArray(status=[status, other]))
+        info.publish(CameraInfo(header=stamped(node.get_clock().now().nanoseconds)))
+        poses.publish(PoseStamped(header=stamped(7 * 10**9)))
+
+    def stamped(stamp_ns):
+        message = PoseStamped()
+        set_stamp(message, stamp_ns)
+        return message.header
+
+    node.create_timer(0.1, publish)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    stop = threading.Event()
+
+    def spin():
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+
+    thread = threading.Thread(target=spin)
+    thread.start()
+    try:
+        findings = find(observe_nodes(4.0))
+    finally:
+        stop.set()
+        thread.join()
+        executor.shutdown()
+        node.destroy_node()
+    texts = {finding.code: str(finding) for finding in findings}
+    assert set(texts) == {"no_publisher", "qos", "clock", "no_input", "late_poses", "turned"}
+    assert "Nobody publishes /rgb/image_raw" in texts["no_publisher"]
+    assert "/camera/color/image_raw" in texts["no_publisher"]
+    assert "/depth/image_raw is published best effort" in texts["qos"]
+    assert "/camera/pose are" in texts["clock"]
+    assert "60 images" in texts["late_poses"]
+
+
+def test_without_nodes_that_is_the_finding(context):
+    assert [finding.code for finding in find(observe_nodes(2.0, context))] == ["no_nodes"]
