@@ -10,6 +10,7 @@ from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.merging.common import check_fits
+from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
 from deworldsg_ros.relations import edge_beliefs
@@ -19,6 +20,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import check_pose, invert_pose
 from deworldsg_ros.scene.correction import nodes_since
+from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
@@ -115,6 +117,17 @@ class GraphBuilder:
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
+
+    def edit(self, request: EditRequest) -> EditReply:
+        """Make an operator's edit, or undo the newest one.
+
+        The next `update` contains what it changes.
+
+        Raises:
+            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
+        """
+        stamp_ns = self._newest_ns or int(self.graph.nodes.last_seen_ns.max(initial=0))
+        return self.merging.edit(self.graph, request, stamp_ns)
 
     def add_evidence(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs and predictions; see `EdgeBeliefs.add`."""

@@ -13,14 +13,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from deworldsg_ros.config import Config
+from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.files import FileLock, check_writable
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
+from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.array_checks import checked
 from deworldsg_ros.scene.array_file import Arrays
+from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.words import counted
@@ -135,7 +137,8 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     graph = graph_io.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
     prior = _prior(arrays, graph.vocabulary)
     for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
-        graph.remove_node(node_id)
+        if not graph.edits.hides(node_id):
+            graph.remove_node(node_id)
     graph.take_removals()
     builder = GraphBuilder(config, graph.vocabulary, graph.frame_id, graph, prior)
     memory = {
@@ -147,6 +150,35 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     if "up" in arrays:  # not in maps of older releases
         builder.up.restore(arrays["up"])
     return builder
+
+
+def edit_map(path: Path, request: EditRequest) -> EditReply:
+    """Make an operator's edit in a map, or undo the newest one; the map before it stays.
+
+    Raises:
+        ConfigurationError: if the file is no map, or cannot be written.
+        RefusedInput: ``invalid_edit``, with the reason; the file is unchanged.
+    """
+    if not path.is_file():
+        raise ConfigurationError(
+            f"map {path}: expected a file that graph_node or --map has written"
+        )
+    lock = claim_map(path)
+    try:
+        association = "surface" if _is_of_surface_rule(path) else "paper"
+        builder = read_map(Config(merging=MergingConfig(association=association)), path)
+        reply = builder.edit(request)
+        write_map(builder, path)
+    finally:
+        lock.release()
+    return reply
+
+
+def _is_of_surface_rule(path: Path) -> bool:
+    try:
+        return graph_io.header_of(graph_io.read(path)).even_gaussians
+    except (RefusedInput, ValueError) as error:
+        raise ConfigurationError(f"map {path} cannot be used: {error}") from error
 
 
 def _prior(arrays: Arrays, vocabulary: Vocabulary) -> ClassPairPrior:

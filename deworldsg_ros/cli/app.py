@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import ask, exchange, mcp, probe
+from deworldsg_ros.cli import ask, edit, exchange, mcp, probe
 from deworldsg_ros.cli import models as models_command
 from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_FINDINGS, EXIT_INTERRUPTED, EXIT_USAGE
@@ -464,6 +464,7 @@ for parent, function, summary in (
     (app, ask.query, "Ask a scene graph in words."),
     (app, ask.goal, "Print a pose from which an object is in view."),
     (app, ask.explain, "Explain an object, a relation or a class."),
+    (app, edit.edit, "Correct a map by hand, or undo it."),
     (app, mcp.mcp, "Serve a scene graph to an LLM agent (MCP)."),
     (app, exchange.export, "Write a scene graph in another format."),
     (app, exchange.diff, "List what differs between two scene graphs."),

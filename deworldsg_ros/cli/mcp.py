@@ -22,6 +22,9 @@ def mcp(
     ] = None,
     live: Live = False,
     namespace: Namespace = "",
+    edits: Annotated[
+        bool, typer.Option("--edit", help="with --live: the agent may edit the graph, too")
+    ] = False,
 ) -> None:
     """Serve a scene graph to an LLM agent: an MCP server on stdio, offline, without a key.
 
@@ -29,10 +32,12 @@ def mcp(
     """
     if live == (graph is not None):
         raise ClientError("expected a graph or --live, and not both")
+    if edits and not live:
+        raise ClientError("--edit needs --live; edit a map file with deworldsg edit")
     if graph is not None:
         make_server(WatchedFile(graph)).run()
         return
     from deworldsg_ros.client import SceneGraphClient
 
     with SceneGraphClient(namespace) as client:
-        make_server(lambda: client.graph).run()
+        make_server(lambda: client.graph, client if edits else None).run()

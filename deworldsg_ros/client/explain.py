@@ -50,7 +50,10 @@ def explain_object(item: SceneObject, relations: Sequence[Relation]) -> Explanat
     if item.existence is not None:
         lines.append(f"exists with {item.existence:.0%} ({odds_of(item.existence)})")
     names = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])
-    lines.append(f"class: {names}; all others {item.other_classes:.0%}")
+    if item.is_labelled_by_hand:
+        lines.append(f"class: {item.label}, set by the operator")
+    else:
+        lines.append(f"class: {names}; all others {item.other_classes:.0%}")
     if not item.is_sure:
         lines.append(f"not sure: it is a {item.label} with {item.probability:.0%} in all")
     looks = f"{len(item.surface_m)} surface points" if len(item.surface_m) else "no surface points"

@@ -16,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from deworldsg_ros.client.changes import Changes
+from deworldsg_ros.client.commands import GraphCommands
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.scene import wire
@@ -29,12 +30,12 @@ SPIN_PERIOD_S = 0.1
 Callback = Callable[[SceneGraph, Changes], object]
 
 
-class SceneGraphClient:
+class SceneGraphClient(GraphCommands):
     """Follows `/scene_graph` and `/scene_graph/updates`; use it in a `with` block.
 
     It starts from the latched snapshot and applies the numbered updates. After a gap it waits for
     the next snapshot, about a second, and continues from there. Messages arrive in a thread of its
-    own.
+    own. Its commands (`GraphCommands`) change the graph of the robot.
 
     Args:
         namespace: of the robot, e.g. ``/robot_1``; empty = the topics as they are.

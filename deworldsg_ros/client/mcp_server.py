@@ -8,7 +8,7 @@ from typing import Any
 
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.tools import GraphTools
+from deworldsg_ros.client.tools import EditTools, GraphTools
 from deworldsg_ros.scene.errors import DeWorldSGError
 
 INSTRUCTIONS = (
@@ -19,11 +19,12 @@ INSTRUCTIONS = (
 )
 
 
-def make_server(newest: Callable[[], SceneGraph]) -> Any:
+def make_server(newest: Callable[[], SceneGraph], edits: Any = None) -> Any:
     """The server with its tools.
 
     Args:
         newest: returns the newest graph.
+        edits: a live client: the agent may edit its graph. None = the agent only reads.
 
     Raises:
         ClientError: without the package mcp.
@@ -47,6 +48,7 @@ def make_server(newest: Callable[[], SceneGraph]) -> Any:
         return call
 
     tools = GraphTools(newest)
+    writing = [] if edits is None else list(EditTools(edits))
     server = MCPServer("deworldsg", instructions=INSTRUCTIONS, log_level="WARNING")
     for function in (
         tools.list_objects,
@@ -55,6 +57,7 @@ def make_server(newest: Callable[[], SceneGraph]) -> Any:
         tools.get_object_context,
         tools.what_changed,
         tools.goal_near,
+        *writing,
     ):
         server.tool()(reporting(function))
     return server

@@ -98,6 +98,11 @@ class SceneObject:
         return self.probability >= SURE
 
     @property
+    def is_labelled_by_hand(self) -> bool:
+        """Whether an operator has set the label."""
+        return self.state.label_provenance == "operator"
+
+    @property
     def height_m(self) -> float:
         """Height of the centre of the box above the origin of the world frame."""
         return float(np.dot(self.position_m, self.up))
@@ -119,6 +124,7 @@ class SceneObject:
             "label": self.label,
             "probability": round(self.probability, 3),
             "sure": self.is_sure,
+            "labelled_by_hand": self.is_labelled_by_hand,
             "classes": {belief.label: round(belief.probability, 3) for belief in self.classes},
             "other_classes": round(self.other_classes, 3),
             "existence": self.existence,

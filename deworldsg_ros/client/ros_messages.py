@@ -5,8 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.srv import AddDiagnostics
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+# The types of the services of graph_node: with JSON in `load_namespace`, and without arguments.
+TEXT_SERVICE, TRIGGER_SERVICE = AddDiagnostics, Trigger
 
 
 def pose_stamped(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -148,6 +148,58 @@ class GraphTools:
         if not self._known or self._known[-1] is not graph:
             self._known.append(graph)
         return graph
+
+
+class EditTools:
+    """The edits of an operator, as tools.
+
+    Args:
+        client: a `SceneGraphClient`.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def __iter__(self) -> Iterator[Callable[..., dict[str, Any]]]:
+        return iter((self.set_label, self.merge, self.split, self.delete, self.undo))
+
+    def set_label(self, object: int, label: str) -> dict[str, Any]:
+        """Correct the class of an object. It stays for later frames; undo takes it back.
+
+        Args:
+            object: id.
+            label: e.g. "cup".
+        """
+        return dict(self._client.set_label(object, label))
+
+    def merge(self, object: int, other: int) -> dict[str, Any]:
+        """Say that two objects are one. The answer has the id of the new object.
+
+        Args:
+            object: id.
+            other: id.
+        """
+        return dict(self._client.merge(object, other))
+
+    def split(self, object: int) -> dict[str, Any]:
+        """Say that an object is two, one beside the other along its longest axis.
+
+        Args:
+            object: id.
+        """
+        return dict(self._client.split(object))
+
+    def delete(self, object: int) -> dict[str, Any]:
+        """Say that there is no such object. It does not come back from its place and class.
+
+        Args:
+            object: id.
+        """
+        return dict(self._client.delete(object))
+
+    def undo(self) -> dict[str, Any]:
+        """Undo the newest edit of the graph that holds, whoever made it."""
+        return dict(self._client.undo())
 
 
 class WatchedFile:

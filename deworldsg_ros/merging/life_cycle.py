@@ -23,6 +23,8 @@ FORGOTTEN_NS = 10_000_000_000
 ABSENT_FRAMES = 5
 # A moved object keeps its id if it is detected again within this time. Chosen, not measured.
 LOST_S = 30.0
+# Why a deleted node is not published.
+DELETED = "deleted by the operator"
 
 
 class LifeCycle:
@@ -82,7 +84,7 @@ class LifeCycle:
         self._publish(graph, ids)
         for node_id in self._absent(view, scores.keys()):
             # It may be gone: another absent node of this frame has taken its place.
-            if node_id in records:
+            if node_id in records and node_id not in graph.edits.deleted:
                 self._lose(graph, node_id, local.stamp_ns)
 
     def _absent(self, view: View, detected: Collection[int]) -> list[int]:
@@ -104,7 +106,8 @@ class LifeCycle:
     def hidden(self, graph: SceneGraph) -> dict[int, str]:
         """The nodes that are not published, each with its reason, in words."""
         nodes, records = graph.nodes, self._records
-        hidden = nodes.ids[~nodes.confirmed].tolist()
+        edits = graph.edits
+        hidden = [i for i in nodes.ids[~nodes.confirmed].tolist() if i not in edits.replaced]
         ids = [node_id for node_id in hidden if node_id in records]
         missed = records.are_missed([records.owner(i) for i in ids], self._min_existence)
         reasons = {
@@ -112,7 +115,20 @@ class LifeCycle:
         }
         for node_id, is_missed in zip(ids, missed.tolist()):
             reasons[node_id] = "missed by the detector" if is_missed else "seen too little"
-        return reasons
+        return {**reasons, **dict.fromkeys(edits.deleted, DELETED)}
+
+    def publish_again(self, graph: SceneGraph, node_ids: list[int]) -> None:
+        """Publish nodes that an edit has hidden, if they are likely to be objects."""
+        owners = [self._records.owner(node_id) for node_id in node_ids]
+        graph.set_existence(node_ids, self._records.existence(owners), self._min_existence)
+
+    def remove(self, graph: SceneGraph, node_id: int) -> None:
+        """Remove a node, wherever its object is."""
+        if node_id in self._lost:
+            self._lost.remove(node_id)
+        else:
+            self._records.remove(node_id)
+        graph.remove_node(node_id)
 
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
@@ -140,7 +156,7 @@ class LifeCycle:
         rows = [nodes.row(node_id) for node_id in ids]
         old = _are_improbable(graph, rows) & (nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS)
         for node_id in np.array(ids, np.int64)[old].tolist():
-            if node_id not in self._lost:
+            if node_id not in self._lost and not graph.edits.hides(node_id):
                 self._improbable.discard(node_id)
                 graph.remove_node(node_id)
                 self._records.remove(node_id)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
@@ -175,13 +177,12 @@ class NodeRecords:
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
-    def restore(self, graph: SceneGraph, memory: Memory) -> None:
-        """Continue with a graph of an earlier run; see `Merging.restore`."""
-        nodes = graph.nodes
-        owner_of = {
-            node_id: self.add(node_id, nodes.class_probabilities[row], int(nodes.last_seen_ns[row]))
-            for row, node_id in enumerate(nodes.ids.tolist())
-        }
+    def restore(self, graph: SceneGraph, memory: Memory, node_ids: Sequence[int]) -> None:
+        """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
+        nodes, owner_of = graph.nodes, dict[int, int]()
+        for node_id, row in zip(node_ids, map(nodes.row, node_ids)):
+            named_ns = int(nodes.last_seen_ns[row])
+            owner_of[node_id] = self.add(node_id, nodes.class_probabilities[row], named_ns)
         self.place(graph, list(owner_of.values()))
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
@@ -248,8 +249,8 @@ def _cells(map_: VoxelMap, owners: list[int]) -> Memory:
 
 def _rebuild(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
     """Make records from the surfaces and observations in the graph."""
-    nodes = graph.nodes
-    surfaces = [nodes.surface(row) for row in range(len(nodes))]
+    nodes, rows = graph.nodes, records.graph_rows(graph, owners)
+    surfaces = [nodes.surface(row) for row in rows]
     records.map.add(owners, records.map.cells_of(surfaces))
-    for owner, observations in zip(owners, nodes.observations.tolist()):
+    for owner, observations in zip(owners, nodes.observations[rows].tolist()):
         existence.assume(records.rows[owner], observations)

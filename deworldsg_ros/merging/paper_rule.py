@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
+from deworldsg_ros.merging.edited_frames import may_merge
+from deworldsg_ros.merging.editing import Editor, EditReply
+from deworldsg_ros.merging.life_cycle import DELETED
 from deworldsg_ros.merging.nearest import (
     Observed,
     bhattacharyya_bound,
@@ -12,6 +15,7 @@ from deworldsg_ros.merging.nearest import (
     warm_up,
 )
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -42,8 +46,12 @@ class PaperMerging:
         return node_ids
 
     def hidden(self, graph: SceneGraph) -> dict[int, str]:
-        """None: every node is published."""
-        return {}
+        """The deleted nodes; all others are published."""
+        return dict.fromkeys(sorted(graph.edits.deleted), DELETED)
+
+    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+        """See `Merging.edit`."""
+        return Editor().apply(graph, request, stamp_ns)
 
     def memory(self) -> Memory:
         """Empty: the rule has no state besides the graph."""
@@ -82,7 +90,7 @@ class PaperMerging:
                 nodes.class_probabilities[row],
             )
             other_id = self._nearest(graph, node, skipped_row=row)
-            if other_id is None:
+            if other_id is None or (graph.edits and not may_merge(graph, node_id, other_id)):
                 return node_id
             node_id = graph.merge_nodes(node_id, other_id)
 

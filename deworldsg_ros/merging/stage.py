@@ -6,9 +6,11 @@ from typing import Protocol
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.common import Memory
+from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -49,6 +51,14 @@ class Merging(Protocol):
 
         Raises:
             KeyError, ValueError, TypeError, IndexError: if this is no memory of a rule.
+        """
+        ...
+
+    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+        """Make an operator's edit, or undo one; see `Editor.apply`.
+
+        Raises:
+            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
         """
         ...
 

@@ -12,12 +12,15 @@ import numpy as np
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits
+from deworldsg_ros.merging.edited_frames import as_edited, may_merge, reject_deleted
+from deworldsg_ros.merging.editing import EditReply, SurfaceEditor
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.merging.views import View, frame_arrays, see, see_nothing
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
+from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -38,6 +41,7 @@ class SurfaceMerging:
         self._config = config
         self._records = NodeRecords()
         self._life_cycle = LifeCycle(self._records, min_existence)
+        self._editor = SurfaceEditor(self._records, self._life_cycle)
 
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
@@ -61,15 +65,22 @@ class SurfaceMerging:
         Two objects of one frame never become one node, even if both overlap the same node.
         """
         check_fits(graph, local)
+        frame, rows = local, list(range(len(local)))
+        if graph.edits.merged or graph.edits.separate:
+            frame, rows = as_edited(graph, local, self._records)
+        node_ids = [graph.resolve(node_id) for node_id in self._merge_frame(graph, frame)]
+        node_ids = [node_ids[row] for row in rows]
+        graph.remember_frame(local.stamp_ns, node_ids)
+        add_relations(graph, local, node_ids)
+        return node_ids
+
+    def _merge_frame(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         cells = self._records.map.cells_of(local.surface_points_world)
         view = self._see(graph, local)
         matches = self._associate(graph, local, cells, view)
         node_ids = self._update(graph, local, cells, matches)
         node_ids = self._merge_parts(graph, local, matches, node_ids)
         self._life_cycle.observe(graph, local, view, node_ids)
-        node_ids = [graph.resolve(node_id) for node_id in node_ids]
-        graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids)
         return node_ids
 
     def hidden(self, graph: SceneGraph) -> dict[int, str]:
@@ -78,16 +89,24 @@ class SurfaceMerging:
 
     def memory(self) -> Memory:
         """See `Merging.memory`."""
-        return self._records.memory()
+        return {**self._records.memory(), **self._editor.memory()}
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """See `Merging.restore`."""
-        self._records.restore(graph, memory)
+        replaced = graph.edits.replaced
+        node_ids = [node_id for node_id in graph.nodes.ids.tolist() if node_id not in replaced]
+        self._records.restore(graph, memory, node_ids)
+        self._editor.restore(graph, memory)
         self._life_cycle.restore(graph)
+
+    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+        """See `Merging.edit`."""
+        return self._editor.apply(graph, request, stamp_ns)
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
-        self._records.apply_correction(graph, node_ids, T_correction)
+        for records in (self._records, self._editor.aside):
+            records.apply_correction(graph, node_ids, T_correction)
 
     def _see(self, graph: SceneGraph, local: LocalGraph) -> View:
         """What the frame shows of the nodes that may be in view."""
@@ -111,6 +130,8 @@ class SurfaceMerging:
             rows, view.rows[shown], assume_unique=True, return_indices=True
         )
         covered[:, columns] = view.covered[:, shown][:, places]
+        if graph.edits.deleted:
+            reject_deleted(graph, local, graph.nodes.ids[rows].tolist(), on_nodes)
         return match(
             local,
             graph.nodes,
@@ -189,6 +210,8 @@ class SurfaceMerging:
         records.joint.add_frame(owners, matches, local.scores, local.T_world_camera[:3, 3])
         while (pair := records.joint.next_merge()) is not None:
             a_id, b_id = (records.node(owner) for owner in pair)
+            if graph.edits and not may_merge(graph, a_id, b_id):
+                continue
             kept_id = graph.merge_nodes(a_id, b_id)
             records.merge(graph, kept_id, b_id if kept_id == a_id else a_id)
         return [graph.resolve(node_id) for node_id in node_ids]

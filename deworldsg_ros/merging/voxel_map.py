@@ -15,7 +15,7 @@ import numpy as np
 from deworldsg_ros.merging import cell_beliefs, cell_kernels
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets, SumArrays
 from deworldsg_ros.merging.views import frame_arrays
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt64
 from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
 
@@ -69,8 +69,7 @@ class VoxelMap:
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
         blocks, masks, _ = self.cells(owner)
-        bits = np.arange(64, dtype=np.uint64)
-        rows, cells = np.nonzero((masks[:, None] >> bits) & np.uint64(1))
+        rows, cells = np.nonzero(cell_bits(masks))
         corners = np.stack([blocks >> 42, (blocks >> 21) & INDEX_MASK, blocks & INDEX_MASK], axis=1)
         within = np.stack([cells >> 4, (cells >> 2) & 3, cells & 3], axis=1)
         indices = 4 * corners[rows] + within - INDEX_BIAS
@@ -195,6 +194,12 @@ class VoxelMap:
         larger = cell_kernels.new_table(capacity)
         self._used = cell_kernels.rehash(self._table[:], larger[:], self._firsts)
         self._table = larger
+
+
+def cell_bits(masks: UInt64) -> UInt64:
+    """Which cells of blocks are in their masks (m,): (m, 64), 1 or 0."""
+    bits: UInt64 = (masks[:, None] >> np.arange(64, dtype=np.uint64)) & np.uint64(1)
+    return bits
 
 
 def _new_sums(owner_count: int) -> SumArrays:

@@ -11,6 +11,7 @@ from typing import Any
 
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
+from deworldsg_ros.ros.graph_services import GraphServices
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.perceiving import PerceivingNode
 from deworldsg_ros.ros.relating import Relating
@@ -34,6 +35,7 @@ class DeworldsgNode(PerceivingNode):
         self._lifting.warm_up()
         self._relating = Relating(self, self._deliver)
         self.graph = GraphKeeper(self, markers, self._updated)
+        GraphServices(self, self.graph)
         self.listen_to_camera(self._process)
 
     def _process(self, frame: RgbdFrame) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
+from deworldsg_ros.ros.graph_services import GraphServices
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
@@ -29,6 +30,7 @@ class GraphNode(StageNode):
         self.graph = GraphKeeper(
             self, markers, lambda _, latency_s: self.health.published(latency_s)
         )
+        GraphServices(self, self.graph)
         self._received_s = time.monotonic()
         self.listen_json(
             "deworldsg/local_graph", wire.LocalGraphMessage, self._integrate, 50, self._receive

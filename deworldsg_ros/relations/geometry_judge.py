@@ -54,7 +54,9 @@ class GeometryJudge:
             upright(points, R_up_world),
             floor_m,
         )
-        known = (nodes.class_probabilities[node_rows], nodes.observations[node_rows])
+        edits, names = self._graph.edits, self._graph.vocabulary
+        classes = edits.believed_classes(nodes, names, node_rows)
+        known = (classes, nodes.observations[node_rows])
         table.state_logits[rows] = self._model.state_logits(
             self._inputs.make(there, *known, first, second),
             self._inputs.make(back, *known, second, first),

@@ -82,7 +82,9 @@ class LiveGraph:
         row = nodes.row(node_id)
         if not nodes.confirmed[row]:
             return None
-        label = self._graph.vocabulary.classes[int(nodes.class_probabilities[row].argmax())]
+        names = self._graph.vocabulary
+        classes = self._graph.edits.believed_classes(nodes, names, [row])
+        label = names.classes[int(classes.argmax())]
         return NodeView(label, int(nodes.observations[row]))
 
     def visual_entropy_nats(self, a_id: int, b_id: int) -> float:

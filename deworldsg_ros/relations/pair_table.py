@@ -127,7 +127,8 @@ class PairTable(PairRows):
             self._forget_bottom(shape)
         counts = nodes.surface_counts[rows]
         shapes.put(at, nodes.surface_points_world[rows], counts, self._R_up_world)
-        best = nodes.class_probabilities[rows].argmax(axis=1)
+        edits, names = self._graph.edits, self._graph.vocabulary
+        best = edits.believed_classes(nodes, names, rows).argmax(axis=1)
         differs = np.flatnonzero(shapes.best_classes[at] != best).tolist()
         shapes.best_classes[at] = best
         for shape in at.tolist():

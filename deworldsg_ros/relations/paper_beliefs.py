@@ -67,12 +67,12 @@ class PaperBeliefs:
 
     def _follow_nodes(self) -> set[Pair]:
         """Pairs of the nodes that came, went or have another class now."""
-        nodes = self._graph.nodes
+        nodes, edits, names = self._graph.nodes, self._graph.edits, self._graph.vocabulary
         pairs = set()
         for node_id in self._touched:
             best = -1
             if node_id in nodes and nodes.confirmed[row := nodes.row(node_id)]:
-                best = int(nodes.class_probabilities[row].argmax())
+                best = int(edits.believed_classes(nodes, names, [row]).argmax())
             if self._class_of.get(node_id, -1) == best:
                 continue
             self._class_of[node_id] = best

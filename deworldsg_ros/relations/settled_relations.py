@@ -127,11 +127,11 @@ class SettledRelations:
 
     def _tables_with_seats(self, rows: Int64) -> Bool:
         """(m, 2) bool: a table and a seat in its reach; the table is the first, or the second."""
-        t, nodes = self._table, self._graph.nodes
+        t, graph = self._table, self._graph
         ends = t.nodes[rows]
         ids, places = np.unique(ends, return_inverse=True)
-        classes = nodes.class_probabilities[[nodes.row(node_id) for node_id in ids.tolist()]]
-        classes = classes.reshape(-1, nodes.class_probabilities.shape[1])
+        node_rows = np.array([graph.nodes.row(node_id) for node_id in ids.tolist()], np.int64)
+        classes = graph.edits.believed_classes(graph.nodes, graph.vocabulary, node_rows)
         first, second = places.reshape(-1, 2).T
         table, seat = classes @ self._tables > 0.5, classes @ self._seats > 0.5
         found = np.column_stack([table[first] & seat[second], table[second] & seat[first]])

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from geometry_msgs.msg import PoseStamped
-from rclpy.task import Future
-from std_srvs.srv import Trigger
 
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import Continued
@@ -53,6 +51,7 @@ class GraphKeeper:
 
     Attributes:
         newest_ns: stamp of the newest merged frame; 0 = none.
+        files: the map, and the JSON file.
 
     Raises:
         ConfigurationError: for a map file that cannot be read or written.
@@ -79,16 +78,15 @@ class GraphKeeper:
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher("scene_graph/updates", 50)
         self._whole = WholeGraph(node, markers)
-        self._files = GraphFiles(node)
+        self.files = GraphFiles(node)
         # None until a map or the first local graph gives the world frame and the vocabulary.
-        continued = self._files.continued_map()
+        continued = self.files.continued_map()
         self._builder = None if continued is None else continued.builder
         self._worker = Worker(
             "graph", self._run, size=QUEUE_JOBS, on_overrun=_drop, after=self._publish
         )
         if continued is not None:
             self._announce(continued)
-        node.create_service(Trigger, "~/save", self._save)
         node.create_subscription(
             PoseStamped, CORRECTION_TOPIC, node.guarded(self._receive_correction), reliable(10)
         )
@@ -114,7 +112,7 @@ class GraphKeeper:
         """End the threads, then write the map file."""
         ended = self._worker.stop()
         self._whole.close()
-        self._files.close(self._builder, busy=not ended)
+        self.files.close(self._builder, busy=not ended)
 
     def values(self) -> dict[str, str]:
         """The size of the graph, for /diagnostics."""
@@ -135,6 +133,26 @@ class GraphKeeper:
         self.submit(lambda: self._times.changed(now_s, now_s))
 
     # The methods below run in the graph's thread.
+
+    @property
+    def builder(self) -> GraphBuilder | None:
+        """The graph; None before the first frame."""
+        return self._builder
+
+    def replace(self, builder: GraphBuilder) -> None:
+        """Continue with another graph: clients see a new session."""
+        self._builder = builder
+        self._session = secrets.token_hex(8)
+        self.newest_ns = 0
+        self._clock = ClockGate()
+        self._pending.clear()
+        self._whole.changed()
+        self.changed()
+
+    def changed(self) -> None:
+        """Publish what a call has changed in the graph."""
+        self.files.changed()
+        self._times.changed(self._running_s, time.monotonic())
 
     def integrate(self, local: LocalGraph) -> None:
         """Merge a local graph; one whose stamp jumps is held back until the next one."""
@@ -186,11 +204,11 @@ class GraphKeeper:
         if self._whole.wait_s(time.monotonic()) == 0.0:
             with self._node.refusing():
                 self._publish_whole()
-        if self._files.wait_s(time.monotonic()) == 0.0:
+        if self.files.wait_s(time.monotonic()) == 0.0:
             with self._node.refusing():
-                self._files.checkpoint(self._builder)
+                self.files.checkpoint(self._builder)
         now_s = time.monotonic()
-        parts = (self._times, self._whole, self._files)
+        parts = (self._times, self._whole, self.files)
         waits = (part.wait_s(now_s) for part in parts)
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 
@@ -207,7 +225,7 @@ class GraphKeeper:
         update.session = self._session
         self._publish_update(update)
         self._whole.changed()
-        self._files.changed()
+        self.files.changed()
         self._on_update(update, time.monotonic() - changed_s)
 
     def _publish_whole(self) -> None:
@@ -218,23 +236,6 @@ class GraphKeeper:
         self._values = _sizes(snapshot, self._builder.hidden)
 
     # The methods below run in the executor's thread.
-
-    async def _save(self, request: Any, response: Any) -> Any:
-        """Answer ~/save when the graph's thread has written the files."""
-        done = Future()
-
-        def save() -> None:
-            result = (False, "refused: see /diagnostics")
-            try:
-                result = self._files.save(self._builder)
-            finally:
-                done.set_result(result)
-                if self._node.executor is not None:
-                    self._node.executor.wake()
-
-        self.submit(save, lambda: done.set_result((False, "too many messages wait: try again")))
-        response.success, response.message = await done
-        return response
 
     def _receive_correction(self, message: Any) -> None:
         self._node.health.received(CORRECTION_TOPIC)

@@ -102,6 +102,16 @@ class EdgeMap:
             if pair[0] != pair[1]:
                 self.add(pair, evidence._replace(revision=revision))
 
+    def copy(self, old_id: int, new_id: int, without: Collection[int], revision: int) -> None:
+        """Give a node the edges of another one, except those to some nodes."""
+        for partner in list(self._partners.get(old_id, {})):
+            for pair, new in (
+                ((old_id, partner), (new_id, partner)),
+                ((partner, old_id), (partner, new_id)),
+            ):
+                if partner not in without and pair in self._evidence:
+                    self.add(new, self._evidence[pair]._replace(revision=revision))
+
     def drop(self, node_id: int) -> None:
         """Drop all edges of a node."""
         self._pop_all(node_id)

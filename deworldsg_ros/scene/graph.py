@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
+from deworldsg_ros.scene.edits import Edit, EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import IdState, NodeIds
 from deworldsg_ros.scene.node_states import NodeStates
@@ -32,6 +33,7 @@ class GraphState:
         edges: evidence of each directed pair of ids.
         votes: votes of frames on each unordered pair of ids.
         ids: the id memory.
+        edits: of an operator, oldest first.
     """
 
     vocabulary: Vocabulary
@@ -45,6 +47,7 @@ class GraphState:
     surface_point_capacity: int
     remembered_frames: int
     even_gaussians: bool
+    edits: Sequence[Edit] = ()
 
 
 class SceneGraph(NodeStore):
@@ -87,6 +90,7 @@ class SceneGraph(NodeStore):
         for pair, votes in state.votes.items():
             graph._votes.add(pair, votes.frames, votes.counts, votes.revision)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
+        graph.edits = EditLog(state.edits)
         graph.revision = state.revision
         return graph
 
@@ -105,7 +109,22 @@ class SceneGraph(NodeStore):
             surface_point_capacity=self.surface_point_capacity,
             remembered_frames=self.remembered_frames,
             even_gaussians=self.even_gaussians,
+            edits=list(self.edits.edits),
         )
+
+    def copy_relations(self, node_id: int, new_id: int, without: Collection[int]) -> None:
+        """Give a node the edges and votes of another one, except those with some nodes."""
+        self._edges.copy(node_id, new_id, without, self.revision)
+        self._votes.copy(node_id, new_id, without, self.revision)
+
+    def add_edit(self, edit: Edit) -> Edit:
+        """Note an operator's edit, with a new number; the nodes that it replaces are hidden."""
+        edit, lost = self.edits.add(edit)
+        rows = [self.nodes.row(node_id) for node_id in (*edit.nodes, *edit.replaced)]
+        self.nodes.confirmed[rows] &= [not self.edits.hides(i) for i in self.nodes.ids[rows]]
+        self._changed(rows)
+        self._drop(lost)
+        return edit
 
     def merge_nodes(self, a_id: int, b_id: int) -> int:
         """Merge two live nodes (Eq. 7) and return the id that stays, the older one.
@@ -169,18 +188,14 @@ class SceneGraph(NodeStore):
         return self._votes.partners(node_id)
 
     def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
-        """Count a frame that showed two different live nodes, with its votes (2, R) or None.
-
-        The first row of the votes has `a_id` as the subject.
-        """
+        """Count a frame that showed two live nodes; votes (2, R) or None, first row: a to b."""
         self.revision += 1
         self._votes.add((a_id, b_id), 1, counts, self.revision)
 
     def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
         """Sum a frame's visual relation logits (R,) into an edge (Eq. 9).
 
-        Ids are resolved first. Returns False and changes nothing if one of the nodes was removed or
-        both have become one node.
+        Returns False if, by now, one of the nodes was removed or both have become one node.
         """
         pair = self._live_pair(subject_id, object_id)
         if pair is not None:
@@ -227,3 +242,11 @@ class SceneGraph(NodeStore):
         for watcher in self._watchers:
             watcher.add(node_id)
         self._ids.retire(node_id, successor)
+        if self.edits:
+            self._drop(self.edits.removed(node_id, successor))
+
+    def _drop(self, successors: Mapping[int, int]) -> None:
+        for node_id, successor in successors.items():
+            self._edges.drop(node_id)
+            self._votes.drop(node_id)
+            self._remove(node_id, successor)

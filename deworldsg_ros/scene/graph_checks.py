@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -20,6 +20,7 @@ from deworldsg_ros.scene.array_checks import (
     within,
 )
 from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.scene.edits import MAX_EDITS, Edit
 
 # Map projections (UTM) have coordinates up to 10^7 m.
 MAX_POSITION_M = 1e8
@@ -70,6 +71,30 @@ def check_arrays(arrays: Arrays, header: Header) -> None:
     if "vote_pairs" in arrays:  # not in files of older releases
         _check_votes(arrays, header, ids)
     _check_id_memory(arrays, header, ids)
+
+
+def check_edits(edits: Sequence[Edit], arrays: Arrays) -> None:
+    """Raise ValueError unless the edits are of the nodes in the arrays."""
+    holds("edits", len(edits) <= MAX_EDITS, f"at most {MAX_EDITS}")
+    numbers = np.array([0, *(edit.id for edit in edits)])
+    holds("edits (id)", (np.diff(numbers) > 0).all(), "ascending numbers")
+    replaced = np.array([node_id for edit in edits for node_id in edit.replaced], np.int64)
+    distinct("edits (replaced)", replaced)
+    deleted = [node_id for edit in edits if edit.kind == "delete" for node_id in edit.nodes]
+    hidden = arrays["ids"][~arrays["confirmed"]]
+    contained("edits (replaced)", replaced, hidden)
+    contained("edits (deleted)", np.array(deleted, np.int64), hidden)
+    nodes = np.array([node_id for edit in edits for node_id in edit.nodes], np.int64)
+    contained("edits (nodes)", nodes, arrays["ids"])
+    for edit in edits:
+        within("edits (stamp_ns)", np.array(edit.stamp_ns), *_sym(MAX_STAMP_NS))
+        # New nodes have later ids: so no node is replaced by itself, in any number of steps.
+        newer = max(edit.replaced, default=0) < min(edit.nodes)
+        holds("edits (nodes)", newer, "later ids than the nodes that they replace")
+        is_merge_or_split = edit.kind in ("merge", "split")
+        holds("edits (replaced)", is_merge_or_split or not edit.replaced, "of a merge or a split")
+        wanted = 2 if edit.kind == "split" else 1
+        holds("edits (nodes)", len(edit.nodes) == wanted, f"{wanted} for {edit.kind}")
 
 
 def _check_nodes(arrays: Arrays, header: Header) -> None:

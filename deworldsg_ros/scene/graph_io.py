@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,10 +19,11 @@ from deworldsg_ros.scene.array_checks import checked
 from deworldsg_ros.scene.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.edits import Edit
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.graph import GraphState, SceneGraph
-from deworldsg_ros.scene.graph_checks import Header, check_arrays, check_header
+from deworldsg_ros.scene.graph_checks import Header, check_arrays, check_edits, check_header
 from deworldsg_ros.scene.node_ids import IdState
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
 from deworldsg_ros.scene.votes import PairVotes
@@ -62,7 +64,14 @@ def to_arrays(state: GraphState) -> Arrays:
         **_edge_arrays(state),
         **_vote_arrays(state),
         **_id_arrays(state.ids),
+        **_edit_arrays(state),
     }
+
+
+def _edit_arrays(state: GraphState) -> Arrays:
+    """Empty without edits, as in files of older releases."""
+    content = msgspec.json.encode(list(state.edits))
+    return {"edits": np.frombuffer(content, np.uint8)} if state.edits else {}
 
 
 def _edge_arrays(state: GraphState) -> Arrays:
@@ -118,8 +127,9 @@ def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> SceneGrap
 
 
 def _state(arrays: Arrays) -> GraphState:
-    header = _header(arrays)
+    header, edits = header_of(arrays), _edits(arrays)
     check_arrays(arrays, header)
+    check_edits(edits, arrays)
     return GraphState(
         vocabulary=Vocabulary(tuple(header.classes), tuple(header.predicates)),
         frame_id=header.frame_id,
@@ -132,10 +142,18 @@ def _state(arrays: Arrays) -> GraphState:
         surface_point_capacity=header.surface_point_capacity,
         remembered_frames=header.remembered_frames,
         even_gaussians=header.even_gaussians,
+        edits=edits,
     )
 
 
-def _header(arrays: Arrays) -> Header:
+def _edits(arrays: Arrays) -> list[Edit]:
+    if "edits" not in arrays:
+        return []
+    return parse_json(checked(arrays, "edits", np.uint8, None).tobytes(), list[Edit])
+
+
+def header_of(arrays: Arrays) -> Header:
+    """The settings of a saved graph; ValueError if there are none."""
     header = parse_json(checked(arrays, "header", np.uint8, None).tobytes(), Header)
     if header.version > FORMAT_VERSION:
         raise ValueError(f"version {header.version}: expected {FORMAT_VERSION} or older")

@@ -73,6 +73,9 @@ class NodeStates:
         nodes = self._store.nodes
         probabilities = nodes.class_probabilities[row]
         beliefs = best_beliefs(probabilities, self._store.vocabulary.classes, self._top_k)
+        label = self._store.edits.labels.get(int(nodes.ids[row]))
+        if label is not None:
+            probabilities, beliefs = np.ones(1), [wire.Belief(label, 1.0)]
         possible = probabilities[probabilities > 0]
         mean, covariance = nodes.means[row], nodes.covariances[row]
         points = nodes.surface(row)
@@ -92,6 +95,7 @@ class NodeStates:
             first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
             last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
             entropy_nats=round(max(0.0, -float(possible @ np.log(possible))), DECIMALS),
+            label_provenance=UNSET if label is None else "operator",
         )
 
 

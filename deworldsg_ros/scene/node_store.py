@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64
+from deworldsg_ros.scene.edits import EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import NodeIds
 from deworldsg_ros.scene.nodes import NodeTable, Observations
@@ -26,6 +27,7 @@ class NodeStore:
         surface_point_capacity: maximum number of surface points of a node.
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
         nodes: the nodes as parallel arrays; read only.
+        edits: what an operator has said about nodes; read only.
         revision: number of changes so far.
     """
 
@@ -41,6 +43,7 @@ class NodeStore:
         self.surface_point_capacity = surface_point_capacity
         self.remembered_frames = remembered_frames
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
+        self.edits = EditLog()
         self.revision = 0
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[set[int]] = []
@@ -156,10 +159,7 @@ class NodeStore:
     ) -> list[int]:
         """Set the probabilities (n,) that n live nodes are objects, to two decimals.
 
-        Args:
-            node_ids: n ids.
-            existence: (n,) probabilities.
-            minimum: a node is confirmed if it has at least this probability.
+        A node is confirmed if it has at least the minimum, and no edit hides it.
 
         Returns:
             The ids of the nodes that were not confirmed before, and are now.
@@ -168,6 +168,8 @@ class NodeStore:
         rows = np.array([nodes.row(node_id) for node_id in node_ids], np.int64)
         existence = np.round(existence, 2)
         confirmed = existence >= minimum
+        if self.edits:
+            confirmed &= [not self.edits.hides(node_id) for node_id in node_ids]
         differs = (nodes.existence[rows] != existence) | (nodes.confirmed[rows] != confirmed)
         new: list[int] = nodes.ids[rows[confirmed & ~nodes.confirmed[rows]]].tolist()
         nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed

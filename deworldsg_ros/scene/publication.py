@@ -80,7 +80,8 @@ class Publication:
             return None
         # A live node that was hidden is removed from the snapshot. Clients know ids that no
         # snapshot contained from associations.
-        left = {**dict.fromkeys(gone_nodes), **removed}
+        replaced = self._graph.edits.replaced
+        left = {**{node: replaced.get(node) or None for node in gone_nodes}, **removed}
         self._updated = self._message(self._updated.sequence + 1, [], [])
         message = wire.SceneGraphUpdateMessage(
             schema=wire.schema_of(wire.SceneGraphUpdateMessage),

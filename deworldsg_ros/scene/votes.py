@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -83,6 +83,15 @@ class VoteMap:
         for partner, votes in self.drop(old_id):
             if partner == new_id:
                 continue
+            counts = votes.counts
+            if counts is not None and old_id > partner:
+                counts = counts[::-1]
+            self.add((new_id, partner), votes.frames, counts, revision)
+
+    def copy(self, old_id: int, new_id: int, without: Collection[int], revision: int) -> None:
+        """Give a node the votes of another one, except those with some nodes."""
+        for partner in sorted(self.partners(old_id) - set(without)):
+            votes = self._votes[min(old_id, partner), max(old_id, partner)]
             counts = votes.counts
             if counts is not None and old_id > partner:
                 counts = counts[::-1]

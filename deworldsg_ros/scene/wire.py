@@ -279,6 +279,10 @@ class NodeState(msgspec.Struct, frozen=True):
             "little-endian, millimetres, base64; replaces surface_points_m"
         ),
     ] = msgspec.UNSET
+    label_provenance: Annotated[
+        Union[Literal["operator"], msgspec.UnsetType],
+        msgspec.Meta(description="operator = set by hand; absent = from the frames"),
+    ] = msgspec.UNSET
 
 
 class HiddenNode(msgspec.Struct, frozen=True):

@@ -1,0 +1,305 @@
+"""The edits of an operator: each changes the graph, and adds to its log what holds from now on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.spatial import cKDTree
+
+from deworldsg_ros.merging.common import Memory
+from deworldsg_ros.merging.life_cycle import LifeCycle
+from deworldsg_ros.merging.node_records import NodeRecords
+from deworldsg_ros.merging.voxel_map import cell_bits
+from deworldsg_ros.scene.arrays import Bool, Float32
+from deworldsg_ros.scene.copies import copy_node
+from deworldsg_ros.scene.edits import (
+    MAX_EDITS,
+    DeleteNode,
+    Edit,
+    EditRequest,
+    MergeNodes,
+    SetLabel,
+    SplitNode,
+    Undo,
+)
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.names import check_labels
+
+# Either part of a split has at least this many surface points.
+MIN_PART_POINTS = 8
+
+# Before the names of the arrays of replaced nodes.
+_ASIDE = "aside_"
+
+# Which points (n, 3) belong to a part of a node.
+Belongs = Callable[[Float32], Bool]
+
+
+class EditReply(msgspec.Struct, frozen=True):
+    """What an edit did.
+
+    Attributes:
+        kind: as the request: set_label, merge, split, delete or undo.
+        nodes: the objects that there are now in place of those that were edited.
+        text: a sentence.
+    """
+
+    kind: str
+    nodes: list[int]
+    text: str
+
+
+class Editor:
+    """The edits that need nothing but the graph."""
+
+    def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+        """Make an edit, or undo one.
+
+        Args:
+            graph: changed.
+            request: names published nodes.
+            stamp_ns: of the newest frame.
+
+        Raises:
+            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
+        """
+        if isinstance(request, Undo):
+            return self._undo(graph)
+        if len(graph.edits) >= MAX_EDITS:
+            raise refused(f"{MAX_EDITS} edits hold: expected fewer, undo some")
+        for node_id in request.nodes if isinstance(request, MergeNodes) else [request.node]:
+            _check_published(graph, node_id)
+        if isinstance(request, SetLabel):
+            return self._set_label(graph, request, stamp_ns)
+        if isinstance(request, DeleteNode):
+            graph.add_edit(Edit(0, "delete", stamp_ns, [request.node]))
+            return EditReply("delete", [], f"object {request.node} is deleted")
+        if isinstance(request, MergeNodes):
+            return self._merge(graph, request, stamp_ns)
+        return self._split(graph, request, stamp_ns)
+
+    def _set_label(self, graph: SceneGraph, request: SetLabel, stamp_ns: int) -> EditReply:
+        try:
+            check_labels([request.label])
+        except ValueError as error:
+            raise refused(str(error)) from error
+        graph.add_edit(Edit(0, "set_label", stamp_ns, [request.node], label=request.label))
+        text = f"object {request.node} is a '{request.label}'"
+        if request.label not in graph.vocabulary.classes:
+            text += "; the detector does not know this class, so relations take that of the frames"
+        return EditReply("set_label", [request.node], text)
+
+    def _merge(self, graph: SceneGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
+        raise refused("the paper's rule cannot merge by hand: use merging.association surface")
+
+    def _split(self, graph: SceneGraph, request: SplitNode, stamp_ns: int) -> EditReply:
+        raise refused("the paper's rule cannot split by hand: use merging.association surface")
+
+    def _undo(self, graph: SceneGraph) -> EditReply:
+        if not graph.edits:
+            raise refused("there is nothing to undo: no edit holds")
+        edit = graph.edits.pop()
+        said = f"undone: {edit.kind} of {_names(edit.replaced or edit.nodes)}"
+        if edit.replaced:
+            self._bring_back(graph, edit)
+            return EditReply("undo", edit.replaced, said)
+        if edit.kind == "delete":
+            self._publish(graph, edit.nodes)
+        # Their messages say another label now.
+        rows = [graph.nodes.row(node_id) for node_id in edit.nodes]
+        graph.set_classes(edit.nodes, graph.nodes.class_probabilities[rows])
+        if edit.kind in ("merge", "split"):
+            said += " does not hold any more, but the objects before it are forgotten"
+        return EditReply("undo", edit.nodes, said)
+
+    def _bring_back(self, graph: SceneGraph, edit: Edit) -> None:
+        raise AssertionError("a rule without merges and splits has no replaced nodes")
+
+    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+        """Publish nodes that an edit has hidden: all, with a rule that hides none."""
+        rows = [graph.nodes.row(node_id) for node_id in node_ids]
+        graph.set_existence(node_ids, graph.nodes.existence[rows], minimum=-1.0)
+
+
+class SurfaceEditor(Editor):
+    """All edits, for the surface rule.
+
+    Args:
+        records: of the rule.
+        life_cycle: of its nodes.
+
+    Attributes:
+        aside: records of nodes that an edit replaced, for undo. No frame is compared with them.
+    """
+
+    def __init__(self, records: NodeRecords, life_cycle: LifeCycle) -> None:
+        self._records = records
+        self._life_cycle = life_cycle
+        self.aside = NodeRecords()
+
+    def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+        """See `Editor.apply`."""
+        reply = super().apply(graph, request, stamp_ns)
+        for node_id in self.aside.rows["node_id"][self.aside.owners].tolist():
+            if node_id not in graph.edits.replaced:
+                self.aside.remove(node_id)
+        return reply
+
+    def _merge(self, graph: SceneGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
+        old_ids = sorted(request.nodes)
+        if old_ids[0] == old_ids[1]:
+            raise refused(f"object {old_ids[0]} cannot be merged with itself: expected two ids")
+        labels = [graph.edits.labels.get(node_id, "") for node_id in old_ids]
+        new_ids = [copy_node(graph, node_id, without=old_ids) for node_id in old_ids]
+        for old_id, new_id in zip(old_ids, new_ids):
+            self._replace(graph, old_id, {new_id: None})
+        kept_id = graph.merge_nodes(*new_ids)
+        self._records.merge(graph, kept_id, new_ids[1])
+        graph.add_edit(Edit(0, "merge", stamp_ns, [kept_id], old_ids, labels[0] or labels[1]))
+        return EditReply("merge", [kept_id], f"objects {_names(old_ids)} are object {kept_id} now")
+
+    def _split(self, graph: SceneGraph, request: SplitNode, stamp_ns: int) -> EditReply:
+        old_id = request.node
+        points = graph.nodes.surface(graph.nodes.row(old_id)).copy()
+        parts = _parts(points, request.near_m)
+        if len(parts) < 2:
+            raise refused(
+                f"object {old_id} with {len(points)} surface points has no two parts of at least "
+                f"{MIN_PART_POINTS} there"
+            )
+        label = graph.edits.labels.get(old_id, "")
+        new_ids = [copy_node(graph, old_id, points_world=part) for part in parts]
+        tree = cKDTree(np.concatenate(parts))
+        sides = np.repeat([0, 1], [len(part) for part in parts])
+
+        def on_side(side: int) -> Belongs:
+            return lambda centres: sides[tree.query(centres)[1]] == side
+
+        belongs = {new_id: on_side(side) for side, new_id in enumerate(new_ids)}
+        self._replace(graph, old_id, dict(belongs))
+        graph.add_edit(Edit(0, "split", stamp_ns, new_ids, [old_id], label))
+        text = f"object {old_id} is the objects {_names(new_ids)} now"
+        return EditReply("split", new_ids, text)
+
+    def _replace(self, graph: SceneGraph, old_id: int, new: dict[int, Belongs | None]) -> None:
+        """Put the record of a node aside, and give copies of it, or of parts, to new nodes."""
+        balances = self._balances([old_id])
+        _transfer(graph, self._records, self.aside, old_id, old_id)
+        self._records.remove(old_id)
+        for new_id, belongs in new.items():
+            _transfer(graph, self.aside, self._records, old_id, new_id, belongs)
+            self._add_balances(new_id, balances)
+
+    def _bring_back(self, graph: SceneGraph, edit: Edit) -> None:
+        balances = self._balances(edit.nodes)
+        for node_id in edit.nodes:
+            self._life_cycle.remove(graph, node_id)
+        for old_id in edit.replaced:
+            _transfer(graph, self.aside, self._records, old_id, old_id)
+            self.aside.remove(old_id)
+            self._add_balances(old_id, balances)
+        self._publish(graph, edit.replaced)
+
+    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+        self._life_cycle.publish_again(graph, node_ids)
+
+    def memory(self) -> Memory:
+        """The records of replaced nodes, for `restore`; empty without any."""
+        memory = self.aside.memory() if self.aside.owners else {}
+        return {_ASIDE + name: values for name, values in memory.items()}
+
+    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+        """Continue with a graph of an earlier run."""
+        own = {
+            name.removeprefix(_ASIDE): values
+            for name, values in memory.items()
+            if name.startswith(_ASIDE)
+        }
+        self.aside.restore(graph, own, sorted(graph.edits.replaced))
+
+    def _balances(self, node_ids: Sequence[int]) -> dict[int, int]:
+        """Evidence that other nodes are one object with one of these, by the id of the other."""
+        records = self._records
+        owners = {records.owner(node_id) for node_id in node_ids if node_id in records}
+        return {
+            records.node(other): balance
+            for pair, balance in records.joint.balances.items()
+            for owner, other in (pair, pair[::-1])
+            if owner in owners and other not in owners
+        }
+
+    def _add_balances(self, node_id: int, balances: dict[int, int]) -> None:
+        records, owner = self._records, self._records.owner(node_id)
+        known = {records.owner(other): n for other, n in balances.items() if other in records}
+        records.joint.restore({(owner, other): balance for other, balance in known.items()})
+
+
+def refused(message: str) -> RefusedInput:
+    """The error of an edit that cannot be made."""
+    return RefusedInput("invalid_edit", message)
+
+
+def _check_published(graph: SceneGraph, node_id: int) -> None:
+    if node_id not in graph:
+        new_id = graph.resolve(node_id)
+        now = f"it is object {new_id} now" if new_id else "it is gone, or never was"
+        raise refused(f"object {node_id} is not in the graph: {now}")
+    if not graph.nodes.confirmed[graph.nodes.row(node_id)]:
+        replaced = graph.edits.replaced.get(node_id)
+        reason = f"it was merged into object {replaced}" if replaced else "it is hidden"
+        raise refused(f"object {node_id} is not in the graph: {reason}")
+
+
+def _names(node_ids: Sequence[int]) -> str:
+    return " and ".join(map(str, node_ids))
+
+
+def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
+    """The points (k, 3) nearer to either of two places; without places, the two halves.
+
+    The larger part is the first one. Parts of fewer than MIN_PART_POINTS are left out.
+    """
+    if not len(points):
+        return []
+    places = np.array(near_m, np.float64) if near_m else _ends(points)
+    sides = cKDTree(places).query(points)[1]
+    parts = sorted((points[sides == side] for side in (0, 1)), key=len, reverse=True)
+    return [part for part in parts if len(part) >= MIN_PART_POINTS]
+
+
+def _ends(points: Float32) -> Any:
+    """The centres (2, 3) of two clusters, which start at the ends of the longest axis."""
+    along = (points - points.mean(axis=0)) @ np.linalg.svd(np.cov(points.T))[0][:, 0]
+    ends = points[[along.argmin(), along.argmax()]].astype(np.float64)
+    return kmeans2(points.astype(np.float64), ends, minit="matrix")[0]
+
+
+def _transfer(
+    graph: SceneGraph,
+    source: NodeRecords,
+    target: NodeRecords,
+    node_id: int,
+    as_id: int,
+    belongs: Belongs | None = None,
+) -> None:
+    """Copy the record and the cells of a node to another table, or those that belong to a part."""
+    owner = source.owner(node_id)
+    cells, scores = source.map.cells(owner), source.map.scores(owner)
+    if belongs is not None:
+        centres, rows = source.map.centres(owner), {}
+        rows = {block: row for row, block in enumerate(cells.blocks.tolist())}
+        cells = target.map.cells_of([centres[belongs(centres)]])
+        scores = scores[[rows[block] for block in cells.blocks.tolist()]]
+        scores *= cell_bits(cells.masks).astype(np.int8)
+    row = graph.nodes.row(as_id)
+    new = target.add(as_id, graph.nodes.class_probabilities[row], 0)
+    target.rows[new] = source.rows[owner]
+    target.rows["node_id"][new] = as_id
+    target.map.add([new], cells)
+    target.map.add_scores(new, cells.blocks, scores)
+    target.place(graph, [new])

@@ -1,0 +1,203 @@
+"""The services of a node with a graph: save, load, clear, questions, and an operator's edits.
+
+ROS 2 has no service type for a text and an answer, and this package defines no types of its own. So
+services without arguments are std_srvs/Trigger. The others are diagnostic_msgs/AddDiagnostics,
+which has the fields of such a service: the request is JSON in `load_namespace`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from diagnostic_msgs.srv import AddDiagnostics
+from geometry_msgs.msg import PoseStamped
+from rclpy.task import Future
+from std_srvs.srv import Trigger
+
+from deworldsg_ros.client.asking import ask
+from deworldsg_ros.client.goals import Goal
+from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import read_map
+from deworldsg_ros.parsing import parse_json
+from deworldsg_ros.ros.graph_keeper import GraphKeeper
+from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene.edits import (
+    DeleteNode,
+    EditRequest,
+    MergeNodes,
+    SetLabel,
+    SplitNode,
+    Undo,
+)
+from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
+from deworldsg_ros.scene.wire import Point
+
+GOAL_TOPIC = "deworldsg/goal"
+# A question is a line. An edit is a few numbers.
+MAX_REQUEST_CHARACTERS = 10_000
+
+Request = TypeVar("Request")
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
+
+
+class Query(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A question in words; see `client.asking`."""
+
+    question: Text
+
+
+class GoalNear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An object, by id or class, and where to stand; see `client.goals`."""
+
+    object: int | Text
+    distance_m: float = 1.0
+    towards: Point | None = None
+
+
+class Explain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """An object, by id or class, and for a pair a second one."""
+
+    object: int | Text
+    other: int | Text | None = None
+
+
+class Load(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A map file, absolute or relative to the working folder of the node."""
+
+    path: Text
+
+
+class GraphServices:
+    """Answers each request in the graph's thread, between two frames.
+
+    A request that cannot be answered changes nothing. It is counted as ``invalid_request``, and the
+    answer says why.
+
+    Args:
+        node: has the services.
+        graph: its graph.
+    """
+
+    def __init__(self, node: StageNode, graph: GraphKeeper) -> None:
+        self._node = node
+        self._graph = graph
+        self._publish_goal = node.create_publisher(PoseStamped, GOAL_TOPIC, reliable(1)).publish
+        for name, kind, answer in (
+            ("query", Query, self._query),
+            ("goal_near", GoalNear, self._goal_near),
+            ("explain", Explain, self._explain),
+            ("load", Load, self._load),
+            ("set_label", SetLabel, self._edit),
+            ("merge", MergeNodes, self._edit),
+            ("split", SplitNode, self._edit),
+            ("delete", DeleteNode, self._edit),
+        ):
+            self._serve(name, AddDiagnostics, partial(_parsed, kind, answer))
+        self._serve("save", Trigger, lambda text: self._save())
+        self._serve("clear", Trigger, lambda text: self._clear())
+        self._serve("undo", Trigger, lambda text: self._edit(Undo()))
+
+    def _serve(self, name: str, kind: Any, answer: Callable[[str], str]) -> None:
+        async def call(request: Any, response: Any) -> Any:
+            done = Future()
+            text = getattr(request, "load_namespace", "")
+            self._graph.submit(
+                lambda: self._answer(name, partial(answer, text), done),
+                lambda: done.set_result((False, "too many messages wait: try again")),
+            )
+            response.success, response.message = await done
+            return response
+
+        self._node.create_service(kind, f"~/{name}", call)
+
+    # The methods below run in the graph's thread.
+
+    def _answer(self, name: str, answer: Callable[[], str], done: Future) -> None:
+        result = (False, "internal error: see /diagnostics")
+        try:
+            result = (True, answer())
+        except (DeWorldSGError, OSError) as error:
+            self._node.drop("invalid_request", f"{name}: {error}")
+            result = (False, str(error))
+        finally:
+            done.set_result(result)
+            if self._node.executor is not None:
+                self._node.executor.wake()
+
+    @property
+    def _builder(self) -> GraphBuilder:
+        if self._graph.builder is None:
+            raise RefusedInput("invalid_request", "no graph yet: no local graph has arrived")
+        return self._graph.builder
+
+    def _asked(self) -> SceneGraph:
+        return SceneGraph(self._builder.full())
+
+    def _query(self, request: Query) -> str:
+        return _json(ask(self._asked(), request.question).to_dict())
+
+    def _goal_near(self, request: GoalNear) -> str:
+        x, y, z = request.towards or (0.0, 0.0, 0.0)
+        towards = None if request.towards is None else (x, y, z)
+        goal: Goal = self._asked().goal_near(request.object, request.distance_m, towards=towards)
+        self._publish_goal(goal.pose_stamped())
+        return _json(goal.to_dict())
+
+    def _explain(self, request: Explain) -> str:
+        what = request.object if request.other is None else (request.object, request.other)
+        found = self._asked().explain(what)
+        return _json({"subject": found.subject, "lines": found.lines, **found.values})
+
+    def _edit(self, request: EditRequest) -> str:
+        reply = self._builder.edit(request)
+        self._graph.changed()
+        return _json(reply)
+
+    def _save(self) -> str:
+        saved, said = self._graph.files.save(self._builder)
+        if not saved:
+            raise RefusedInput("invalid_request", said)
+        return said
+
+    def _load(self, request: Load) -> str:
+        builder = read_map(self._node.parameters, Path(request.path))
+        present = self._graph.builder
+        if present is not None and present.graph.vocabulary != builder.graph.vocabulary:
+            raise RefusedInput(
+                "invalid_request",
+                f"map {request.path} has other classes or predicates than the present graph: "
+                "expected the same ones",
+            )
+        self._graph.replace(builder)
+        return f"{request.path}: {builder.confirmed} nodes in frame '{builder.graph.frame_id}'"
+
+    def _clear(self) -> str:
+        graph = self._builder.graph
+        self._graph.replace(GraphBuilder(self._node.parameters, graph.vocabulary, graph.frame_id))
+        return f"{len(graph)} nodes are cleared"
+
+
+def _parsed(kind: type[Request], answer: Callable[[Request], str], text: str) -> str:
+    if len(text) > MAX_REQUEST_CHARACTERS:
+        raise RefusedInput(
+            "invalid_request",
+            f"request of {len(text)} characters: expected at most {MAX_REQUEST_CHARACTERS}",
+        )
+    try:
+        request = parse_json(text.encode(), kind)
+    except ValueError as error:
+        fields = ", ".join(field.name for field in msgspec.structs.fields(kind))
+        raise RefusedInput(
+            "invalid_request", f"request {text[:80]!r}: {error}; expected JSON with {fields}"
+        ) from error
+    return answer(request)
+
+
+def _json(value: Any) -> str:
+    return msgspec.json.encode(value).decode()

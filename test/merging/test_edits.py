@@ -1,0 +1,316 @@
+"""An operator's edits hold for later frames, and undo brings back what was before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.merging import VOCABULARY
+from support.surfaces import CHAIR, CUP, HERE, TABLE, slab, view
+
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import copy_state, read_map, write_map
+from deworldsg_ros.scene import graph_io, wire
+from deworldsg_ros.scene.edits import (
+    MAX_UNDO,
+    DeleteNode,
+    MergeNodes,
+    SetLabel,
+    SplitNode,
+    Undo,
+)
+from deworldsg_ros.scene.errors import RefusedInput
+
+# A long table as two halves, which a detector may see as two tables, and something in its place.
+LEFT, RIGHT = slab((-0.3, 0.1, 0.7), (0.5, 0.3, 0.01)), slab((0.22, 0.1, 0.7), (0.5, 0.3, 0.01))
+LONG = np.concatenate([LEFT, RIGHT])
+WHOLE = slab((0, 0, 0.95), (1.2, 0.8, 0.01))
+BESIDE = slab((-0.5, -0.3, 0.7), (0.1, 0.1, 0.1))
+
+
+def builder_of(association: str = "surface") -> GraphBuilder:
+    config = Config(
+        merging=MergingConfig(association=association), output=OutputConfig(min_existence=0.0)
+    )
+    return GraphBuilder(config, VOCABULARY, "world")
+
+
+class Room:
+    """A graph that sees the same objects frame by frame."""
+
+    def __init__(self, *objects: tuple[np.ndarray, int], association: str = "surface") -> None:
+        self.builder = builder_of(association)
+        self.stamp = 0
+        self.objects = objects
+        self.see(5)
+
+    def see(self, frames: int = 1, *objects: tuple[np.ndarray, int]) -> list[int]:
+        node_ids: list[int] = []
+        for _ in range(frames):
+            self.stamp += 1
+            node_ids = self.builder.integrate(view(self.stamp, *(objects or self.objects)))
+        return node_ids
+
+    def labels(self) -> dict[int, str]:
+        return {node.id: node.label for node in self.builder.full().nodes}
+
+    def full(self) -> tuple[list[wire.NodeState], list[wire.EdgeState]]:
+        message = self.builder.full()
+        return message.nodes, message.edges
+
+
+RULES = pytest.mark.parametrize("association", ["surface", "paper"])
+
+
+@RULES
+def test_a_label_stays_and_tells_who_said_it(association):
+    room = Room((HERE, CUP), association=association)
+    before = room.full()
+    room.builder.update()
+    reply = room.builder.edit(SetLabel(1, "chair"))
+    assert (reply.kind, reply.nodes) == ("set_label", [1])
+    update = room.builder.update()
+    assert update is not None
+    (state,) = update.nodes
+    assert (state.label, state.label_provenance) == ("chair", "operator")
+    assert state.classes == [wire.Belief("chair", 1.0)] and state.entropy_nats == 0.0
+    room.builder.edit(Undo())
+    assert room.full() == before
+    room.builder.edit(SetLabel(1, "chair"))
+    for _ in range(20):
+        assert room.see() == [1]  # the detector goes on to call it a cup: that is this object
+    assert room.labels() == {1: "chair"}
+    room.builder.edit(SetLabel(1, "Anna's mug"))  # in no vocabulary
+    assert room.labels() == {1: "Anna's mug"}
+    room.builder.edit(Undo())
+    assert room.labels() == {1: "chair"}
+    room.builder.edit(Undo())
+    assert room.labels() == {1: "cup"}
+
+
+@RULES
+def test_a_deleted_object_stays_deleted_and_others_may_take_its_place(association):
+    room = Room((HERE, CUP), (WHOLE, TABLE), association=association)
+    assert room.labels() == {1: "cup", 2: "table"}
+    room.builder.update()
+    room.builder.edit(DeleteNode(1))
+    update = room.builder.update()
+    assert update is not None and [gone.id for gone in update.removed_nodes] == [1]
+    room.see(20)
+    assert room.labels() == {2: "table"}
+    hidden = room.builder.full().hidden
+    assert [(item.label, item.reason) for item in hidden] == [("cup", "deleted by the operator")]
+    assert room.builder.hidden == {"deleted by the operator": 1}
+    # Something of another class in the same place is another object.
+    room.see(5, (HERE, CHAIR), (WHOLE, TABLE))
+    assert sorted(room.labels().values()) == ["chair", "table"]
+    room.builder.edit(Undo())
+    assert room.labels()[1] == "cup"
+
+
+def test_a_deleted_object_stays_deleted_when_it_was_away():
+    room = Room((HERE, CUP), (WHOLE, TABLE))
+    room.builder.edit(DeleteNode(1))
+    room.see(20, (WHOLE, TABLE))
+    room.see(20)
+    assert room.labels() == {2: "table"}
+
+
+def test_merged_objects_stay_one_though_the_detector_sees_two():
+    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
+    assert room.labels() == {1: "table", 2: "table", 3: "cup"}
+    room.builder.update()
+    before = room.full()
+    reply = room.builder.edit(MergeNodes([2, 1]))
+    assert reply.nodes == [4] and room.labels() == {3: "cup", 4: "table"}
+    update = room.builder.update()
+    assert update is not None
+    assert {gone.id: gone.merged_into for gone in update.removed_nodes if gone.id < 4} == {
+        1: 4,
+        2: 4,
+    }
+    node = room.builder.full().nodes[1]
+    assert node.box.size_m[0] > 0.95  # both halves
+    room.builder.edit(Undo())
+    assert room.full() == before
+    room.builder.edit(MergeNodes([1, 2]))
+    for _ in range(20):
+        one, two, cup = room.see()
+        assert one == two != cup
+    assert sorted(room.labels().values()) == ["cup", "table"]
+    node = next(node for node in room.builder.full().nodes if node.label == "table")
+    assert node.box.size_m[0] > 0.95 and node.existence > 0.5
+    assert room.see(3, (LONG, TABLE)) == [one]
+    room.builder.edit(Undo())
+    assert sorted(room.labels()) == [1, 2, 3]
+    assert room.see(3) == [1, 2, 3]
+
+
+def test_a_split_stays_split_though_the_detector_sees_one():
+    room = Room((LONG, TABLE), (BESIDE, CUP))
+    before = room.full()
+    reply = room.builder.edit(SplitNode(1))
+    first, second = reply.nodes
+    assert sorted(room.labels()) == [2, first, second] == [2, 3, 4]
+    room.builder.edit(Undo())
+    assert room.full() == before
+    first, second = room.builder.edit(SplitNode(1)).nodes
+    for _ in range(20):
+        assert room.see()[0] in (first, second)
+    states = {node.id: node for node in room.builder.full().nodes}
+    assert states.keys() == {2, first, second}
+    for node_id in (first, second):
+        assert 0.4 < states[node_id].box.size_m[0] < 0.6
+        assert states[node_id].existence > 0.5 and states[node_id].label == "table"
+    # A detector that sees both finds both.
+    assert set(room.see(1, (LEFT, TABLE), (RIGHT, TABLE))) == {first, second}
+    room.builder.edit(Undo())
+    assert sorted(room.labels()) == [1, 2]
+    assert room.see(3) == [1, 2]
+
+
+def test_a_split_takes_the_places_that_are_named():
+    room = Room((LONG, TABLE))
+    reply = room.builder.edit(SplitNode(1, [[-0.5, 0.1, 0.7], [-0.1, 0.1, 0.7]]))
+    widths = [node.box.size_m[0] for node in room.builder.full().nodes]
+    assert sorted(np.round(widths, 1)) == [0.3, 0.8]
+    assert len(reply.nodes) == 2
+    with pytest.raises(RefusedInput, match="no two parts of at least 8 there"):
+        room.builder.edit(SplitNode(reply.nodes[0], [[5, 5, 5], [9, 9, 9]]))
+
+
+def test_edits_of_edited_objects_are_undone_newest_first():
+    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
+    steps = []
+    for request in (
+        SetLabel(1, "chair"),
+        MergeNodes([1, 2]),
+        SplitNode(4),
+        DeleteNode(3),
+        MergeNodes([6, 7]),
+    ):
+        steps.append(room.full())
+        room.builder.edit(request)
+    assert list(room.labels().values()) == ["chair"]
+    for before in reversed(steps):
+        room.builder.edit(Undo())
+        assert room.full() == before
+    with pytest.raises(RefusedInput, match="nothing to undo"):
+        room.builder.edit(Undo())
+
+
+@pytest.mark.parametrize("frames", [0, 6])
+def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
+    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
+    room.builder.edit(SetLabel(1, "chair"))
+    merged = room.builder.edit(MergeNodes([1, 2])).nodes[0]
+    room.builder.edit(DeleteNode(3))
+    room.see(frames)
+    write_map(room.builder, tmp_path / "room.map")
+    write_map(room.builder, tmp_path / "again.map")
+    first, second = (tmp_path / name for name in ("room.map", "again.map"))
+    assert first.read_bytes() == second.read_bytes()
+    config = Config(output=OutputConfig(min_existence=0.0))
+    whole, again = room.builder, read_map(config, first)
+    assert copy_state(again).keys() == copy_state(whole).keys()
+    assert again.full() == whole.full()
+    whole.graph.take_removals()
+    for stamp in range(room.stamp + 1, room.stamp + 6):
+        local = view(stamp, *room.objects)
+        assert again.integrate(local) == whole.integrate(local)
+    assert [node.id for node in again.full().nodes] == [merged]
+    for builder in (again, whole):
+        assert builder.edit(Undo()).text == "undone: delete of 3"
+        assert builder.edit(Undo()).nodes == [1, 2]
+    assert again.full().nodes == whole.full().nodes
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (b"[{}]", "missing required field"),
+        (b'[{"id":1,"kind":"paint","stamp_ns":0,"nodes":[1]}]', "Invalid enum value"),
+        (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[99],"label":"x"}]', "id 99"),
+        (b'[{"id":1,"kind":"delete","stamp_ns":0,"nodes":[1]}]', "deleted"),
+        (b'[{"id":1,"kind":"merge","stamp_ns":0,"nodes":[2],"replaced":[1,7]}]', "replaced"),
+        (b'[{"id":1,"kind":"split","stamp_ns":0,"nodes":[1]}]', "2 for split"),
+        (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[1],"label":"a\\nb"}]', "regex"),
+    ],
+)
+def test_a_map_with_wrong_edits_is_refused(tmp_path, damage, message):
+    room = Room((HERE, CUP), (WHOLE, TABLE))
+    path = tmp_path / "room.map"
+    write_map(room.builder, path)
+    graph_io.write(path, {**graph_io.read(path), "edits": np.frombuffer(damage, np.uint8)})
+    with pytest.raises(Exception, match=message):
+        read_map(Config(), path)
+
+
+def test_a_map_without_edits_has_no_array_of_them():
+    room = Room((HERE, CUP))
+    assert not [name for name in copy_state(room.builder) if "edit" in name or "aside" in name]
+    room.builder.edit(SetLabel(1, "chair"))
+    room.builder.edit(Undo())
+    assert not [name for name in copy_state(room.builder) if "edit" in name or "aside" in name]
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        (SetLabel(9, "cup"), "object 9 is not in the graph: it is gone, or never was"),
+        (SetLabel(1, "a\u009bb"), "control character"),
+        (MergeNodes([1, 1]), "cannot be merged with itself"),
+        (MergeNodes([1, 8]), "object 8 is not in the graph"),
+        (DeleteNode(9), "object 9 is not"),
+        (Undo(), "nothing to undo: no edit holds"),
+    ],
+)
+def test_a_bad_edit_changes_nothing(request_, message):
+    room = Room((HERE, CUP), (WHOLE, TABLE))
+    before = copy_state(room.builder)
+    with pytest.raises(RefusedInput, match=message) as refusal:
+        room.builder.edit(request_)
+    assert refusal.value.reason == "invalid_edit"
+    after = copy_state(room.builder)
+    assert before.keys() == after.keys()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+
+
+def test_an_edited_object_is_named_by_what_it_is_now():
+    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
+    room.builder.edit(MergeNodes([1, 2]))
+    room.builder.edit(DeleteNode(3))
+    for node_id, reason in ((1, "merged into object 4"), (3, "hidden")):
+        with pytest.raises(RefusedInput, match=reason):
+            room.builder.edit(SetLabel(node_id, "cup"))
+
+
+def test_the_papers_rule_refuses_what_it_cannot_do():
+    room = Room((HERE, CUP), (WHOLE, TABLE), association="paper")
+    for request in (MergeNodes([1, 2]), SplitNode(1)):
+        with pytest.raises(RefusedInput, match="merging.association surface"):
+            room.builder.edit(request)
+
+
+def test_old_edits_hold_but_cannot_be_undone():
+    room = Room((LEFT, TABLE), (RIGHT, TABLE))
+    for _ in range(MAX_UNDO + 1):
+        nodes = sorted(room.labels())
+        if len(nodes) == 2:
+            last = room.builder.edit(MergeNodes(nodes)).nodes
+        else:
+            last = room.builder.edit(SplitNode(nodes[0])).nodes
+    assert sorted(room.labels()) == sorted(last)
+    assert len(room.builder.graph.edits.replaced) == 150  # two of each merge, one of each split
+    for _ in range(MAX_UNDO):
+        room.builder.edit(Undo())
+    reply = room.builder.edit(Undo())
+    assert "the objects before it are forgotten" in reply.text
+    assert len(room.builder.graph) == len(room.labels()) == 1
+
+
+def test_an_object_that_goes_takes_its_edits_with_it():
+    room = Room((HERE, CUP), (WHOLE, TABLE))
+    room.builder.edit(SetLabel(1, "chair"))
+    room.builder.graph.remove_node(1)
+    assert not room.builder.graph.edits
