@@ -124,7 +124,7 @@ class GraphBuilder:
         The next `update` contains what it changes.
 
         Raises:
-            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
+            RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
         stamp_ns = self._newest_ns or int(self.graph.nodes.last_seen_ns.max(initial=0))
         return self.merging.edit(self.graph, request, stamp_ns)

@@ -157,7 +157,7 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
 
     Raises:
         ConfigurationError: if the file is no map, or cannot be written.
-        RefusedInput: ``invalid_edit``, with the reason; the file is unchanged.
+        RefusedInput: ``invalid_request``, with the reason; the file is unchanged.
     """
     if not path.is_file():
         raise ConfigurationError(
@@ -165,8 +165,9 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
         )
     lock = claim_map(path)
     try:
-        association = "surface" if _is_of_surface_rule(path) else "paper"
-        builder = read_map(Config(merging=MergingConfig(association=association)), path)
+        of_paper = MergingConfig(association="paper")
+        merging = MergingConfig() if _is_of_surface_rule(path) else of_paper
+        builder = read_map(Config(merging=merging), path)
         reply = builder.edit(request)
         write_map(builder, path)
     finally:

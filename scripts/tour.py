@@ -1,4 +1,4 @@
-"""A tour: a recording becomes a graph, which is asked, exported, compared and merged.
+"""A tour: a recording becomes a graph, which is asked, corrected, exported, compared and merged.
 
 scripts/tour starts it with its environment.
 """
@@ -9,6 +9,7 @@ import asyncio
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -76,12 +77,47 @@ def ask_as_an_agent(folder: Path) -> None:
     asyncio.run(talk())
 
 
+def correct_by_hand(out: Path, cup_id: int) -> None:
+    """An operator's edits: in the map file, and through the services of a node."""
+    room = out / "room.map"
+    deworldsg("edit", room, "set_label", cup_id, "my mug")
+    deworldsg("edit", room, "delete", cup_id)
+    deworldsg("edit", room, "undo")
+    try:
+        from deworldsg_ros.client import SceneGraphClient
+    except ImportError:
+        print("\nservices: skipped, ROS 2 is not installed")
+        return
+    values = {"map_path": room.absolute(), "save_path": (out / "edited.json").absolute()}
+    options = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
+    command = [COMMAND[0], "-m", "deworldsg_ros.nodes.graph_node", "--ros-args", *options]
+    node = subprocess.Popen(command)
+    try:
+        with SceneGraphClient() as client:
+            mug = client.wait(timeout_s=120.0)[cup_id]
+            print(f"\n>>> {mug.name} is in the running graph")
+            print(f"labelled by hand: {mug.is_labelled_by_hand}")
+            assert mug.label == "my mug" and mug.is_labelled_by_hand
+            table = client.graph.one("dining table").id
+            for answer in (
+                client.split(table),
+                client.undo(),
+                client.command("goal_near", object=cup_id, distance_m=0.8),
+            ):
+                print(str(answer)[:200])
+            print(client.save())
+    finally:
+        node.send_signal(signal.SIGINT)
+        node.wait(30)
+    deworldsg("diff", out / "first", out / "edited.json")
+
+
 def main() -> None:
     """Run all steps; the first one that fails ends the tour."""
     recording = sys.argv[1] if len(sys.argv) > 1 else ROOT / "bags" / "demo_room"
     out = Path(sys.argv[2] if len(sys.argv) > 2 else "tour_out")
     more = sys.argv[3:]
-    deworldsg("run", recording, "--out", out / "first", *more)
+    deworldsg("run", recording, "--out", out / "first", "--map", out / "room.map", *more)
     graph = ask_in_python(out / "first")
     assert len(graph) > 0
 
@@ -89,6 +125,7 @@ def main() -> None:
         deworldsg("query", out / "first", question)
     deworldsg("goal", out / "first", "cup", "--distance", 0.8)
     ask_as_an_agent(out / "first")
+    correct_by_hand(out, graph.one("cup").id)
 
     for kind, name in (
         ("graphml", "graph.graphml"),

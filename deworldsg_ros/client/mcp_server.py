@@ -48,16 +48,16 @@ def make_server(newest: Callable[[], SceneGraph], edits: Any = None) -> Any:
         return call
 
     tools = GraphTools(newest)
-    writing = [] if edits is None else list(EditTools(edits))
-    server = MCPServer("deworldsg", instructions=INSTRUCTIONS, log_level="WARNING")
-    for function in (
+    functions: list[Callable[..., dict[str, Any]]] = [
         tools.list_objects,
         tools.list_relations,
         tools.find,
         tools.get_object_context,
         tools.what_changed,
         tools.goal_near,
-        *writing,
-    ):
+        *([] if edits is None else EditTools(edits)),
+    ]
+    server = MCPServer("deworldsg", instructions=INSTRUCTIONS, log_level="WARNING")
+    for function in functions:
         server.tool()(reporting(function))
     return server

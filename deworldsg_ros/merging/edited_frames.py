@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from deworldsg_ros.merging.matching import CLASS_AGREEMENT
 from deworldsg_ros.merging.node_records import NodeRecords
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, derived
 from deworldsg_ros.scene.gaussian import fuse
 from deworldsg_ros.scene.graph import SceneGraph
@@ -53,8 +53,9 @@ def as_edited(
         return local, []
     owners, on_nodes, _ = records.map.overlaps(records.map.cells_of(local.surface_points_world))
     ids = [records.node(owner) for owner in owners]
-    classes = graph.nodes.class_probabilities[[graph.nodes.row(node_id) for node_id in ids]]
-    on_nodes = on_nodes * (local.class_probabilities @ classes.T > CLASS_AGREEMENT)
+    on_nodes = (
+        on_nodes * np.array([_agrees(graph, local, i) for i in ids]).reshape(-1, len(local)).T
+    )
     objects: list[_Object] = []
     row_of: list[int] = []
     row_on: dict[int, int] = {}
@@ -105,6 +106,14 @@ def may_merge(graph: SceneGraph, a_id: int, b_id: int) -> bool:
     # A fragment of a deleted object becomes a part of it. A published object is something else.
     others = [node_id for node_id in (a_id, b_id) if node_id not in edits.deleted]
     return len(others) != 1 or not nodes.confirmed[nodes.row(others[0])]
+
+
+def _agrees(graph: SceneGraph, local: LocalGraph, node_id: int) -> Bool:
+    """Whether (n,) the class of each object is that of a node, or of one that it was made of."""
+    nodes = graph.nodes
+    rows = [nodes.row(known) for known in (node_id, *graph.edits.origins(node_id))]
+    agreement = local.class_probabilities @ nodes.class_probabilities[rows].T
+    return np.asarray((agreement > CLASS_AGREEMENT).any(axis=1))
 
 
 def _merged_below(graph: SceneGraph, on_nodes: dict[int, float]) -> int:

@@ -66,7 +66,7 @@ class Editor:
             stamp_ns: of the newest frame.
 
         Raises:
-            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
+            RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
         if isinstance(request, Undo):
             return self._undo(graph)
@@ -241,7 +241,7 @@ class SurfaceEditor(Editor):
 
 def refused(message: str) -> RefusedInput:
     """The error of an edit that cannot be made."""
-    return RefusedInput("invalid_edit", message)
+    return RefusedInput("invalid_request", message)
 
 
 def _check_published(graph: SceneGraph, node_id: int) -> None:

@@ -58,7 +58,7 @@ class Merging(Protocol):
         """Make an operator's edit, or undo one; see `Editor.apply`.
 
         Raises:
-            RefusedInput: ``invalid_edit``, with the reason; nothing is changed then.
+            RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
         ...
 

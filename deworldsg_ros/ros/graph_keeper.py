@@ -141,10 +141,8 @@ class GraphKeeper:
 
     def replace(self, builder: GraphBuilder) -> None:
         """Continue with another graph: clients see a new session."""
-        self._builder = builder
-        self._session = secrets.token_hex(8)
-        self.newest_ns = 0
-        self._clock = ClockGate()
+        self._builder, self._session = builder, secrets.token_hex(8)
+        self.newest_ns, self._clock = 0, ClockGate()
         self._pending.clear()
         self._whole.changed()
         self.changed()

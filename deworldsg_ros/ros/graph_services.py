@@ -7,10 +7,10 @@ which has the fields of such a service: the request is JSON in `load_namespace`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 from diagnostic_msgs.srv import AddDiagnostics
@@ -42,7 +42,6 @@ GOAL_TOPIC = "deworldsg/goal"
 # A question is a line. An edit is a few numbers.
 MAX_REQUEST_CHARACTERS = 10_000
 
-Request = TypeVar("Request")
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
 
 
@@ -88,7 +87,7 @@ class GraphServices:
         self._node = node
         self._graph = graph
         self._publish_goal = node.create_publisher(PoseStamped, GOAL_TOPIC, reliable(1)).publish
-        for name, kind, answer in (
+        services: Sequence[tuple[str, Any, Callable[[Any], str]]] = (
             ("query", Query, self._query),
             ("goal_near", GoalNear, self._goal_near),
             ("explain", Explain, self._explain),
@@ -97,7 +96,8 @@ class GraphServices:
             ("merge", MergeNodes, self._edit),
             ("split", SplitNode, self._edit),
             ("delete", DeleteNode, self._edit),
-        ):
+        )
+        for name, kind, answer in services:
             self._serve(name, AddDiagnostics, partial(_parsed, kind, answer))
         self._serve("save", Trigger, lambda text: self._save())
         self._serve("clear", Trigger, lambda text: self._clear())
@@ -183,7 +183,7 @@ class GraphServices:
         return f"{len(graph)} nodes are cleared"
 
 
-def _parsed(kind: type[Request], answer: Callable[[Request], str], text: str) -> str:
+def _parsed(kind: Any, answer: Callable[[Any], str], text: str) -> str:
     if len(text) > MAX_REQUEST_CHARACTERS:
         raise RefusedInput(
             "invalid_request",

@@ -110,6 +110,11 @@ class EditLog:
         """Whether the operator says that a node is not to be published."""
         return node_id in self.deleted or node_id in self.replaced
 
+    def origins(self, node_id: int) -> list[int]:
+        """The hidden nodes of which edits have made a node."""
+        found = [old_id for edit in self.edits if node_id in edit.nodes for old_id in edit.replaced]
+        return [*found, *(origin for old_id in found for origin in self.origins(old_id))]
+
     def believed_classes(
         self, nodes: NodeTable, vocabulary: Vocabulary, rows: Int64 | Sequence[int]
     ) -> Float64:

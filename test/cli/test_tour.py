@@ -34,4 +34,7 @@ def test_the_tour(tmp_path: Path) -> None:
     assert "not sure" in done.stdout
     assert "stand at" in done.stdout
     assert "transform found" in done.stdout
+    assert "is a 'my mug'" in done.stdout and "undone: delete" in done.stdout
+    assert "labelled by hand: True" in done.stdout and "undone: split" in done.stdout
+    assert "relabelled" in done.stdout
     assert "MCP find" in done.stdout or "mcp is not installed" in done.stdout

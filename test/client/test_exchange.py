@@ -97,7 +97,9 @@ def test_the_splats_are_the_gaussians(room: SceneGraph, tmp_path: Path) -> None:
 
 
 def test_spark_dsg_reads_its_json(room: SceneGraph, tmp_path: Path) -> None:
-    spark_dsg = pytest.importorskip("spark_dsg")
+    spark_dsg = pytest.importorskip(
+        "spark_dsg", reason="needs spark_dsg, 276 MB: pip install 'deworldsg_ros[spark]'"
+    )
     (path,) = export(room, "spark_dsg", tmp_path / "graph.json")
     graph = spark_dsg.DynamicSceneGraph.load(str(path))
     assert graph.num_nodes() == len(room)

@@ -270,7 +270,7 @@ def test_a_bad_edit_changes_nothing(request_, message):
     before = copy_state(room.builder)
     with pytest.raises(RefusedInput, match=message) as refusal:
         room.builder.edit(request_)
-    assert refusal.value.reason == "invalid_edit"
+    assert refusal.value.reason == "invalid_request"
     after = copy_state(room.builder)
     assert before.keys() == after.keys()
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)

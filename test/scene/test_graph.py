@@ -187,7 +187,7 @@ def test_frames_are_remembered_up_to_a_number() -> None:
     assert graph.nodes_of_frame(20) == [0]
 
 
-def test_invalid_edits_raise_and_change_nothing() -> None:
+def test_invalid_requests_raise_and_change_nothing() -> None:
     graph = graph_of(2)
     graph.take_removals()
     before = arrays_of(graph)
