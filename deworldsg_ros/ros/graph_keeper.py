@@ -142,8 +142,7 @@ class GraphKeeper:
     def replace(self, builder: GraphBuilder) -> None:
         """Continue with another graph: clients see a new session."""
         self._builder, self._session = builder, secrets.token_hex(8)
-        self.newest_ns, self._clock = 0, ClockGate()
-        self._pending.clear()
+        self.newest_ns, self._clock, self._pending = 0, ClockGate(), PendingEvidence()
         self._whole.changed()
         self.changed()
 

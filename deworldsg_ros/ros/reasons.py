@@ -24,8 +24,8 @@ REASONS: dict[str, str] = {
     "invalid_pose": "A pose contains NaN or infinity, its quaternion is not of length 1, or it is "
     "more than 10 km from the origin. Check the source of the poses; publish them in a frame that "
     "begins near the robot.",
-    "invalid_request": "A request to a [service](nodes.md#services) cannot be fulfilled, and changed "
-    "nothing. Its answer says why.",
+    "invalid_request": "A request to a [service](nodes.md#services) cannot be fulfilled, and "
+    "changed nothing. Its answer says why.",
     "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "
     "session. Publish all of them in one world frame, and set `inputs.world_frame` to it.",
     "pose_jump": "The camera moved more than 1 m between two frames, or rotated faster than 360 "
