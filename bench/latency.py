@@ -113,6 +113,9 @@ class RecordedPerceiver:
     def __init__(self, perceived: dict[int, Perceived]) -> None:
         self._perceived = perceived
 
+    def watch(self, wrap: Any) -> None:
+        """There is no model to watch."""
+
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The results of the image, with the stamp of this frame."""
         known = self._perceived[fingerprint(frame.rgb)]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import gc
+import functools
+import sys
+import threading
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from types import ModuleType
+from typing import Any, ClassVar, TypeVar, cast
 
-import numba
 import numpy as np
-from numba.core import event
 from numpy.typing import DTypeLike, NDArray
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -20,14 +21,48 @@ COMPILING = "compiling the kernels, for the first run on this machine …"
 def kernel(function: F) -> F:
     """Compile with numba: strict IEEE arithmetic, without the GIL, cached on disk if possible.
 
+    Numba is imported at the first call of a kernel: a program that calls none starts earlier.
+
     A kernel may call kernels of its own module only. Numba invalidates a cached kernel when the
     kernel's own file changes, but ignores changes in the files of the kernels that it calls.
     """
-    try:
-        compiled: Any = numba.njit(cache=True, nogil=True)(function)
-    except RuntimeError:  # the cache folder is not writable: compile in every process
-        compiled = numba.njit(nogil=True)(function)
-    return cast(F, compiled)
+    return cast(F, _Kernel(function))
+
+
+class _Kernel:
+    """Stands for a kernel until one of its module is called; then numba's dispatchers do."""
+
+    _waiting: ClassVar[dict[ModuleType, list[_Kernel]]] = {}
+    _lock = threading.Lock()
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._function = function
+        self._dispatcher: Any = None
+        self._module = sys.modules[function.__module__]
+        self._waiting.setdefault(self._module, []).append(self)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.dispatcher(*args)
+
+    @property
+    def dispatcher(self) -> Any:
+        """Numba's; other modules that imported the kernel before keep this object."""
+        if self._dispatcher is None:
+            with self._lock:
+                for item in self._waiting.pop(self._module, ()):
+                    item._dispatcher = _jit(item._function)
+                    setattr(self._module, item._function.__name__, item._dispatcher)
+        return self._dispatcher
+
+    @property
+    def signatures(self) -> Any:
+        """The types of arguments for which it is compiled."""
+        return self.dispatcher.signatures
+
+
+# Functions to call when the first kernel is compiled.
+_awaiting: list[Callable[[], None]] = []
 
 
 def on_compilation(notify: Callable[[], None]) -> None:
@@ -35,46 +70,31 @@ def on_compilation(notify: Callable[[], None]) -> None:
 
     A kernel that is loaded from the cache on disk is not compiled.
     """
-    event.register("numba:compile", _FirstEvent(notify))
+    _awaiting.append(notify)
 
 
-class _FirstEvent(event.Listener):
-    def __init__(self, notify: Callable[[], None]) -> None:
-        self._notify: Callable[[], None] | None = notify
+@functools.cache
+def _numba() -> ModuleType:
+    import numba
+    from numba.core import event
 
-    def on_start(self, found: Any) -> None:
-        notify, self._notify = self._notify, None
-        if notify is not None:
-            notify()
+    class Compilation(event.Listener):
+        def on_start(self, found: Any) -> None:
+            while _awaiting:
+                _awaiting.pop()()
 
-    def on_end(self, found: Any) -> None:
-        pass
+        def on_end(self, found: Any) -> None:
+            pass
 
-
-class _WithoutCollector(event.Listener):
-    """Pauses the garbage collector of Python while a kernel is compiled.
-
-    The compiler makes many objects that live until its end. Looking at them again and again would
-    take a fifth of its time.
-    """
-
-    def __init__(self) -> None:
-        self._depth = 0
-        self._was_enabled = False
-
-    def on_start(self, found: Any) -> None:
-        if self._depth == 0:
-            self._was_enabled = gc.isenabled()
-            gc.disable()
-        self._depth += 1
-
-    def on_end(self, found: Any) -> None:
-        self._depth -= 1
-        if self._depth == 0 and self._was_enabled:
-            gc.enable()
+    event.register("numba:compile", Compilation())
+    return numba
 
 
-event.register("numba:compile", _WithoutCollector())
+def _jit(function: Callable[..., Any]) -> Any:
+    try:
+        return _numba().njit(cache=True, nogil=True)(function)
+    except RuntimeError:  # the cache folder is not writable: compile in every process
+        return _numba().njit(nogil=True)(function)
 
 
 def read_only(array: NDArray[Any], dtype: DTypeLike | None = None) -> NDArray[Any]:

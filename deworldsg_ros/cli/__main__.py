@@ -2,4 +2,5 @@
 
 from deworldsg_ros.cli import main
 
-main()
+if __name__ == "__main__":  # the processes of `deworldsg compile` import it, too
+    main()

@@ -52,6 +52,10 @@ class DeworldsgNode(PerceivingNode):
         if self._relating.follows_graph:
             self._relating.apply(update)
 
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """Missing inputs, and models that fail or hang, in words."""
+        return [*super().waiting_for(now_ns), *self._relating.problems()]
+
     def more_values(self) -> dict[str, str]:
         """The size of the graph, and numbers of clips by their state."""
         return {**super().more_values(), **self._relating.values(), **self.graph.values()}

@@ -78,6 +78,10 @@ class RelationNode(JoiningNode[PairingFrame]):
     def _deliver(self, evidence: RelationEvidence) -> None:
         self._publish(evidence_to_message(evidence, self._world_frame))
 
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """Missing inputs, and a world model that fails or hangs, in words."""
+        return [*super().waiting_for(now_ns), *self._relating.problems()]
+
     def more_values(self) -> dict[str, str]:
         """Numbers of clips by their state."""
         return {**super().more_values(), **self._relating.values()}

@@ -6,6 +6,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -106,6 +107,12 @@ class Perception:
             if config.score_threshold < 0
             else config.score_threshold
         )
+
+    def watch(self, wrap: Callable[[str, Any], Any]) -> None:
+        """Replace each backend by the result of a function of its name and the backend."""
+        self._detector = wrap("detector", self._detector)
+        self._segmenter = wrap("segmenter", self._segmenter)
+        self._relation_head = wrap("relation_head", self._relation_head)
 
     def turn_upright(self, frame: RgbdFrame) -> UprightFrame:
         """A frame, turned upright if the camera is mounted on its side and detections are refined.

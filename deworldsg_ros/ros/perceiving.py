@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import msgspec
+
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
@@ -19,6 +21,7 @@ from deworldsg_ros.ros.inputs import (
     listen_rgb,
 )
 from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
+from deworldsg_ros.ros.models import PERCEPTION_LIMIT_S, Supervised, parse_faults
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.streams.frame_assemblers import FrameAssembler
 
@@ -37,6 +40,16 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         inputs = self.parameters.inputs
         require_checkpoints(self.parameters.perception)
         self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
+        faults = parse_faults(self.parameters.debug.faults)
+        self._models: dict[str, Supervised] = {}
+
+        def supervise(part: str, backend: Any) -> Supervised:
+            self._models[part] = Supervised(
+                part.replace("_", " "), backend, PERCEPTION_LIMIT_S, self._reload, faults[part]
+            )
+            return self._models[part]
+
+        self._perception.watch(supervise)
         self._frames = FrameAssembler(inputs, **self.assembler_options())
         self._turns: Counter[int] = Counter()
 
@@ -48,6 +61,18 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         listen_pose(self, frames)
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
+
+    def waiting_for(self, now_ns: int) -> list[str]:
+        """Missing inputs, and models that fail or hang, in words."""
+        problems = [model.problem() for model in self._models.values()]
+        return [*super().waiting_for(now_ns), *filter(None, problems)]
+
+    def _reload(self) -> None:
+        """Load all models again, on the CPU: a GPU that failed once fails for this process."""
+        config = msgspec.structs.replace(self.parameters.perception, device="cpu")
+        self.get_logger().warning("loading the models again, on the CPU")
+        fresh = build_perception(config, world_up=self.parameters.inputs.world_up)
+        fresh.watch(lambda part, backend: self._models[part].replace(backend))
 
     def perceive(self, frame: RgbdFrame) -> Perceived:
         """The results of a frame, in the camera's frame; failures and drops are counted."""

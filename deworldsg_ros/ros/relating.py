@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from deworldsg_ros.checkpoints.card import graph_predicates
 from deworldsg_ros.checkpoints.required import require_checkpoints
@@ -10,6 +11,7 @@ from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
 from deworldsg_ros.relations.world_model import build_world_model, require_predicates
+from deworldsg_ros.ros.models import WORLD_MODEL_LIMIT_S, Supervised, parse_faults
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import RelationEvidence
@@ -33,7 +35,13 @@ class Relating:
         config = node.parameters.relations
         report = node.get_logger().warning
         require_checkpoints(relations=config)
-        world_model = build_world_model(config, node.parameters.perception.device)
+        world_model: Any = build_world_model(config, node.parameters.perception.device)
+        if world_model is not None:
+            faults = parse_faults(node.parameters.debug.faults)["world_model"]
+            world_model = Supervised(
+                "world model", world_model, WORLD_MODEL_LIMIT_S, self._reload, faults
+            )
+        self._config, self._model = config, world_model
         predicates = graph_predicates(node.parameters.perception)
         if predicates is not None:  # else the first local graph contains them
             require_predicates(world_model, predicates)
@@ -47,6 +55,14 @@ class Relating:
         self.follows_graph = self.needs_images and config.max_clips_per_s > 0
         if self.follows_graph:
             self._reasoner.watch(self.graph)
+
+    def problems(self) -> list[str]:
+        """What is wrong with the world model, in words."""
+        return [] if self._model is None else list(filter(None, [self._model.problem()]))
+
+    def _reload(self) -> None:
+        """Load the world model again, on the CPU."""
+        self._model.replace(build_world_model(self._config, "cpu"))
 
     def relate(self, frame: PairingFrame) -> None:
         """Deliver the evidence of a frame; queue its clips."""

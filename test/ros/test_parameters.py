@@ -42,7 +42,7 @@ def test_every_field_of_the_configuration_is_a_parameter() -> None:
         for section, values in configuration.to_mapping(configuration.Config()).items()
         for name in values
     }
-    assert set(FIELDS) == names | set(NodeOptions.__struct_fields__)
+    assert set(FIELDS) == names | {"debug.faults"} | set(NodeOptions.__struct_fields__)
     replay = {field.name for field in fields(ReplayParameters)}
     assert replay == names | set(ReplayOptions.__struct_fields__)
 
