@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import resource
 import sys
 import time
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF
 
 from fuzz.harness import CORPUS, keep, replay, run_parallel
 from fuzz.targets import TARGETS
@@ -31,8 +33,10 @@ def main() -> int:
         options.targets, seed=options.seed, jobs=options.jobs, seconds=60 * options.minutes
     )
     for name, count in sorted(report.cases.items()):
-        print(f"  {name:24} {count:7}")
+        print(f"  {name:24} {count:7}  {1000 * report.seconds[name] / count:7.1f} ms each")
     print(report)
+    peaks = [resource.getrusage(who).ru_maxrss >> 10 for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
+    print(f"most memory: {peaks[0]} MB here, {peaks[1]} MB in a process of cases")
     for path in keep(report, options.corpus):
         print(f"kept {path}")
     return 1 if report.failures else 0

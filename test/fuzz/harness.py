@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import random
+import itertools
 import threading
 import time
 from collections import Counter
@@ -12,16 +12,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote, unquote
 
-import hypothesis
-
-from fuzz.mutations import mutate
-from fuzz.target import Target
 from fuzz.targets import TARGETS
-from fuzz.worker import Worker
+from fuzz.worker import Failure, Worker
 
 CORPUS = Path(__file__).resolve().parent / "corpus"
-# Larger cases are reported, but not kept in the repository.
-MAX_CORPUS_BYTES = 100_000
+# Larger cases are reported, but not kept in the repository: LARGE_CASES makes them.
+MAX_CORPUS_BYTES = 50_000
+# By target: file name and content of cases that failed once.
+LARGE_CASES: dict[str, list[tuple[str, bytes]]] = {
+    "set_option": [("set.txt", b"\n" * 38_712 + b"\0\0\0\x80" + b"\0" * 4 + b"\n" * 61_280)],
+}
 # Cases of one target before the next one has its turn.
 TURN = 25
 
@@ -34,19 +34,23 @@ class Report:
         cases: number of cases by target.
         failures: by target and place in the code, the case that failed first (file name, content).
         texts: by the same, the failure in words.
+        seconds: what the cases took, by target.
     """
 
     cases: Counter[str] = field(default_factory=Counter)
     failures: dict[tuple[str, str], tuple[str, bytes]] = field(default_factory=dict)
     texts: dict[tuple[str, str], str] = field(default_factory=dict)
+    seconds: Counter[str] = field(default_factory=Counter)
 
-    def add(self, target: str, member: str, content: bytes, failure: str | None) -> None:
+    def add(self, target: str, failed: Failure | None) -> None:
         """Count a case. A failure counts once for each target and place in the code."""
         self.cases[target] += 1
-        if failure is not None:
-            key = target, failure.split(": ", 2)[1]
-            self.failures.setdefault(key, (member, content))
-            self.texts.setdefault(key, failure)
+        if failed is not None:
+            key = target, failed.text.split(": ", 2)[1]
+            if key not in self.failures:
+                self.failures[key] = failed.member, failed.content
+                self.texts[key] = failed.text
+                print(f"{target} ({failed.member}): {failed.text!a}"[:300], flush=True)
 
     def __str__(self) -> str:
         lines = [f"{sum(self.cases.values())} cases, {len(self.failures)} failures"]
@@ -70,60 +74,21 @@ def run_cases(
     """
     report, worker = Report(), Worker()
     end_s = time.monotonic() + (seconds if seconds is not None else float("inf"))
-    turns = [TARGETS[name] for name in names for _ in range(TARGETS[name].weight)]
-    turn = 0
+    turns = [name for name in names for _ in range(TARGETS[name].weight)]
     try:
-        while time.monotonic() < end_s:
+        for turn in itertools.count():
             left = TURN if cases is None else min(TURN, cases - sum(report.cases.values()))
-            if left <= 0:
-                break
-            target = turns[turn % len(turns)]
-            _turn(target, worker, report, f"{seed} {turn}", left, end_s)
-            turn += 1
+            if left <= 0 or time.monotonic() > end_s:
+                return report
+            name = turns[turn % len(turns)]
+            worker.ready(name)
+            began_s = time.monotonic()
+            for case in worker.turn(name, f"{seed} {turn}", left):
+                report.add(name, case)
+            report.seconds[name] += time.monotonic() - began_s
     finally:
         worker.close()
-    return report
-
-
-def _turn(
-    target: Target, worker: Worker, report: Report, seed: str, count: int, end_s: float
-) -> None:
-    """Run some cases of one target; some are documents of hypothesis, if there are any."""
-    rng = random.Random(f"{target.name} {seed}")
-    good = worker.members(target.name)
-    # Every third turn.
-    if target.documents is not None and rng.randrange(3) == 0:
-        _documents(target, worker, report, rng, count)
-        return
-    for _ in range(count):
-        if time.monotonic() > end_s:
-            return
-        member = rng.choice(list(good))
-        content = mutate(member, good[member], rng)
-        report.add(target.name, member, content, worker.run(target.name, member, content))
-
-
-def _documents(
-    target: Target, worker: Worker, report: Report, rng: random.Random, count: int
-) -> None:
-    assert target.documents is not None
-    member = rng.choice(list(worker.members(target.name)))
-
-    @hypothesis.seed(rng.randrange(2**32))
-    @hypothesis.settings(
-        max_examples=count,
-        database=None,
-        deadline=None,
-        derandomize=False,
-        phases=[hypothesis.Phase.generate],
-        suppress_health_check=list(hypothesis.HealthCheck),
-    )
-    @hypothesis.given(target.documents)
-    def each(content: bytes) -> None:
-        # Not raised here: the run goes on to other failures.
-        report.add(target.name, member, content, worker.run(target.name, member, content))
-
-    each()
+    raise AssertionError("turns have no end")
 
 
 def run_parallel(
@@ -152,6 +117,7 @@ def run_parallel(
     whole = Report()
     for report in reports:
         whole.cases.update(report.cases)
+        whole.seconds.update(report.seconds)
         whole.failures = {**report.failures, **whole.failures}
         whole.texts = {**report.texts, **whole.texts}
     return whole
@@ -177,7 +143,7 @@ def replay(names: Iterable[str], corpus: Path = CORPUS) -> Report:
     try:
         for name in names:
             for member, content in corpus_cases(name, corpus):
-                report.add(name, member, content, worker.run(name, member, content))
+                report.add(name, worker.run(name, member, content))
     finally:
         worker.close()
     return report
@@ -186,4 +152,5 @@ def replay(names: Iterable[str], corpus: Path = CORPUS) -> Report:
 def corpus_cases(target: str, corpus: Path = CORPUS) -> list[tuple[str, bytes]]:
     """Cases of a target that failed once, as file name and content."""
     found = sorted((corpus / target).glob("*"))
-    return [(unquote(path.name.rpartition(".")[0]), path.read_bytes()) for path in found]
+    kept = [(unquote(path.name.rpartition(".")[0]), path.read_bytes()) for path in found]
+    return kept + LARGE_CASES.get(target, [])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import random
@@ -39,7 +40,7 @@ VALUES: tuple[Any, ...] = (
 
 
 MAX_PLACES = 10_000
-# Later mutations of a case see no more of it.
+# A mutation that would make a case longer is left out.
 MAX_CASE_BYTES = 4_000_000
 
 
@@ -47,13 +48,13 @@ def mutate(name: str, content: bytes, rng: random.Random) -> bytes:
     """Damaged content of a file; its name says which kind of file it is."""
     kinds = BY_SUFFIX.get(Path(name).suffix.lower(), (words,))
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        if len(content) > MAX_CASE_BYTES:
-            break
         mutation = rng.choice((raw_bytes, *kinds, *kinds, *kinds))
         try:
-            content = mutation(content, rng)
+            damaged = mutation(content, rng)
         except Exception:  # the last mutation left nothing of this kind to damage
-            content = raw_bytes(content, rng)
+            damaged = raw_bytes(content, rng)
+        if len(damaged) <= MAX_CASE_BYTES:
+            content = damaged
     return content
 
 
@@ -95,7 +96,8 @@ def words(content: bytes, rng: random.Random) -> bytes:
     elif kind == 3:
         del parts[column]
     elif kind == 4:
-        parts[column:column] = [parts[column]] * rng.choice((1, 3, 1000))
+        times = rng.choice((1, 3, 1000 if len(parts[column]) < 4000 else 1))
+        parts[column:column] = [parts[column]] * times
     lines[row] = b" ".join(parts)
     if kind == 5:
         other = rng.randrange(len(lines))
@@ -121,9 +123,12 @@ def yaml_tree(content: bytes, rng: random.Random) -> bytes:
         )
     if b"&a0" in content:  # written out, the aliases would fill the memory
         return raw_bytes(content, rng)
-    return yaml.safe_dump(_tree(yaml.safe_load(content), rng), allow_unicode=True).encode(
-        errors="surrogatepass"
-    )
+    tree = _tree(yaml.load(content, yaml.CSafeLoader), rng)
+    try:
+        text = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True)
+    except UnicodeEncodeError:  # the dumper in C takes no lone surrogates
+        text = yaml.safe_dump(tree, allow_unicode=True)
+    return text.encode(errors="surrogatepass")
 
 
 def _tree(tree: Any, rng: random.Random) -> Any:
@@ -150,7 +155,7 @@ def _tree(tree: Any, rng: random.Random) -> Any:
         node[key:key] = [node[key]] * rng.choice((1, 2, 50))
     elif kind == 2:
         other, place = rng.choice(places)
-        node[key] = json.loads(json.dumps(other[place]))
+        node[key] = copy.deepcopy(other[place])  # what aliases share stays shared
     elif kind == 3:
         deep: Any = node[key]
         for _ in range(rng.choice((1, 3, 60, 400))):
@@ -159,10 +164,6 @@ def _tree(tree: Any, rng: random.Random) -> Any:
     else:
         node[key] = rng.choice(VALUES)
     return tree
-
-
-def _keys(node: Any) -> Any:
-    return node if isinstance(node, dict) else range(len(node) if isinstance(node, list) else 0)
 
 
 def arrays(content: bytes, rng: random.Random) -> bytes:
@@ -180,7 +181,7 @@ def arrays(content: bytes, rng: random.Random) -> bytes:
         entries[name] = raw_bytes(entries[name], rng)
     elif kind == 3:
         compression = rng.choice((zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA))
-        entries[name] += bytes(rng.choice((0, 1 << 24)))
+        entries[name] += bytes(rng.choice((0, 1 << 16)))
     else:
         array = _array(np.load(io.BytesIO(entries[name]), allow_pickle=False), rng)
         packed = io.BytesIO()
@@ -266,6 +267,7 @@ def table(content: bytes, rng: random.Random) -> bytes:
     with tempfile.NamedTemporaryFile(suffix=".db3") as file:
         Path(file.name).write_bytes(content)
         database = sqlite3.connect(file.name)
+        database.execute("PRAGMA synchronous = OFF")
         names = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         name = rng.choice(names)[0]
         columns = [row[1] for row in database.execute(f"PRAGMA table_info({name})")]

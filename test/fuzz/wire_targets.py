@@ -63,7 +63,7 @@ def _message(name: str, use: Callable[[Any], object]) -> Target:
     def make(folder: Path) -> None:
         (folder / "message.json").write_bytes(_example(name))
 
-    return Target(f"wire_{name}", make, read, weight=3)
+    return Target(f"wire_{name}", make, read, weight=6)
 
 
 def _rows_are_distributions(rows: np.ndarray) -> bool:
@@ -160,7 +160,7 @@ def _graph(name: str) -> Target:
             builder.add_evidence(hostile_evidence_in(rng, local))
             check_published(builder, replica)
 
-    return Target(f"graph_{name}", make, read, weight=3)
+    return Target(f"graph_{name}", make, read)
 
 
 def hostile_evidence_in(rng: np.random.Generator, local: LocalGraph) -> RelationEvidence:

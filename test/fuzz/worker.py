@@ -14,23 +14,39 @@ import signal
 import tempfile
 import traceback
 import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import FrameType
 
-# Time of a case. The slowest good file takes 0.2 s; a busy machine is ten times slower.
-CASE_S = 8.0
-# After this, the process does not answer to its own alarm: it hangs in compiled code.
-SILENCE_S = CASE_S + 7.0
+from fuzz.target import Target
+
+# Processor time of a case, which a busy machine does not change. The slowest good file takes 0.1 s.
+CASE_S = 5.0
+# After this time, the process waits for something, or hangs in compiled code.
+SILENCE_S = 120.0
 # Address space of a case above that of the idle process. Every good file is below 1 MB.
 CASE_BYTES = 1 << 30
 # A new process imports the package and reads the good files of a target first; it may compile.
 START_S = 300.0
+# Ends the answers to an order; the name of a file is never empty.
+DONE = ""
 ROOT = Path(__file__).resolve().parents[2]
 
 
 class CaseTimeout(BaseException):
     """Not an Exception: no reader may take it for a problem of its file."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A case that failed: the file, its content, and what happened in words."""
+
+    member: str
+    content: bytes
+    text: str
 
 
 class Worker:
@@ -39,33 +55,32 @@ class Worker:
     def __init__(self) -> None:
         self._start()
 
-    def run(self, target: str, member: str, content: bytes) -> str | None:
+    def run(self, target: str, member: str, content: bytes) -> Failure | None:
         """Run a case: the good files of a target with another content of one of them.
 
         Returns:
             None if it was read or refused with a documented error, else the failure.
         """
-        try:
-            self._send_and_wait((target, None, None), START_S)
-            return self._send_and_wait((target, member, content), SILENCE_S)
-        except TimeoutError:
-            self.close()
-            self._start()
-            return f"hang: no answer within {SILENCE_S:.0f} s"
-        except (EOFError, ConnectionError):
-            self._process.join(10.0)
-            code = self._process.exitcode
-            self.close()
-            self._start()
-            return f"crash: the process ended with {code}"
+        (failure,) = self._cases(target, ("run", target, member, content))
+        return failure
+
+    def turn(self, target: str, seed: str, count: int) -> Iterator[Failure | None]:
+        """Make some cases and run them; one item per case, as `run` returns it.
+
+        The process makes them itself: what damage to a file costs is in its limits too. A case that
+        ends the process ends the turn.
+        """
+        return self._cases(target, ("turn", target, seed, count))
+
+    def ready(self, target: str) -> None:
+        """Make the good files of a target, unless they are made."""
+        self._connection.send(("ready", target))
+        self._answer(START_S)
 
     def members(self, target: str) -> dict[str, bytes]:
         """The good files of a target."""
-        self._send_and_wait((target, None, None), START_S)
-        folder = self._folder / target
-        from fuzz.targets import TARGETS
-
-        return {name: (folder / name).read_bytes() for name in TARGETS[target].members(folder)}
+        self.ready(target)
+        return good_files(target, self._folder / target)
 
     def close(self) -> None:
         """End the process and remove its files."""
@@ -86,52 +101,89 @@ class Worker:
         self._process.start()
         theirs.close()
 
-    def _send_and_wait(
-        self, case: tuple[str, str | None, bytes | None], wait_s: float
-    ) -> str | None:
-        self._connection.send(case)
+    def _cases(self, target: str, order: tuple[object, ...]) -> Iterator[Failure | None]:
+        member = ""
+        try:
+            self.ready(target)
+            self._connection.send(order)
+            while (answer := self._answer(SILENCE_S)) != DONE:
+                if isinstance(answer, str):
+                    member = answer
+                else:
+                    yield answer
+        except TimeoutError:
+            yield self._restart(target, member, f"hang: no answer within {SILENCE_S:.0f} s")
+        except (EOFError, ConnectionError):
+            self._process.join(10.0)
+            text = f"crash: the process ended with {self._process.exitcode}"
+            yield self._restart(target, member, text)
+
+    def _answer(self, wait_s: float) -> str | Failure | None:
         if not self._connection.poll(wait_s):
             raise TimeoutError
-        answer: str | None = self._connection.recv()
+        answer: str | Failure | None = self._connection.recv()
         return answer
+
+    def _restart(self, target: str, member: str, text: str) -> Failure:
+        """Start another process; the content that ended this one is in its folder."""
+        path = self._folder / target / member
+        failure = Failure(member, path.read_bytes() if path.is_file() else b"", text)
+        self.close()
+        self._start()
+        return failure
+
+
+def good_files(target: str, folder: Path) -> dict[str, bytes]:
+    """Contents of the files that the cases of a target may replace, by name."""
+    from fuzz.targets import TARGETS
+
+    return {name: (folder / name).read_bytes() for name in TARGETS[target].members(folder)}
 
 
 def _serve(connection: Connection, folder: Path) -> None:
-    """The process: answers each case."""
+    """The process: for each case sends the name of the file, then None or a Failure."""
     with contextlib.suppress(OSError):
         os.nice(5)
     warnings.simplefilter("ignore")
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    signal.signal(signal.SIGALRM, _alarm)
+    signal.signal(signal.SIGPROF, _alarm)
+    from fuzz.cases import make_cases
     from fuzz.targets import TARGETS
 
-    ready: set[str] = set()
+    good: dict[str, dict[str, bytes]] = {}
+
+    def run(name: str, member: str, content: bytes) -> None:
+        connection.send(member)
+        path = folder / name / member
+        path.write_bytes(content)
+        text = _outcome(TARGETS[name], folder / name)
+        path.write_bytes(good[name][member])
+        connection.send(None if text is None else Failure(member, content, text))
+
     while True:
         try:
-            name, member, content = connection.recv()
+            kind, name, *rest = connection.recv()
         except EOFError:
             return
-        target, place = TARGETS[name], folder / name
-        if name not in ready:
-            place.mkdir()
-            target.make(place)
-            target.read(place)  # the good files are good; imports and kernels are loaded
-            ready.add(name)
-        if member is None:
-            connection.send(None)
-            continue
-        path = place / member
-        good = path.read_bytes()
-        path.write_bytes(content)
-        answer = _answer(target, place)
-        path.write_bytes(good)
-        connection.send(answer)
+        if kind == "run":
+            run(name, *rest)
+        elif kind == "turn":
+            make_cases(TARGETS[name], good[name], *rest, use=partial(run, name))
+        else:
+            _set_limit(resource.getrlimit(resource.RLIMIT_AS)[1])
+            if name not in good:
+                (folder / name).mkdir()
+                TARGETS[name].make(folder / name)
+                good[name] = good_files(name, folder / name)
+                TARGETS[name].read(folder / name)  # they are good; imports and kernels are loaded
+            _set_limit(_address_space() + CASE_BYTES)
+        connection.send(DONE)
 
 
-def _answer(target, place: Path) -> str | None:  # type: ignore[no-untyped-def]
+def _outcome(target: Target, place: Path) -> str | None:
+    """Read a case; None, or the failure in words."""
     try:
-        _set_limit(_address_space() + CASE_BYTES)
-        signal.setitimer(signal.ITIMER_REAL, CASE_S)
+        signal.setitimer(signal.ITIMER_PROF, CASE_S)
         target.read(place)
     except target.errors as error:
         # Errors are shown: their text must be text.
@@ -143,8 +195,7 @@ def _answer(target, place: Path) -> str | None:  # type: ignore[no-untyped-def]
     except BaseException as error:
         return f"{type(error).__name__}: {_where(error)}: {str(error)[:200]}"
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        _set_limit(resource.getrlimit(resource.RLIMIT_AS)[1])
+        signal.setitimer(signal.ITIMER_PROF, 0)
     return None
 
 
