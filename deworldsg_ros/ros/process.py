@@ -12,9 +12,13 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
 from deworldsg_ros.memory import keep_freed_memory
-from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 EXIT_USAGE = 2
+NO_SECURITY = ConfigurationError(
+    "ROS_SECURITY_ENABLE is true, but this middleware was built without security, as the wheels of "
+    "ROS 2 are: source a ROS 2 Jazzy of the system, or unset ROS_SECURITY_ENABLE"
+)
 
 
 def run_process(body: Callable[[threading.Event], int], args: list[str] | None = None) -> int:
@@ -42,6 +46,10 @@ def run_process(body: Callable[[threading.Event], int], args: list[str] | None =
         return 0
     except DeWorldSGError as error:
         return refuse(error)
+    except RuntimeError as error:  # RCLError, which rclpy does not export
+        if "security libraries" not in str(error):
+            raise
+        return refuse(NO_SECURITY)
     finally:
         rclpy.try_shutdown()
 

@@ -1,0 +1,71 @@
+"""SROS2: the policies are what the nodes use; without security, a secured node does not start."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import distributions
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+WHEELS = any(item.metadata["Name"] == "ros-jazzy-rclpy" for item in distributions())
+KEY_FILES = (
+    *("identity_ca.cert.pem", "cert.pem", "key.pem"),
+    *("permissions_ca.cert.pem", "governance.p7s", "permissions.p7s"),
+)
+
+
+def run(*command: str | Path, limit_s: float = 110.0, **environment: str) -> tuple[int, str]:
+    """Exit code and output of a command."""
+    done = subprocess.run(
+        [sys.executable, *map(str, command)],
+        env={**os.environ, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=limit_s,
+    )
+    return done.returncode, done.stdout
+
+
+@pytest.mark.timeout(600)  # kernels may have to be compiled
+def test_policies_are_what_the_nodes_use(root_dir: Path, tmp_path: Path) -> None:
+    made = tmp_path / "policies.xml"
+    code, output = run(root_dir / "tools" / "make_policies.py", made, limit_s=590)
+    assert code == 0, output
+    committed = root_dir / "config" / "sros2" / "policies.xml"
+    assert committed.read_text() == made.read_text(), "run python tools/make_policies.py"
+
+
+def test_there_is_one_enclave_for_each_node_and_no_wildcard(root_dir: Path) -> None:
+    policies = ElementTree.parse(root_dir / "config" / "sros2" / "policies.xml").getroot()
+    enclaves = [enclave.get("path") for enclave in policies.iter("enclave")]
+    nodes = {path.name for path in (root_dir / "scripts" / "ros").iterdir()}
+    assert sorted(enclaves) == sorted(f"/{name}" for name in nodes)
+    names = [element.text or "" for kind in ("topic", "service") for element in policies.iter(kind)]
+    assert names and all(names)
+    assert {name.partition("*")[0] for name in names if "*" in name} <= {"scene_graph_client_"}
+
+
+@pytest.mark.skipif(not WHEELS, reason="a full ROS 2 has a Fast DDS with security")
+@pytest.mark.parametrize("strategy", ["Enforce", "Permissive"])
+def test_a_middleware_without_security_ends_the_node(
+    root_dir: Path, tmp_path: Path, strategy: str
+) -> None:
+    enclave = tmp_path / "enclaves" / "graph_node"
+    enclave.mkdir(parents=True)
+    for name in KEY_FILES:
+        (enclave / name).write_text("no key")
+    security = {
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": strategy,
+        "ROS_SECURITY_KEYSTORE": str(tmp_path),
+    }
+    node = ("-m", "deworldsg_ros.nodes.graph_node", "--ros-args", "--enclave", "/graph_node")
+    code, output = run(*node, **security)
+    assert code == 2, output
+    assert "error: ROS_SECURITY_ENABLE is true, but" in output
+    assert "Traceback" not in output
