@@ -50,14 +50,14 @@ def models() -> dict[str, object]:
 def loaded(name: str, model: object, folder: Path) -> object:
     """The checkpoint of a folder; that of a video model in the image model."""
     if name != "sam2_video":
-        return type(model).from_pretrained(folder)
+        return type(model).from_pretrained(folder, use_safetensors=True)
     found = transformers.AutoConfig.from_pretrained(folder)
     parts = {
         part: {k: v for k, v in getattr(found, part).to_dict().items() if k != "model_type"}
         for part in ("prompt_encoder_config", "mask_decoder_config")
     }
     config = transformers.Sam2Config(vision_config=found.vision_config.to_dict(), **parts)
-    return transformers.Sam2Model.from_pretrained(folder, config=config)
+    return transformers.Sam2Model.from_pretrained(folder, config=config, use_safetensors=True)
 
 
 def main(out: Path) -> None:
