@@ -6,6 +6,8 @@
 #
 # Each slow step stores the hash of its input in .venv/.bootstrap. A second call without changes
 # does no work. A call after an interruption continues where the first one stopped.
+#
+# With DEWORLDSG_LOCKED=1 it installs the versions of locks/ instead, and checks their hashes.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 venv="$root/.venv"
@@ -116,6 +118,10 @@ pip_install() { "$venv/bin/python" -m pip install --no-input --prefer-binary \
 # It needs the major version of numpy with which its message types were compiled.
 install_requirements() {
   local ros=$1 profile=$2 extras=(build run) arguments=() list expected
+  if [ -n "${DEWORLDSG_LOCKED:-}" ]; then
+    install_locked "$ros" "$profile"
+    return
+  fi
   [ "$ros" = sourced ] || extras+=(ros)
   [ "$profile" = run ] || extras+=(test)
   if [ "$profile" = test ] && [ -n "${DEWORLDSG_TEST_MODELS:-}" ]; then
@@ -133,6 +139,27 @@ install_requirements() {
   fi
   rm -f "$stamps/$profile"
   quietly "installing the requirements (${extras[*]})" pip_install "${arguments[@]}"
+  echo "$expected" >"$stamps/$profile"
+}
+
+# Install the exact files that locks/ names, by their hashes.
+install_locked() {
+  local ros=$1 profile=$2 version locks lock expected
+  [ "$ros" = wheels ] || fail "ROS 2 is sourced, and the locks contain the wheels of ROS 2:" \
+    "unset DEWORLDSG_LOCKED, or start in a shell without a sourced ROS 2"
+  [ "$profile" = run ] || [ -z "${DEWORLDSG_TEST_MODELS:-}" ] || fail "the locks contain no torch:" \
+    "unset DEWORLDSG_LOCKED or DEWORLDSG_TEST_MODELS"
+  version=$(version_of "$venv/bin/python")
+  # One package of the test profile has no wheel. The run profile has what builds it.
+  locks=("run-$version.txt")
+  [ "$profile" = run ] || locks+=("$profile-$version.txt")
+  expected=$(cd "$root/locks" && sha256sum "${locks[@]}" | sha256sum | cut -d ' ' -f 1)
+  is_current "$profile" "$expected" && return
+  rm -f "$stamps/$profile"
+  for lock in "${locks[@]}"; do
+    quietly "installing locks/$lock" pip_install --require-hashes --no-build-isolation \
+      -r "$root/locks/$lock"
+  done
   echo "$expected" >"$stamps/$profile"
 }
 

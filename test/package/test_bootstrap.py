@@ -32,7 +32,7 @@ def bash(checkout: Path, code: str, **environment: str) -> subprocess.CompletedP
 
 def fake_python(folder: Path, name: str, version: str, *, has_venv: bool = True) -> None:
     """A Python that knows its version and, perhaps, venv."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     path = folder / name
     path.write_text(
         f"""#!/bin/sh
@@ -120,3 +120,35 @@ def test_another_ros_is_put_aside(checkout: Path) -> None:
     done = bash(checkout, code, ROS_DISTRO="humble", PYTHONPATH="/old", LD_LIBRARY_PATH="/old")
     assert done.stdout == "\n"
     assert "ROS 2 humble is sourced" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("profile", "files"), [("run", "run-3.12"), ("test", "run-3.12 test-3.12")]
+)
+def test_locked_installs_take_the_locks_of_the_python_once(
+    checkout: Path, profile: str, files: str
+) -> None:
+    (checkout / "locks").mkdir()
+    for name in ("run-3.12.txt", "test-3.12.txt", "run-3.11.txt"):
+        (checkout / "locks" / name).write_text(name)
+    fake_python(checkout / ".venv" / "bin", "python", "3.12")
+    code = (
+        'mkdir -p "$stamps"; quietly() { shift; "$@"; }; pip_install() { echo "$@"; }; '
+        f"install_requirements wheels {profile}; install_requirements wheels {profile}"
+    )
+    done = bash(checkout, code, DEWORLDSG_LOCKED="1")
+    lines = done.stdout.splitlines()
+    assert [Path(line.split()[-1]).stem for line in lines] == files.split(), done.stderr
+    assert all(line.startswith("--require-hashes ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("ros", "profile", "reason"),
+    [("sourced", "run", "ROS 2 is sourced"), ("wheels", "test", "no torch")],
+)
+def test_locks_are_refused_where_they_do_not_fit(
+    checkout: Path, ros: str, profile: str, reason: str
+) -> None:
+    code = f"install_requirements {ros} {profile}"
+    done = bash(checkout, code, DEWORLDSG_LOCKED="1", DEWORLDSG_TEST_MODELS="1")
+    assert done.returncode != 0 and reason in done.stderr
