@@ -43,11 +43,12 @@ class _Kernel:
         self._waiting.setdefault(self._module, []).append(self)
 
     def __call__(self, *args: Any) -> Any:
-        return self.dispatcher(*args)
+        # Other modules that imported the kernel keep this object, and call it in every frame.
+        return (self._dispatcher or self.dispatcher)(*args)
 
     @property
     def dispatcher(self) -> Any:
-        """Numba's; other modules that imported the kernel before keep this object."""
+        """Numba's."""
         if self._dispatcher is None:
             with self._lock:
                 for item in self._waiting.pop(self._module, ()):

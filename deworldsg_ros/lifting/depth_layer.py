@@ -120,6 +120,13 @@ def _least_above(depths: Float32, buckets: UInt16, bucket: int) -> float:
 
 
 @kernel
+def _sorted(depths: Float32) -> Float64:
+    """The depths in ascending order. Numba compiles a sort for each type: all here are float64."""
+    ordered: Float64 = np.sort(depths.astype(np.float64))
+    return ordered
+
+
+@kernel
 def _median(depths: Float32, buckets: UInt16, counts: Int64) -> float:
     """Median of depths, from their buckets and the counts of these."""
     rank, next_rank = (depths.size - 1) // 2, depths.size // 2
@@ -137,8 +144,9 @@ def _median(depths: Float32, buckets: UInt16, counts: Int64) -> float:
             return lowest
         depths = members
         if depths.size <= 64:
-            depths.sort()
-            return (np.float64(depths[rank]) + np.float64(depths[next_rank])) / 2.0
+            ordered = _sorted(depths)
+            middle: float = (ordered[rank] + ordered[next_rank]) / 2.0
+            return middle
         buckets = _buckets(depths, lowest, 256 / (highest - lowest), 256)
         counts = _bucket_counts(buckets, 256)
 
@@ -177,7 +185,7 @@ def _blocks(
 @kernel
 def _median_step(depths: Float32) -> float:
     """median(Δz) of the sorted depths."""
-    ordered = np.sort(depths).astype(np.float64)
+    ordered = _sorted(depths)
     steps = np.sort(ordered[1:] - ordered[:-1])
     middle: float = (steps[(steps.size - 1) // 2] + steps[steps.size // 2]) / 2.0
     return middle
@@ -252,7 +260,7 @@ def _dominant_layer(
         reference = _median(depths, buckets, counts)
         lows, highs = _blocks(depths, buckets, starts, lowest, highest)
     else:
-        lows = np.sort(depths).astype(np.float64)
+        lows = _sorted(depths)
         highs = lows
         reference = (lows[steps // 2] + lows[(steps + 1) // 2]) / 2.0
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from deworldsg_ros.merging import existence, names
@@ -163,6 +162,8 @@ class NodeRecords:
 
     def memory(self) -> Memory:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
+        from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
+
         owners = [self._owners[node_id] for node_id in sorted(self._owners)]
         balances = self.joint.balances
         pairs = [[*sorted(map(self.node, pair)), balance] for pair, balance in balances.items()]
