@@ -40,13 +40,15 @@ class Entry:
 ENTRIES = {
     entry.name: entry
     for entry in (
-        Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=15),
+        Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=8),
         Entry("integration", "bench.integration:figures", limit_s=300, takes_s=90),
         Entry("step", "bench.step:figures", limit_s=120, takes_s=30),
-        Entry("fross", "bench.fross:figures", limit_s=240, takes_s=60),
-        Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=15),
+        Entry("fross", "bench.fross:figures", limit_s=240, takes_s=50),
+        Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=5),
         Entry("kitchen", "bench.kitchen:figures", limit_s=240, takes_s=45),
-        Entry("memory", "bench.memory:figures", limit_s=120, takes_s=20),
+        Entry("memory", "bench.memory:figures", limit_s=120, takes_s=8),
+        Entry("building", "bench.building:figures", limit_s=180, takes_s=12),
+        Entry("store", "bench.store:figures", limit_s=180, takes_s=20),
         Entry("compile", "bench.start:compile_figures", limit_s=240, takes_s=40),
         Entry("start", "bench.start:node_figures", limit_s=180, takes_s=25),
         Entry("start_demo", "bench.start:demo_figures", limit_s=240, takes_s=15),

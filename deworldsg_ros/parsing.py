@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import msgspec
@@ -66,3 +69,19 @@ def check_yaml(content: bytes) -> None:
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_YAML_DEPTH:
             raise ValueError(f"YAML has more than {MAX_YAML_DEPTH} levels")
+
+
+@contextmanager
+def paused_collector() -> Iterator[None]:
+    """Pause the garbage collector while millions of values are made.
+
+    Messages have no cycles. The collector would visit what is there again and again: reading a
+    graph of 10^5 nodes takes half as long without it.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()

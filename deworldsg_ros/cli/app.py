@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import ask, edit, exchange, mcp, probe
+from deworldsg_ros.cli import ask, edit, exchange, mcp, probe, store
 from deworldsg_ros.cli import models as models_command
 from deworldsg_ros.cli.evaluate import commands as evaluate
 from deworldsg_ros.cli.exit_codes import EXIT_FINDINGS, EXIT_INTERRUPTED, EXIT_USAGE
@@ -469,9 +469,14 @@ for parent, function, summary in (
     (app, exchange.export, "Write a scene graph in another format."),
     (app, exchange.diff, "List what differs between two scene graphs."),
     (app, exchange.merge, "Merge two scene graphs into one."),
+    (store.app, store.add, "Add graphs, or follow the running graph_node."),
+    (store.app, store.ask, "Ask in Cypher."),
+    (store.app, store.at, "Print where objects were at a time."),
+    (store.app, store.rebuild, "Make the database anew from the messages."),
     (app, probe.train_probe, "Train the probe of a world model."),
     (app, probe.import_probe, "Make the published probe ready for use."),
 ):
     parent.command(short_help=summary)(_reporting_errors()(function))
 app.add_typer(evaluation)
+app.add_typer(store.app)
 app.add_typer(models_command.app)

@@ -28,6 +28,7 @@ UPDATE_DEPTH = 50
 SPIN_PERIOD_S = 0.1
 
 Callback = Callable[[SceneGraph, Changes], object]
+GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
 
 
 class SceneGraphClient(GraphCommands):
@@ -52,9 +53,13 @@ class SceneGraphClient(GraphCommands):
         self._context = context if context is not None else Context()
         self._namespace = namespace.rstrip("/")
         self._replica = GraphReplica()
+        # Made from the copy when somebody asks: a large graph changes more often than that.
         self._graph: SceneGraph | None = None
+        self._told: SceneGraph | None = None
+        self._has_graph = self._is_outdated = False
         self._waiting: deque[wire.SceneGraphUpdateMessage] = deque(maxlen=UPDATE_DEPTH)
         self._callbacks: list[Callback] = []
+        self._listeners: list[Callable[[GraphMessage], object]] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -97,7 +102,11 @@ class SceneGraphClient(GraphCommands):
     @property
     def newest(self) -> SceneGraph | None:
         """The newest graph; None before the first one."""
-        return self._graph
+        with self._changed:
+            if self._is_outdated:
+                self._graph = SceneGraph(self._replica.message())
+                self._is_outdated = False
+            return self._graph
 
     @property
     def graph(self) -> SceneGraph:
@@ -106,7 +115,7 @@ class SceneGraphClient(GraphCommands):
         Raises:
             ClientError: if none arrives.
         """
-        return self._graph if self._graph is not None else self.wait(timeout_s=10.0)
+        return self.wait(timeout_s=10.0)
 
     def wait(self, sequence: int = 0, timeout_s: float = math.inf) -> SceneGraph:
         """The graph, as soon as it contains the update with this number.
@@ -116,7 +125,7 @@ class SceneGraphClient(GraphCommands):
         """
         end_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
-            while self._graph is None or self._graph.sequence < sequence:
+            while not self._has_graph or self._replica.sequence < sequence:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
                     topic = f"{self._namespace}/scene_graph"
@@ -125,7 +134,9 @@ class SceneGraphClient(GraphCommands):
                         "are ROS_DOMAIN_ID and the namespace the same?"
                     )
                 self._changed.wait(min(left_s, 1.0))
-            return self._graph
+            graph = self.newest
+        assert graph is not None
+        return graph
 
     def on_change(self, callback: Callback) -> None:
         """Call a function with the new graph and the changes, after every change of the graph.
@@ -134,6 +145,13 @@ class SceneGraphClient(GraphCommands):
         """
         self._callbacks.append(callback)
 
+    def on_message(self, callback: Callable[[GraphMessage], object]) -> None:
+        """Call a function with each message that changes the copy, in order: whole graphs, updates.
+
+        It runs in the thread of the client, so it should be short.
+        """
+        self._listeners.append(callback)
+
     def _spin(self) -> None:
         while not self._stop.is_set() and self._context.ok():
             self._executor.spin_once(timeout_sec=SPIN_PERIOD_S)
@@ -141,22 +159,27 @@ class SceneGraphClient(GraphCommands):
     def _guarded(self, receive: Callable[[Any], bool]) -> Callable[[Any], None]:
         def call(message: Any) -> None:
             try:
-                changed = receive(message.data)
+                with self._changed:
+                    changed = receive(message.data)
+                    if changed:
+                        self._has_graph = self._is_outdated = True
+                        self._changed.notify_all()
             except RefusedInput as refusal:
                 self.refused += 1
                 self._node.get_logger().warning(str(refusal), throttle_duration_sec=10.0)
                 return
-            if changed:
-                self._publish(SceneGraph(self._replica.message()))
+            if changed and self._callbacks:
+                self._tell_changes()
 
         return call
 
     def _snapshot(self, text: str) -> bool:
         snapshot = wire.decode(text, wire.SceneGraphMessage)
-        same = self._graph is not None and (snapshot.session or None) == self._replica.session
+        same = self._has_graph and (snapshot.session or None) == self._replica.session
         if same and snapshot.sequence <= self._replica.sequence:
             return False
         self._replica.reset(snapshot)
+        self._tell(snapshot)
         # Updates that came during the gap, and are newer than the snapshot.
         waiting, self._waiting = self._waiting, deque(maxlen=UPDATE_DEPTH)
         for update in waiting:
@@ -169,21 +192,26 @@ class SceneGraphClient(GraphCommands):
     def _apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
         """Apply an update, or keep it until a snapshot closes the gap before it."""
         try:
-            return self._replica.apply(update)
+            is_new = self._replica.apply(update)
         except RefusedInput:
-            self.gaps += self._graph is not None and not self._waiting
+            self.gaps += self._has_graph and not self._waiting
             self._waiting.append(update)
             return False
+        if is_new:
+            self._tell(update)
+        return is_new
 
-    def _publish(self, graph: SceneGraph) -> None:
-        before = self._graph
-        with self._changed:
-            self._graph = graph
-            self._changed.notify_all()
-        if self._callbacks:
-            changes = graph.changes_since(before or SceneGraph(GraphReplica().message()))
-            for callback in self._callbacks:
-                callback(graph, changes)
+    def _tell(self, message: GraphMessage) -> None:
+        for listener in self._listeners:
+            listener(message)
+
+    def _tell_changes(self) -> None:
+        before, graph = self._told, self.newest
+        assert graph is not None
+        self._told = graph
+        changes = graph.changes_since(before or SceneGraph(GraphReplica().message()))
+        for callback in self._callbacks:
+            callback(graph, changes)
 
 
 def _qos(depth: int) -> QoSProfile:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from deworldsg_ros.files import read_regular, write_atomically
+from deworldsg_ros.parsing import paused_collector
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -26,13 +27,23 @@ def read_graph(path: Path) -> wire.SceneGraphMessage:
     Raises:
         RefusedInput: ``unreadable_graph``, or the reason for which `wire.decode` refuses it.
     """
+    content = read_content(path)
+    try:
+        with paused_collector():
+            return wire.decode(content, wire.SceneGraphMessage, MAX_GRAPH_BYTES)
+    except RefusedInput as refusal:
+        raise RefusedInput(refusal.reason, f"scene graph {path}: {refusal}") from refusal
+
+
+def read_content(path: Path) -> bytes:
+    """The text of a scene graph: a file, or ``scene_graph.json`` of a folder.
+
+    Raises:
+        RefusedInput: ``unreadable_graph``.
+    """
     path = path / GRAPH_FILE if path.is_dir() else path
     try:
-        content = read_regular(path, MAX_GRAPH_BYTES)
+        return read_regular(path, MAX_GRAPH_BYTES)
     except OSError as error:
         message = f"scene graph {path} cannot be read ({error.strerror})"
         raise RefusedInput("unreadable_graph", message) from error
-    try:
-        return wire.decode(content, wire.SceneGraphMessage)
-    except RefusedInput as refusal:
-        raise RefusedInput(refusal.reason, f"scene graph {path}: {refusal}") from refusal

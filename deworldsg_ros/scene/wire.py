@@ -5,7 +5,7 @@ because JSON numbers cannot hold 64-bit nanoseconds. Floats keep full precision 
 decimal that reads back as the same float64), so that a graph over DDS equals one in process.
 """
 
-from typing import Annotated, Any, Literal, TypeVar, Union
+from typing import Annotated, Any, Literal, Optional, TypeVar, Union
 
 import msgspec
 
@@ -85,7 +85,8 @@ Names = Annotated[list[Name], msgspec.Meta(min_length=1, max_length=MAX_NAMES)]
 Row = Annotated[int, msgspec.Meta(ge=0, lt=MAX_OBJECTS)]
 
 
-class Stamp(msgspec.Struct, frozen=True):
+# gc=False: a graph has millions of these, and none is in a cycle. The collector skips them.
+class Stamp(msgspec.Struct, frozen=True, gc=False):
     """A ROS time."""
 
     sec: Annotated[int, msgspec.Meta(ge=0, le=MAX_SECONDS)]
@@ -215,14 +216,14 @@ class RelationEvidenceMessage(Message, kw_only=True):
     pairs: Annotated[list[PairEvidence], msgspec.Meta(max_length=MAX_PAIRS)]
 
 
-class Belief(msgspec.Struct, frozen=True):
+class Belief(msgspec.Struct, frozen=True, gc=False):
     """A label with its probability."""
 
     label: str
     probability: Probability
 
 
-class GravityBox(msgspec.Struct, frozen=True):
+class GravityBox(msgspec.Struct, frozen=True, gc=False):
     """A box around an object with one axis along `up`; points far from the others are left out."""
 
     center_m: Vector3
@@ -235,7 +236,7 @@ class GravityBox(msgspec.Struct, frozen=True):
     ]
 
 
-class NodeState(msgspec.Struct, frozen=True):
+class NodeState(msgspec.Struct, frozen=True, gc=False):
     """One object of the global graph."""
 
     id: Annotated[NodeId, msgspec.Meta(description="stable, never reused")]
@@ -298,7 +299,7 @@ class HiddenNode(msgspec.Struct, frozen=True):
 Provenance = Literal["visual", "prior", "fused"]
 
 
-class EdgeState(msgspec.Struct, frozen=True):
+class EdgeState(msgspec.Struct, frozen=True, gc=False):
     """One directed edge of the global graph."""
 
     subject: NodeId
@@ -439,18 +440,24 @@ def max_bytes(kind: type[Message]) -> int:
     return MAX_GRAPH_BYTES if is_graph else MAX_FRAME_BYTES
 
 
-def decode(text: Union[str, bytes], kind: type[M]) -> M:
+def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = None) -> M:
     """Read and validate a message.
+
+    Args:
+        text: JSON.
+        kind: type of the message.
+        most_bytes: largest size that is read; None = `max_bytes`, the limit of the topics.
 
     Raises:
         RefusedInput: ``invalid_message`` if the text does not fit the schema, ``message_too_large``
-            if it is longer than `max_bytes`, ``unknown_schema`` if it is another message or of a
+            if it is longer than that, ``unknown_schema`` if it is another message or of a
             later version, ``invalid_frame_id``.
     """
-    if len(text) > max_bytes(kind):
+    limit = max_bytes(kind) if most_bytes is None else most_bytes
+    if len(text) > limit:
         raise RefusedInput(
             "message_too_large",
-            f"{kind.__name__} of {len(text)} bytes: expected at most {max_bytes(kind)}",
+            f"{kind.__name__} of {len(text)} bytes: expected at most {limit}",
         )
     try:
         message = msgspec.json.decode(text, type=kind)

@@ -77,7 +77,7 @@ def imported_modules(root: Path) -> set[str]:
 def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
     known = {
         *requirements(root_dir),
-        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "view"),
+        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "view", "store"),
     }
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()

@@ -1,0 +1,318 @@
+"""The database of a store: its tables, and the statements that fill them.
+
+Labels and names only ever enter a statement as parameters.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.store.errors import StoreError
+from deworldsg_ros.store.history import STILL_NS, Stay, box_of
+
+# Of the tables below. A database of another version is made anew from the messages.
+VERSION = 1
+# The database uses less memory if the graph is small.
+BUFFER_BYTES = 1 << 30
+# A question that takes longer is ended.
+QUESTION_LIMIT_MS = 60_000
+# More rows are loaded at once. That also joins the log with the database: a third of a second.
+MANY_ROWS = 1000
+# A writer has the database for some milliseconds every other second, and for seconds to rebuild it.
+WAIT_S = 10.0
+
+_BOX = {"x": "DOUBLE", "y": "DOUBLE", "z": "DOUBLE"} | {
+    name: "DOUBLE" for name in ("size_x", "size_y", "size_z")
+}
+_OBJECT = {"id": "INT64", "label": "STRING", "probability": "DOUBLE", **_BOX} | {
+    name: "INT64" for name in ("observations", "first_seen_ns", "last_seen_ns")
+}
+_ENDS = {"subject": "INT64", "object": "INT64"}
+_RELATION = {
+    "predicate": "STRING",
+    "probability": "DOUBLE",
+    "provenance": "STRING",
+    "observations": "INT64",
+}
+_STAY = {"key": "INT64", "id": "INT64", "label": "STRING", **_BOX} | {
+    name: "INT64" for name in ("since_ns", "until_ns")
+}
+_HEAD = {"key": "INT64", "version": "INT64", "position": "INT64", "stamp_ns": "INT64"} | {
+    "frame_id": "STRING",
+    "session": "STRING",
+    "sequence": "INT64",
+}
+
+# Values of the columns of a table, in their order.
+_Row = tuple[Any, ...]
+
+
+@dataclass
+class Head:
+    """What the database contains.
+
+    Attributes:
+        position: in the file of messages; all before it is in the database.
+        stamp_ns: of the newest message.
+        frame_id: the world frame; empty = no message yet.
+        session: of the newest message; empty = of a file.
+        sequence: number of the newest message in its session.
+    """
+
+    position: int = 0
+    stamp_ns: int = 0
+    frame_id: str = ""
+    session: str = ""
+    sequence: int = 0
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The answer to a question: names of the columns, and the rows."""
+
+    columns: list[str]
+    rows: list[list[Any]]
+
+
+class Database:
+    """An open database; use it within `opened`."""
+
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    def run(self, cypher: str, parameters: Mapping[str, Any] | None = None) -> Rows:
+        """Run a statement; raises RuntimeError of ladybug."""
+        result = self._connection.execute(cypher, dict(parameters or {}))
+        with closing(result):
+            return Rows(result.get_column_names(), result.get_all())
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All statements of the block, or none."""
+        self.run("BEGIN TRANSACTION")
+        try:
+            yield
+        except BaseException:
+            with suppress(RuntimeError):  # a statement that failed has ended it
+                self.run("ROLLBACK")
+            raise
+        self.run("COMMIT")
+
+    def make_tables(self) -> None:
+        """Make the tables of an empty database."""
+        for name, columns in (("Stay", _STAY), ("Head", _HEAD)):
+            self.run(f"CREATE NODE TABLE {name}({_typed(columns)}, PRIMARY KEY (key))")
+        self.run("CREATE (:Head {key: 0, version: $version})", {"version": VERSION})
+        self._make_graph_tables()
+        self.write_head(Head())
+
+    def head(self) -> Head | None:
+        """What is in the database; None = nothing, or it is of another version."""
+        names = [name for name in _HEAD if name != "key"]
+        try:
+            found = self.run("MATCH (h:Head) RETURN " + ", ".join(f"h.{name}" for name in names))
+        except RuntimeError:
+            return None
+        version, *values = found.rows[0] if found.rows else [None]
+        return Head(*values) if version == VERSION else None
+
+    def write_head(self, head: Head) -> None:
+        """Note what is in the database."""
+        values = vars(head)
+        changes = ", ".join(f"h.{name} = ${name}" for name in values)
+        self.run(f"MATCH (h:Head) SET {changes}", values)
+
+    def current_stays(self) -> list[Stay]:
+        """The stays that have not ended."""
+        columns = ", ".join(f"s.{name}" for name in _STAY)
+        found = self.run(f"MATCH (s:Stay) WHERE s.until_ns = $e RETURN {columns}", {"e": STILL_NS})
+        return [stay_of(row) for row in found.rows]
+
+    def next_key(self) -> int:
+        """Number of the next stay."""
+        last = self.run("MATCH (s:Stay) RETURN max(s.key)").rows[0][0]
+        return (last or 0) + 1
+
+    def replace_graph(
+        self, nodes: Mapping[int, wire.NodeState], edges: Iterable[wire.EdgeState]
+    ) -> None:
+        """Replace all objects and relations. A relation without both of its objects is left out."""
+        for table in ("Relation", "Object"):
+            self.run(f"DROP TABLE {table}")
+        self._make_graph_tables()
+        self._copy("Object", _OBJECT, map(_object_row, nodes.values()))
+        rows = (_edge_row(edge) for edge in edges if edge.subject in nodes and edge.object in nodes)
+        self._copy("Relation", {**_ENDS, **_RELATION}, rows)
+
+    def remove(self, nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> None:
+        """Remove relations, and objects with theirs; those that are not there are no error."""
+        for a, b in edges:
+            cypher = "MATCH (:Object {id: $a})-[r:Relation]->(o:Object) WHERE o.id = $b DELETE r"
+            self.run(cypher, {"a": a, "b": b})
+        self._each("MATCH (o:Object {id: row.id}) DETACH DELETE o", [{"id": i} for i in nodes])
+
+    def put(
+        self,
+        new: Sequence[wire.NodeState],
+        changed: Sequence[wire.NodeState],
+        edges: Sequence[wire.EdgeState],
+    ) -> None:
+        """Add or change objects and relations."""
+        self._each(_creation("Object", _OBJECT), _dicts(_OBJECT, map(_object_row, new)))
+        changes = ", ".join(f"o.{name} = row.{name}" for name in _OBJECT if name != "id")
+        cypher = f"MATCH (o:Object {{id: row.id}}) SET {changes}"
+        self._each(cypher, _dicts(_OBJECT, map(_object_row, changed)))
+        changes = ", ".join(f"r.{name} = row.{name}" for name in _RELATION)
+        # In this form, both ends are found by their key; `MATCH (a), (b)` would scan all objects.
+        cypher = (
+            "MATCH (a:Object {id: row.subject}) WITH a, row MATCH (b:Object {id: row.object}) "
+            f"WITH a, b, row MERGE (a)-[r:Relation]->(b) SET {changes}"
+        )
+        self._each(cypher, _dicts((*_ENDS, *_RELATION), map(_edge_row, edges)))
+
+    def put_stays(self, begun: Sequence[Stay], ended: Mapping[int, int]) -> None:
+        """Add stays, and end older ones by key."""
+        rows = map(_stay_row, begun)
+        if len(begun) > MANY_ROWS:
+            self._copy("Stay", _STAY, rows)
+        else:
+            self._each(_creation("Stay", _STAY), _dicts(_STAY, rows))
+        cypher = "MATCH (s:Stay {key: row.key}) SET s.until_ns = row.until_ns"
+        self._each(cypher, _dicts(("key", "until_ns"), ended.items()))
+
+    def _make_graph_tables(self) -> None:
+        self.run(f"CREATE NODE TABLE Object({_typed(_OBJECT)}, PRIMARY KEY (id))")
+        self.run(f"CREATE REL TABLE Relation(FROM Object TO Object, {_typed(_RELATION)})")
+
+    def _each(self, cypher: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        if rows:
+            self.run(f"UNWIND $rows AS row {cypher}", {"rows": rows})
+
+    def _copy(self, table: str, columns: Mapping[str, str], rows: Iterable[_Row]) -> None:
+        """Load rows at once. Strings go as one list of parameters, and their numbers as a file."""
+        names = _Numbers()
+        values = [list(column) for column in zip(*rows)]
+        if not values:
+            return
+        for number, kind in enumerate(columns.values()):
+            if kind == "STRING":
+                values[number] = [names[text] for text in values[number]]
+        # JSON of numbers without its brackets is CSV.
+        content = msgspec.json.encode(list(zip(*values)))[2:-2].replace(b"],[", b"\n")
+        typed = _typed({i: "INT64" if kind == "STRING" else kind for i, kind in columns.items()})
+        found = ", ".join(
+            f"list_extract($names, {name})" if kind == "STRING" else name
+            for name, kind in columns.items()
+        )
+        with os.fdopen(os.memfd_create("rows"), "wb") as file:
+            file.write(content)
+            file.flush()
+            self.run(
+                f"COPY {table} FROM (LOAD WITH HEADERS ({typed}) FROM '/proc/self/fd/"
+                f"{file.fileno()}' (HEADER=false, FILE_FORMAT='csv') RETURN {found})",
+                {"names": list(names)},
+            )
+
+
+class _Numbers(dict[str, int]):
+    """Numbers strings from 1 on, in the order in which they are asked for."""
+
+    def __missing__(self, name: str) -> int:
+        self[name] = number = len(self) + 1
+        return number
+
+
+@contextmanager
+def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
+    """Open a database, which is made if it is missing.
+
+    Several processes can read it at a time; or one writes it, and the others wait.
+
+    Raises:
+        StoreError: the extra is not installed, or another process does not end its work in time.
+        RuntimeError: of ladybug, e.g. if the database is damaged.
+    """
+    try:
+        import ladybug
+    except ImportError as error:
+        raise StoreError(
+            "the store needs the package ladybug: pip install 'deworldsg_ros[store]'"
+        ) from error
+    with _access(path.with_suffix(".lock"), fcntl.LOCK_SH if read_only else fcntl.LOCK_EX):
+        database = ladybug.Database(path, buffer_pool_size=BUFFER_BYTES, read_only=read_only)
+        with closing(database), closing(ladybug.Connection(database)) as connection:
+            if read_only:
+                connection.set_query_timeout(QUESTION_LIMIT_MS)
+            else:
+                # Changes stay in the log beside the database until there are many: joining them
+                # takes a third of a second.
+                connection.execute("CALL force_checkpoint_on_close=false")
+            yield Database(connection)
+
+
+def stay_of(row: Sequence[Any]) -> Stay:
+    """The stay of a row of the table, all columns in their order."""
+    key, node, label, x, y, z, a, b, c, since_ns, until_ns = row
+    return Stay(key, node, label, (x, y, z), (a, b, c), since_ns, until_ns)
+
+
+def _object_row(node: wire.NodeState) -> _Row:
+    center, size = box_of(node)
+    share = next((item.probability for item in node.classes if item.label == node.label), 0.0)
+    existence = node.existence if isinstance(node.existence, float) else 1.0
+    first, last = wire.ns_from_stamp(node.first_seen), wire.ns_from_stamp(node.last_seen)
+    return (
+        node.id, node.label, share * existence, *center, *size, node.observations, first, last
+    )  # fmt: skip
+
+
+def _edge_row(edge: wire.EdgeState) -> _Row:
+    return (
+        edge.subject, edge.object, edge.predicate, edge.probability, edge.provenance,
+        edge.observations,
+    )  # fmt: skip
+
+
+def _stay_row(stay: Stay) -> _Row:
+    where = (*stay.position_m, *stay.size_m)
+    return stay.key, stay.node, stay.label, *where, stay.since_ns, stay.until_ns
+
+
+def _typed(columns: Mapping[str, str]) -> str:
+    return ", ".join(f"{name} {kind}" for name, kind in columns.items())
+
+
+def _creation(table: str, columns: Iterable[str]) -> str:
+    return f"CREATE (:{table} {{{', '.join(f'{name}: row.{name}' for name in columns)}}})"
+
+
+def _dicts(names: Iterable[str], rows: Iterable[_Row]) -> list[dict[str, Any]]:
+    names = list(names)
+    return [dict(zip(names, row)) for row in rows]
+
+
+@contextmanager
+def _access(path: Path, kind: int) -> Iterator[None]:
+    """Hold a lock beside the database; ladybug's own lets a reader open it beside a writer."""
+    with path.open("ab") as file:
+        end_s = time.monotonic() + WAIT_S
+        while True:
+            try:
+                fcntl.flock(file, kind | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > end_s:
+                    message = f"store {path.parent}: another process has used it for {WAIT_S:g} s"
+                    raise StoreError(f"{message}; try again later") from error
+                time.sleep(0.01)
+        yield
