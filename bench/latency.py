@@ -29,7 +29,7 @@ import msgspec
 import numpy as np
 
 from bench.figures import Figure, Setup
-from deworldsg_ros.cli.demo import dds_environment
+from deworldsg_ros.cli.installation import dds_environment
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
 from deworldsg_ros.config import Config
 from deworldsg_ros.memory import keep_freed_memory

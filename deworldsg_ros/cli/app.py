@@ -257,6 +257,9 @@ def demo(
             "embedded: the default",
         ),
     ] = "embedded",
+    no_view: Annotated[
+        bool, typer.Option("--no-view", help="without the page that shows the graph growing")
+    ] = False,
 ) -> None:
     """Build it with the four ROS 2 nodes, from a replay."""
     with _reporting_errors():
@@ -272,6 +275,7 @@ def demo(
                 topics=TopicChoice(rgb, depth, camera_info, pose),
                 intrinsics=parse_intrinsics(intrinsics),
                 odometry=odometry,
+                view=not no_view,
             ),
             console=Console(markup=False),
         )

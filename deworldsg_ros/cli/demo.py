@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -18,7 +16,8 @@ from deworldsg_ros import __version__
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.installation import find_shared, node_command
+from deworldsg_ros.cli.demo_view import DemoView
+from deworldsg_ros.cli.installation import dds_environment, find_shared, node_command
 from deworldsg_ros.cli.observing import as_report, print_findings, sizes_of
 from deworldsg_ros.cli.processes import LoggedProcess, ending, one_interrupt
 from deworldsg_ros.cli.replay_progress import ReplayProgress
@@ -58,12 +57,14 @@ class DemoOptions:
         topics: topics of a bag that the user named.
         intrinsics: fx, fy, cx, cy in pixels, for a folder without intrinsics.
         odometry: whether odometry_node makes the poses, and none of the recording is published.
+        view: whether viewer_node shows the graph.
     """
 
     rate: float = 1.0
     topics: TopicChoice = TopicChoice()
     intrinsics: tuple[float, float, float, float] | None = None
     odometry: bool = False
+    view: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,21 +104,25 @@ def run_demo(
     require_checkpoints(config.perception, config.relations)
     # Opened first, so that a problem of the recording is reported before any process starts.
     recording = _check_recording(path or _shipped(), config, options)
-    with outputs.writing(out, config) as staged:
-        started_s = time.perf_counter()
-        with one_interrupt(), ending(console) as processes:
-            _start(processes, recording, staged, out / "logs", options)
-            *nodes, replay = processes
-            finished = ReplayProgress(replay, nodes, recording.frames, console).follow()
-        wall_s = time.perf_counter() - started_s
-        graph = read_graph(staged)
-        poses = [np.array(values).reshape(4, 4) for values in finished.poses]
-        frames = _frames(recording.path, config, options)
-        outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
-        findings = _findings(graph, finished)
-        _write_report(staged, recording, graph, finished, wall_s, findings)
-    _print_summary(out, finished, console)
-    print_findings(console, findings)
+    with one_interrupt(), ending(console) as viewers:
+        with outputs.writing(out, config) as staged:
+            view = DemoView(viewers, staged / outputs.CONFIG_FILE, out / "logs", console)
+            started_s = time.perf_counter()
+            with ending(console) as processes:
+                _start(processes, recording, staged, out / "logs", options)
+                *nodes, replay = processes
+                progress = ReplayProgress(replay, nodes, recording.frames, console)
+                finished = progress.follow(view.start if options.view else None)
+            wall_s = time.perf_counter() - started_s
+            graph = read_graph(staged)
+            poses = [np.array(values).reshape(4, 4) for values in finished.poses]
+            frames = _frames(recording.path, config, options)
+            outputs.show_graph(staged, graph, console, poses, config.inputs.world_up, frames)
+            findings = _findings(graph, finished)
+            _write_report(staged, recording, graph, finished, wall_s, findings)
+        _print_summary(out, finished, console)
+        print_findings(console, findings)
+        view.stay_open()
 
 
 def _frames(path: Path, config: Config, options: DemoOptions) -> list[RgbdFrame]:
@@ -145,21 +150,6 @@ def configuration_of(models: str, config_path: Path | None) -> Path | None:
     if found is None:
         raise ConfigurationError("config/paper.yaml is missing: install the package again")
     return found
-
-
-def dds_environment() -> dict[str, str]:
-    """Environment of the nodes: this machine, its own domain, shared memory for images."""
-    environment = dict(os.environ)
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    # Domains above 101 collide with ephemeral ports on Linux.
-    environment.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
-    # The wheels of ROS 2 do not set it, and rclpy looks for its type support there.
-    environment.setdefault("AMENT_PREFIX_PATH", sys.prefix)
-    profile = find_shared("config/fastdds.xml")
-    if profile is not None:
-        environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
-    environment["PYTHONUNBUFFERED"] = "1"
-    return environment
 
 
 def _shipped() -> Path:

@@ -37,6 +37,21 @@ def find_shared(relative: str) -> Path | None:
     return next((folder / relative for folder in folders if (folder / relative).exists()), None)
 
 
+def dds_environment() -> dict[str, str]:
+    """Environment of the nodes: this machine, its own domain, shared memory for images."""
+    environment = dict(os.environ)
+    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    # Domains above 101 collide with ephemeral ports on Linux.
+    environment.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    # The wheels of ROS 2 do not set it, and rclpy looks for its type support there.
+    environment.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+    profile = find_shared("config/fastdds.xml")
+    if profile is not None:
+        environment.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    environment["PYTHONUNBUFFERED"] = "1"
+    return environment
+
+
 def node_command(name: str) -> list[str]:
     """Command that starts a node: its installed executable, or its module."""
     if checkout() is None:

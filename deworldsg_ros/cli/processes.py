@@ -78,8 +78,8 @@ class LoggedProcess:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.pid, number)
 
-    def wait(self, timeout_s: float) -> int | None:
-        """Exit code; None on timeout."""
+    def wait(self, timeout_s: float | None) -> int | None:
+        """Exit code; None on timeout. A timeout of None waits without end."""
         try:
             return self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:

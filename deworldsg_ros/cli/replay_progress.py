@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 from rich.console import Console
@@ -47,8 +47,11 @@ class ReplayProgress:
         self._saved: events.Saved | None = None
         self._finished: events.Finished | None = None
 
-    def follow(self) -> events.Finished:
+    def follow(self, on_started: Callable[[], None] | None = None) -> events.Finished:
         """Show events until the replay has finished.
+
+        Args:
+            on_started: called when the nodes are ready and the first frame is published.
 
         Raises:
             DemoFailed: if a process ends early, or graph_node does not save its graph.
@@ -57,7 +60,10 @@ class ReplayProgress:
         self._status.start()
         try:
             while self._finished is None:
-                self._show(self._next())
+                event = self._next()
+                self._show(event)
+                if on_started is not None and isinstance(event, events.Started):
+                    on_started()
         finally:
             self._status.stop()
             self._progress.stop()

@@ -101,6 +101,7 @@ def _become_viewer_node(options: ViewOptions) -> None:
     if options.namespace:
         command += ["-r", f"__ns:={options.namespace}"]
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+    os.environ["PYTHONUNBUFFERED"] = "1"
     os.execvp(command[0], command)
 
 

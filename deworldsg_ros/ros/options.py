@@ -93,6 +93,23 @@ class ReplayParameters(Config, frozen=True, forbid_unknown_fields=True):
     node: ReplayOptions = ReplayOptions()
 
 
+class ViewerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The page of viewer_node."""
+
+    host: Annotated[
+        str, option("address of the page; 0.0.0.0 lets other machines see the images, too")
+    ] = "127.0.0.1"
+    port: Annotated[int, option("port of the page; the next free one is used", ge=1, le=65535)] = (
+        8080
+    )
+
+
+class ViewerParameters(Config, frozen=True, forbid_unknown_fields=True):
+    """Parameters of viewer_node; of the configuration, `inputs` chooses the type of the images."""
+
+    node: ViewerOptions = ViewerOptions()
+
+
 class FleetOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The network of fleet_node and fleet_link_node."""
 

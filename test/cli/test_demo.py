@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -11,8 +12,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+from rich.console import Console
 from support.cli import DEMO_ROOM, deworldsg, first_frames, start
 
+from deworldsg_ros.cli import demo_view
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.scene import wire
@@ -78,6 +81,7 @@ def test_demo_and_run_end_with_the_same_graph(recording, unposed, tmp_path, pose
         assert (tmp_path / "shown" / name).stat().st_size > 0
     for node in NODES:
         assert "ready" in (tmp_path / "shown" / "logs" / f"{node}.log").read_text()
+    assert "live view: http://127.0.0.1:" in shown.stdout
     # Every node ended by itself.
     assert "ended with code" not in shown.stdout
 
@@ -112,7 +116,7 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
         assert time.monotonic() < end_s
         time.sleep(0.1)
     nodes = children(process.pid)
-    assert len(nodes) == 5
+    assert len(nodes) in (5, 6), "viewer_node starts when the others are ready"
     process.send_signal(number)
     process.send_signal(number)  # a user who presses Ctrl-C twice
     _, errors = process.communicate(timeout=60)
@@ -121,3 +125,14 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
     for pid in nodes:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+def test_the_demo_goes_on_without_the_viewer(tmp_path, monkeypatch):
+    console = Console(file=io.StringIO(), width=200)
+    monkeypatch.setattr(demo_view, "find_spec", lambda name: None)
+    processes = []
+    view = demo_view.DemoView(processes, tmp_path / "config.yaml", tmp_path, console)
+    view.start()
+    view.stay_open()
+    assert processes == []
+    assert "pip install 'deworldsg_ros[view]'" in console.file.getvalue()

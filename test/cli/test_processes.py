@@ -10,8 +10,7 @@ import time
 import pytest
 
 from deworldsg_ros.cli import installation, processes
-from deworldsg_ros.cli.demo import dds_environment
-from deworldsg_ros.cli.installation import find_shared, node_command
+from deworldsg_ros.cli.installation import dds_environment, find_shared, node_command
 from deworldsg_ros.cli.processes import LoggedProcess, end_all
 
 GENTLE = """

@@ -19,6 +19,7 @@ from deworldsg_ros.ros.options import (  # noqa: E402
     FleetParameters,
     Parameters,
     ReplayParameters,
+    ViewerParameters,
 )
 from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
 from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
@@ -65,6 +66,7 @@ def with_tables(text: str) -> str:
         "reasons": reasons_table(),
         "abnormal": abnormal.table(),
         "parameters": parameters_table(fields(Parameters)),
+        "viewer": parameters_table([f for f in fields(ViewerParameters) if f.path[0] == "node"]),
         "fleet": parameters_table(fields(FleetParameters)),
         "fleet_link": parameters_table(fields(FleetLinkParameters)),
         # The configuration is in the other table.

@@ -42,6 +42,16 @@ class History:
         self._blocks: list[_Block] = []
 
     @property
+    def session(self) -> str | None:
+        """The session of the graph."""
+        return self.newest.session
+
+    @property
+    def sequence(self) -> int:
+        """Number of the newest update."""
+        return self.newest.sequence
+
+    @property
     def last(self) -> int:
         """Number of the newest moment; `first` - 1 if there is none."""
         return self.first + sum(map(len, self._blocks)) - 1

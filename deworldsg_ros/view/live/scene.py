@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import viser
-from scipy.spatial import ConvexHull
 
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.extent import horizontal_axes
 from deworldsg_ros.view.live.camera import Shot
-from deworldsg_ros.view.live.drawing import CORNERS, Drawing, Shape
+from deworldsg_ros.view.live.drawing import Drawing, Shape
 
 ARROW = {"shaft_radius": 0.009, "head_radius": 0.03, "head_length": 0.08}
 OUTLINE_PX, LINE_PX, TRAIL_PX = 1.6, 2.0, 2.0
@@ -23,7 +22,7 @@ TRAIL_RGB, FRUSTUM_RGB, GRID_RGB = (216, 120, 40), (216, 120, 40), (150, 154, 16
 GRID_MARGIN_M = 1.5
 # More points of the trail are not visible.
 MOST_TRAIL = 1000
-SPHERE_POINTS = 200
+SPHERE_RINGS = 12
 
 _NO_PLACE, _NO_TURN = np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])
 
@@ -40,7 +39,7 @@ class ViserScene:
         self._scene = server.scene
         self._ids: Int64 = np.zeros(0, np.int64)
         self._shape: Shape = "boxes"
-        solids = {"boxes": _hull_of(CORNERS), "ellipsoids": _hull_of(_sphere())}
+        solids = {"boxes": _solid(_cube()), "ellipsoids": _solid(_sphere())}
         self._solids = {
             shape: self._scene.add_batched_meshes_simple(
                 f"/{shape}",
@@ -155,20 +154,33 @@ class ViserScene:
             on_click(int(ids[index]))
 
 
+def _solid(rings: Float64) -> tuple[Float64, Int64]:
+    """A closed surface from rings (m, n, 3) of points, from the lowest one to the highest.
+
+    Returns vertices (m n, 3), and triangles (f, 3) that face outwards.
+    """
+    count, size = rings.shape[:2]
+    corners = np.arange(count * size).reshape(count, size)
+    low, high = corners[:-1], corners[1:]
+    right_low, right_high = np.roll(low, -1, axis=1), np.roll(high, -1, axis=1)
+    sides = [np.stack(t, axis=-1) for t in ((low, right_low, right_high), (low, right_high, high))]
+    ends = [corners[0, [0, i + 1, i]] for i in range(1, size - 1)]
+    ends += [corners[-1, [0, i, i + 1]] for i in range(1, size - 1)]
+    return rings.reshape(-1, 3), np.concatenate([part.reshape(-1, 3) for part in sides + ends])
+
+
+def _cube() -> Float64:
+    """Two rings (2, 4, 3): bottom and top of the unit cube."""
+    ring = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+    return np.stack([np.insert(ring, 2, height, axis=1) for height in (-0.5, 0.5)])
+
+
 def _sphere() -> Float64:
-    """Points (n, 3) on a sphere of diameter one, on a spiral."""
-    steps = np.arange(SPHERE_POINTS) + 0.5
-    heights, angles = 1 - 2 * steps / SPHERE_POINTS, np.pi * (1 + 5**0.5) * steps
-    radii = np.sqrt(1 - heights**2)
-    return np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1) / 2
-
-
-def _hull_of(points: Float64) -> tuple[Float64, Int64]:
-    """The convex hull of points (n, 3) around the origin: vertices, and triangles facing out."""
-    triangles = ConvexHull(points).simplices
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
-    inwards = np.einsum("fi,fi->f", np.cross(b - a, c - a), a) < 0
-    return points, np.where(inwards[:, None], triangles[:, ::-1], triangles)
+    """Rings (m, n, 3) of a sphere of diameter one."""
+    tilts = np.linspace(-0.49 * np.pi, 0.49 * np.pi, SPHERE_RINGS)[:, None]
+    angles = 2 * np.pi * np.arange(2 * SPHERE_RINGS) / (2 * SPHERE_RINGS)
+    x, y = np.cos(tilts) * np.cos(angles), np.cos(tilts) * np.sin(angles)
+    return np.stack([x, y, np.broadcast_to(np.sin(tilts), x.shape)], axis=-1) / 2
 
 
 def _screen(width_px: float) -> dict[str, Any]:

@@ -66,17 +66,30 @@ class Viewer:
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
+    @property
+    def session(self) -> str | None:
+        """The session of the graph."""
+        return self._state.history.session
+
+    @property
+    def sequence(self) -> int:
+        """Number of the newest update."""
+        return self._state.history.sequence
+
     def reset(self, snapshot: wire.SceneGraphMessage) -> None:
         """Continue with a snapshot."""
         self._change(lambda state: state.reset(snapshot))
 
-    def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
-        """Apply the next update.
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        """Apply the next update; False for one that is known.
 
         Raises:
             RefusedInput: ``lost_updates`` or ``other_session``: a snapshot has to come first.
         """
-        self._change(lambda state: state.apply(update))
+        with self._lock:
+            applied = self._state.apply(update)
+        self._changed.set()
+        return applied
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera; under load, frames are left out."""

@@ -8,23 +8,15 @@ from pathlib import Path
 from typing import Protocol
 
 from deworldsg_ros.pipeline import Pipeline
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.following import Copy
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.view.live.camera import CameraView, view_of
 
 
-class Sink(Protocol):
-    """Shows a graph; its methods may be called from any thread."""
-
-    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
-        """Continue with a snapshot."""
-        ...
-
-    def apply(self, update: wire.SceneGraphUpdateMessage) -> None:
-        """Apply the next update; raises RefusedInput if others are missing before it."""
-        ...
+class Sink(Copy, Protocol):
+    """Shows a copy of a graph; its methods may be called from any thread."""
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera."""
