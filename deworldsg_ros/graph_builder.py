@@ -27,6 +27,7 @@ from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.limits import RESTART_NS
 from deworldsg_ros.scene.node_states import hidden_node
 from deworldsg_ros.scene.publication import Publication
+from deworldsg_ros.scene.seen_frames import FrameMemory
 from deworldsg_ros.scene.up import UpEstimator
 
 # Parts of the kernels that take about equally long to compile.
@@ -45,6 +46,7 @@ class GraphBuilder:
     Attributes:
         graph: the global graph.
         merging: the association rule.
+        frames: from which frames the nodes and edges come.
         prior: of class pairs.
     """
 
@@ -73,6 +75,7 @@ class GraphBuilder:
             top_k=output.top_k,
             include_surface_points=output.include_surface_points,
         )
+        self.frames = FrameMemory()
         self._newest_ns: int | None = None
 
     @property
@@ -114,6 +117,7 @@ class GraphBuilder:
             local = self._drift.align(local)
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
         self._edges.observe(local, node_ids)
+        self.frames.note(self.graph, local, node_ids)
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
@@ -127,7 +131,11 @@ class GraphBuilder:
             RefusedInput: ``invalid_request``, with the reason; nothing is changed then.
         """
         stamp_ns = self._newest_ns or int(self.graph.nodes.last_seen_ns.max(initial=0))
-        return self.merging.edit(self.graph, request, stamp_ns)
+        reply = self.merging.edit(self.graph, request, stamp_ns)
+        for node_id in reply.nodes:
+            for old_id in self.graph.edits.origins(node_id):
+                self.frames.copy(old_id, node_id)
+        return reply
 
     def add_evidence(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs and predictions; see `EdgeBeliefs.add`."""

@@ -1,6 +1,7 @@
 """A graph as a map: a file from which a later run continues.
 
-It contains the graph, the state of merging, the priors of class pairs, and the up direction.
+It contains the graph, the state of merging, the priors of class pairs, the up direction, and from
+which frames everything comes.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.seen_frames import FrameMemory, SeenFrames
 from deworldsg_ros.words import counted
 
 # Before the names of the arrays of merging.
@@ -46,7 +48,9 @@ def copy_state(builder: GraphBuilder) -> Arrays:
     prior = np.frombuffer(msgspec.json.encode(builder.prior.to_state()), np.uint8)
     memory = {_MERGING + name: np.array(v) for name, v in builder.merging.memory().items()}
     arrays = graph_io.to_arrays(builder.graph.state())
-    return {**arrays, **memory, "prior": prior, "up": np.array(builder.up.state())}
+    seen = np.frombuffer(msgspec.json.encode(builder.frames.all(builder.graph)), np.uint8)
+    up = np.array(builder.up.state())
+    return {**arrays, **memory, "prior": prior, "up": up, "seen_frames": seen}
 
 
 def write_state(state: Arrays, path: Path) -> None:
@@ -149,6 +153,9 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     builder.merging.restore(graph, memory)
     if "up" in arrays:  # not in maps of older releases
         builder.up.restore(arrays["up"])
+    if "seen_frames" in arrays:  # nor this
+        content = checked(arrays, "seen_frames", np.uint8, None).tobytes()
+        builder.frames = FrameMemory(parse_json(content, list[SeenFrames]))
     return builder
 
 

@@ -41,6 +41,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
+from deworldsg_ros.scene.seen_frames import write_seen
 from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
 from deworldsg_ros.view.photos import Album
 from deworldsg_ros.words import counted
@@ -250,7 +251,10 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
     graph = pipeline.graph()
     T_world_cameras = list(processed.poses.values())
     with outputs.writing(options.out, pipeline.config) as staged:
-        write_graph(staged, graph)
+        path = write_graph(staged, graph)
+        if pipeline.builder is not None:
+            seen = pipeline.builder.frames.all(pipeline.builder.graph)
+            write_seen(path, wire.ns_from_stamp(graph.stamp), seen)
         world_up = pipeline.config.inputs.world_up
         frames = processed.album.frames
         outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)

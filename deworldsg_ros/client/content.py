@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from deworldsg_ros.client.boxes import footprint, gap_m
 from deworldsg_ros.client.errors import ClientError
@@ -19,6 +19,7 @@ from deworldsg_ros.client.words import is_class, predicate_names
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.extent import DEFAULT_UP
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
+from deworldsg_ros.scene.seen_frames import SeenFrames
 from deworldsg_ros.words import counted
 
 # What an argument of a question may be: an object, its id, or the name of a class.
@@ -28,8 +29,9 @@ Which = SceneObject | int | str
 class GraphContent:
     """Finds objects and relations; see `SceneGraph`."""
 
-    def __init__(self, message: wire.SceneGraphMessage) -> None:
+    def __init__(self, message: wire.SceneGraphMessage, seen: Iterable[SeenFrames] = ()) -> None:
         self.message = message
+        self._seen = {(item.node, item.other): item for item in seen}
         self.frame_id = message.frame_id
         self.stamp_ns = wire.ns_from_stamp(message.stamp)
         self.sequence = message.sequence
@@ -166,6 +168,11 @@ class GraphContent:
             known = ", ".join(self.labels) or "none"
             raise ClientError(f"no object of class '{which}'; classes of the graph: {known}")
         return found[0]
+
+    def frames(self, subject_id: int, object_id: int = 0) -> SeenFrames | None:
+        """The frames of an object, or of a relation; None = not known."""
+        pair = (subject_id, object_id)
+        return self._seen.get(pair, self._seen.get(pair[::-1]) if object_id else None)
 
     def edge(self, subject_id: int, object_id: int) -> wire.EdgeState | None:
         """The message of a directed edge; None = there is none."""

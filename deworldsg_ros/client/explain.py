@@ -14,6 +14,7 @@ from deworldsg_ros.client.objects import (
     odds_of,
 )
 from deworldsg_ros.client.words import is_class
+from deworldsg_ros.scene.seen_frames import SeenFrames
 from deworldsg_ros.words import counted
 
 # Two boxes are in contact below this gap: the error of a measured extent.
@@ -38,15 +39,18 @@ class Explanation:
         return "\n".join([self.subject, *(f"  {line}" for line in self.lines)])
 
 
-def explain_object(item: SceneObject, relations: Sequence[Relation]) -> Explanation:
+def explain_object(
+    item: SceneObject, relations: Sequence[Relation], seen: SeenFrames | None = None
+) -> Explanation:
     """Why an object is in the graph and has its name.
 
     Args:
         item: the object.
         relations: all relations of the object.
+        seen: its frames; None = not known.
     """
     frames, seconds = item.observations, (item.last_seen_ns - item.first_seen_ns) / 1e9
-    lines = [f"detected in {counted(frames, 'frame')} over {seconds:.1f} s"]
+    lines = [f"detected in {counted(frames, 'frame')} over {seconds:.1f} s", *_frame_lines(seen)]
     if item.existence is not None:
         lines.append(f"exists with {item.existence:.0%} ({odds_of(item.existence)})")
     names = ", ".join(f"{belief.label} {belief.probability:.0%}" for belief in item.classes[:3])
@@ -61,16 +65,18 @@ def explain_object(item: SceneObject, relations: Sequence[Relation]) -> Explanat
     lines.append(f"box {size} cm, from the {item.box_source}; {looks} in this message")
     lines += [f"{relation.text}: {relation.probability:.0%}" for relation in relations[:5]]
     values = {**item.to_dict(), "relations": [relation.to_dict() for relation in relations]}
+    values["frames"] = _frame_values(seen)
     return Explanation(item.name, tuple(lines), values)
 
 
-def explain_relation(relation: Relation) -> Explanation:
+def explain_relation(relation: Relation, seen: SeenFrames | None = None) -> Explanation:
     """Why a relation is in the graph: frames, sources, and the geometry of the two boxes."""
     geometry = pair_geometry(relation.subject, relation.object)
     lines = [
         f"holds with {relation.probability:.0%} ({odds_of(relation.probability)})"
         + ("" if relation.is_sure else ": not sure"),
         f"evidence: {relation.evidence}",
+        *_frame_lines(seen),
         f"no relation at all: {relation.unrelated:.0%}",
         geometry_line(geometry),
     ]
@@ -79,7 +85,29 @@ def explain_relation(relation: Relation) -> Explanation:
     if likely:
         names = ", ".join(f"{item.label} {item.probability:.0%}" for item in likely[:3])
         lines.append(f"other predicates: {names}")
-    return Explanation(relation.text, tuple(lines), {**relation.to_dict(), **geometry})
+    values = {**relation.to_dict(), **geometry, "frames": _frame_values(seen)}
+    return Explanation(relation.text, tuple(lines), values)
+
+
+def _frame_lines(seen: SeenFrames | None) -> list[str]:
+    """The frames of an object or a relation, as a sentence; stamps in seconds."""
+    if seen is None:
+        return []
+    clearest = ", ".join(
+        f"{frame.stamp_ns / 1e9:.3f} ({frame.name} {frame.strength:.0%})" for frame in seen.clearest
+    )
+    first, last = seen.first_ns / 1e9, seen.last_ns / 1e9
+    return [f"frames: first {first:.3f}, last {last:.3f}, clearest {clearest}"]
+
+
+def _frame_values(seen: SeenFrames | None) -> dict[str, Any] | None:
+    if seen is None:
+        return None
+    clearest = [
+        {"stamp_ns": frame.stamp_ns, "name": frame.name, "strength": frame.strength}
+        for frame in seen.clearest
+    ]
+    return {"first_ns": seen.first_ns, "last_ns": seen.last_ns, "clearest": clearest}
 
 
 def explain_absence(

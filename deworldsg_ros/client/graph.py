@@ -19,7 +19,9 @@ from deworldsg_ros.client.goals import ROBOT_RADIUS_M, Goal, free_direction, goa
 from deworldsg_ros.client.networks import to_networkx
 from deworldsg_ros.client.objects import Point, Relation, SceneObject, relation
 from deworldsg_ros.client.paths import cheapest_chain
-from deworldsg_ros.scene.graph_file import read_graph
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
+from deworldsg_ros.scene.seen_frames import read_seen
 
 
 class SceneGraph(GraphContent):
@@ -29,6 +31,7 @@ class SceneGraph(GraphContent):
 
     Args:
         message: of `/scene_graph`, or of a file.
+        seen: from which frames its objects and relations come, for `explain`.
 
     Attributes:
         message: the message.
@@ -40,12 +43,14 @@ class SceneGraph(GraphContent):
 
     @classmethod
     def load(cls, path: str | Path) -> SceneGraph:
-        """The graph of a file, or of the folder of a run.
+        """The graph of a file, or of the folder of a run, with its frames if they are beside it.
 
         Raises:
             RefusedInput: if the file is missing or contains no scene graph.
         """
-        return cls(read_graph(Path(path)))
+        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
+        message = read_graph(file)
+        return cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
 
     def on(self, support: Which, label: str | None = None) -> list[SceneObject]:
         """Objects that are on another one with a probability of at least one half."""
@@ -88,13 +93,15 @@ class SceneGraph(GraphContent):
         if isinstance(what, tuple):
             a, b = self.one(what[0]), self.one(what[1])
             found = self.relations(a, None, b) or self.relations(b, None, a)
-            return explain_relation(found[0]) if found else explain_no_relation(a, b)
+            if not found:
+                return explain_no_relation(a, b)
+            what = found[0]
         if isinstance(what, Relation):
-            return explain_relation(what)
+            return explain_relation(what, self.frames(what.subject.id, what.object.id))
         if isinstance(what, str) and not self.objects(what):
             return explain_absence(what, self.hidden, list(self))
         item = self.one(what)
-        return explain_object(item, self.relations_of(item))
+        return explain_object(item, self.relations_of(item), self.frames(item.id))
 
     def changes_since(self, before: SceneGraph) -> Changes:
         """What differs from an earlier graph, in the same world frame.

@@ -10,6 +10,7 @@ from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.map_keeper import MapKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.seen_frames import write_seen
 from deworldsg_ros.words import counted
 
 
@@ -50,6 +51,8 @@ class GraphFiles:
         try:
             self._save_path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._save_path, wire.encode(message))
+            stamp_ns = wire.ns_from_stamp(message.stamp)
+            write_seen(self._save_path, stamp_ns, builder.frames.all(builder.graph))
         except OSError as error:
             return False, f"{self._save_path}: {error}"
         nodes, edges = counted(len(message.nodes), "node"), counted(len(message.edges), "edge")

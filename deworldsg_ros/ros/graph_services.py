@@ -137,7 +137,8 @@ class GraphServices:
         return self._graph.builder
 
     def _asked(self) -> SceneGraph:
-        return SceneGraph(self._builder.full())
+        builder = self._builder
+        return SceneGraph(builder.full(), builder.frames.all(builder.graph))
 
     def _query(self, request: Query) -> str:
         return _json(ask(self._asked(), request.question).to_dict())

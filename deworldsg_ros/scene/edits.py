@@ -112,8 +112,13 @@ class EditLog:
 
     def origins(self, node_id: int) -> list[int]:
         """The hidden nodes of which edits have made a node."""
-        found = [old_id for edit in self.edits if node_id in edit.nodes for old_id in edit.replaced]
-        return [*found, *(origin for old_id in found for origin in self.origins(old_id))]
+        found: list[int] = []
+        waiting = [node_id]
+        while waiting:
+            new = [old_id for old_id in self._made_of.get(waiting.pop(), ()) if old_id not in found]
+            found += new
+            waiting += new
+        return found
 
     def believed_classes(
         self, nodes: NodeTable, vocabulary: Vocabulary, rows: Int64 | Sequence[int]
@@ -181,6 +186,8 @@ class EditLog:
                 self.deleted.update(edit.nodes)
             successor = edit.nodes[0] if edit.kind == "merge" else 0
             self.replaced.update(dict.fromkeys(edit.replaced, successor))
+        made = [edit for edit in self.edits if edit.replaced]
+        self._made_of = {node_id: edit.replaced for edit in made for node_id in edit.nodes}
         merges = [edit.nodes[0] for edit in self.edits if edit.kind == "merge"]
         self.merged = {node_id for node_id in merges if node_id not in self.replaced}
         self.separate = self._split_pairs()

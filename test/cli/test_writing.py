@@ -48,7 +48,7 @@ def test_nothing_is_written_past_the_helper():
 def write_results(out: Path, run: int) -> None:
     with outputs.writing(out, Config()) as staged:
         write_graph(staged, make_room(3))
-        for name in (outputs.PICTURE_FILE, outputs.PAGE_FILE, outputs.REPORT_FILE):
+        for name in outputs.RESULTS[2:]:
             write_atomically(staged / name, f"{run} " * 2000)
 
 
