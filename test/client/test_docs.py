@@ -1,32 +1,110 @@
-"""The Python of README.md and of the page "use the graph" runs."""
+"""Every code block of README.md's client and of the page "use the graph" runs."""
 
 from __future__ import annotations
 
 import re
+import shlex
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer.testing
+from support.merging import VOCABULARY
+from support.surfaces import CUP, HERE, view
 
-BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+import deworldsg_ros.client
+from deworldsg_ros.cli.app import app
+from deworldsg_ros.client import SceneGraph
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import write_map
+from deworldsg_ros.scene.edits import SetLabel
+
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
-def blocks(path: Path) -> list[str]:
+def blocks(path: Path) -> list[tuple[str, str]]:
+    """Language and content of each block."""
     return BLOCK.findall(path.read_text(encoding="utf-8"))
+
+
+class FakeClient:
+    """A live client without ROS: the graph of a file, and answers to commands."""
+
+    def __init__(self, namespace: str = "") -> None:
+        self.graph = SceneGraph.load("demo_out")
+        self.calls: list[tuple[Any, ...]] = []
+
+    def __enter__(self) -> FakeClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self.calls or self.graph
+
+    def on_change(self, callback: Callable[..., object]) -> None:
+        callback(self.graph, self.graph.changes_since(self.graph))
+
+    def command(self, *call: Any, **request: Any) -> dict[str, Any]:
+        self.calls.append((*call, request))
+        return {"nodes": [58], "text": "done"}
+
+    set_label = merge = split = delete = undo = command
+
+
+@pytest.fixture
+def page(root_dir: Path, demo_out: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """The blocks of the page, with the files that it names and a client without ROS."""
+    monkeypatch.setattr(deworldsg_ros.client, "SceneGraphClient", FakeClient, raising=False)
+    for name in ("monday", "tuesday", "kitchen", "living_room"):
+        shutil.copytree(demo_out, demo_out.with_name(name))
+    builder = GraphBuilder(Config(), VOCABULARY, "world")
+    for stamp in range(1, 8):
+        builder.integrate(view(stamp, (HERE, CUP)))
+    builder.edit(SetLabel(1, "mug"))
+    write_map(builder, Path("room.map"))
+    return blocks(root_dir / "docs" / "use_the_graph.md")
 
 
 def test_the_readme_says_which_cup_is_on_the_table(
     root_dir: Path, demo_out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (block,) = blocks(root_dir / "README.md")
+    (block,) = [text for language, text in blocks(root_dir / "README.md") if language == "python"]
     assert len(block.strip().splitlines()) == 3
     exec(compile(block, "README.md", "exec"), {})
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("cup #13 (-0.8")
 
 
-def test_the_page_use_the_graph_runs(root_dir: Path, demo_out: Path) -> None:
+def test_the_python_of_the_page_runs(page: list[tuple[str, str]]) -> None:
     names: dict[str, object] = {}
-    page = blocks(root_dir / "docs" / "use_the_graph.md")
-    assert len(page) >= 5
-    for block in page:
+    python = [text for language, text in page if language == "python"]
+    assert len(python) >= 7
+    for block in python:
         exec(compile(block, "use_the_graph.md", "exec"), names)
+
+
+def test_the_commands_of_the_page_run(
+    page: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served: list[Any] = []
+    # The MCP server itself is tested in test_mcp.py.
+    from deworldsg_ros.cli import mcp
+
+    monkeypatch.setattr(mcp, "make_server", lambda *_: served.append(1) or _Server())
+    lines = [line for language, text in page if not language for line in text.splitlines()]
+    commands = [shlex.split(line, comments=True) for line in lines if line.strip()]
+    assert len(commands) >= 18
+    for program, *words in commands:
+        if program == "pip":
+            continue
+        assert program == "deworldsg", words
+        done = typer.testing.CliRunner().invoke(app, words)
+        assert done.exit_code == 0, (words, done.output)
+    assert served
+
+
+class _Server:
+    def run(self) -> None:
+        """Does nothing."""
