@@ -115,11 +115,7 @@ class Perception:
         self._relation_head = wrap("relation_head", self._relation_head)
 
     def turn_upright(self, frame: RgbdFrame) -> UprightFrame:
-        """A frame, turned upright if the camera is mounted on its side and detections are refined.
-
-        Args:
-            frame: the frames come in order of time.
-        """
+        """The next frame, turned upright if the camera is on its side and detections are refined."""
         if self._uprighter is None:
             return UprightFrame(frame, frame)
         return self._uprighter.turn(frame)
@@ -194,11 +190,7 @@ class Perception:
         return Perceived(frame_graph, instances, dict(drops), self._failures)
 
     def detect(self, frame: RgbdFrame) -> Detections:
-        """Objects and, if detections are refined, weak boxes; raises ``detector_error``.
-
-        Args:
-            frame: upright.
-        """
+        """Objects and, if refined, weak boxes of an upright frame; raises ``detector_error``."""
         fraction = WEAK_SCORE_FRACTION if self._refine else 1.0
         try:
             return self._detector.detect(frame.rgb, fraction * self.score_threshold)
