@@ -115,7 +115,7 @@ class Perception:
         self._relation_head = wrap("relation_head", self._relation_head)
 
     def turn_upright(self, frame: RgbdFrame) -> UprightFrame:
-        """The next frame, turned upright if the camera is on its side and detections are refined."""
+        """The next frame, upright; as it is if detections are not refined."""
         if self._uprighter is None:
             return UprightFrame(frame, frame)
         return self._uprighter.turn(frame)
