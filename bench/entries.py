@@ -42,7 +42,7 @@ ENTRIES = {
     for entry in (
         Entry("lifting", "bench.lifting:figures", limit_s=120, takes_s=8),
         Entry("integration", "bench.integration:figures", limit_s=300, takes_s=90),
-        Entry("step", "bench.step:figures", limit_s=120, takes_s=30),
+        Entry("step", "bench.step:figures", limit_s=240, takes_s=25),
         Entry("fross", "bench.fross:figures", limit_s=240, takes_s=50),
         Entry("merging_search", "bench.merging:search_figures", limit_s=120, takes_s=5),
         Entry("kitchen", "bench.kitchen:figures", limit_s=240, takes_s=45),
