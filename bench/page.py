@@ -1,4 +1,4 @@
-"""Write docs/performance.md from the figures of `python -m bench`: python -m bench.page FILE.json
+"""Write docs/dev/performance.md from figures of `python -m bench`: python -m bench.page FILE.json
 
 The tables contain no figure that is typed by hand, except those of before (`BEFORE`), which nothing
 can measure again.
@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "dev" / "performance.md"
 # Figures before the work on speed, on two idle cores (commit 1bc6f72), by the name of the figure.
 BEFORE = {
     "update_1000_nodes": "12 ms",

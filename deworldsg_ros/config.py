@@ -63,7 +63,8 @@ class PerceptionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         bool,
         option(
             "beyond the paper: nested detections of one object are joined, boxes that fill the "
-            "image are dropped, and weak boxes inside a larger object keep their pixels"
+            "image are dropped, weak boxes inside a larger object keep their pixels, and images of "
+            "a camera on its side are turned upright"
         ),
     ] = True
     detector_path: Annotated[

@@ -41,7 +41,7 @@ class CheckpointSource:
         if not name:
             raise ConfigurationError(
                 f"{parameter} is empty: set it to the folder or hub id of a checkpoint; "
-                "docs/models.md lists sources"
+                "docs/dev/models.md lists sources"
             )
         folder = Path(name).expanduser()
         if folder.is_dir():

@@ -45,7 +45,7 @@ def require_checkpoints(
     lines += [] if relations is None else missing_world_model(relations)
     if lines:
         raise ConfigurationError(
-            "checkpoints of the configuration are missing (see docs/models.md):\n"
+            "checkpoints of the configuration are missing (see docs/dev/models.md):\n"
             + "\n".join(lines)
         )
 

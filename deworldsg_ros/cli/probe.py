@@ -255,7 +255,8 @@ def import_probe(
     )
     Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(
         "warning: the file does not know the weights of its backbone, and the released code may "
-        "not have loaded any (docs/models.md, The published probe): measure it before you trust it"
+        "not have loaded any (docs/dev/models.md, The published probe): measure it before you "
+        "trust it"
     )
 
 

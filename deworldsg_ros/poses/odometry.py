@@ -37,7 +37,7 @@ LEVEL_CAMERA = np.array(
 # Name of the world frame if `inputs.world_frame` is empty; the usual name of an odometry frame
 # (REP 105).
 ODOMETRY_FRAME = "odom"
-# With the following limits no frame of the recordings in docs/poses.md is lost.
+# With the following limits no frame of the recordings in docs/dev/poses.md is lost.
 # Depth beyond this is not aligned: the noise of depth cameras grows with the square of the depth.
 MAX_DEPTH_M = 4.0
 # A frame is lost if the camera would have moved by more than this since the reference: 9 m/s at

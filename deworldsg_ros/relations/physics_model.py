@@ -2,7 +2,7 @@
 
 A few small networks map the fused geometry and the classes of an ordered pair to logits. They are
 trained on rooms in which a physics engine knows every contact, and what falls when an object is
-taken away (tools/physics_rooms, tools/physics_model). docs/relations.md has the model card.
+taken away (tools/physics_rooms, tools/physics_model). docs/dev/relations.md has the model card.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class Store:
         """Answer a question in Cypher; it cannot change the database.
 
         Args:
-            cypher: with the tables Object, Relation and Stay (docs/store.md).
+            cypher: with the tables Object, Relation and Stay (docs/dev/store.md).
             parameters: values of its ``$names``.
 
         Raises:

@@ -1,7 +1,7 @@
 """Clips of pairs with their predicates, from a folder.
 
-Two layouts (docs/models.md): `FOLDER/PREDICATE/[GROUP__]NAME.npz|mp4|avi`, or `FOLDER/index.jsonl`
-with one line per clip.
+Two layouts (docs/dev/models.md): `FOLDER/PREDICATE/[GROUP__]NAME.npz|mp4|avi`, or
+`FOLDER/index.jsonl` with one line per clip.
 """
 
 from collections.abc import Callable

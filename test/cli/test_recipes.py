@@ -1,4 +1,4 @@
-"""The recipes of docs/models.md with small networks of random weights from a local hub."""
+"""The recipes of docs/dev/models.md with small networks of random weights from a local hub."""
 
 from __future__ import annotations
 

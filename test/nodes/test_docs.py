@@ -25,10 +25,11 @@ from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
 from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
 
 PAGES = (
-    ROOT / "docs" / "nodes.md",
-    ROOT / "docs" / "recordings.md",
-    ROOT / "docs" / "reliability.md",
+    ROOT / "docs" / "dev" / "nodes.md",
+    ROOT / "docs" / "dev" / "recordings.md",
+    ROOT / "docs" / "dev" / "reliability.md",
     ROOT / "docs" / "troubleshooting.md",
+    ROOT / "docs" / "topics_and_parameters.md",
 )
 # Everything that runs in the nodes.
 PACKAGES = (

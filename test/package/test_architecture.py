@@ -1,4 +1,4 @@
-"""docs/architecture.md names functions that exist, and every folder of the package."""
+"""docs/dev/architecture.md names functions that exist, and every folder of the package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROW = re.compile(r"^\| [^|]+ \| `(\w+)` \| `([\w/]+\.py)` \|$", re.M)
 @pytest.fixture()
 def page(root_dir: Path) -> str:
     """The text of the page."""
-    return (root_dir / "docs" / "architecture.md").read_text(encoding="utf-8")
+    return (root_dir / "docs" / "dev" / "architecture.md").read_text(encoding="utf-8")
 
 
 def test_each_step_names_a_function_or_class_of_its_file(root_dir: Path, page: str) -> None:

@@ -12,9 +12,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "deworldsg_ros"
-METHOD = ROOT / "docs" / "method.md"
+METHOD = ROOT / "docs" / "dev" / "method.md"
 # The fixtures below are checked as if they were the text of this page.
-PAGE = ROOT / "docs" / "page.md"
+PAGE = ROOT / "docs" / "dev" / "page.md"
 # A changelog names files of earlier versions.
 HISTORY = {"CHANGELOG.md"}
 # A program of another project, and files that the package writes.

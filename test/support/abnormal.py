@@ -199,7 +199,7 @@ CASES: list[Case] = [
 
 
 def table() -> str:
-    """The table of docs/reliability.md."""
+    """The table of docs/dev/reliability.md."""
     rows = [
         f"| `{case.node}` | `{case.topic.replace('__', '/')}` | {case.text} | `{case.reason}` |"
         for case in CASES

@@ -38,7 +38,7 @@ from deworldsg_ros.scene.errors import ConfigurationError
 PRINTED = ("main", "predictions", "pose", "ablation", "runtime")
 NOT_PRINTED = (
     "Numbers of the paper appear only beside a row of the same method, on its whole test split. "
-    "This table has none. docs/models.md says how to get the paper's networks."
+    "This table has none. docs/dev/models.md says how to get the paper's networks."
 )
 
 

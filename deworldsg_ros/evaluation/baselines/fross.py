@@ -1,6 +1,6 @@
 """FROSS (Hou et al., ICCV 2025): boxes lifted at their centre, merged by class and distance.
 
-Implemented from the published description; docs/evaluation/protocol.md lists the open choices.
+Implemented from the published description; docs/dev/evaluation/protocol.md lists the open choices.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Kim et al. (3-D Scene Graph, 2019): windows of boxes, merged by three similarities.
 
-Implemented from the published description; docs/evaluation/protocol.md lists the open choices.
+Implemented from the published description; docs/dev/evaluation/protocol.md lists the open choices.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CLASS_WEIGHT, POSITION_WEIGHT, COLOUR_WEIGHT = 0.5, 0.4, 0.1
 CLASS_SIMILARITIES = (0.0, 0.8, 0.9, 1.0)
 # Distances are divided by the first; the position similarity is 1 up to the second (0.56 m).
 POSITION_SCALE_M, POSITION_REACH = 5.0, 0.112
-# Kim et al. do not state it; docs/evaluation/protocol.md gives the reason for this value.
+# Kim et al. do not state it; docs/dev/evaluation/protocol.md gives the reason for this value.
 MIN_SIMILARITY = 0.9
 
 

@@ -1,7 +1,8 @@
 """Recorded detections and relations: a frontend.json beside each frame.
 
-docs/evaluation/protocol.md describes the file. The rest of a distribution, which the file does not
-state, is spread evenly over the other classes or predicates. Relation probabilities become logits.
+docs/dev/evaluation/protocol.md describes the file. The rest of a distribution, which the file does
+not state, is spread evenly over the other classes or predicates. Relation probabilities become
+logits.
 """
 
 from __future__ import annotations

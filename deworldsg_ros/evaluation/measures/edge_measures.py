@@ -1,6 +1,6 @@
 """Edges of a graph compared with annotated relations, predicate by predicate.
 
-docs/evaluation/protocol.md defines every measure.
+docs/dev/evaluation/protocol.md defines every measure.
 """
 
 from __future__ import annotations

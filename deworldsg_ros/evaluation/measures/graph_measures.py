@@ -1,7 +1,7 @@
 """Measures beside recall: precision, duplicates, position, extent, edges, calibration.
 
-docs/evaluation/protocol.md defines every measure. `Measures` stores counts, so that several scans
-can be pooled.
+docs/dev/evaluation/protocol.md defines every measure. `Measures` stores counts, so that several
+scans can be pooled.
 """
 
 from __future__ import annotations

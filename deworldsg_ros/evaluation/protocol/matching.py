@@ -49,7 +49,7 @@ def match(
     segments: Sequence[NDArray[np.floating[Any]]],
     threshold_m: float = OVERLAP_THRESHOLD_M,
 ) -> Matching:
-    """Match predictions to objects (docs/evaluation/protocol.md, "Matching").
+    """Match predictions to objects (docs/dev/evaluation/protocol.md, "Matching").
 
     Args:
         object_ids: ids of the annotated objects; annotated points of other ids are ignored.

@@ -1,6 +1,6 @@
 """Predicted scene graphs of the protocol, and the two formats that they are read from.
 
-The open format (JSON) and the official pickle are described in docs/evaluation/protocol.md.
+The open format (JSON) and the official pickle are described in docs/dev/evaluation/protocol.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The official protocol: recall of objects, predicates and relationships.
 
 The rules are those of the program behind the published numbers (FROSS, ``Merging/evaluate.py``).
-docs/evaluation/protocol.md states them.
+docs/dev/evaluation/protocol.md states them.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ CANDIDATE_SCORE = 0.15
 SAME_CLASS_IOU = 0.5
 # Boxes of any classes with a larger overlap show one object.
 ANY_CLASS_IOU = 0.75
-# Fitted by tools/calibration/calibrate_detector.py; see docs/perception.md.
+# Fitted by tools/calibration/calibrate_detector.py; see docs/dev/perception.md.
 CALIBRATION = SoftmaxCalibration(temperature=0.35)
 
 

@@ -1,6 +1,6 @@
 """Ground truth of a data set in one of the two official layouts: objects, relations, points.
 
-docs/evaluation/protocol.md lists the rules of the official evaluation program followed here.
+docs/dev/evaluation/protocol.md lists the rules of the official evaluation program followed here.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ def build_probed(
     if not probe.card.backbone.fingerprint:
         logger.warning(
             "probe %s does not know the weights of its backbone, so '%s' is not compared with "
-            "them: with other weights its predictions mean nothing (docs/models.md, The published "
-            "probe)",
+            "them: with other weights its predictions mean nothing (docs/dev/models.md, The "
+            "published probe)",
             config.probe_path,
             config.world_model_path,
         )
