@@ -171,16 +171,16 @@ class GraphBuilder:
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """The changes since the last call; None if there are none.
 
-        It costs as much as what changed, however large the graph is. Of many pairs whose evidence
-        changed, some are left for the next calls: see `waiting`.
+        It costs as much as what changed, however large the graph is. Of many surfaces and pairs
+        that changed, some are left for the next calls: see `waiting`.
         """
-        self._publication.set_up(self.up.up_world())
+        self._publication.set_up(self.up.up_world(exact=False))
         return self._publication.update()
 
     @property
     def waiting(self) -> int:
-        """Number of pairs of nodes that the next updates judge; `full` leaves none."""
-        return self._edges.waiting
+        """Number of surfaces and pairs that the next updates take in; `full` leaves none."""
+        return self._edges.waiting + self._publication.waiting
 
     def snapshot(self) -> wire.SceneGraphMessage:
         """The graph after the last `update`."""

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY as VOCABULARY_OF_FRAMES
 from support.merging import local_graph, set_confirmed
+from support.reference_updates import diff
 
 from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -135,6 +136,30 @@ def test_edges_do_not_depend_on_the_history_of_the_builder(robust: bool, seed: i
         )
         assert builder.full().edges == fresh.full().edges
         assert replica.edges == {(e.subject, e.object): e for e in fresh.full().edges}
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("seed", range(4))
+def test_an_update_is_what_two_snapshots_differ_in(
+    robust: bool, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    builder, generator = builder_of(6, robust), np.random.default_rng(seed)
+    removals: list[dict[int, int | None]] = []
+    take = builder.graph.take_removals
+    monkeypatch.setattr(
+        builder.graph, "take_removals", lambda: removals.append(take()) or removals[-1]
+    )
+    previous, told = builder.snapshot(), 0
+    for _ in range(40):
+        change(builder, generator)
+        update = builder.update()
+        current = builder.snapshot()
+        if update is None:
+            assert current is previous and not removals[-1]
+            continue
+        assert update == diff(previous, current, removals[-1])
+        previous, told = current, told + 1
+    assert told > 5
 
 
 def test_a_clock_that_was_set_back_does_not_end_the_graph() -> None:

@@ -11,7 +11,6 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import even_moments
 
 # State of a rule besides the graph, as arrays by name.
 Memory = dict[str, NDArray[Any]]
@@ -22,7 +21,6 @@ def warm_up_graph() -> None:
     graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
     observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
     graph.observe(graph.add_node(*observation), *observation)
-    even_moments(np.zeros((1, 3), np.float32))
     graph.node_states(1)
 
 

@@ -21,13 +21,16 @@ from deworldsg_ros.relations.prior import ClassPairPrior, Prior
 from deworldsg_ros.relations.robust_beliefs import ChangedBeliefs, RobustBeliefs
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64
-from deworldsg_ros.scene.edges import Pair
+from deworldsg_ros.scene.beliefs import listed
+from deworldsg_ros.scene.edges import EdgeEvidence, Pair
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
+from deworldsg_ros.scene.publication import MEASURED_A_CALL
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.votes import frame_votes
+from deworldsg_ros.scene.waiting import some_of
 
 # Votes of objects whose means are farther apart are not counted.
 MAX_DISTANCE_M = 2.5
@@ -35,13 +38,12 @@ MAX_DISTANCE_M = 2.5
 MIN_PROBABILITY = 0.2
 # Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
 # 12 objects changes about 80 pairs.
-JUDGED_A_CALL = 32
+JUDGED_A_CALL = 12
 # A symmetric relation is sent once a pair if its probabilities in both directions differ by less.
 SAME_PROBABILITY = 0.01
-# If more wait than this many calls judge, a call judges more: edges lag by a second at 30 Hz.
-MAX_CALLS = 32
 # Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
+NO_EVIDENCE = EdgeEvidence(np.zeros(0), 0, 0, 0, 0)
 
 
 class EdgeBeliefs:
@@ -65,17 +67,19 @@ class EdgeBeliefs:
         self._graph = graph
         self._top_k = config.output.top_k
         relations = config.relations
-        self._robust = relations.edge_belief == "robust"
-        self._table = PairTable(
-            graph,
-            load_physics_model(),
-            geometry=relations.world_model != "none",
-        )
-        self._has_predictions = relations.world_model == "physics"
-        self._paper_beliefs = PaperBeliefs(relations, graph, self._top_k)
-        self._robust_beliefs = RobustBeliefs(config, graph, self._table)
-        self._predicted = PredictedPrior(graph.vocabulary)
-        self.states: dict[Pair, wire.EdgeState] = {} if self._robust else self._paper_beliefs.states
+        has_predictions = relations.world_model == "physics"
+        self._table: PairTable | None = None
+        self._robust: RobustBeliefs | None = None
+        self._paper: PaperBeliefs | None = None
+        if relations.edge_belief == "robust" or has_predictions:
+            geometry = relations.world_model != "none"
+            self._table = PairTable(graph, load_physics_model(), geometry=geometry)
+        if relations.edge_belief == "robust" and self._table is not None:
+            self._robust = RobustBeliefs(config, graph, self._table)
+        else:
+            self._paper = PaperBeliefs(relations, graph, self._top_k)
+        self._predicted = PredictedPrior(graph.vocabulary) if has_predictions else None
+        self.states: dict[Pair, wire.EdgeState] = self._paper.states if self._paper else {}
         names = graph.vocabulary.predicates
         self._symmetric = np.array([plain(name) in SYMMETRIC for name in names], np.bool_)
         self._begun = False
@@ -84,7 +88,7 @@ class EdgeBeliefs:
 
     def weigh(self, local: LocalGraph) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
-        if not self._robust:
+        if self._robust is None:
             return local
         logits = bounded_logits(local.relations.logits, OUTLIER_RATE)
         return derived(local, relations=derived(local.relations, logits=logits))
@@ -97,7 +101,7 @@ class EdgeBeliefs:
             node_ids: the node of each of its rows.
         """
         self.up.observe(local.T_world_camera)
-        if not self._robust or len(node_ids) < 2:
+        if self._robust is None or len(node_ids) < 2:
             return
         votes = frame_votes(local.relations.logits)
         counts: dict[tuple[int, int], Float64] = {}
@@ -134,8 +138,8 @@ class EdgeBeliefs:
 
     @property
     def waiting(self) -> int:
-        """Number of pairs that wait to be judged."""
-        return self._table.waiting
+        """Number of nodes that wait to be measured, and of pairs that wait to be judged."""
+        return 0 if self._table is None else self._table.nodes_waiting + self._table.pairs_waiting
 
     def refresh(self, whole: bool = True) -> list[Pair]:
         """Bring `states` up to date; returns the pairs with another message, or none.
@@ -143,20 +147,30 @@ class EdgeBeliefs:
         Args:
             whole: judge all pairs that wait, as the first call does. False: about `JUDGED_A_CALL`.
         """
-        prior: Prior = self.prior
-        if self._robust or self._has_predictions:
-            some = max(JUDGED_A_CALL, self._table.waiting // MAX_CALLS)
-            everything = whole or not self._begun
-            self._table.refresh(self.up.up_world(), None if everything else some)
-            self._begun = True
-        if self._has_predictions:
-            self._predicted.follow(self._table, self._table.changed_pairs)
-            prior = self._predicted
-        if self._robust:
-            return self._follow(self._robust_beliefs.refresh(prior))
-        self._table.changed_pairs.clear()
-        self._table.changed_nodes.clear()
-        return self._paper_beliefs.refresh(prior)
+        prior = self._follow_table(whole or not self._begun)
+        self._begun = True
+        if self._robust is not None:
+            return self._follow(self._robust.refresh(prior))
+        assert self._paper is not None
+        return self._paper.refresh(prior)
+
+    def _follow_table(self, everything: bool) -> Prior:
+        """Judge pairs that wait, all of them or some; returns the prior that is used."""
+        table, prior = self._table, self.prior
+        if table is None:
+            return prior
+        limits = (
+            some_of(table.pairs_waiting, JUDGED_A_CALL),
+            some_of(table.nodes_waiting, MEASURED_A_CALL),
+        )
+        up_world = self.up.up_world(exact=everything)
+        table.refresh(up_world, *((None, None) if everything else limits))
+        if self._predicted is not None:
+            self._predicted.follow(table, table.changed_pairs)
+        if self._robust is None:
+            table.changed_pairs.clear()
+            table.changed_nodes.clear()
+        return prior if self._predicted is None else self._predicted
 
     def _follow(self, beliefs: ChangedBeliefs) -> list[Pair]:
         """Messages of the edges that are probable enough."""
@@ -177,9 +191,7 @@ class EdgeBeliefs:
                 self._basis[pair] = basis
                 changed.append(pair)
         changed.extend((evidence_changed & self.states.keys()).difference(changed))
-        for pair in changed:
-            if pair in self._basis:
-                self.states[pair] = self._message(pair, *self._basis[pair])
+        self._tell([pair for pair in changed if pair in self._basis])
         return changed
 
     def _mutual(self, rounded: Float64, said: Bool) -> Bool:
@@ -189,27 +201,31 @@ class EdgeBeliefs:
         both &= np.ptp(rounded.max(axis=1, initial=0.0).reshape(-1, 2), axis=1) <= SAME_PROBABILITY
         return np.repeat(both & self._symmetric[best[:, 0]], 2)
 
-    def _message(
-        self, pair: Pair, rounded: bytes, provenance: wire.Provenance, mutual: bool
-    ) -> wire.EdgeState:
-        evidence = self._graph.edges.get(pair)
-        probabilities = np.frombuffer(rounded)
-        votes = self._graph.votes.get((min(pair), max(pair)))
-        logits = np.zeros(len(probabilities))
-        frames = 0
-        if evidence is not None and evidence.frames:
-            logits, frames = evidence.visual_logits, evidence.frames
-        return edge_state(
-            pair,
-            probabilities,
-            self._graph.vocabulary.predicates,
-            self._top_k,
-            provenance=provenance,
-            entropy_nats=float(entropy_nats(visual_distribution(logits))),
-            observations=frames,
-            shown=0 if votes is None else votes.frames,
-            mutual=mutual,
-        )
+    def _tell(self, pairs: list[Pair]) -> None:
+        """Write the messages of edges."""
+        if not pairs:
+            return
+        graph = self._graph
+        probabilities = np.array([np.frombuffer(self._basis[pair][0]) for pair in pairs])
+        evidence = [graph.edges.get(pair, NO_EVIDENCE) for pair in pairs]
+        logits = np.zeros(probabilities.shape)
+        for row, item in enumerate(evidence):
+            if item.frames:
+                logits[row] = item.visual_logits
+        entropies = entropy_nats(visual_distribution(logits)).tolist()
+        told = listed(probabilities, graph.vocabulary.predicates, self._top_k)
+        for pair, one, item, entropy in zip(pairs, told, evidence, entropies):
+            _, provenance, mutual = self._basis[pair]
+            votes = graph.votes.get((min(pair), max(pair)))
+            self.states[pair] = edge_state(
+                pair,
+                one,
+                provenance=provenance,
+                entropy_nats=entropy,
+                observations=item.frames,
+                shown=0 if votes is None else votes.frames,
+                mutual=mutual,
+            )
 
     def _check_vocabulary(self, evidence: RelationEvidence) -> None:
         seen, known = evidence.vocabulary, self._graph.vocabulary

@@ -12,6 +12,9 @@ from deworldsg_ros.scene.graph import SceneGraph
 
 _GAP, _BOTTOM_STEP = FEATURES.index("gap_m"), FEATURES.index("bottom_over_bottom_m")
 
+# Pairs in arrays at once, so that a whole map needs no large ones.
+AT_ONCE = 1024
+
 
 class GeometryJudge:
     """Judges pairs of nodes by their surfaces.
@@ -35,15 +38,18 @@ class GeometryJudge:
             R_up_world: (3, 3) rotation from the world frame to the upright frame.
             floor_m: height of the floor in the upright frame.
         """
-        if not len(rows):
-            return
-        used, places = np.unique(table.ends[rows], return_inverse=True)
-        first, second = np.ascontiguousarray(places.reshape(-1, 2).T)
+        for start in range(0, len(rows), AT_ONCE):
+            self._judge(table, rows[start : start + AT_ONCE], R_up_world, floor_m)
+
+    def _judge(self, table: PairRows, rows: Int64, R_up_world: Float64, floor_m: float) -> None:
         shapes, nodes = table.shapes, self._graph.nodes
+        ends = table.ends[rows]
+        used = sorted({*ends.ravel().tolist()})
+        places = {row: place for place, row in enumerate(used)}
+        first, second = np.array([[places[row] for row in end] for end in ends.T.tolist()])
         low, high = shapes.low[used], shapes.high[used]
-        node_rows = [nodes.row(node_id) for node_id in shapes.ids[used].tolist()]
-        points = nodes.surface_points_world[node_rows, :SHAPE_POINTS]
-        there, back = pair_features(
+        node_rows = [nodes.places[node_id] for node_id in shapes.ids[used].tolist()]
+        features = pair_features(
             first,
             second,
             low,
@@ -51,18 +57,17 @@ class GeometryJudge:
             shapes.means[used],
             shapes.covariances[used],
             shapes.counts[used],
-            upright(points, R_up_world),
+            upright(nodes.surface_points_world[node_rows, :SHAPE_POINTS], R_up_world),
             floor_m,
         )
         edits, names = self._graph.edits, self._graph.vocabulary
-        classes = edits.believed_classes(nodes, names, node_rows)
-        known = (classes, nodes.observations[node_rows])
-        table.state_logits[rows] = self._model.state_logits(
-            self._inputs.make(there, *known, first, second),
-            self._inputs.make(back, *known, second, first),
-        )
+        known = edits.believed_classes(nodes, names, node_rows), nodes.observations[node_rows]
+        both = np.append(first, second), np.append(second, first)
+        inputs = self._inputs.make(features.reshape(2 * len(rows), -1), *known, *both)
+        table.state_logits[rows] = self._model.state_logits(*inputs.reshape(2, len(rows), -1))
         table.judged[rows] = True
-        table.gaps_m[rows] = there[:, _GAP]
-        table.bottom_steps_m[rows] = there[:, _BOTTOM_STEP]
+        table.gaps_m[rows] = features[0, :, _GAP]
+        table.bottom_steps_m[rows] = features[0, :, _BOTTOM_STEP]
         centres = (low[:, :2] + high[:, :2]) / 2.0
-        table.centre_steps_m[rows] = np.linalg.norm(centres[first] - centres[second], axis=1)
+        step_x, step_y = (centres[first] - centres[second]).T
+        table.centre_steps_m[rows] = np.sqrt(step_x * step_x + step_y * step_y)

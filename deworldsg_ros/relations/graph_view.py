@@ -11,9 +11,9 @@ from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.relations.evidence import entropy_nats, visual_distribution
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.beliefs import DECIMALS
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import DECIMALS
 from deworldsg_ros.scene.replica import GraphReplica
 
 # Frames whose nodes are remembered: 34 s at 30 frames/s. Clips wait for a few seconds.

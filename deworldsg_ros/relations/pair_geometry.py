@@ -45,14 +45,12 @@ class NodeShapes(Columns):
     """Shapes of n nodes in the upright frame; see `Columns` for rows and ids.
 
     Attributes:
-        revisions: (n,) int64, node revision of the shape.
         low, high: (n, 3) trimmed bounds.
         means: (n, 3), and
         covariances: (n, 3, 3) of the points.
         counts: (n,) int64, number of points used.
     """
 
-    revisions: Int64
     low: Float64
     high: Float64
     means: Float64
@@ -62,7 +60,6 @@ class NodeShapes(Columns):
     def __init__(self, more: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] | None = None) -> None:
         super().__init__(
             {
-                "revisions": (np.int64, ()),
                 "low": (np.float64, (3,)),
                 "high": (np.float64, (3,)),
                 "means": (np.float64, (3,)),
@@ -72,20 +69,27 @@ class NodeShapes(Columns):
             }
         )
 
-    def put(self, rows: Int64, points_world: Float32, counts: Int64, R_up_world: Float64) -> None:
+    def put(
+        self,
+        rows: Int64,
+        points_world: Float32,
+        counts: Int64,
+        point_rows: Int64,
+        R_up_world: Float64,
+    ) -> None:
         """Replace the shapes of rows.
 
         Args:
             rows: (k,) of the nodes.
-            points_world: (k, K, 3) samples of their surfaces, world frame.
-            counts: (k,) numbers of these points.
+            points_world: (S, K, 3) samples of surfaces, world frame.
+            counts: (S,) numbers of their points.
+            point_rows: (k,) which sample each node has.
             R_up_world: (3, 3) rotation from the world frame to the upright frame.
         """
-        points = upright(points_world[:, :SHAPE_POINTS], R_up_world)
-        self.counts[rows] = np.minimum(counts, points.shape[1])
-        cuts = np.rint(TRIM_FRACTION * (self.counts[rows] - 1)).astype(np.int64)
+        self.counts[rows] = np.minimum(counts[point_rows], SHAPE_POINTS)
         shapes = (self.low, self.high, self.means, self.covariances, self.counts)
-        _measure(rows, points, cuts, *shapes)
+        for row, point_row in zip(rows.tolist(), point_rows.tolist()):
+            _measure(row, upright(points_world[point_row], R_up_world), *shapes)
 
 
 def upright(points_world: Float32, R_up_world: Float64) -> Float32:
@@ -98,36 +102,34 @@ def upright(points_world: Float32, R_up_world: Float64) -> Float32:
 
 @kernel
 def _measure(
-    rows: Int64,
+    row: int,
     points: Float32,
-    cuts: Int64,
     low: Float64,
     high: Float64,
     means: Float64,
     covariances: Float64,
     counts: Int64,
 ) -> None:
-    """Bounds without `cuts` points at either end, mean and covariance of points (k, K, 3)."""
-    for index in range(len(rows)):
-        row, cut = rows[index], cuts[index]
-        if not counts[row]:
-            continue
-        cloud = points[index, : counts[row]]
-        for axis in range(3):
-            least, greatest, total = _ends(cloud[:, axis], cut)
-            # Give back what the quantiles cut off an evenly covered surface. Not in height: most
-            # visible points of a table are at one height.
-            given = 0.0
-            if axis < 2:
-                given = (greatest - least) * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
-            low[row, axis], high[row, axis] = least - given, greatest + given
-            means[row, axis] = total / len(cloud)
-        for i in range(3):
-            for j in range(i, 3):
-                total = 0.0
-                for k in range(len(cloud)):
-                    total += (cloud[k, i] - means[row, i]) * (cloud[k, j] - means[row, j])
-                covariances[row, i, j] = covariances[row, j, i] = total / len(cloud)
+    """Bounds without outer points, mean and covariance of the first of points (K, 3)."""
+    if not counts[row]:
+        return
+    cloud = points[: counts[row]]
+    cut = int(np.rint(TRIM_FRACTION * (counts[row] - 1)))
+    for axis in range(3):
+        least, greatest, total = _ends(cloud[:, axis], cut)
+        # Give back what the quantiles cut off an evenly covered surface. Not in height: most
+        # visible points of a table are at one height.
+        given = 0.0
+        if axis < 2:
+            given = (greatest - least) * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
+        low[row, axis], high[row, axis] = least - given, greatest + given
+        means[row, axis] = total / len(cloud)
+    for i in range(3):
+        for j in range(i, 3):
+            total = 0.0
+            for k in range(len(cloud)):
+                total += (cloud[k, i] - means[row, i]) * (cloud[k, j] - means[row, j])
+            covariances[row, i, j] = covariances[row, j, i] = total / len(cloud)
 
 
 @kernel

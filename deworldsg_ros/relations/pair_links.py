@@ -12,6 +12,12 @@ from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Int64
 
 
+def joined(first: Int64, second: Int64 | list[int]) -> Int64:
+    """The values of both, ascending, each once. For few values, this is faster than NumPy."""
+    values = second if isinstance(second, list) else second.ravel().tolist()
+    return np.array(sorted({*first.ravel().tolist(), *values}), np.int64)
+
+
 @kernel
 def link(first_links: Int64, links: Int64, ends: Int64, row: int) -> None:
     """Enter a pair in the lists of both its objects."""

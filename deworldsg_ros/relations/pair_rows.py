@@ -35,11 +35,13 @@ class PublishedNodes(NodeShapes):
 
     Attributes:
         best_classes: (n,) int64, the class of the highest probability.
+        seating: (n, 2) bool, whether it is a table, and a seat.
         first_links: (n,) int64; see `pair_links`.
         floor_odds, on_floor, totals, shares, marks: see `settling`.
     """
 
     best_classes: Int64
+    seating: Bool
     first_links: Int64
     floor_odds: Float64
     on_floor: Float64
@@ -51,6 +53,7 @@ class PublishedNodes(NodeShapes):
         super().__init__(
             {
                 "best_classes": (np.int64, ()),
+                "seating": (np.bool_, (2,)),
                 "first_links": (np.int64, ()),
                 "floor_odds": (np.float64, ()),
                 "on_floor": (np.float64, ()),

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from sortedcontainers import SortedList
 
 from deworldsg_ros.relations.geometry_judge import GeometryJudge
-from deworldsg_ros.relations.pair_geometry import (
-    rotation_to_upright,
-)
+from deworldsg_ros.relations.pair_geometry import rotation_to_upright
 from deworldsg_ros.relations.pair_links import move_object, pairs_of
 from deworldsg_ros.relations.pair_rows import PairRows, ends_of, key
 from deworldsg_ros.relations.physical_states import relation_of_predicates
 from deworldsg_ros.relations.physics_model import PhysicsModel
 from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach
 from deworldsg_ros.relations.vote_model import relation_counts
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.relations.waiting_pairs import WaitingPairs
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.class_kinds import SEATS, TABLES
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.votes import PairVotes
+from deworldsg_ros.scene.waiting import take_first
 
 # The floor is where the lowest objects stand; single nodes may reach below it.
 FLOOR_QUANTILE = 0.05
@@ -52,67 +52,75 @@ class PairTable(PairRows):
         self._graph = graph
         self._geometry = geometry
         self._judge_near = GeometryJudge(graph, model)
+        names = graph.vocabulary.classes
+        self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
         self._relation_of = relation_of_predicates(graph.vocabulary.predicates)
-        self._R_up_world = np.eye(3)
+        self._R_up_world, self._up = np.eye(3), [0.0, 0.0, 1.0]
         self._touched = graph.watch_nodes()
+        # Published nodes that changed since they were measured.
+        self._stale: dict[int, None] = {}
         self._grid = ReachGrid()
         self._bottoms: SortedList = SortedList()
-        # Keys of the pairs that wait to be judged: those that never were, and the others; and which
-        # of them have another geometry since.
-        self._new: dict[int, None] = {}
-        self._waiting: dict[int, None] = {}
-        self._moved: set[int] = set()
+        self._waiting = WaitingPairs(self.places, self.shapes.places)
 
     @property
-    def waiting(self) -> int:
+    def pairs_waiting(self) -> int:
         """Number of pairs that wait to be judged."""
-        return len(self._new) + len(self._waiting)
+        return len(self._waiting)
 
-    def refresh(self, up_world: Float64, at_most: int | None = None) -> None:
+    @property
+    def nodes_waiting(self) -> int:
+        """Number of nodes that wait to be measured."""
+        return len(self._stale)
+
+    def refresh(
+        self, up_world: Float64, at_most: int | None = None, nodes_at_most: int | None = None
+    ) -> None:
         """Follow the graph: its nodes, their surfaces and classes, and the votes.
 
         Args:
             up_world: (3,) direction that points up in the world frame; it is used in `UP_STEP`s.
             at_most: number of pairs to judge, new ones first, then those that wait longest. The
                 others wait for the next call. None = all.
+            nodes_at_most: number of nodes to measure, those that wait longest first. None = all.
         """
-        self._find(self._follow_nodes(up_world))
-        self._wait(key(*pair) for pair in self._graph.take_changed_votes())
+        self._find(self._follow_nodes(up_world, nodes_at_most))
+        self._waiting.add(self._graph.take_changed_votes())
         floor_m = floor_height(self._bottoms)
         if floor_m != self.floor_m:
             self.floor_m = floor_m
             self.changed_nodes.update(self.shapes.ids.tolist())
-            self._move(self.ids[np.isfinite(self.gaps_m)].tolist())
-        waiting = itertools.chain(list(self._new), list(self._waiting))
-        keys = list(itertools.islice(waiting, at_most))
+            self._waiting.move(self.ids[np.isfinite(self.gaps_m)])
+        keys, moved = self._waiting.take(at_most)
         if keys:
-            self._judge(keys)
+            self._judge(keys, moved)
 
-    def _wait(self, keys: Iterable[int]) -> None:
-        for pair_key in keys:
-            (self._waiting if pair_key in self else self._new)[pair_key] = None
-
-    def _move(self, keys: Sequence[int]) -> None:
-        """Note pairs that have another geometry."""
-        self._moved.update(keys)
-        self._wait(keys)
-
-    def _follow_nodes(self, up_world: Float64) -> list[int]:
-        """Measure the nodes that changed, and forget those that went; returns ids."""
-        turned = rotation_to_upright(stepped_up(up_world))
-        if not np.array_equal(turned, self._R_up_world):
-            self._R_up_world = turned
-            self._touched.update(self.shapes.ids.tolist())
+    def _follow_nodes(self, up_world: Float64, at_most: int | None) -> list[int]:
+        """Measure nodes that changed, and forget those that went; returns ids."""
         nodes = self._graph.nodes
-        changed = []
         for node_id in sorted(self._touched):
             if node_id in nodes and nodes.confirmed[nodes.row(node_id)]:
-                changed.append(node_id)
-            elif node_id in self.shapes:
-                self._forget(node_id)
+                self._stale[node_id] = None
+            else:
+                self._stale.pop(node_id, None)
+                if node_id in self.shapes:
+                    self._forget(node_id)
         self._touched.clear()
+        if self._turn(up_world):
+            # All shapes are in one frame.
+            at_most = None
+            self._stale.update(dict.fromkeys(self.shapes.ids.tolist()))
+        changed = take_first(self._stale, at_most)
         self._measure(changed)
         return changed
+
+    def _turn(self, up_world: Float64) -> bool:
+        """Follow the up direction; true if it has made a step."""
+        stepped = stepped_up(up_world)
+        if stepped.tolist() == self._up:
+            return False
+        self._up, self._R_up_world = stepped.tolist(), rotation_to_upright(stepped)
+        return True
 
     def _measure(self, node_ids: list[int]) -> None:
         """Take in the shapes and classes of nodes."""
@@ -125,10 +133,12 @@ class PairTable(PairRows):
         at = np.array([shapes.row(node_id) for node_id in node_ids], np.int64)
         for shape in at.tolist():
             self._forget_bottom(shape)
-        counts = nodes.surface_counts[rows]
-        shapes.put(at, nodes.surface_points_world[rows], counts, self._R_up_world)
+        surfaces = nodes.surface_points_world, nodes.surface_counts
+        shapes.put(at, *surfaces, rows, self._R_up_world)
         edits, names = self._graph.edits, self._graph.vocabulary
-        best = edits.believed_classes(nodes, names, rows).argmax(axis=1)
+        classes = edits.believed_classes(nodes, names, rows)
+        shapes.seating[at] = classes @ self._seating > 0.5
+        best = classes.argmax(axis=1)
         differs = np.flatnonzero(shapes.best_classes[at] != best).tolist()
         shapes.best_classes[at] = best
         for shape in at.tolist():
@@ -138,15 +148,16 @@ class PairTable(PairRows):
             else:
                 self._grid.remove(shape)
         self._came(new)
-        others = self.rows_of([node_ids[index] for index in differs])
-        self._wait(self.ids[others].tolist())
+        if differs:
+            others = self.rows_of([node_ids[index] for index in differs])
+            self._waiting.add(map(ends_of, self.ids[others].tolist()))
         self.changed_nodes.update(node_ids)
 
     def _came(self, node_ids: list[int]) -> None:
         """Count the votes on nodes that are published from now on."""
         for node_id in node_ids:
             partners = self._graph.seen_together(node_id)
-            self._wait(key(min(node_id, other), max(node_id, other)) for other in partners)
+            self._waiting.add((min(node_id, other), max(node_id, other)) for other in partners)
 
     def _forget(self, node_id: int) -> None:
         """Forget a node that is not published any more, and its pairs."""
@@ -154,6 +165,7 @@ class PairTable(PairRows):
         row, last = shapes.row(node_id), len(shapes) - 1
         for pair_key in self.ids[self.rows_of([node_id])].tolist():
             self.forget_pair(pair_key)
+            self._waiting.forget(pair_key)
         self._forget_bottom(row)
         self._grid.remove(row)
         if row != last:
@@ -173,35 +185,26 @@ class PairTable(PairRows):
         shapes = self.shapes
         at = np.array([shapes.row(node_id) for node_id in changed], np.int64)
         ends = shapes.ids[self._grid.pairs(at, shapes.low, shapes.high, shapes.counts)]
-        self._move(key(ends.min(axis=1), ends.max(axis=1)).tolist())
+        self._waiting.move(key(ends.min(axis=1), ends.max(axis=1)))
         # Those that were in reach, and may be no more; and those with too few points until now.
         rows = pairs_of(shapes.first_links, self.links, at)
         solid = (shapes.counts[self.ends[rows]] >= MIN_SHAPE_POINTS).all(axis=1)
-        self._move(
-            self.ids[rows[(self.judged[rows] != solid) | np.isfinite(self.gaps_m[rows])]].tolist()
+        self._waiting.move(
+            self.ids[rows[(self.judged[rows] != solid) | np.isfinite(self.gaps_m[rows])]]
         )
 
-    def _judge(self, keys: list[int]) -> None:
+    def _judge(self, keys: list[int], moved: Bool) -> None:
         """Take in what is known of pairs now; those without any evidence go."""
         shapes = self.shapes
-        moved = [pair_key in self._moved for pair_key in keys]
-        self._moved.difference_update(keys)
-        for pair_key in keys:
-            self._new.pop(pair_key, None)
-            self._waiting.pop(pair_key, None)
-        known = [ends_of(one)[0] in shapes and ends_of(one)[1] in shapes for one in keys]
-        moved = [has for has, is_known in zip(moved, known) if is_known]
-        keys = list(itertools.compress(keys, known))
-        if not keys:
-            return
         known_rows = len(self)
         rows = self.add(keys)
         self._count(rows, keys)
         if self._geometry:
-            self.set_apart(rows[rows >= known_rows])
             again = rows[moved]
             near = in_reach(self.ends[again], shapes.low, shapes.high, shapes.counts)
-            self.set_apart(again[~near])
+            for apart in (rows[rows >= known_rows], again[~near]):
+                if len(apart):
+                    self.set_apart(apart)
             self._judge_near(self, again[near], self._R_up_world, self.floor_m)
         self.changed_pairs.update(keys)
         idle = (self.frames[rows] == 0) & ~(self.judged[rows] & np.isfinite(self.gaps_m[rows]))
@@ -212,14 +215,14 @@ class PairTable(PairRows):
         """Take in the votes on pairs."""
         votes = self._graph.votes
         found = [votes.get(ends_of(pair_key), NO_VOTES) for pair_key in keys]
-        counts = np.zeros((len(rows), 2, len(self._relation_of)))
-        for index, pair in enumerate(found):
-            if pair.counts is not None:
-                counts[index] = pair.counts
         self.frames[rows] = [pair.frames for pair in found]
-        self.counts[rows] = relation_counts(counts, self._relation_of)
-        others = counts[:, :, self._relation_of < 0]
-        self.other_votes[rows] = others.max(axis=(1, 2), initial=0.0)
+        told = [index for index, pair in enumerate(found) if pair.counts is not None]
+        self.counts[rows], self.other_votes[rows] = 0.0, 0.0
+        if told:
+            counts = np.array([found[index].counts for index in told])
+            self.counts[rows[told]] = relation_counts(counts, self._relation_of)
+            others = counts[:, :, self._relation_of < 0]
+            self.other_votes[rows[told]] = others.max(axis=(1, 2), initial=0.0)
 
 
 def floor_height(bottoms_m: Sequence[float]) -> float:

@@ -8,13 +8,13 @@ import numpy as np
 from msgspec import UNSET
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
+from deworldsg_ros.relations.evidence import PROVENANCES, fuse_edges
 from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
-from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.beliefs import DECIMALS, Listed, listed
+from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import DECIMALS, best_beliefs, rest_of
 
 
 class PaperBeliefs:
@@ -115,29 +115,22 @@ class PaperBeliefs:
             self._config.fusion_alpha,
             self._config.entropy_threshold_nats,
         )
-        for row in np.flatnonzero(fused.known).tolist():
-            made[pairs[row]] = self._state(pairs[row], evidence[row], fused, row)
+        rows = np.flatnonzero(fused.known).tolist()
+        names = self._graph.vocabulary.predicates
+        for row, told in zip(rows, listed(fused.probabilities[rows], names, self._top_k)):
+            made[pairs[row]] = edge_state(
+                pairs[row],
+                told,
+                provenance=PROVENANCES[fused.provenance_codes[row]],
+                entropy_nats=float(fused.entropies_nats[row]),
+                observations=evidence[row].frames,
+            )
         return made
-
-    def _state(
-        self, pair: Pair, evidence: EdgeEvidence, fused: FusedEdges, row: int
-    ) -> wire.EdgeState:
-        return edge_state(
-            pair,
-            fused.probabilities[row],
-            self._graph.vocabulary.predicates,
-            self._top_k,
-            provenance=PROVENANCES[fused.provenance_codes[row]],
-            entropy_nats=float(fused.entropies_nats[row]),
-            observations=evidence.frames,
-        )
 
 
 def edge_state(
     pair: Pair,
-    probabilities: Float64,
-    predicates: Sequence[str],
-    top_k: int,
+    told: Listed,
     *,
     provenance: wire.Provenance,
     entropy_nats: float,
@@ -145,18 +138,17 @@ def edge_state(
     shown: int | None = None,
     mutual: bool = False,
 ) -> wire.EdgeState:
-    """The message of an edge with the probabilities (R,) of its predicates, the best first."""
-    beliefs = best_beliefs(probabilities, predicates, top_k)
+    """The message of an edge with the probabilities of its predicates."""
     return wire.EdgeState(
         subject=pair[0],
         object=pair[1],
-        predicate=beliefs[0].label,
-        probability=beliefs[0].probability,
-        predicates=beliefs,
+        predicate=told.beliefs[0].label,
+        probability=told.beliefs[0].probability,
+        predicates=told.beliefs,
         provenance=provenance,
         entropy_nats=round(entropy_nats, DECIMALS),
         observations=observations,
-        remainder=rest_of(probabilities, beliefs),
+        remainder=told.remainder,
         shown=UNSET if shown is None else shown,
         mutual=mutual or UNSET,
     )

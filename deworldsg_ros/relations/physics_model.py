@@ -7,6 +7,7 @@ taken away (tools/physics_rooms, tools/physics_model). docs/dev/relations.md has
 
 from __future__ import annotations
 
+import math
 import zipfile
 from dataclasses import dataclass, fields
 from functools import cache
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.relations.evidence import entropy_nats
 from deworldsg_ros.relations.pair_geometry import FEATURES
 from deworldsg_ros.relations.physical_states import DIRECTED, states_of_relations
@@ -21,7 +23,6 @@ from deworldsg_ros.relations.vote_model import VoteScales
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.softmax import log_softmax
 
 PATH = Path(__file__).with_name("weights") / "physics.npz"
 
@@ -78,9 +79,8 @@ class PhysicsModel:
 
     def state_logits(self, there: Float64, back: Float64) -> Float64:
         """Logits (m, STATE_COUNT) of pairs, from the inputs of both directions."""
-        return states_of_relations(
-            np.stack([self.relation_logits(there), self.relation_logits(back)])
-        )
+        both = self.relation_logits(np.concatenate([there, back]))
+        return states_of_relations(both.reshape(2, len(there), -1))
 
     def floor_logits(self, bottoms_m: Float64, heights_m: Float64) -> Float64:
         """Logits (n,) that objects stand on the floor.
@@ -110,15 +110,39 @@ def believed_logits(
         independent: (m,) bool; the votes do not come from the embedded head, or the geometry was
             not judged.
     """
-    by_geometry, by_independent, broken = model.source_weights
     prior = np.concatenate([[0.0], np.repeat(model.prior, 2)])
-    judged = (geometry != 0).any(axis=1)[:, None]
-    sound = np.where(judged, by_geometry * geometry, prior)
-    mixed = np.logaddexp(
-        np.log1p(-broken) + log_softmax(sound),
-        np.log(broken) + log_softmax(prior),
-    )
-    return np.asarray(mixed + np.where(independent, by_independent, 1.0)[:, None] * votes)
+    return _believed(geometry, votes, independent, prior, model.source_weights)
+
+
+@kernel
+def _believed(
+    geometry: Float64, votes: Float64, independent: Bool, prior: Float64, source_weights: Float64
+) -> Float64:
+    by_geometry, by_independent, broken = source_weights
+    result = np.empty(geometry.shape)
+    sound = np.empty(len(prior))
+    of_prior = _log_sum(prior)
+    for row in range(len(geometry)):
+        judged = np.any(geometry[row] != 0.0)
+        for state in range(len(prior)):
+            sound[state] = by_geometry * geometry[row, state] if judged else prior[state]
+        of_sound = _log_sum(sound)
+        worth = by_independent if independent[row] else 1.0
+        for state in range(len(prior)):
+            a = math.log1p(-broken) + sound[state] - of_sound
+            b = math.log(broken) + prior[state] - of_prior
+            mixed = max(a, b) + math.log1p(math.exp(-abs(a - b)))
+            result[row, state] = mixed + worth * votes[row, state]
+    return result
+
+
+@kernel
+def _log_sum(logits: Float64) -> float:
+    """Logarithm of the sum of exponentials."""
+    best, total = logits.max(), 0.0
+    for value in logits:
+        total += math.exp(value - best)
+    return float(best + math.log(total))
 
 
 class PairInputs:

@@ -38,6 +38,9 @@ class PredictedPrior:
         self.changed: set[ClassPair] = set()
         self._canonical = canonical_predicates(vocabulary.predicates)
         self._predicate_count = len(vocabulary.predicates)
+        # Which states are a relation that has a name: (2, STATE_COUNT, NONE), by direction.
+        named = RELATIONS_OF_STATE.T[:, :, None] == np.arange(NONE)
+        self._named = (named & (self._canonical >= 0)).astype(np.float64)
         # By class pair: sum of the predictions of each relation, and their number.
         self._sums: dict[ClassPair, tuple[Int64, int]] = {}
         # By key of a pair: what it adds, to which class pair.
@@ -57,12 +60,11 @@ class PredictedPrior:
         states = softmax(table.state_logits[rows])
         related = states[:, 0] < 1.0 - MIN_RELATED
         rows, states = rows[related], states[related]
+        if not len(rows):
+            return
         classes = table.shapes.best_classes[table.ends[rows]]
         for end in (0, 1):
-            predictions = np.zeros((len(rows), NONE))
-            for state, relation in enumerate(RELATIONS_OF_STATE[:, end].tolist()):
-                if relation != NONE and self._canonical[relation] >= 0:
-                    predictions[:, relation] += states[:, state]
+            predictions = states @ self._named[end]
             total = predictions.sum(axis=1)
             for index in np.flatnonzero(total > MIN_RELATED).tolist():
                 first, second = classes[index, end], classes[index, 1 - end]

@@ -8,6 +8,7 @@ around the pairs that changed.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Set
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ import numpy as np
 from deworldsg_ros.config import Config
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
 from deworldsg_ros.relations.naming import MIN_OTHER_VOTES, predicate_probabilities, uncertain
+from deworldsg_ros.relations.pair_links import joined
 from deworldsg_ros.relations.pair_rows import ends_of
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physical_states import (
@@ -85,17 +87,18 @@ class RobustBeliefs:
         """
         table = self._table
         keys = sorted(table.changed_pairs)
-        rows = np.array([table.row(one) for one in keys if one in table], np.int64)
-        gone = [one for one in keys if one not in table]
-        changed = np.union1d(rows, self._settled.settle(rows))
+        places = table.places
+        rows = np.array([places[one] for one in keys if one in places], np.int64)
+        gone = [one for one in keys if one not in places]
+        changed = self._settled.settle(rows)
         for pair_key in gone:
             self._index(pair_key, set())
         again = set().union(*(self._by_classes.get(pair, ()) for pair in prior.changed))
-        changed = np.union1d(changed, np.array([table.row(one) for one in again], np.int64))
+        changed = joined(rows, [*changed.tolist(), *(table.row(one) for one in again)])
         table.changed_pairs.clear()
         table.changed_nodes.clear()
         prior.changed.clear()
-        return self._beliefs(changed.astype(np.int64), gone, prior)
+        return self._beliefs(changed, gone, prior)
 
     def _beliefs(self, rows: Int64, gone: list[int], prior: Prior) -> ChangedBeliefs:
         """Beliefs of pairs in both directions: few of those in reach are related."""
@@ -106,6 +109,9 @@ class RobustBeliefs:
             self._index(pair_key, set())
             gone.append(pair_key)
         rows = rows[related]
+        if not len(rows):
+            none = np.zeros((0, len(self._relation_of)))
+            return ChangedBeliefs([pair for one in gone for pair in _both(one)], [], none, [])
         votes = self._votes(rows)
         probabilities = predicate_probabilities(
             t.relations[rows],
@@ -122,8 +128,8 @@ class RobustBeliefs:
         self._add_prior(rows, probabilities, judged, prior)
         voted = votes.any(axis=2)
         return ChangedBeliefs(
-            [pair for one in gone for pair in _both(*ends_of(one))],
-            [pair for ends in t.nodes[rows].tolist() for pair in _both(*ends)],
+            [pair for one in gone for pair in _both(one)],
+            [pair for one in t.ids[rows].tolist() for pair in _both(one)],
             probabilities.reshape(-1, len(self._relation_of)),
             [_source(*known) for known in zip(judged.ravel().tolist(), voted.ravel().tolist())],
         )
@@ -143,16 +149,19 @@ class RobustBeliefs:
         table = self._table
         open_ = uncertain(probabilities, self._config.entropy_threshold_nats)
         best = table.shapes.best_classes[table.ends[rows]]
-        for index, pair_key in enumerate(table.ids[rows].tolist()):
-            first, second = best[index].tolist()
+        for pair_key, (first, second), ends in zip(
+            table.ids[rows].tolist(), best.tolist(), open_.tolist()
+        ):
             pairs = [(first, second), (second, first)]
             # Two objects of one class have the same class pair in both directions.
-            self._index(pair_key, {pairs[end] for end in (0, 1) if open_[index, end]})
+            self._index(pair_key, set(itertools.compress(pairs, ends)))
         places, ends = np.nonzero(open_)
         if not len(places):
             return
         classes = np.column_stack([best[places, ends], best[places, 1 - ends]])
         priors, has_prior = prior.lookup(classes)
+        if not has_prior.any():
+            return
         fused, active = fuse_prior(
             probabilities[places, ends],
             priors,
@@ -165,6 +174,8 @@ class RobustBeliefs:
 
     def _index(self, pair_key: int, classes: Set[ClassPair]) -> None:
         """Note the class pairs whose prior may enter a pair."""
+        if not classes and pair_key not in self._classes_of:
+            return
         for known in self._classes_of.pop(pair_key, ()):
             self._by_classes[known].discard(pair_key)
             if not self._by_classes[known]:
@@ -175,7 +186,8 @@ class RobustBeliefs:
                 self._by_classes.setdefault(pair, set()).add(pair_key)
 
 
-def _both(first: int, second: int) -> tuple[Pair, Pair]:
+def _both(pair_key: int) -> tuple[Pair, Pair]:
+    first, second = ends_of(pair_key)
     return (first, second), (second, first)
 
 

@@ -5,23 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.relations.exclusions import CARRIED_FIRST, CARRIED_SECOND, MOST, SEAT_GAP_M
-from deworldsg_ros.relations.naming import MIN_OTHER_VOTES
-from deworldsg_ros.relations.pair_links import pairs_of
+from deworldsg_ros.relations.pair_links import joined, pairs_of
 from deworldsg_ros.relations.pair_table import PairTable
-from deworldsg_ros.relations.physical_states import NONE
 from deworldsg_ros.relations.physics_model import believed_logits, load_physics_model
 from deworldsg_ros.relations.settling import (
     find_neighbours,
     rank_neighbours,
     relate,
     share_supports,
+    take_in,
 )
 from deworldsg_ros.relations.vote_model import near_logits, vote_logits
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64
-from deworldsg_ros.scene.class_kinds import SEATS, TABLES
+from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.softmax import softmax
 
 
 class SettledRelations:
@@ -42,20 +38,16 @@ class SettledRelations:
     def __init__(self, config: Config, graph: SceneGraph, table: PairTable) -> None:
         self._geometry = config.relations.world_model != "none"
         self._own_head = config.perception.relation_head == "geometric"
-        self._graph = graph
         self._table = table
         self._model = load_physics_model()
-        classes = graph.vocabulary.classes
-        self._tables = np.array([name in TABLES for name in classes], np.float64)
-        self._seats = np.array([name in SEATS for name in classes], np.float64)
         # Nodes of each circle of supports that was cut.
         self._circles: list[set[int]] = []
 
     def settle(self, rows: Int64) -> Int64:
         """Relations around the changed rows; returns the rows whose relations changed."""
         t, shapes = self._table, self._table.shapes
-        nodes = [shapes.row(node_id) for node_id in t.changed_nodes]
-        objects = np.union1d(t.ends[rows], np.array(nodes, np.int64)).astype(np.int64)
+        nodes = [shapes.places[node_id] for node_id in t.changed_nodes]
+        objects = joined(t.ends[rows], nodes)
         if not len(objects):
             return objects
         self._judge(rows)
@@ -84,7 +76,7 @@ class SettledRelations:
         moved = rank_neighbours(
             ranked, t.gaps_m, t.centre_steps_m, t.eligible, t.close, t.links, shapes.first_links
         )
-        around = np.union1d(pairs_of(shapes.first_links, t.links, objects), moved).astype(np.int64)
+        around = joined(pairs_of(shapes.first_links, t.links, objects), moved)
         around = around[t.live[around]]
         changed = relate(
             around,
@@ -103,39 +95,33 @@ class SettledRelations:
         """What the evidence on each changed pair alone says."""
         if not len(rows):
             return
-        table, model = self._table, self._model
-        counts, frames, judged = table.counts[rows], table.frames[rows], table.judged[rows]
-        geometry = np.where(judged[:, None], table.state_logits[rows], 0.0)
+        t, model = self._table, self._model
+        counts, frames = t.counts[rows], t.frames[rows]
+        geometry = t.state_logits[rows]
+        geometry[~t.judged[rows]] = 0.0
         votes = vote_logits(counts, frames, model.votes)
-        independent = ~judged | (not self._own_head)
-        states = softmax(believed_logits(model, geometry, votes, independent))
-        table.states[rows] = states
-        carried = [states[:, CARRIED_FIRST].sum(1), states[:, CARRIED_SECOND].sum(1)]
-        table.carried[rows] = np.minimum(np.column_stack(carried), MOST)
-        by_votes = np.where(independent, model.source_weights[1], 1.0)
-        near_votes = by_votes * near_logits(counts, frames, model.votes)
-        table.near_votes[rows] = near_votes
-        table.by_votes[rows] = by_votes
-        apart = judged & np.isinf(table.gaps_m[rows])
-        spoken = (votes > 0.0).any(axis=1) | (near_votes > 0.0)
-        live = ~apart | spoken | (table.other_votes[rows] >= MIN_OTHER_VOTES)
-        table.live[rows] = live
-        idle = rows[~live]
-        table.near[idle], table.eligible[idle], table.relations[idle] = 0.0, False, 0.0
-        table.relations[idle, :, NONE] = 1.0
-        table.with_[rows] = self._tables_with_seats(rows)
-
-    def _tables_with_seats(self, rows: Int64) -> Bool:
-        """(m, 2) bool: a table and a seat in its reach; the table is the first, or the second."""
-        t, graph = self._table, self._graph
-        ends = t.nodes[rows]
-        ids, places = np.unique(ends, return_inverse=True)
-        node_rows = np.array([graph.nodes.row(node_id) for node_id in ids.tolist()], np.int64)
-        classes = graph.edits.believed_classes(graph.nodes, graph.vocabulary, node_rows)
-        first, second = places.reshape(-1, 2).T
-        table, seat = classes @ self._tables > 0.5, classes @ self._seats > 0.5
-        found = np.column_stack([table[first] & seat[second], table[second] & seat[first]])
-        return found & (t.judged[rows] & (t.gaps_m[rows] <= SEAT_GAP_M))[:, None]
+        independent = ~t.judged[rows] | (not self._own_head)
+        take_in(
+            rows,
+            believed_logits(model, geometry, votes, independent),
+            votes,
+            near_logits(counts, frames, model.votes),
+            np.where(independent, model.source_weights[1], 1.0),
+            t.ends,
+            t.shapes.seating,
+            t.judged,
+            t.gaps_m,
+            t.other_votes,
+            t.states,
+            t.carried,
+            t.near,
+            t.near_votes,
+            t.by_votes,
+            t.relations,
+            t.eligible,
+            t.with_,
+            t.live,
+        )
 
     def _floor_odds(self, objects: Int64) -> Float64:
         """Odds (n,) that nodes stand on the floor; 0 without surfaces or a world model."""
@@ -156,7 +142,7 @@ class SettledRelations:
         opened = [circle for circle in self._circles if not circle.isdisjoint(ids)]
         self._circles = [circle for circle in self._circles if circle.isdisjoint(ids)]
         more = [shapes.row(i) for circle in opened for i in circle if i in shapes]
-        return np.union1d(objects, np.array(more, np.int64)).astype(np.int64)
+        return joined(objects, more)
 
     def _note_circles(self, cut: list[int]) -> None:
         """Remember the nodes of the circles that were cut at these places."""

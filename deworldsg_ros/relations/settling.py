@@ -27,6 +27,7 @@ from deworldsg_ros.relations.exclusions import (
     NEAREST,
     SEAT_GAP_M,
 )
+from deworldsg_ros.relations.naming import MIN_OTHER_VOTES
 from deworldsg_ros.relations.physical_states import NEAR, NONE, RELATIONS_OF_STATE, STATE_COUNT
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
@@ -38,6 +39,69 @@ MIN_NEIGHBOUR = 0.3
 # States in which the first object rests on the second, and the opposite.
 # Numba keeps contiguous arrays only in its cache.
 _FIRST, _SECOND = np.ascontiguousarray(CARRIED_FIRST), np.ascontiguousarray(CARRIED_SECOND)
+
+
+@kernel
+def take_in(  # noqa: D417
+    rows: Int64,
+    logits: Float64,
+    votes: Float64,
+    near_logits: Float64,
+    votes_worth: Float64,
+    ends: Int64,
+    seating: Bool,
+    judged: Bool,
+    gaps_m: Float64,
+    other_votes: Float64,
+    states: Float64,
+    carried: Float64,
+    near: Float64,
+    near_votes: Float64,
+    by_votes: Float64,
+    relations: Float64,
+    eligible: Bool,
+    with_: Bool,
+    live: Bool,
+) -> None:
+    """What the evidence on each of some pairs alone says; see `SettledRelations`.
+
+    Args:
+        rows: (k,) rows of pairs.
+        logits: (k, STATE_COUNT) of their states, from all evidence.
+        votes: (k, STATE_COUNT) logits of their states, from votes.
+        near_logits: (k,) that votes add to "near".
+        votes_worth: (k,) exponents of votes.
+        ends: see `pair_links`.
+        seating: (n, 2) bool, whether a node is a table, and a seat.
+        judged, gaps_m, other_votes: see `PairRows`. The other arrays are written.
+    """
+    for index in range(len(rows)):
+        row = rows[index]
+        best, total = logits[index].max(), 0.0
+        for state in range(STATE_COUNT):
+            states[row, state] = math.exp(logits[index, state] - best)
+            total += states[row, state]
+        spoken, carried[row] = False, 0.0
+        for state in range(STATE_COUNT):
+            states[row, state] /= total
+            spoken |= votes[index, state] > 0.0
+            if _FIRST[state]:
+                carried[row, 0] += states[row, state]
+            elif _SECOND[state]:
+                carried[row, 1] += states[row, state]
+        for end in range(2):
+            seated = seating[ends[row, end], 0] and seating[ends[row, 1 - end], 1]
+            with_[row, end] = seated and judged[row] and gaps_m[row] <= SEAT_GAP_M
+            carried[row, end] = min(carried[row, end], MOST)
+        by_votes[row] = votes_worth[index]
+        near_votes[row] = votes_worth[index] * near_logits[index]
+        apart = judged[row] and np.isinf(gaps_m[row])
+        spoken |= near_votes[row] > 0.0 or other_votes[row] >= MIN_OTHER_VOTES
+        live[row] = spoken or not apart
+        if not live[row]:
+            near[row], eligible[row] = 0.0, False
+            relations[row] = 0.0
+            relations[row, :, NONE] = 1.0
 
 
 @kernel

@@ -12,10 +12,12 @@ without votes. The four numbers are fitted to simulated rooms (tools/physics_mod
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.relations.physical_states import (
     NEAR,
     NONE,
@@ -25,9 +27,9 @@ from deworldsg_ros.relations.physical_states import (
 )
 from deworldsg_ros.scene.arrays import Float64, Int64
 
-# Relations of each state in both directions, and which of them have a name.
+# Relations of each state in both directions, and how many of them have a name.
 _STATES = RELATIONS_OF_STATE
-_NAMED = (_STATES != NONE).astype(np.float64)
+_NAMED = (_STATES != NONE).sum(axis=1).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -77,10 +79,25 @@ def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64
         frames: (m,) number of frames that showed both objects.
         scales: of the evidence.
     """
+    slopes = (scales.slope, scales.n_half, scales.floor, scales.even)
+    return _vote_logits(counts, frames, *slopes)
+
+
+@kernel
+def _vote_logits(
+    counts: Float64, frames: Float64, slope: float, n_half: float, floor: float, even: float
+) -> Float64:
     logits = np.zeros((len(counts), STATE_COUNT))
-    named = _NAMED[1:] / _NAMED[1:].sum(axis=1, keepdims=True)
-    first, second = (counts[:, end, _STATES[1:, end] % NONE] * named[:, end] for end in (0, 1))
-    logits[:, 1:] = scales.evidence(first + second, frames[:, None])
+    for row in range(len(counts)):
+        known = max(frames[row], 1e-9)
+        worth = frames[row] / (frames[row] + n_half) * slope
+        for state in range(1, STATE_COUNT):
+            votes = 0.0
+            for end in range(2):
+                relation = _STATES[state, end]
+                if relation != NONE:
+                    votes += counts[row, end, relation] / _NAMED[state]
+            logits[row, state] = worth * math.log((votes / known + floor) / (even + floor))
     return logits
 
 

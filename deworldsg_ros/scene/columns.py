@@ -41,6 +41,11 @@ class Columns:
     def __contains__(self, node_id: object) -> bool:
         return node_id in self._rows
 
+    @property
+    def places(self) -> Mapping[int, int]:
+        """The present row of each id; read only. Loops are faster with it than with `row`."""
+        return self._rows
+
     def row(self, node_id: int) -> int:
         """The present row of an id; KeyError if there is none."""
         try:
@@ -55,6 +60,8 @@ class Columns:
 
     def extend(self, ids: Sequence[int]) -> None:
         """Add a row of zeros for each of these new ids, in their order."""
+        if not ids:
+            return
         first, count = len(self._rows), len(self._rows) + len(ids)
         while count > len(self._storage["ids"]):
             for name, column in self._storage.items():

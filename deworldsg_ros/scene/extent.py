@@ -1,10 +1,11 @@
-"""The extent of a surface: a gravity-aligned box, and its points as compact bytes."""
+"""The extent of a surface: even moments, a gravity-aligned box, and its points as compact bytes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,11 +14,14 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 
-# A point is an outlier if its `NEIGHBOURS`-th neighbour is farther away than this many times the
+# Radius in which the density of points is counted: half a cell of the surface map.
+EVEN_RADIUS_M = 0.015
+# A point is an outlier if its third neighbour is farther away than this many times the
 # median of that distance. Mixed pixels at depth edges lie apart from the surface. Chosen on the two
 # rendered rooms: 1.5 cuts corners off, 3 keeps mixed pixels.
-NEIGHBOURS = 3
 OUTLIER_FACTOR = 2.0
+# Weights of points with these many points around.
+_EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
 # Heading of a box: the smallest rectangle of this many directions over 90 degrees.
 DIRECTIONS = 45
 # Points of a box, the first ones: surfaces are stored in random order. 256 of 512 take a quarter of
@@ -29,6 +33,49 @@ DEFAULT_UP = (0.0, 0.0, 1.0)
 _MOST_MM = 32767
 
 
+class Extents(NamedTuple):
+    """Extents of n surfaces.
+
+    Attributes:
+        means: (n, 3) metres, and
+        covariances: (n, 3, 3) square metres; see `even_moments`.
+        centers: (n, 3) metres, of the boxes;
+        sizes: (n, 3) metres, along the axes of the boxes; and
+        quats_xyzw: (n, 4), axes of the boxes to world, w >= 0.
+    """
+
+    means: Float64
+    covariances: Float64
+    centers: Float64
+    sizes: Float64
+    quats_xyzw: Float64
+
+
+def extents_of(points_world: Float32, counts: Int64, rows: Int64, up: Sequence[float]) -> Extents:
+    """Extents of the surfaces of some rows.
+
+    Args:
+        points_world: (S, K, 3) metres; the first `counts` of each row are used.
+        counts: (S,) 1 or more in the rows.
+        rows: (n,).
+        up: unit vector against gravity.
+    """
+    return Extents(*_measure(points_world, counts, rows, *_frame_of(tuple(up))))
+
+
+def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
+    """Mean (3,) and covariance (3, 3) of a surface with uneven point density.
+
+    Points (n, 3), n >= 1, are dense on parts that were seen longer or from nearby. The weight of a
+    point is the inverse square root of the number of points within `EVEN_RADIUS_M`. The inverse
+    itself would give a stray point the weight of a whole patch. The covariance of a ball of that
+    radius is added.
+    """
+    means, covariances = np.empty(3), np.empty((3, 3))
+    _even_moments(np.ascontiguousarray(points_world.T, np.float64), means, covariances)
+    return means, covariances
+
+
 def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.GravityBox:
     """The box around points (n, 3), n >= 1, without outliers.
 
@@ -36,17 +83,17 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         points_world: metres.
         up: unit vector against gravity.
     """
-    axes, quat_axes = _frame_of(tuple(up))
-    points = np.ascontiguousarray(points_world[:MOST_POINTS], np.float64) @ axes.T
-    low, high, heading = _bounds(points)
-    cos, sin = math.cos(heading), math.sin(heading)
-    turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    rotation = turn @ axes  # rows: axes of the box in the world
-    return wire.GravityBox(
-        center_m=rounded((low + high) / 2 @ rotation, 3),
-        size_m=rounded(high - low, 3),
-        orientation_xyzw=rounded(_turned(quat_axes, heading), 4),
-    )
+    box = np.empty(3), np.empty(3), np.empty(4)
+    columns = np.ascontiguousarray(points_world[:MOST_POINTS].T, np.float64)
+    _box(columns, *_frame_of(tuple(up)), *box)
+    center, size, quat_xyzw = box
+    return wire.GravityBox(rounded(center, 3), rounded(size, 3), rounded(quat_xyzw, 4))
+
+
+def boxes(extents: Extents) -> list[wire.GravityBox]:
+    """The messages of the boxes."""
+    parts = ((extents.centers, 3), (extents.sizes, 3), (extents.quats_xyzw, 4))
+    return [wire.GravityBox(*box) for box in zip(*(rounded_rows(*part) for part in parts))]
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -65,18 +112,16 @@ def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
     return axes, quaternion_from_rotation(axes.T)
 
 
-def _turned(quat_xyzw: Float64, heading: float) -> Float64:
-    """A quaternion after a turn about its own third axis; w >= 0."""
-    x, y, z, w = quat_xyzw.tolist()
-    cos, sin = math.cos(heading / 2), math.sin(heading / 2)
-    turned = np.array([x * cos + y * sin, y * cos - x * sin, z * cos + w * sin, w * cos - z * sin])
-    return -turned if turned[3] < 0 else turned
-
-
 def rounded(values: Float64, decimals: int) -> list[float]:
     """Flat list of rounded values, without negative zeros."""
     flat: list[float] = (np.round(values, decimals) + 0.0).ravel().tolist()
     return flat
+
+
+def rounded_rows(values: Float64, decimals: int) -> list[list[float]]:
+    """`rounded` for each row of values (n, ...)."""
+    rows: list[list[float]] = (np.round(values, decimals) + 0.0).reshape(len(values), -1).tolist()
+    return rows
 
 
 def surface_bytes(points_world: Float32, mean_m: Sequence[float]) -> bytes:
@@ -97,93 +142,237 @@ def surface_points(node: wire.NodeState) -> Float64:
 
 
 @kernel
-def _bounds(points: Float64) -> tuple[Float64, Float64, float]:
-    """Lower and upper corner (3,) along the axes of the smallest box, and its heading."""
-    by_y = points[np.argsort(points[:, 1])]
-    ordered = by_y[np.argsort(by_y[:, 0], kind="mergesort")]
-    inliers = ordered[_inliers(ordered)]
-    # Only corners of the convex hull touch a box.
-    hull = _hull(inliers)
+def _measure(
+    points_world: Float32, counts: Int64, rows: Int64, axes: Float64, quat_axes: Float64
+) -> tuple[Float64, Float64, Float64, Float64, Float64]:
+    means, covariances = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
+    centers, sizes = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    quats = np.empty((len(rows), 4))
+    for index in range(len(rows)):
+        count = counts[rows[index]]
+        columns = np.empty((3, count))
+        for place in range(count):
+            for axis in range(3):
+                columns[axis, place] = points_world[rows[index], place, axis]
+        _even_moments(columns, means[index], covariances[index])
+        first = np.ascontiguousarray(columns[:, :MOST_POINTS])
+        _box(first, axes, quat_axes, centers[index], sizes[index], quats[index])
+    return means, covariances, centers, sizes, quats
+
+
+@kernel
+def _along_widest(columns: Float64) -> tuple[Float64, int]:
+    """Points, columns (3, n), in the order of the coordinate that spreads most; and its axis."""
+    count = columns.shape[1]
+    widest, low, spread = 0, 0.0, -1.0
+    for axis in range(3):
+        least, most = columns[axis, 0], columns[axis, 0]
+        for place in range(1, count):
+            least, most = min(least, columns[axis, place]), max(most, columns[axis, place])
+        if most - least > spread:
+            widest, low, spread = axis, least, most - least
+    # As many buckets as points; then each point is near its place.
+    per_m = (count - 1) / spread if spread > 0.0 else 0.0
+    starts = np.zeros(count + 1, np.int64)
+    for place in range(count):
+        starts[int((columns[widest, place] - low) * per_m) + 1] += 1
+    for bucket in range(count):
+        starts[bucket + 1] += starts[bucket]
+    order = np.empty(count, np.int64)
+    for place in range(count):
+        bucket = int((columns[widest, place] - low) * per_m)
+        order[starts[bucket]] = place
+        starts[bucket] += 1
+    for index in range(1, count):
+        place, at = order[index], index
+        while at > 0 and columns[widest, order[at - 1]] > columns[widest, place]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = place
+    ordered = np.empty((3, count))
+    for axis in range(3):
+        for index in range(count):
+            ordered[axis, index] = columns[axis, order[index]]
+    return ordered, widest
+
+
+@kernel
+def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
+    """See `even_moments`; columns (3, n), and the results are written."""
+    ordered, widest = _along_widest(columns)
+    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
+    count = len(along)
+    weights = np.empty(count)
+    first, last, total = 0, 0, 0.0
+    for a in range(count):
+        while along[a] - along[first] > EVEN_RADIUS_M:
+            first += 1
+        while last < count and along[last] - along[a] <= EVEN_RADIUS_M:
+            last += 1
+        near = _count_near(x[first:last], y[first:last], z[first:last], x[a], y[a], z[a])
+        weights[a] = _EVEN_WEIGHTS[min(near, len(_EVEN_WEIGHTS) - 1)]
+        total += weights[a]
+    for axis in range(3):
+        mean[axis] = 0.0
+        for a in range(count):
+            weights[a] = weights[a] / total if axis == 0 else weights[a]
+            mean[axis] += weights[a] * ordered[axis, a]
+    for i in range(3):
+        for j in range(i, 3):
+            total = EVEN_RADIUS_M**2 / 5 if i == j else 0.0
+            for a in range(count):
+                total += weights[a] * (ordered[i, a] - mean[i]) * (ordered[j, a] - mean[j])
+            covariance[i, j] = covariance[j, i] = total
+
+
+@kernel
+def _count_near(xs: Float64, ys: Float64, zs: Float64, x: float, y: float, z: float) -> int:
+    """Number of points within `EVEN_RADIUS_M` of a point. The compiler makes vectors of this."""
+    near = 0
+    for b in range(len(xs)):
+        step_x, step_y, step_z = x - xs[b], y - ys[b], z - zs[b]
+        squared = step_x * step_x + step_y * step_y + step_z * step_z
+        near += int(squared <= EVEN_RADIUS_M * EVEN_RADIUS_M)
+    return near
+
+
+@kernel
+def _box(
+    columns: Float64,
+    axes: Float64,
+    quat_axes: Float64,
+    center: Float64,
+    size: Float64,
+    quat_xyzw: Float64,
+) -> None:
+    """See `box_of`; points are columns (3, n) of the world frame, and the results are written."""
+    upright = np.zeros(columns.shape)
+    for axis in range(3):
+        for k in range(3):
+            if axes[axis, k] != 0.0:
+                upright[axis] += axes[axis, k] * columns[k]
+    corners = _outer(_without_outliers(upright))
     best, heading = np.inf, 0.0
     for step in range(DIRECTIONS):
-        angle = 0.5 * np.pi * step / DIRECTIONS
-        low, high = _corners(hull, np.cos(angle), np.sin(angle))
-        area = (high[0] - low[0]) * (high[1] - low[1])
+        angle = 0.5 * math.pi * step / DIRECTIONS
+        left, right, back, front = _bounds(corners, math.cos(angle), math.sin(angle))
+        area = (right - left) * (front - back)
         # Ties go to the axes of the world.
         if area < best - 1e-12:
             best, heading = area, angle
-    low, high = _corners(hull, np.cos(heading), np.sin(heading))
-    low[2], high[2] = inliers[:, 2].min(), inliers[:, 2].max()
-    return low, high, heading
+    cos, sin = math.cos(heading), math.sin(heading)
+    left, right, back, front = _bounds(corners, cos, sin)
+    low, high = corners[2].min(), corners[2].max()
+    size[0], size[1], size[2] = right - left, front - back, high - low
+    u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2
+    for axis in range(3):
+        center[axis] = (
+            (cos * u - sin * v) * axes[0, axis]
+            + (sin * u + cos * v) * axes[1, axis]
+            + w * axes[2, axis]
+        )
+    # The turn about the third axis, after the axes.
+    qx, qy, qz, qw = quat_axes
+    cos, sin = math.cos(heading / 2), math.sin(heading / 2)
+    sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
+    quat_xyzw[0], quat_xyzw[1] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
+    quat_xyzw[2], quat_xyzw[3] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)
 
 
 @kernel
-def _corners(points: Float64, cos: float, sin: float) -> tuple[Float64, Float64]:
-    """Horizontal bounds along turned axes; the third value is not set."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for row in range(len(points)):
-        x, y = points[row, 0], points[row, 1]
+def _bounds(points: Float64, cos: float, sin: float) -> tuple[float, float, float, float]:
+    """Horizontal bounds of columns (3, n) along turned axes."""
+    left, right, back, front = np.inf, -np.inf, np.inf, -np.inf
+    for place in range(points.shape[1]):
+        x, y = points[0, place], points[1, place]
         u, v = cos * x + sin * y, cos * y - sin * x
-        low[0], high[0] = min(low[0], u), max(high[0], u)
-        low[1], high[1] = min(low[1], v), max(high[1], v)
-    return low, high
+        left, right = min(left, u), max(right, u)
+        back, front = min(back, v), max(front, v)
+    return left, right, back, front
 
 
 @kernel
-def _hull(ordered: Float64) -> Float64:
-    """Corners (k, 3) of the convex hull of points seen from above, sorted by x and y."""
-    count = len(ordered)
-    rows = np.empty(2 * count + 2, np.int64)
+def _outer(points: Float64) -> Float64:
+    """The points, columns (3, n), that may be corners of the hull seen from above, or its ends.
+
+    Those inside the octagon of the outermost points in eight directions are left out.
+    """
+    count = points.shape[1]
+    x, y, z = points[0], points[1], points[2]
+    outermost = np.zeros(8, np.int64)
+    lowest = highest = 0
+    for place in range(count):
+        if z[place] < z[lowest]:
+            lowest = place
+        if z[place] > z[highest]:
+            highest = place
+        for side in range(8):
+            other = outermost[side]
+            if _reach(side, x[place], y[place]) > _reach(side, x[other], y[other]):
+                outermost[side] = place
+    kept = np.empty((3, count))
     size = 0
-    for turn in range(2):  # the lower side from the left, then the upper side from the right
-        start = size
-        for index in range(count):
-            row = index if turn == 0 else count - 1 - index
-            while size - start >= 2 and _turns_right(ordered, rows[size - 2], rows[size - 1], row):
-                size -= 1
-            rows[size] = row
+    for place in range(count):
+        inside = True
+        for side in range(8):
+            a, b = outermost[side], outermost[(side + 1) % 8]
+            if a == b or not inside:
+                continue
+            cross = (x[b] - x[a]) * (y[place] - y[a]) - (y[b] - y[a]) * (x[place] - x[a])
+            inside = cross > 0.0
+        if not inside or place in (lowest, highest):
+            for axis in range(3):
+                kept[axis, size] = points[axis, place]
             size += 1
-    return ordered[rows[:size]]
+    return kept[:, :size]
 
 
 @kernel
-def _turns_right(points: Float64, a: int, b: int, c: int) -> bool:
-    ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
-    vx, vy = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1]
-    return bool(ux * vy - uy * vx <= 0.0)
+def _reach(side: int, x: float, y: float) -> float:
+    """How far a point lies in one of eight directions, counterclockwise from x."""
+    if side % 4 == 0:
+        reach = x
+    elif side % 4 == 1:
+        reach = x + y
+    elif side % 4 == 2:
+        reach = y
+    else:
+        reach = y - x
+    return reach if side < 4 else -reach
 
 
 @kernel
-def _inliers(ordered: Float64) -> Int64:
-    """Rows of points, sorted by x, that have neighbours as close as the others have."""
-    count = len(ordered)
-    if count <= 2 * NEIGHBOURS:
-        return np.arange(count)
+def _without_outliers(columns: Float64) -> Float64:
+    """The points, columns (3, n), that have neighbours as close as the others have."""
+    count = columns.shape[1]
+    if count <= 6:
+        return columns
+    ordered, widest = _along_widest(columns)
+    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
     last = np.empty(count)
-    nearest = np.empty(NEIGHBOURS)
     for row in range(count):
-        nearest[:] = np.inf
+        # Squared distances of the three nearest points so far.
+        near_1 = near_2 = near_3 = np.inf
         for step in (1, -1):
             other = row + step
             while 0 <= other < count:
-                x = ordered[other, 0] - ordered[row, 0]
-                y = ordered[other, 1] - ordered[row, 1]
-                z = ordered[other, 2] - ordered[row, 2]
-                if x * x >= nearest[NEIGHBOURS - 1]:
+                apart = along[other] - along[row]
+                if apart * apart >= near_3:
                     break
-                _insert(nearest, x * x + y * y + z * z)
+                step_x, step_y, step_z = x[other] - x[row], y[other] - y[row], z[other] - z[row]
+                squared = step_x * step_x + step_y * step_y + step_z * step_z
+                if squared < near_3:
+                    near_3 = max(near_2, squared)
+                    near_2 = min(near_2, max(near_1, squared))
+                    near_1 = min(near_1, squared)
                 other += step
-        last[row] = nearest[NEIGHBOURS - 1]
-    return np.flatnonzero(last <= OUTLIER_FACTOR**2 * np.median(last))
-
-
-@kernel
-def _insert(smallest: Float64, value: float) -> None:
-    """Insert a value into an ascending row that keeps its length."""
-    place = len(smallest) - 1
-    if value >= smallest[place]:
-        return
-    while place > 0 and smallest[place - 1] > value:
-        smallest[place] = smallest[place - 1]
-        place -= 1
-    smallest[place] = value
+        last[row] = near_3
+    most = OUTLIER_FACTOR**2 * np.median(last)
+    kept = np.empty((3, count))
+    size = 0
+    for row in range(count):
+        if last[row] <= most:
+            for axis in range(3):
+                kept[axis, size] = ordered[axis, row]
+            size += 1
+    return kept[:, :size]

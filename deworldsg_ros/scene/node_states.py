@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Union
 
 import msgspec
 import numpy as np
@@ -11,19 +12,36 @@ from msgspec import UNSET
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.extent import DEFAULT_UP, box_of, rounded, surface_bytes
+from deworldsg_ros.scene.beliefs import Listed, listed
+from deworldsg_ros.scene.extent import (
+    DEFAULT_UP,
+    boxes,
+    extents_of,
+    rounded,
+    rounded_rows,
+    surface_bytes,
+)
 from deworldsg_ros.scene.node_store import NodeStore
-from deworldsg_ros.scene.surface import even_moments
+from deworldsg_ros.scene.waiting import take_first
 
 # Decimals of numbers in messages: positions to 0.1 mm, variances to (0.3 mm)², so that a thin
-# object keeps its thickness; probabilities and entropies to more than their calibration.
-POSITION_DECIMALS, VARIANCE_DECIMALS, DECIMALS = 4, 7, 4
+# object keeps its thickness.
+POSITION_DECIMALS, VARIANCE_DECIMALS = 4, 7
 # Smaller turns of the estimated up direction change no box.
 MIN_TURN_RAD = math.radians(1.0)
+
+# Mean, covariance and box of a surface, as messages have them; None and UNSET without points.
+_Extent = tuple[
+    Union[list[float], None], Union[list[float], None], Union[wire.GravityBox, msgspec.UnsetType]
+]
+_NO_EXTENT: _Extent = (None, None, UNSET)
 
 
 class NodeStates:
     """The newest message of each confirmed node, without surface points.
+
+    The extent of a surface is most of the work. So a call may leave some extents for the next one:
+    those of nodes that have one already. Everything else of a message is always the newest.
 
     Args:
         store: the nodes.
@@ -41,27 +59,44 @@ class NodeStates:
         self._top_k = top_k
         self._even_gaussians = even_gaussians
         self._touched = store.watch_nodes()
+        # Which surface the extent of a message is of, and the nodes whose extent is an older one.
+        self._measured: dict[int, int] = {}
+        self._stale: dict[int, None] = {}
         self.up: tuple[float, ...] = DEFAULT_UP
+
+    @property
+    def waiting(self) -> int:
+        """Number of nodes whose extent waits for a call."""
+        return len(self._stale)
 
     def set_up(self, up_world: Float64) -> None:
         """Set the direction against gravity (3,); smaller turns than `MIN_TURN_RAD` are ignored."""
         if float(up_world @ self.up) < math.cos(MIN_TURN_RAD):
             self.up = tuple(rounded(up_world, POSITION_DECIMALS))
-            self._touched.update(self._store.nodes.ids.tolist())
+            self._stale.update(dict.fromkeys(sorted(self._measured)))
 
-    def refresh(self) -> list[int]:
-        """Follow the nodes; returns the ids that have another message now, or none."""
+    def refresh(self, at_most: int | None = None) -> list[int]:
+        """Follow the nodes; returns the ids that have another message now, or none.
+
+        Args:
+            at_most: number of extents to measure again, those that wait longest first; None = all.
+        """
         nodes = self._store.nodes
-        ids = sorted(self._touched)
-        self._touched.clear()
-        changed = []
-        for node_id in ids:
+        gone, present = [], {}
+        for node_id in sorted(self._touched):
             if node_id in nodes and nodes.confirmed[row := nodes.row(node_id)]:
-                self.states[node_id] = self._state(row)
-            elif self.states.pop(node_id, None) is None:
-                continue
-            changed.append(node_id)
-        return changed
+                present[node_id] = row
+            elif self.states.pop(node_id, None) is not None:
+                gone.append(node_id)
+                self._measured.pop(node_id, None)
+                self._stale.pop(node_id, None)
+        self._touched.clear()
+        extents = self._measure(present, at_most)
+        for node_id in extents.keys() - present.keys():
+            present[node_id] = nodes.row(node_id)
+        if present:
+            self._make(present, extents)
+        return [*gone, *present]
 
     def with_points(self, state: wire.NodeState) -> wire.NodeState:
         """A message with the surface points of its node."""
@@ -69,34 +104,71 @@ class NodeStates:
         points = nodes.surface(nodes.row(state.id))
         return msgspec.structs.replace(state, surface_mm=surface_bytes(points, state.mean_m))
 
-    def _state(self, row: int) -> wire.NodeState:
-        nodes = self._store.nodes
-        probabilities = nodes.class_probabilities[row]
-        beliefs = best_beliefs(probabilities, self._store.vocabulary.classes, self._top_k)
-        label = self._store.edits.labels.get(int(nodes.ids[row]))
-        if label is not None:
-            probabilities, beliefs = np.ones(1), [wire.Belief(label, 1.0)]
-        possible = probabilities[probabilities > 0]
-        mean, covariance = nodes.means[row], nodes.covariances[row]
-        points = nodes.surface(row)
-        if self._even_gaussians and len(points):
-            mean, covariance = even_moments(points)
-        return wire.NodeState(
-            id=int(nodes.ids[row]),
-            label=beliefs[0].label,
-            classes=beliefs,
-            remainder=rest_of(probabilities, beliefs),
-            mean_m=rounded(mean, POSITION_DECIMALS),
-            covariance_m2=rounded(covariance, VARIANCE_DECIMALS),
-            box=box_of(points, self.up) if len(points) else UNSET,
-            observations=int(nodes.observations[row]),
-            confirmed=True,
-            existence=float(existence) if (existence := nodes.existence[row]) >= 0 else UNSET,
-            first_seen=wire.stamp_from_ns(int(nodes.first_seen_ns[row])),
-            last_seen=wire.stamp_from_ns(int(nodes.last_seen_ns[row])),
-            entropy_nats=round(max(0.0, -float(possible @ np.log(possible))), DECIMALS),
-            label_provenance=UNSET if label is None else "operator",
-        )
+    def _measure(self, changed: Mapping[int, int], at_most: int | None) -> dict[int, _Extent]:
+        """Extents of the nodes that have none, and of some whose surface changed; by id."""
+        nodes, due = self._store.nodes, []
+        for node_id, row in changed.items():
+            known = self._measured.get(node_id)
+            if known is None:
+                due.append(node_id)
+            elif known != nodes.surface_revisions[row]:
+                self._stale[node_id] = None
+        due += take_first(self._stale, at_most)
+        rows = np.array([nodes.row(node_id) for node_id in due], np.int64)
+        self._measured.update(zip(due, nodes.surface_revisions[rows].tolist()))
+        solid = np.flatnonzero(nodes.surface_counts[rows])
+        extents = dict.fromkeys(due, _NO_EXTENT)
+        if len(solid):
+            surfaces = nodes.surface_points_world, nodes.surface_counts
+            found = extents_of(*surfaces, rows[solid], self.up)
+            for index, *extent in zip(
+                solid.tolist(),
+                rounded_rows(found.means, POSITION_DECIMALS),
+                rounded_rows(found.covariances, VARIANCE_DECIMALS),
+                boxes(found),
+            ):
+                extents[due[index]] = tuple(extent)
+        return extents
+
+    def _make(self, present: Mapping[int, int], extents: Mapping[int, _Extent]) -> None:
+        """Write the messages of nodes, given by id and row, with a new or the known extent."""
+        nodes, rows = self._store.nodes, np.array(list(present.values()), np.int64)
+        vocabulary, labels = self._store.vocabulary, self._store.edits.labels
+        means, covariances = nodes.means[rows], nodes.covariances[rows]
+        columns = (nodes.observations, nodes.existence, nodes.first_seen_ns, nodes.last_seen_ns)
+        for node_id, classes, *pooled, observations, existence, first_ns, last_ns in zip(
+            present,
+            listed(nodes.class_probabilities[rows], vocabulary.classes, self._top_k),
+            rounded_rows(means, POSITION_DECIMALS),
+            rounded_rows(covariances, VARIANCE_DECIMALS),
+            *(column[rows].tolist() for column in columns),
+        ):
+            label = labels.get(node_id)
+            if label is not None:
+                classes = Listed([wire.Belief(label, 1.0)], 0.0, 0.0)
+            mean, covariance, box = extents.get(node_id) or self._known_extent(node_id)
+            if mean is None or covariance is None or not self._even_gaussians:
+                mean, covariance = pooled
+            self.states[node_id] = wire.NodeState(
+                id=node_id,
+                label=classes.beliefs[0].label,
+                classes=classes.beliefs,
+                remainder=classes.remainder,
+                mean_m=mean,
+                covariance_m2=covariance,
+                box=box,
+                observations=observations,
+                confirmed=True,
+                existence=existence if existence >= 0 else UNSET,
+                first_seen=wire.stamp_from_ns(first_ns),
+                last_seen=wire.stamp_from_ns(last_ns),
+                entropy_nats=classes.entropy_nats,
+                label_provenance=UNSET if label is None else "operator",
+            )
+
+    def _known_extent(self, node_id: int) -> _Extent:
+        state = self.states[node_id]
+        return _NO_EXTENT if state.box is UNSET else (state.mean_m, state.covariance_m2, state.box)
 
 
 def hidden_node(store: NodeStore, node_id: int, reason: str) -> wire.HiddenNode:
@@ -110,19 +182,3 @@ def hidden_node(store: NodeStore, node_id: int, reason: str) -> wire.HiddenNode:
         observations=int(nodes.observations[row]),
         reason=reason,
     )
-
-
-def best_beliefs(probabilities: Float64, names: Sequence[str], top_k: int) -> list[wire.Belief]:
-    """The labels with the highest probabilities (n,), the best first, at most `top_k`."""
-    # A stable sort: labels of equal probability stay in the order of the vocabulary.
-    order = (-probabilities).argsort(kind="stable")[:top_k]
-    return [
-        wire.Belief(names[index], round(probability, DECIMALS))
-        for index, probability in zip(order.tolist(), probabilities[order].tolist())
-    ]
-
-
-def rest_of(probabilities: Float64, listed: Sequence[wire.Belief]) -> float:
-    """The probability of all labels that are not listed."""
-    rest = float(probabilities.sum()) - sum(belief.probability for belief in listed)
-    return round(max(rest, 0.0), DECIMALS)

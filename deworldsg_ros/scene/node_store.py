@@ -145,8 +145,7 @@ class NodeStore:
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
         rows = [self.nodes.row(node_id) for node_id in node_ids]
-        self.nodes.drop_points(rows, dropped)
-        self._changed([row for row, some in zip(rows, dropped) if some.any()])
+        self._changed(self.nodes.drop_points(rows, dropped))
 
     def set_classes(self, node_ids: Sequence[int], class_probabilities: Float64) -> None:
         """Replace the class distributions of n live nodes, (n, C)."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.columns import Columns
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
 from deworldsg_ros.scene.surface import add_points, drop_points
@@ -75,9 +75,9 @@ class NodeTable(Columns):
         first_seen_ns, last_seen_ns: (n,) int64.
         revisions: (n,) int64, graph revision at which the node last changed.
         existence: (n,) float64, probability that it is an object; -1 = not estimated.
-        surface_hashes: (n, K) uint64, and
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
         surface_counts: (n,) int64 points; see `surface`.
+        surface_revisions: (n,) int64, number of changes of the surface so far.
     """
 
     means: Float64
@@ -92,9 +92,9 @@ class NodeTable(Columns):
     first_seen_ns: Int64
     last_seen_ns: Int64
     revisions: Int64
-    surface_hashes: UInt64
     surface_points_world: Float32
     surface_counts: Int64
+    surface_revisions: Int64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
         super().__init__(
@@ -111,9 +111,9 @@ class NodeTable(Columns):
                 "first_seen_ns": (np.int64, ()),
                 "last_seen_ns": (np.int64, ()),
                 "revisions": (np.int64, ()),
-                "surface_hashes": (np.uint64, (surface_point_capacity,)),
                 "surface_points_world": (np.float32, (surface_point_capacity, 3)),
                 "surface_counts": (np.int64, ()),
+                "surface_revisions": (np.int64, ()),
             }
         )
 
@@ -221,17 +221,20 @@ class NodeTable(Columns):
     def set_surface(self, row: int, points_world: Float32) -> None:
         """Replace the surface points of a row by a sample of these (k, 3)."""
         self.surface_counts[row] = 0
+        self.surface_revisions[row] += 1
         self._add_surfaces([row], [points_world])
 
-    def drop_points(self, rows: list[int], dropped: Bool) -> None:
-        """Remove some of the surface points of n rows, (n, K); but never all points of a row."""
-        drop_points(
-            self.surface_hashes,
-            self.surface_points_world,
-            self.surface_counts,
-            np.array(rows, np.int64),
-            dropped,
-        )
+    def drop_points(self, rows: list[int], dropped: Bool) -> list[int]:
+        """Remove some of the surface points of n rows, (n, K); but never all points of a row.
+
+        Returns:
+            The rows of which some were to be removed.
+        """
+        at = np.array(rows, np.int64)
+        drop_points(self.surface_points_world, self.surface_counts, at, dropped)
+        changed = at[dropped.any(axis=1)]
+        self.surface_revisions[changed] += 1
+        return changed.tolist()
 
     def restore(self, columns: Mapping[str, NDArray[Any]], surfaces: Sequence[Float32]) -> None:
         """Fill an empty table with saved columns and the surface points of each row."""
@@ -250,13 +253,8 @@ class NodeTable(Columns):
                 getattr(self, name)[row] = columns[name][index]
 
     def _add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:
-        add_points(
-            self.surface_hashes,
-            self.surface_points_world,
-            self.surface_counts,
-            rows,
-            point_sets,
-        )
+        surfaces = self.surface_points_world, self.surface_counts
+        self.surface_revisions[rows] += add_points(*surfaces, rows, point_sets)
 
 
 @kernel

@@ -14,6 +14,10 @@ from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.node_states import NodeStates
+from deworldsg_ros.scene.waiting import some_of
+
+# Surfaces that changed and are measured anew in a call that may leave some for the next one.
+MEASURED_A_CALL = 2
 
 Key = TypeVar("Key", int, Pair)
 Message = TypeVar("Message", wire.NodeState, wire.EdgeState)
@@ -67,10 +71,16 @@ class Publication:
         """Set the direction against gravity (3,)."""
         self._nodes.set_up(up_world)
 
+    @property
+    def waiting(self) -> int:
+        """Number of nodes whose extent the next updates measure; `full` leaves none."""
+        return self._nodes.waiting
+
     def update(self) -> wire.SceneGraphUpdateMessage | None:
         """The changes since the last call; None if there are none.
 
-        It costs as much as what changed, however large the graph is.
+        It costs as much as what changed, however large the graph is. Of many surfaces that
+        changed, some are left for the next calls.
         """
         self._refresh(whole=False)
         nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._touched_states())
@@ -113,7 +123,8 @@ class Publication:
         return self._message(self._updated.sequence, nodes, _ordered(self._edges))
 
     def _refresh(self, whole: bool) -> None:
-        self._touched_nodes.update(self._nodes.refresh())
+        limit = None if whole else some_of(self._nodes.waiting, MEASURED_A_CALL)
+        self._touched_nodes.update(self._nodes.refresh(limit))
         self._touched_edges.update(self._refresh_edges(whole))
 
     def _touched_states(self) -> dict[int, wire.NodeState]:

@@ -12,6 +12,9 @@ AXES = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}
 
 MAX_POSES = 2**52
 
+# An estimate of all but this fraction of the poses is as good, and saves most estimates.
+_NEW_POSES = 1 / 32
+
 # Hand-held cameras roll less than this. A world axis is vertical if the image rows are orthogonal
 # to it within this angle and it points up in the image.
 _LEVEL_RADIANS = np.radians(15.0)
@@ -61,6 +64,9 @@ class UpEstimator:
         self._rows = np.zeros((3, 3))  # sum of x xᵀ over the cameras' x axes
         self._image_up = np.zeros(3)  # sum of the cameras' -y axes
         self._began_on_side = False
+        # The last estimate, and how many poses it is from.
+        self._known: Float64 | None = None
+        self._known_count = -1
 
     def observe(self, T_world_camera: Float64) -> None:
         """Add a camera pose (4, 4)."""
@@ -98,9 +104,20 @@ class UpEstimator:
         self._rows = state[1:10].reshape(3, 3).copy()
         self._image_up = state[10:13].copy()
         self._began_on_side = bool(state[13])
+        self._known_count = -1
 
-    def up_world(self) -> Float64:
-        """Up, (3,) float64 unit vector; +z before the first pose."""
+    def up_world(self, exact: bool = True) -> Float64:
+        """Up, (3,) float64 unit vector; +z before the first pose.
+
+        Args:
+            exact: false = the newest poses may be left out.
+        """
+        most = self._known_count if exact else self._known_count * (1 + _NEW_POSES)
+        if self._known is None or not self._known_count <= self._count <= most:
+            self._known, self._known_count = self._estimate(), self._count
+        return self._known
+
+    def _estimate(self) -> Float64:
         if self._axis != "auto":
             return np.array(AXES[self._axis])
         z = np.array(AXES["z"])

@@ -12,7 +12,7 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.edges import Pair
 
 
-@dataclass
+@dataclass(slots=True)
 class PairVotes:
     """The votes on one unordered pair of nodes (R predicates).
 

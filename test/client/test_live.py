@@ -12,12 +12,12 @@ pytest.importorskip("rclpy")
 import msgspec
 from std_msgs.msg import String
 from support.nodes import Peer, peer, wait_until
+from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraphClient
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff
 
 LIMIT_S = 20.0
 

@@ -27,7 +27,12 @@ from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations.edge_beliefs import DECIMALS, MAX_DISTANCE_M, MIN_PROBABILITY
+from deworldsg_ros.relations.edge_beliefs import (
+    DECIMALS,
+    MAX_DISTANCE_M,
+    MIN_PROBABILITY,
+    EdgeBeliefs,
+)
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physics_model import load_physics_model
@@ -559,5 +564,30 @@ def test_many_changes_are_told_in_several_updates() -> None:
             replica.apply(update)
     assert 2 <= updates <= 10
     whole = builder.full()
+    assert list(replica.nodes.values()) == [
+        msgspec.structs.replace(node, surface_mm=msgspec.UNSET) for node in whole.nodes
+    ]
     assert replica.edges == {(edge.subject, edge.object): edge for edge in whole.edges}
     assert builder.update() is None
+
+
+@pytest.mark.parametrize(
+    ("relations", "watchers"),
+    [
+        ({"edge_belief": "robust", "world_model": "physics"}, 1),
+        ({"edge_belief": "paper", "world_model": "physics"}, 2),
+        ({"edge_belief": "paper", "world_model": "none"}, 1),
+    ],
+)
+def test_nobody_collects_nodes_for_a_rule_that_is_not_used(
+    relations: dict[str, str], watchers: int
+) -> None:
+    builder, ids = room(DESK, config(**relations))
+    known = len(builder.graph._watchers)
+    edges = EdgeBeliefs(config(**relations), builder.graph, builder.prior)
+    added = builder.graph._watchers[known:]
+    assert len(added) == watchers
+    edges.refresh()
+    builder.graph.move_node(ids["cup"], np.eye(4))
+    edges.refresh()
+    assert edges.waiting == 0 and not any(added)

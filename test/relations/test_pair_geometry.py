@@ -44,7 +44,8 @@ def shapes_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> Clouds:
     for row, points in enumerate(clouds):
         shapes.points[row, : len(points)] = points
     R = np.eye(3) if R is None else R
-    shapes.put(np.arange(len(clouds)), shapes.points, counts, R)
+    rows = np.arange(len(clouds))
+    shapes.put(rows, shapes.points, counts, rows, R)
     shapes.points = upright(shapes.points, R)
     return shapes
 
@@ -320,7 +321,8 @@ def test_a_shape_that_is_put_again_forgets_the_old_one() -> None:
     clouds = random_clouds(3)
     shapes = shapes_of(clouds[0], clouds[1])
     points = clouds[2].astype(np.float32)
-    shapes.put(np.array([0]), points[None], np.array([len(points)]), np.eye(3))
+    row = np.array([0])
+    shapes.put(row, points[None], np.array([len(points)]), row, np.eye(3))
     shapes.points = np.zeros((2, 50, 3), np.float32)
     for row, cloud in enumerate((points, clouds[1])):
         shapes.points[row, : len(cloud)] = cloud

@@ -244,6 +244,40 @@ def test_hidden_nodes_take_no_part() -> None:
     assert {tuple(pair) for pair in followed.nodes.tolist()} == {(ids["cup"], ids["chair"])}
 
 
+def test_votes_on_hidden_nodes_hold_up_no_other_pair() -> None:
+    builder, ids = room({"cup": THINGS[2], "table": THINGS[0], "chair": THINGS[1]})
+    graph = builder.graph
+    followed = table_of(graph)
+    followed.refresh(Z)
+    hidden = [add_node(builder, THINGS[5], np.random.default_rng(i), frames=1) for i in range(4)]
+    for node_id in hidden:
+        set_confirmed(graph, node_id, False)
+        graph.add_votes(node_id, ids["chair"], None)
+    graph.add_votes(ids["cup"], ids["chair"], None)
+    followed.refresh(Z, at_most=1)
+    assert followed.pairs_waiting == 0
+    assert followed.frames[followed.row(key(ids["cup"], ids["chair"]))] == 1
+    set_confirmed(graph, hidden[0], True)  # its votes count from now on
+    followed.refresh(Z)
+    assert followed.frames[followed.row(key(ids["chair"], hidden[0]))] == 1
+
+
+def test_pairs_of_nodes_that_go_wait_no_more() -> None:
+    builder, ids = room({"cup": THINGS[2], "table": THINGS[0], "chair": THINGS[1]})
+    followed = table_of(builder.graph)
+    followed.refresh(Z)
+    for name in ("cup", "table", "chair"):
+        builder.graph.move_node(ids[name], np.eye(4))
+    followed.refresh(Z, at_most=0)
+    assert followed.pairs_waiting == 3
+    set_confirmed(builder.graph, ids["cup"], False)
+    followed.refresh(Z, at_most=0)
+    assert followed.pairs_waiting == 1
+    set_confirmed(builder.graph, ids["cup"], True)
+    followed.refresh(Z)
+    assert followed.pairs_waiting == 0 and len(followed) == 3
+
+
 def test_pairs_out_of_reach_are_not_related() -> None:
     far = thing("refrigerator", 5.0, 0, 0, 0.6, 0.6, 1.7)
     builder, ids = room({"table": THINGS[0], "far": far, "cup": THINGS[2]})

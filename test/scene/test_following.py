@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from support.reference_updates import diff
 from support.view import make_graph, make_node
 
-from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.scene.following import GraphFollower
 from deworldsg_ros.scene.replica import GraphReplica
 

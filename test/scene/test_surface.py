@@ -8,26 +8,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import seeds
 
-from deworldsg_ros.scene.surface import add_points, drop_points, even_moments
+from deworldsg_ros.scene.extent import even_moments
+from deworldsg_ros.scene.surface import _hash, add_points, drop_points
 
 
 class Samples:
     """Some samples of surface points, as a table of nodes keeps them."""
 
     def __init__(self, count: int, capacity: int) -> None:
-        self.hashes = np.zeros((count, capacity), np.uint64)
         self.points_world = np.zeros((count, capacity, 3), np.float32)
         self.counts = np.zeros(count, np.int64)
 
     def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
-        add_points(self.hashes, self.points_world, self.counts, rows, point_sets)
+        add_points(self.points_world, self.counts, rows, point_sets)
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.hashes, self.points_world, self.counts
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.points_world, self.counts
 
     def of(self, row: int) -> tuple[list[int], list[list[float]]]:
-        count = self.counts[row]
-        return self.hashes[row, :count].tolist(), self.points_world[row, :count].tolist()
+        points = self.points(row)
+        return [int(_hash(bits)) for bits in points.view(np.uint32)], points.tolist()
 
     def points(self, row: int) -> np.ndarray:
         return self.points_world[row, : self.counts[row]]

@@ -14,12 +14,13 @@ from pathlib import Path
 import msgspec
 import pytest
 import typer.testing
+from support.reference_updates import diff
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.store import add_joined
 from deworldsg_ros.client.changes import MOVED_M
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff, empty_scene_graph, join
+from deworldsg_ros.scene.delta import empty_scene_graph, join
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.store import Store, StoreError

@@ -66,7 +66,8 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
     shapes = NodeShapes()
     shapes.extend(nodes.ids.tolist())
     points = nodes.surface_points_world
-    shapes.put(np.arange(len(nodes)), points, nodes.surface_counts, np.eye(3))
+    rows = np.arange(len(nodes))
+    shapes.put(rows, points, nodes.surface_counts, rows, np.eye(3))
     at = _match(graph, objects)
     solid = shapes.counts >= MIN_SHAPE_POINTS
     floor_m = floor_height(np.sort(shapes.low[solid, 2]).tolist())

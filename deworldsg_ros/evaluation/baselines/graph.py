@@ -13,9 +13,9 @@ import numpy as np
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.beliefs import listed
 from deworldsg_ros.scene.frame_graph import Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import fuse
-from deworldsg_ros.scene.node_states import best_beliefs
 
 # Number of classes and predicates of each node and edge in the message.
 TOP_K = 5
@@ -218,4 +218,5 @@ def _fractions(scores: Float64 | Int64) -> Float64:
 
 
 def _beliefs(fractions: Float64, names: Sequence[str]) -> list[wire.Belief]:
-    return [item for item in best_beliefs(fractions, names, TOP_K) if item.probability > 0]
+    (best,) = listed(fractions[None], names, TOP_K)
+    return [item for item in best.beliefs if item.probability > 0]

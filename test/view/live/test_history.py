@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.view.live.history import BLOCK, History
 

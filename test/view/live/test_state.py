@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff
 from deworldsg_ros.view.live.filters import Filter
 from deworldsg_ros.view.live.state import LiveState
 from deworldsg_ros.view.live.tables import ObjectTable

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from support.merging import VOCABULARY, edit_at_random, seeds
+from support.reference_updates import diff
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import diff, empty_scene_graph
+from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.replica import GraphReplica

@@ -1,0 +1,65 @@
+"""The pairs of nodes that wait to be judged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from deworldsg_ros.relations.pair_rows import ends_of, key
+from deworldsg_ros.scene.arrays import Bool, Int64
+from deworldsg_ros.scene.edges import Pair
+from deworldsg_ros.scene.waiting import take_first
+
+
+class WaitingPairs:
+    """Pairs that wait to be judged: those that are not in the table come first.
+
+    Args:
+        known: the pairs in the table, by key.
+        published: the nodes that are published, by id.
+    """
+
+    def __init__(self, known: Mapping[int, int], published: Mapping[int, int]) -> None:
+        self._known = known
+        self._published = published
+        self._new: dict[int, None] = {}
+        self._again: dict[int, None] = {}
+        # Those that have another geometry.
+        self._moved: set[int] = set()
+
+    def __len__(self) -> int:
+        return len(self._new) + len(self._again)
+
+    def add(self, pairs: Iterable[Pair]) -> None:
+        """Let pairs wait. Those with a node that is not published count when it is."""
+        for first, second in pairs:
+            pair_key = key(first, second)
+            if pair_key in self._known:
+                self._again[pair_key] = None
+            elif first in self._published and second in self._published:
+                self._new[pair_key] = None
+
+    def move(self, keys: Int64) -> None:
+        """Let pairs wait that have another geometry."""
+        self._moved.update(keys.tolist())
+        self.add(map(ends_of, keys.tolist()))
+
+    def forget(self, pair_key: int) -> None:
+        """A pair has left the table."""
+        self._again.pop(pair_key, None)
+        self._moved.discard(pair_key)
+
+    def take(self, at_most: int | None) -> tuple[list[int], Bool]:
+        """Keys (k,) of the pairs to judge now; and (k,) which have another geometry."""
+        due = []
+        for pair_key in take_first(self._new, at_most):
+            first, second = ends_of(pair_key)
+            if first in self._published and second in self._published:
+                due.append(pair_key)
+            else:  # a node went since
+                self._moved.discard(pair_key)
+        due += take_first(self._again, None if at_most is None else at_most - len(due))
+        moved = np.array([pair_key in self._moved for pair_key in due], np.bool_)
+        self._moved.difference_update(due)
+        return due, moved
