@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from deworldsg_ros.scene.arrays import Float32
+from deworldsg_ros.scene.extent import even_moments
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.surface import even_moments
 
 
 def copy_node(
