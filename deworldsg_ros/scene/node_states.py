@@ -121,13 +121,13 @@ class NodeStates:
         if len(solid):
             surfaces = nodes.surface_points_world, nodes.surface_counts
             found = extents_of(*surfaces, rows[solid], self.up)
-            for index, *extent in zip(
+            for index, mean, covariance, box in zip(
                 solid.tolist(),
                 rounded_rows(found.means, POSITION_DECIMALS),
                 rounded_rows(found.covariances, VARIANCE_DECIMALS),
                 boxes(found),
             ):
-                extents[due[index]] = tuple(extent)
+                extents[due[index]] = mean, covariance, box
         return extents
 
     def _make(self, present: Mapping[int, int], extents: Mapping[int, _Extent]) -> None:

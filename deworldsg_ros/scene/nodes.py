@@ -232,9 +232,9 @@ class NodeTable(Columns):
         """
         at = np.array(rows, np.int64)
         drop_points(self.surface_points_world, self.surface_counts, at, dropped)
-        changed = at[dropped.any(axis=1)]
+        changed: list[int] = at[dropped.any(axis=1)].tolist()
         self.surface_revisions[changed] += 1
-        return changed.tolist()
+        return changed
 
     def restore(self, columns: Mapping[str, NDArray[Any]], surfaces: Sequence[Float32]) -> None:
         """Fill an empty table with saved columns and the surface points of each row."""
