@@ -98,6 +98,10 @@ class GraphBuilder:
         """Number of nodes that are not published, by reason, in words."""
         return dict(Counter(self.merging.hidden(self.graph).values()))
 
+    def configure(self, config: Config) -> None:
+        """Use other thresholds of the section ``merging`` from the next frame on."""
+        self.merging.configure(config.merging)
+
     def integrate(self, local: LocalGraph) -> list[int]:
         """Merge a frame's local graph; returns the node id of each of its rows.
 

@@ -66,8 +66,12 @@ class Lifting:
     def __init__(
         self, config: LiftingConfig, constants: LiftingConstants = LiftingConstants()
     ) -> None:
-        self._config = config
         self._constants = constants
+        self.configure(config)
+
+    def configure(self, config: LiftingConfig) -> None:
+        """Use another section from the next frame on."""
+        self._config = config
 
     def lift(
         self,

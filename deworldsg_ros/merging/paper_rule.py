@@ -24,6 +24,10 @@ class PaperMerging:
     """Merges local graphs into a scene graph by the rule of Eq. 5-7."""
 
     def __init__(self, config: MergingConfig) -> None:
+        self.configure(config)
+
+    def configure(self, config: MergingConfig) -> None:
+        """Use other thresholds from the next frame on."""
         self._bound = bhattacharyya_bound(config.hellinger_threshold)
         self._class_threshold = config.class_distance_threshold
 

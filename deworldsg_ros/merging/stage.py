@@ -22,6 +22,10 @@ class Merging(Protocol):
         """Compile the kernels before the first frame."""
         ...
 
+    def configure(self, config: MergingConfig) -> None:
+        """Use other thresholds from the next frame on; the rule stays."""
+        ...
+
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph. All calls use the same graph.
 

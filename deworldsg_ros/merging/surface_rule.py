@@ -38,10 +38,14 @@ class SurfaceMerging:
     """
 
     def __init__(self, config: MergingConfig, min_existence: float = 0.5) -> None:
-        self._config = config
+        self.configure(config)
         self._records = NodeRecords()
         self._life_cycle = LifeCycle(self._records, min_existence)
         self._editor = SurfaceEditor(self._records, self._life_cycle)
+
+    def configure(self, config: MergingConfig) -> None:
+        """Use another threshold from the next frame on."""
+        self._config = config
 
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""

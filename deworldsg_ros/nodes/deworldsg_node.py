@@ -13,6 +13,7 @@ from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.graph_services import GraphServices
 from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.options import LIVE_GRAPH, LIVE_LIFTING, LIVE_RELATIONS
 from deworldsg_ros.ros.perceiving import PerceivingNode
 from deworldsg_ros.ros.relating import Relating
 from deworldsg_ros.scene import wire
@@ -28,6 +29,8 @@ class DeworldsgNode(PerceivingNode):
     Raises:
         ConfigurationError: for a map file that cannot be read or written.
     """
+
+    LIVE = (*PerceivingNode.LIVE, *LIVE_LIFTING, *LIVE_RELATIONS, *LIVE_GRAPH)
 
     def __init__(self, **options: Any) -> None:
         super().__init__("deworldsg_node", "frames", **options)
@@ -51,6 +54,13 @@ class DeworldsgNode(PerceivingNode):
     def _updated(self, update: wire.SceneGraphUpdateMessage, latency_s: float) -> None:
         if self._relating.follows_graph:
             self._relating.apply(update)
+
+    def configure(self) -> None:
+        """Take changed parameters."""
+        super().configure()
+        self._lifting.configure(self.parameters.lifting)
+        self._relating.configure(self.parameters.relations)
+        self.graph.submit(lambda: self.graph.configure(self.parameters))
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, and models that fail or hang, in words."""

@@ -10,6 +10,7 @@ from typing import Any
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.graph_services import GraphServices
 from deworldsg_ros.ros.node import StageNode, run
+from deworldsg_ros.ros.options import LIVE_GRAPH
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
 from deworldsg_ros.view.markers import markers
@@ -24,6 +25,8 @@ class GraphNode(StageNode):
     Raises:
         ConfigurationError: for a map file that cannot be read or written.
     """
+
+    LIVE = LIVE_GRAPH
 
     def __init__(self, **options: Any) -> None:
         super().__init__("graph_node", "graphs", **options)
@@ -42,6 +45,10 @@ class GraphNode(StageNode):
             50,
             self.graph.submit_evidence,
         )
+
+    def configure(self) -> None:
+        """Take changed parameters."""
+        self.graph.submit(lambda: self.graph.configure(self.parameters))
 
     def close(self) -> None:
         """Write the map file."""

@@ -11,6 +11,7 @@ from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.ros.inputs import listen_camera_info, listen_depth, listen_pose
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.options import LIVE_LIFTING
 from deworldsg_ros.ros.qos import source
 from deworldsg_ros.scene.codec import frame_graph_from_message, local_graph_to_message
 from deworldsg_ros.scene.wire import FrameGraphMessage
@@ -20,6 +21,8 @@ from deworldsg_ros.streams.poses import stamp_ns_of
 
 class LiftingNode(JoiningNode[LiftingFrame]):
     """Stage b as a node."""
+
+    LIVE = LIVE_LIFTING
 
     def __init__(self, **options: Any) -> None:
         super().__init__("lifting_node", "local graphs", **options)
@@ -41,6 +44,10 @@ class LiftingNode(JoiningNode[LiftingFrame]):
         self.listen_json(
             "deworldsg/frame_graph", FrameGraphMessage, self.taking(self._add_frame_graph), 10
         )
+
+    def configure(self) -> None:
+        """Take changed parameters."""
+        self._lifting.configure(self.parameters.lifting)
 
     def _add_frame_graph(self, message: FrameGraphMessage) -> None:
         self._frames.add_frame_graph(frame_graph_from_message(message))

@@ -14,6 +14,7 @@ from std_msgs.msg import String
 from deworldsg_ros.ros.inputs import listen_rgb
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
+from deworldsg_ros.ros.options import LIVE_RELATIONS
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.relating import Relating
 from deworldsg_ros.scene import wire
@@ -24,6 +25,8 @@ from deworldsg_ros.streams.frame_assemblers import PairingFrame, RelationAssembl
 
 class RelationNode(JoiningNode[PairingFrame]):
     """Stage d as a node; the world model runs in its own thread, so that frames do not wait."""
+
+    LIVE = LIVE_RELATIONS
 
     def __init__(self, **options: Any) -> None:
         super().__init__("relation_node", "evidence messages", **options)
@@ -77,6 +80,10 @@ class RelationNode(JoiningNode[PairingFrame]):
 
     def _deliver(self, evidence: RelationEvidence) -> None:
         self._publish(evidence_to_message(evidence, self._world_frame))
+
+    def configure(self) -> None:
+        """Take changed parameters."""
+        self._relating.configure(self.parameters.relations)
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, and a world model that fails or hangs, in words."""

@@ -96,14 +96,18 @@ class Perception:
         self._segmenter = segmenter
         self._relation_head = relation_head
         self._refine = config.refine_detections
-        self._max_relations = config.max_relations
         self._up = UpEstimator(world_up)
         self._uprighter = Uprighter(world_up) if config.refine_detections else None
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
         self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
+        self.configure(config)
+
+    def configure(self, config: PerceptionConfig) -> None:
+        """Use another `score_threshold` and `max_relations` from the next frame on."""
+        self._max_relations = config.max_relations
         self.score_threshold = (
-            detector.default_score_threshold
+            self._detector.default_score_threshold
             if config.score_threshold < 0
             else config.score_threshold
         )

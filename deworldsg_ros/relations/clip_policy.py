@@ -70,14 +70,18 @@ class ClipPolicy:
         self._graph: GraphView | None = None
         self._generation = 0
         self._entropy_threshold_nats = config.entropy_threshold_nats
-        self._max_clips_per_s = config.max_clips_per_s
-        # At most the clips of one second are saved up, and at least one clip.
-        self._most_credit = max(1.0, config.max_clips_per_s)
+        self.limit(config.max_clips_per_s)
         self._credit = self._most_credit
         self._newest_ns: int | None = None
         # Encodings of each pair, and its observations at the last one; the longest ago first.
         self._encodings: dict[PairKey, tuple[int, int]] = {}
         self._class_encodings: Counter[tuple[int, int]] = Counter()
+
+    def limit(self, max_clips_per_s: float) -> None:
+        """Use another budget from now on."""
+        self._max_clips_per_s = max_clips_per_s
+        # At most the clips of one second are saved up, and at least one clip.
+        self._most_credit = max(1.0, max_clips_per_s)
 
     def watch(self, graph: GraphView) -> None:
         """Rank by the state of this graph from now on, unless every clip is encoded."""

@@ -92,6 +92,12 @@ class RelationReasoner:
         self._policy = ClipPolicy(config)
         self._queue = ClipQueue(queue_size, self._policy, self._drop)
 
+    def configure(self, config: RelationsConfig) -> None:
+        """Use another `geo_cost_threshold` and `max_clips_per_s` from the next frame on."""
+        with self._lock:
+            self._config = config
+            self._policy.limit(config.max_clips_per_s)
+
     def watch(self, graph: GraphView) -> None:
         """Choose clips by the state of this graph from now on."""
         with self._lock:

@@ -37,7 +37,11 @@ class GraphFiles:
 
     def continued_map(self) -> Continued | None:
         """The graph of the map file, if there is one; raises ConfigurationError if it has none."""
-        return None if self.map is None else self.map.continued(self._node.parameters)
+        continued = None if self.map is None else self.map.continued(self._node.parameters)
+        if continued is not None:
+            log = self._node.get_logger()
+            log.info(continued.message) if continued.newest else log.warning(continued.message)
+        return continued
 
     def save(self, builder: GraphBuilder | None) -> tuple[bool, str]:
         """Write the whole graph, with surface points, as JSON; and the map file.

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 from geometry_msgs.msg import PoseStamped
 
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
-from deworldsg_ros.map_file import Continued
 from deworldsg_ros.ros.graph_files import GraphFiles
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.pose_corrections import CORRECTION_TOPIC, PoseCorrections
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.update_times import UpdateTimes
@@ -86,7 +86,8 @@ class GraphKeeper:
             "graph", self._run, size=QUEUE_JOBS, on_overrun=_drop, after=self._publish
         )
         if continued is not None:
-            self._announce(continued)
+            now_s = time.monotonic()
+            self.submit(lambda: self._times.changed(now_s, now_s))
         node.create_subscription(
             PoseStamped, CORRECTION_TOPIC, node.guarded(self._receive_correction), reliable(10)
         )
@@ -103,6 +104,13 @@ class GraphKeeper:
     def submit_evidence(self, job: Callable[[], None]) -> None:
         """The same for evidence: the graph has its frame without it."""
         self.submit(job, lambda: self._count_overrun("evidence_overrun"))
+
+    def configure(self, parameters: Parameters) -> None:
+        """Use other thresholds and another rate from now on; `submit` it."""
+        self._parameters = parameters
+        self._times.limit(parameters.output.rate_hz)
+        if self._builder is not None:
+            self._builder.configure(parameters)
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until all jobs are done; False on timeout."""
@@ -124,13 +132,6 @@ class GraphKeeper:
             "evidence waiting": str(len(self._pending)),
             **self._corrections.values(),
         }
-
-    def _announce(self, continued: Continued) -> None:
-        """Report a continued map, and publish it."""
-        log = self._node.get_logger()
-        log.info(continued.message) if continued.newest else log.warning(continued.message)
-        now_s = time.monotonic()
-        self.submit(lambda: self._times.changed(now_s, now_s))
 
     # The methods below run in the graph's thread.
 

@@ -15,13 +15,14 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from std_msgs.msg import String
 
 from deworldsg_ros.kernels import COMPILING, on_compilation
 from deworldsg_ros.ros.diagnosing import DropLog, diagnostic_array
 from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, Health
+from deworldsg_ros.ros.live_parameters import LiveParameters
 from deworldsg_ros.ros.options import Parameters
+from deworldsg_ros.ros.overrides import OverridableNode
 from deworldsg_ros.ros.parameters import declare
 from deworldsg_ros.ros.process import run_process
 from deworldsg_ros.ros.qos import AutoSubscription, LossCounter, Source, reliable
@@ -40,7 +41,7 @@ SPIN_PERIOD_S = 0.05
 SWITCH_S = 0.001
 
 
-class StageNode(Node):
+class StageNode(OverridableNode):
     """A node around one stage.
 
     Callbacks made by `guarded` never raise. Refused input is counted under its reason; an
@@ -52,7 +53,7 @@ class StageNode(Node):
         options: arguments of rclpy's Node.
 
     Attributes:
-        parameters: values of this start; nodes read parameters once.
+        parameters: present values.
         health: counts for /diagnostics.
 
     Raises:
@@ -60,12 +61,15 @@ class StageNode(Node):
     """
 
     PARAMETERS: type[msgspec.Struct] = Parameters
+    # Names of the parameters that `configure` takes while the node runs.
+    LIVE: tuple[str, ...] = ()
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.parameters: Any = declare(self, self.PARAMETERS)
+        self.parameters: Any = declare(self, self.PARAMETERS, self.LIVE)
         self.get_logger().info("loading")
         on_compilation(lambda: self.get_logger().info(COMPILING))
+        LiveParameters(self)
         self.health = Health(product)
         self._drop_log = DropLog(self.get_logger())
         self._subscriptions_to_check: list[AutoSubscription] = []
@@ -76,6 +80,9 @@ class StageNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.every(CHECK_PERIOD_S, self._check_publishers)
         self.every(DIAGNOSTICS_PERIOD_S, self._diagnose)
+
+    def configure(self) -> None:
+        """Take changed `parameters`, those of `LIVE`; for subclasses."""
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, in words; for subclasses."""
@@ -251,6 +258,8 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
             executor = SingleThreadedExecutor()
             executor.add_node(node)
             waiting = Waiting(node, executor)
+            for override in node.unused_overrides():
+                node.get_logger().warning(f"{override} has no effect: there is no such topic yet")
             node.get_logger().info("ready")
             while not stop.is_set() and rclpy.ok():
                 serve(node, waiting)

@@ -6,6 +6,16 @@ import msgspec
 
 from deworldsg_ros.config import Config, option
 
+# Parameters that can be changed while a node runs, by stage. The others are read at the start.
+LIVE_LIFTING = ("lifting.tau", "lifting.gamma_base_m", "lifting.covariance_ridge_m2")
+LIVE_RELATIONS = ("relations.geo_cost_threshold", "relations.max_clips_per_s")
+LIVE_GRAPH = (
+    "merging.hellinger_threshold",
+    "merging.class_distance_threshold",
+    "merging.overlap_threshold",
+    "output.rate_hz",
+)
+
 
 class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Files of graph_node."""

@@ -1,9 +1,9 @@
-"""ROS parameters of a node: declared from its typed options, checked at start-up, read-only."""
+"""ROS parameters of a node: declared from its typed options, and checked."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -12,13 +12,13 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 
 from deworldsg_ros.ros.options import Parameters
+from deworldsg_ros.ros.overrides import PREFIX, OverridableNode
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.words import suggestion
 
 # Parameters that rclpy reads itself.
+CLIP_RATE = "relations.max_clips_per_s"
 RCLPY_NAMES = ("use_sim_time", "start_type_description_service")
-# rclpy reads these only where a node allows them, and ignores the others.
-QOS_PREFIX = "qos_overrides."
 
 P = TypeVar("P", bound=msgspec.Struct)
 
@@ -61,8 +61,13 @@ class Field:
         return " and ".join(parts)
 
 
-def declare(node: Node, kind: type[P]) -> P:
+def declare(node: Node, kind: type[P], live: Collection[str] = ()) -> P:
     """Declare every parameter of a structure on a node; return the values of this start.
+
+    Args:
+        node: an `OverridableNode` also takes ``qos_overrides.*``.
+        kind: structure of sections.
+        live: names of the parameters that can be changed later; the others are read-only.
 
     Raises:
         ConfigurationError: for an unknown name, a wrong type or a value out of range.
@@ -73,11 +78,13 @@ def declare(node: Node, kind: type[P]) -> P:
         name: parameter.value
         for name, parameter in node._parameter_overrides.items()
         if name not in RCLPY_NAMES
+        and not (isinstance(node, OverridableNode) and name.startswith(PREFIX))
     }
     parameters = resolve(overrides, node.get_name(), kind)
     for field in fields(kind):
         value = getattr(getattr(parameters, field.path[0]), field.path[1])
-        node.declare_parameter(field.name, value, descriptor(field), ignore_override=True)
+        described = descriptor(field, read_only=field.name not in live)
+        node.declare_parameter(field.name, value, described, ignore_override=True)
     return parameters
 
 
@@ -96,21 +103,45 @@ def resolve(overrides: dict[str, Any], source: str, kind: type[P]) -> P:
     content: dict[str, dict[str, Any]] = {}
     for name, value in overrides.items():
         field = known.get(name)
-        if name.startswith(QOS_PREFIX):
-            raise ConfigurationError(
-                f"{source}: parameter {name} has no effect: the QoS of a topic follows its "
-                "publishers, or inputs.reliability"
-            )
         if field is None:
             hint = suggestion(name, known)
             raise ConfigurationError(f"{source}: there is no parameter {name}{hint}")
         section, key = field.path
-        try:
-            msgspec.convert({section: {key: value}}, kind)
-        except msgspec.ValidationError as error:
-            raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
+        _check(field, value, kind, source)
         content.setdefault(section, {})[key] = value
     return msgspec.convert(content, kind)
+
+
+def changed(parameters: P, values: dict[str, Any], source: str) -> P:
+    """The structure with other values, by ROS name; names of others are left out.
+
+    Raises:
+        ConfigurationError: as `resolve`; also for a rate of clips that becomes 0 or was 0, because
+            the node then has other inputs.
+    """
+    for field in fields(type(parameters)):
+        if field.name not in values:
+            continue
+        value = values[field.name]
+        _check(field, value, type(parameters), source)
+        section, key = field.path
+        before = getattr(parameters, section)
+        if field.name == CLIP_RATE and bool(value) != bool(getattr(before, key)):
+            raise ConfigurationError(
+                f"{source}: parameter {field.name} is {getattr(before, key):g}: a change from or "
+                "to 0 needs a restart of the node"
+            )
+        section_after = msgspec.structs.replace(before, **{key: value})
+        parameters = msgspec.structs.replace(parameters, **{section: section_after})
+    return parameters
+
+
+def _check(field: Field, value: Any, kind: type[msgspec.Struct], source: str) -> None:
+    section, key = field.path
+    try:
+        msgspec.convert({section: {key: value}}, kind)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"{source}: {_complaint(field, value)}") from error
 
 
 def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
@@ -118,10 +149,10 @@ def fields(kind: type[msgspec.Struct] = Parameters) -> list[Field]:
     return list(_walk(kind))
 
 
-def descriptor(field: Field) -> ParameterDescriptor:
-    """ROS description of a parameter; read-only, because nodes read parameters once."""
+def descriptor(field: Field, *, read_only: bool = True) -> ParameterDescriptor:
+    """ROS description of a parameter."""
     result = ParameterDescriptor(
-        description=field.description, read_only=True, additional_constraints=field.limits()
+        description=field.description, read_only=read_only, additional_constraints=field.limits()
     )
     bounded = field.lowest is not None or field.highest is not None
     if field.kind is float and bounded:

@@ -35,6 +35,8 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         options: arguments of rclpy's Node.
     """
 
+    LIVE: tuple[str, ...] = ("perception.score_threshold", "perception.max_relations")
+
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, product, max_queue_s=MAX_QUEUE_S, **options)
         inputs = self.parameters.inputs
@@ -61,6 +63,10 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         listen_pose(self, frames)
         listen_depth(self, self.taking(frames.add_depth), self.wants_depth, WANTED_DEPTH)
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
+
+    def configure(self) -> None:
+        """Take changed parameters."""
+        self._perception.configure(self.parameters.perception)
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, and models that fail or hang, in words."""

@@ -202,7 +202,8 @@ class AutoSubscription:
         """Topic, type and reliability, in words."""
         assert self._choice is not None
         kind = self._choice.source.type_name
-        return f"{self.topic} [{kind}] {'reliable' if self._choice.reliable else 'best effort'}"
+        best_effort = self._subscription.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        return f"{self.topic} [{kind}] {'best effort' if best_effort else 'reliable'}"
 
     def _receive(self, message: Any, info: dict[str, Any]) -> None:
         self._losses.count(info)

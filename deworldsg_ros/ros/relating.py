@@ -7,6 +7,7 @@ from typing import Any
 
 from deworldsg_ros.checkpoints.card import graph_predicates
 from deworldsg_ros.checkpoints.required import require_checkpoints
+from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
@@ -55,6 +56,10 @@ class Relating:
         self.follows_graph = self.needs_images and config.max_clips_per_s > 0
         if self.follows_graph:
             self._reasoner.watch(self.graph)
+
+    def configure(self, config: RelationsConfig) -> None:
+        """Use another threshold and another rate from the next frame on."""
+        self._reasoner.configure(config)
 
     def problems(self) -> list[str]:
         """What is wrong with the world model, in words."""

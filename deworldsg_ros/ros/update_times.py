@@ -19,12 +19,16 @@ class UpdateTimes:
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self._period_s = 1.0 / (RATE_SLACK * rate_hz)
+        self.limit(rate_hz)
         # Generic cell rate algorithm, with a tolerance of one period: updates on schedule would be
         # published up to this time.
         self._booked_s = 0.0
         self._due_s: float | None = None
         self._since_s = 0.0
+
+    def limit(self, rate_hz: float) -> None:
+        """Use another maximum rate from now on."""
+        self._period_s = 1.0 / (RATE_SLACK * rate_hz)
 
     def changed(self, since_s: float, now_s: float, *, can_wait: bool = False) -> None:
         """Note a change whose cause arrived at `since_s`."""
