@@ -23,7 +23,7 @@ from deworldsg_ros.perception.protocols import (
 )
 from deworldsg_ros.perception.upright import Uprighter, UprightFrame, turned_back
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
-from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.up import UpEstimator
@@ -156,8 +156,8 @@ class Perception:
         self._failures = {}
         found = detect()
         strong = found.scores >= self.score_threshold
-        objects, drops = self._select(found.take(strong), intrinsics.width, intrinsics.height)
-        weak, _ = self._select(found.take(~strong), intrinsics.width, intrinsics.height)
+        objects, drops = _select(found.take(strong), intrinsics, self._refine)
+        weak, _ = _select(found.take(~strong), intrinsics, self._refine)
         masks = self.segment(frame, objects, in_front_of(objects, weak))
         if masks is None:
             drops["segmenter_error"] = len(objects)
@@ -245,25 +245,27 @@ class Perception:
             )
         return message
 
-    def _select(
-        self, found: Detections, width: int, height: int
-    ) -> tuple[Detections, Counter[str]]:
-        """Boxes clipped to the image, best score first, at most `MAX_OBJECTS`; and the drops."""
-        boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
-        large = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
-        view = fills_image(boxes, width, height) & self._refine
-        usable = large & ~view
-        order = np.argsort(-found.scores, kind="stable")
-        order = order[usable[order]]
-        kept = order[:MAX_OBJECTS]
-        drops: Counter[str] = Counter()
-        if not large.all():
-            drops["box_too_small"] = int((~large).sum())
-        if view.any():
-            drops["box_is_the_view"] = int(view.sum())
-        if len(order) > len(kept):
-            drops["over_max_objects"] = len(order) - len(kept)
-        return replace(found, boxes_xyxy=boxes).take(kept), drops
+
+def _select(
+    found: Detections, intrinsics: Intrinsics, refine: bool
+) -> tuple[Detections, Counter[str]]:
+    """Boxes clipped to the image, best score first, at most `MAX_OBJECTS`; and the drops."""
+    width, height = intrinsics.width, intrinsics.height
+    boxes = np.clip(found.boxes_xyxy, 0.0, [width - 1.0, height - 1.0] * 2)
+    large = (boxes[:, 2:] - boxes[:, :2]).min(axis=1) >= MIN_BOX_SIDE_PX
+    view = fills_image(boxes, width, height) & refine
+    usable = large & ~view
+    order = np.argsort(-found.scores, kind="stable")
+    order = order[usable[order]]
+    kept = order[:MAX_OBJECTS]
+    drops: Counter[str] = Counter()
+    if not large.all():
+        drops["box_too_small"] = int((~large).sum())
+    if view.any():
+        drops["box_is_the_view"] = int(view.sum())
+    if len(order) > len(kept):
+        drops["over_max_objects"] = len(order) - len(kept)
+    return replace(found, boxes_xyxy=boxes).take(kept), drops
 
 
 def fills_image(boxes_xyxy: Float64, width: int, height: int) -> Bool:

@@ -64,7 +64,6 @@ class GraphKeeper:
         on_update: Callable[[wire.SceneGraphUpdateMessage, float], None],
     ) -> None:
         self._node = node
-        self._parameters = node.parameters
         self._on_update = on_update
         warm_up(node.parameters)
         self._pending = PendingEvidence()
@@ -74,7 +73,7 @@ class GraphKeeper:
         self._session = secrets.token_hex(8)
         self._corrections = PoseCorrections()
         self._values: dict[str, str] = {}
-        self._times = UpdateTimes(self._parameters.output.rate_hz)
+        self._times = UpdateTimes(self._node.parameters.output.rate_hz)
         self._running_s = 0.0  # when the job that runs now was submitted
         self._publish_update = node.json_publisher("scene_graph/updates", 50)
         self._whole = WholeGraph(node, markers)
@@ -107,7 +106,6 @@ class GraphKeeper:
 
     def configure(self, parameters: Parameters) -> None:
         """Use other thresholds and another rate from now on; `submit` it."""
-        self._parameters = parameters
         self._times.limit(parameters.output.rate_hz)
         if self._builder is not None:
             self._builder.configure(parameters)
@@ -164,7 +162,7 @@ class GraphKeeper:
     def _merge(self, local: LocalGraph) -> None:
         """Merge a local graph, and the evidence that waited for it."""
         if self._builder is None:
-            self._builder = GraphBuilder(self._parameters, local.vocabulary, local.frame_id)
+            self._builder = GraphBuilder(self._node.parameters, local.vocabulary, local.frame_id)
         self._builder.integrate(local)
         if local.stamp_ns < self.newest_ns:
             self._node.drop("time_jump", jump_text("local graph", self.newest_ns))
