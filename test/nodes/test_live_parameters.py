@@ -24,6 +24,9 @@ from deworldsg_ros.ros.parameters import fields
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
 
+# A first start compiles.
+pytestmark = pytest.mark.timeout(300)
+
 PAPER = [Parameter("merging.association", value="paper")]
 UPDATES, GRAPHS = "/scene_graph/updates.publisher", "/deworldsg/local_graph.subscription"
 
