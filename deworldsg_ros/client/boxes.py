@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.extent import horizontal_axes
+
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,18 @@ def footprint(
     corners = (np.array(center_m) + offsets) @ axes.T
     height = float(np.dot(axes[2], center_m))
     return Footprint(corners[:, :2], height - float(half[2]), height + float(half[2]))
+
+
+def box_of(node: wire.NodeState) -> tuple[Triple, Triple]:
+    """Centre and size of an object's box, metres, in microseconds.
+
+    Without a box: the mean of its surface, and 0.
+    """
+    if isinstance(node.box, wire.GravityBox):
+        (x, y, z), (a, b, c) = node.box.center_m, node.box.size_m
+        return (x, y, z), (a, b, c)
+    x, y, z = node.mean_m
+    return (x, y, z), (0.0, 0.0, 0.0)
 
 
 def horizontal_gap_m(a: Footprint, b: Footprint) -> float:

@@ -100,6 +100,11 @@ class SceneGraphClient(GraphCommands):
             self._context.try_shutdown()
 
     @property
+    def has_graph(self) -> bool:
+        """Whether there is a graph to ask."""
+        return self._has_graph
+
+    @property
     def newest(self) -> SceneGraph | None:
         """The newest graph; None before the first one."""
         with self._changed:

@@ -6,9 +6,12 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.change_log import ChangeLog
 
+# The whole graph is for those who join late, as that of graph_node.
+WHOLE_PERIOD_S = 1.0
+
 
 class GraphTopics:
-    """Publishes `PREFIX/scene_graph` and `PREFIX/scene_graph/updates`.
+    """Publishes `PREFIX/scene_graph`, once a second, and `PREFIX/scene_graph/updates`, at once.
 
     A `SceneGraphClient` with the namespace ``/PREFIX`` follows them.
 
@@ -25,6 +28,8 @@ class GraphTopics:
         self._sequence = 0
         self._session: str | None = None
         self._publish_whole = node.text_publisher(f"{prefix}/scene_graph", 1, latched=True)
+        self._whole: wire.SceneGraphMessage | None = None
+        node.every(WHOLE_PERIOD_S, self._tell_whole)
         self._publish_update = node.json_publisher(f"{prefix}/scene_graph/updates", 50)
 
     def publish(self, graph: wire.SceneGraphMessage) -> None:
@@ -35,4 +40,9 @@ class GraphTopics:
             return
         self._session, self._sequence = update.session or None, update.sequence
         self._publish_update(update)
-        self._publish_whole(wire.encode(graph))
+        self._whole = graph
+
+    def _tell_whole(self) -> None:
+        graph, self._whole = self._whole, None
+        if graph is not None:
+            self._publish_whole(wire.encode(graph))

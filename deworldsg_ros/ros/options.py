@@ -163,3 +163,24 @@ class FleetLinkParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     """Parameters of fleet_link_node."""
 
     node: FleetLinkOptions = FleetLinkOptions()
+
+
+class RegionOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The part of the graph that region_node publishes."""
+
+    center: Annotated[
+        str,
+        option("centre as X,Y,Z in the world frame, metres; empty = follow region/center"),
+    ] = ""
+    radius_m: Annotated[
+        float, option("largest distance of the centre of an object's box, metres", gt=0)
+    ] = 5.0
+    classes: Annotated[
+        str, option("classes, separated by commas; table means dining table too; empty = all")
+    ] = ""
+
+
+class RegionParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Parameters of region_node."""
+
+    node: RegionOptions = RegionOptions()

@@ -24,6 +24,8 @@ REASONS: dict[str, str] = {
     "invalid_pose": "A pose contains NaN or infinity, its quaternion is not of length 1, or it is "
     "more than 10 km from the origin. Check the source of the poses; publish them in a frame that "
     "begins near the robot.",
+    "invalid_region": "The parameter center of region_node cannot be read; the region stays as it "
+    "was. Write X,Y,Z in metres.",
     "invalid_request": "A request to a service cannot be fulfilled, and "
     "changed nothing. Its answer says why.",
     "wrong_frame": "The frame_id of a pose or local graph differs from the world frame of this "

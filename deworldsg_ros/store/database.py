@@ -16,9 +16,10 @@ from typing import Any
 
 import msgspec
 
+from deworldsg_ros.client.boxes import box_of
 from deworldsg_ros.scene import wire
 from deworldsg_ros.store.errors import StoreError
-from deworldsg_ros.store.history import STILL_NS, Stay, box_of
+from deworldsg_ros.store.history import STILL_NS, Stay
 
 # Of the tables below. A database of another version is made anew from the messages.
 VERSION = 1

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from deworldsg_ros.client.boxes import box_of
 from deworldsg_ros.client.changes import MOVED_M, MOVED_PART
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.scene import wire
@@ -103,12 +104,3 @@ class History:
         taken = list(self._begun.values()), self._ended
         self._begun, self._ended = {}, {}
         return taken
-
-
-def box_of(node: wire.NodeState) -> tuple[Point, Point]:
-    """Centre and size of an object's box, metres, as in `Stay`."""
-    if isinstance(node.box, wire.GravityBox):
-        (x, y, z), (a, b, c) = node.box.center_m, node.box.size_m
-        return (x, y, z), (a, b, c)
-    x, y, z = node.mean_m
-    return (x, y, z), (0.0, 0.0, 0.0)

@@ -18,6 +18,7 @@ from deworldsg_ros.ros.options import (  # noqa: E402
     FleetLinkParameters,
     FleetParameters,
     Parameters,
+    RegionParameters,
     ReplayParameters,
     ViewerParameters,
 )
@@ -68,6 +69,7 @@ def with_tables(text: str) -> str:
         "abnormal": abnormal.table(),
         "parameters": parameters_table(fields(Parameters)),
         "viewer": parameters_table([f for f in fields(ViewerParameters) if f.path[0] == "node"]),
+        "region": parameters_table(fields(RegionParameters)),
         "fleet": parameters_table(fields(FleetParameters)),
         "fleet_link": parameters_table(fields(FleetLinkParameters)),
         # The configuration is in the other table.

@@ -22,7 +22,7 @@ PACKAGE = "deworldsg_ros"
 EXECUTABLES = {
     *("segmentation_node", "lifting_node", "relation_node", "graph_node"),
     *("deworldsg_node", "odometry_node", "replay_node", "viewer_node"),
-    *("fleet_node", "fleet_link_node"),
+    *("fleet_node", "fleet_link_node", "region_node"),
 }
 SOURCES = (
     *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"),
