@@ -11,7 +11,6 @@ import typer
 
 from deworldsg_ros.cli.ask import AsJson, Live, Namespace, Words, print_json
 from deworldsg_ros.client.errors import ClientError
-from deworldsg_ros.map_file import edit_map
 from deworldsg_ros.scene.edits import (
     DeleteNode,
     EditRequest,
@@ -40,6 +39,8 @@ def edit(
     if path is None:
         reply = _edit_live(namespace, rest[0], request)
     else:
+        from deworldsg_ros.map_file import edit_map  # with all stages: slow to import
+
         reply = msgspec.to_builtins(edit_map(path, request))
     if as_json:
         print_json(reply)

@@ -10,7 +10,6 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from deworldsg_ros.merging.matching import CLASS_AGREEMENT
 from deworldsg_ros.merging.node_records import NodeRecords
@@ -136,6 +135,8 @@ def _parts(graph: SceneGraph, points: Float32, on_nodes: dict[int, float]) -> li
         return whole
     surfaces = [graph.nodes.surface(graph.nodes.row(node_id)) for node_id in sides]
     side_of = np.repeat(np.arange(len(sides)), [len(surface) for surface in surfaces])
+    from scipy.spatial import cKDTree  # slow to import, and only for edits
+
     nearest = side_of[cKDTree(np.concatenate(surfaces)).query(points)[1]]
     parts = [np.flatnonzero(nearest == side) for side in range(len(sides))]
     parts = [part for part in parts if len(part) >= CUT_FRACTION * len(points)]
@@ -206,6 +207,8 @@ def _cut_pixels(
     seen = np.stack([x, y, np.ones(len(x))], axis=1) * depths_m[:, None]
     seen = seen @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     part_of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    from scipy.spatial import cKDTree  # slow to import, and only for edits
+
     nearest = part_of[cKDTree(points[np.concatenate(parts)]).query(seen)[1]]
     instances = grid.instances.copy()
     instances[rows, columns] = np.array(values, np.uint16)[nearest]

@@ -7,8 +7,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from scipy.cluster.vq import kmeans2
-from scipy.spatial import cKDTree
 
 from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.life_cycle import LifeCycle
@@ -174,6 +172,8 @@ class SurfaceEditor(Editor):
             )
         label = graph.edits.labels.get(old_id, "")
         new_ids = [copy_node(graph, old_id, points_world=part) for part in parts]
+        from scipy.spatial import cKDTree  # slow to import, and only for edits
+
         tree = cKDTree(np.concatenate(parts))
         sides = np.repeat([0, 1], [len(part) for part in parts])
 
@@ -267,6 +267,8 @@ def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
     if not len(points):
         return []
     places = np.array(near_m, np.float64) if near_m else _ends(points)
+    from scipy.spatial import cKDTree  # slow to import, and only for edits
+
     sides = cKDTree(places).query(points)[1]
     parts = sorted((points[sides == side] for side in (0, 1)), key=len, reverse=True)
     return [part for part in parts if len(part) >= MIN_PART_POINTS]
@@ -274,6 +276,8 @@ def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
 
 def _ends(points: Float32) -> Any:
     """The centres (2, 3) of two clusters, which start at the ends of the longest axis."""
+    from scipy.cluster.vq import kmeans2  # slow to import, and only for edits
+
     along = (points - points.mean(axis=0)) @ np.linalg.svd(np.cov(points.T))[0][:, 0]
     ends = points[[along.argmin(), along.argmax()]].astype(np.float64)
     return kmeans2(points.astype(np.float64), ends, minit="matrix")[0]

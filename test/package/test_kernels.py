@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
 import sys
 from pathlib import Path
 
@@ -41,3 +42,19 @@ def test_no_frame_waits_for_the_compiler(root_dir: Path) -> None:
     recording.close()
     late = {name: found - before.get(name, set()) for name, found in signatures().items()}
     assert {name: found for name, found in late.items() if found} == {}
+
+
+@pytest.mark.parametrize(
+    "modules",
+    [
+        "deworldsg_ros.cli.app, deworldsg_ros.cli.demo, deworldsg_ros.client",
+        "deworldsg_ros.nodes.graph_node, deworldsg_ros.nodes.relation_node",
+        "deworldsg_ros.nodes.lifting_node, deworldsg_ros.nodes.segmentation_node",
+        "deworldsg_ros.nodes.replay_node, deworldsg_ros.nodes.deworldsg_node",
+    ],
+)
+def test_a_start_imports_nothing_slow_that_it_may_not_need(modules: str) -> None:
+    slow = {"numba", "scipy", "matplotlib", "onnxruntime", "numpy.ma"}
+    code = f"import sys, {modules}; print(*({slow} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
