@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from deworldsg_ros.cli.outputs import print_noted
 from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
-from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.recordings.recording import Recording
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
+
+if TYPE_CHECKING:  # all stages: `deworldsg demo` starts without them
+    from deworldsg_ros.pipeline import FrameResult, Pipeline
 
 
 class RunObserver:
@@ -42,6 +43,8 @@ class RunObserver:
             pipeline: that processed them.
             drops: counts by owner and reason.
         """
+        from deworldsg_ros.perception.stage import Perception
+
         perception, builder = pipeline.perception, pipeline.builder
         graph = None if builder is None else pipeline.graph()
         reasons: Counter[str] = Counter()
