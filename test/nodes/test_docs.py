@@ -109,6 +109,32 @@ def test_every_reason_of_the_code_is_explained() -> None:
     assert used <= set(REASONS)
 
 
+def topics_in(path: Path) -> set[str]:
+    """Names of topics that a module publishes or subscribes to by a literal."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            at = {"create_publisher": 1, "create_subscription": 1}.get(name, 0)
+            calls = ("create_publisher", "create_subscription", "listen_json", "source")
+            if name in (*calls, "json_publisher", "text_publisher") and len(node.args) > at:
+                topic = node.args[at]
+                if isinstance(topic, ast.Constant) and isinstance(topic.value, str) and topic.value:
+                    found.add(topic.value)
+    return found
+
+
+def test_every_topic_of_the_code_is_on_the_page() -> None:
+    package = ROOT / "deworldsg_ros"
+    paths = [path for name in ("nodes", "ros") for path in sorted((package / name).rglob("*.py"))]
+    used = set().union(*(topics_in(path) for path in paths))
+    assert {"deworldsg/frame_graph", "scene_graph/updates", "/diagnostics"} <= used
+    page = (ROOT / "docs" / "topics_and_parameters.md").read_text(encoding="utf-8")
+    assert {
+        topic for topic in used if f"`{topic}`" not in page.replace("`/scene", "`scene")
+    } == set()
+
+
 if __name__ == "__main__":
     for page in PAGES:
         page.write_text(with_tables(page.read_text(encoding="utf-8")), encoding="utf-8")

@@ -24,7 +24,10 @@ Score = Callable[[Topic], "tuple[float, ...] | None"]
 
 IMAGES = (IMAGE, COMPRESSED_IMAGE)
 # Suffixes of image_transport: the user may name a topic without them, as for ROS nodes.
-TRANSPORT_SUFFIXES = {Role.RGB: ("", "/compressed"), Role.DEPTH: ("", "/compressedDepth")}
+TRANSPORT_SUFFIXES = {
+    Role.RGB: ("", "/compressed"),
+    Role.DEPTH: ("", "/compressedDepth", "/compressed"),
+}
 # In order of preference.
 POSES = (POSE_STAMPED, ODOMETRY, TF_MESSAGE)
 # Names of images that are neither colour nor depth.
