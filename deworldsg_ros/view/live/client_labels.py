@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.view.live.drawing import Label
 from deworldsg_ros.view.live.labels import Camera, Placed, place
+from deworldsg_ros.view.live.tables import Label
 
 # One label for so many pixels of the view, and never more than this.
 PIXELS_PER_LABEL = 7_000

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
-from deworldsg_ros.client.objects import SceneObject
+from deworldsg_ros.client.objects import SURE
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64, Int64, UInt8
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.view.colours import GREY, class_colours, predicate_colours, to_rgb
 from deworldsg_ros.view.geometry import MUTUAL
 from deworldsg_ros.view.live.filters import Filter
-from deworldsg_ros.view.live.tables import ObjectTable
+from deworldsg_ros.view.live.tables import Label, ObjectTable
 
 Shape = Literal["boxes", "ellipsoids"]
 
@@ -32,22 +33,6 @@ MOST_PREDICATE_LABELS = 120
 # Of the unit cube, and pairs of corners that share a side.
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _SIDES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1])
-
-
-class Label(NamedTuple):
-    """A text in the scene.
-
-    Attributes:
-        key: stable identity.
-        text: what it says.
-        position: (3,) world, metres.
-        weight: labels of more weight are placed first.
-    """
-
-    key: str
-    text: str
-    position: Float64
-    weight: float
 
 
 @dataclass(frozen=True)
@@ -106,14 +91,13 @@ def draw(
     rows = _shown(table, chosen)
     ids = table.ids[rows].tolist()
     by_id = node_colours(table)
-    colours = _rgb([by_id[node_id] for node_id in ids])
+    colours = rgb_of([by_id[node_id] for node_id in ids])
     centres, sizes, wxyzs = table.centres[rows], table.sizes[rows], table.wxyzs[rows]
-    items = [table.objects[node_id] for node_id in ids]
     outlines = np.zeros((0, 2, 3)) if shape == "ellipsoids" else outlines_of(centres, sizes, wxyzs)
     shown_edges = _edges_between(set(ids), edges, chosen)
     counts = Counter(edge.predicate for edge in shown_edges)
     tints = predicate_colours(counts)
-    edge_colours = _rgb(
+    edge_colours = rgb_of(
         [
             tints[edge.predicate]
             if selected is None or selected in (edge.subject, edge.object)
@@ -129,14 +113,14 @@ def draw(
         wxyzs=table.ellipsoid_wxyzs[rows] if shape == "ellipsoids" else wxyzs,
         scales=table.diameters[rows] if shape == "ellipsoids" else sizes,
         colours=colours,
-        opacities=np.array([_opacity(item, selected) for item in items]),
+        opacities=_opacities(table, rows, selected),
         outlines=outlines,
         outline_colours=np.repeat(colours, len(outlines) // max(len(rows), 1), axis=0),
         arrows=segments[~both_ways],
         arrow_colours=edge_colours[~both_ways],
         lines=segments[both_ways],
         line_colours=edge_colours[both_ways],
-        labels=(*_object_labels(items, selected), *_edge_labels(shown_edges, segments)),
+        labels=(*_object_labels(table, ids, selected), *_edge_labels(shown_edges, segments)),
     )
 
 
@@ -207,19 +191,18 @@ def _segments(table: ObjectTable, edges: list[wire.EdgeState]) -> Float64:
     return np.stack([tails + shift, tips + shift], axis=1)
 
 
-def _opacity(item: SceneObject, selected: int | None) -> float:
-    if item.id == selected:
-        return OPACITIES[2]
-    return OPACITIES[item.is_sure]
+def _opacities(table: ObjectTable, rows: Int64, selected: int | None) -> Float64:
+    faint, usual, strong = OPACITIES
+    opacities = np.where(table.probabilities[rows] >= SURE, usual, faint)
+    opacities[table.ids[rows] == selected] = strong
+    return opacities
 
 
-def _object_labels(items: list[SceneObject], selected: int | None) -> list[Label]:
-    labels = []
-    for item in items:
-        top = np.array(item.position_m) + item.size_m[2] / 2 * np.array(item.up)
-        weight = 1e9 if item.id == selected else float(np.prod(item.size_m))
-        text = f"{item.label} {item.id}" if item.is_sure else f"{item.label}? {item.id}"
-        labels.append(Label(f"object {item.id}", text, top, weight))
+def _object_labels(table: ObjectTable, ids: list[int], selected: int | None) -> list[Label]:
+    labels = [table.texts[node_id] for node_id in ids]
+    if selected in ids:
+        at = ids.index(selected)
+        labels[at] = labels[at]._replace(weight=math.inf)
     return labels
 
 
@@ -238,7 +221,7 @@ def _edge_labels(edges: list[wire.EdgeState], segments: Float64) -> list[Label]:
     ]
 
 
-def _rgb(colours: list[str]) -> UInt8:
+def rgb_of(colours: list[str]) -> UInt8:
     """(n, 3) uint8 of n #rrggbb."""
     known = {colour: [round(255 * value) for value in to_rgb(colour)] for colour in set(colours)}
     return np.array([known[colour] for colour in colours], np.uint8).reshape(-1, 3)

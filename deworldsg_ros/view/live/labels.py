@@ -9,7 +9,8 @@ import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float64
 from deworldsg_ros.scene.boxes import shared_areas
-from deworldsg_ros.view.live.drawing import Label, rotations
+from deworldsg_ros.view.live.drawing import rotations
+from deworldsg_ros.view.live.tables import Label
 
 # Of viser's labels at a scale of one: 12 px letters of this mean width, in a frame.
 LETTER_PX = 6.6

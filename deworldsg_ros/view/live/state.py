@@ -12,11 +12,10 @@ from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
 from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.extent import DEFAULT_UP
 from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.view.colours import to_rgb
 from deworldsg_ros.view.live.camera import CameraView, Shot, Shots, jpeg, with_masks
 from deworldsg_ros.view.live.crops import BestViews
 from deworldsg_ros.view.live.details import counted
-from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours
+from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours, rgb_of
 from deworldsg_ros.view.live.filters import Filter
 from deworldsg_ros.view.live.history import History
 from deworldsg_ros.view.live.tables import ObjectTable
@@ -107,11 +106,11 @@ class LiveState:
             points = item.surface_m if len(item.surface_m) else self._points.get(node_id)
             if points is not None and len(points) and item.label not in self.filter.hidden_classes:
                 parts.append(np.asarray(points, np.float32))
-                tints.append([255 * value for value in to_rgb(self._colours[node_id])])
+                tints.append(self._colours[node_id])
         if not parts:
             return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
         points = np.concatenate(parts)
-        colours = np.repeat(np.array(tints, np.uint8), [len(part) for part in parts], axis=0)
+        colours = np.repeat(rgb_of(tints), [len(part) for part in parts], axis=0)
         stride = -(-len(points) // MOST_POINTS)
         return points[::stride], colours[::stride]
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from deworldsg_ros.client.objects import Point, SceneObject, scene_object
+from deworldsg_ros.client.objects import SURE, Point, SceneObject, scene_object
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
@@ -15,6 +17,22 @@ from deworldsg_ros.view.geometry import SIGMAS, principal_axes
 
 # Thinner ellipsoids are invisible from the side.
 LEAST_DIAMETER_M = 0.012
+
+
+class Label(NamedTuple):
+    """A text in the scene.
+
+    Attributes:
+        key: stable identity.
+        text: what it says.
+        position: (3,) world, metres.
+        weight: labels of more weight are placed first.
+    """
+
+    key: str
+    text: str
+    position: Float64
+    weight: float
 
 
 class ObjectTable(Columns):
@@ -27,6 +45,7 @@ class ObjectTable(Columns):
         means, ellipsoid_wxyzs, diameters: the same of the ellipsoids (2σ).
         probabilities: (n,) that it exists and is of its class.
         objects: each object by its id.
+        texts: the label of each object by its id.
     """
 
     centres: Float64
@@ -46,6 +65,7 @@ class ObjectTable(Columns):
             }
         )
         self.objects: dict[int, SceneObject] = {}
+        self.texts: dict[int, Label] = {}
 
     @property
     def labels(self) -> list[str]:
@@ -57,7 +77,7 @@ class ObjectTable(Columns):
         gone = [node_id for node_id in self.objects if node_id not in nodes]
         for node_id in gone:
             self.remove(node_id)
-            del self.objects[node_id]
+            del self.objects[node_id], self.texts[node_id]
         changed = [
             node
             for node_id, node in nodes.items()
@@ -78,4 +98,7 @@ class ObjectTable(Columns):
         self.means[row] = item.mean_m
         self.ellipsoid_wxyzs[row] = np.roll(quaternion_from_rotation(axes), 1)
         self.diameters[row] = np.maximum(2 * SIGMAS * deviations, LEAST_DIAMETER_M)
-        self.probabilities[row] = item.probability
+        self.probabilities[row] = probability = item.probability
+        top = np.array(item.position_m) + item.size_m[2] / 2 * np.array(item.up)
+        text = f"{item.label}{'' if probability >= SURE else '?'} {item.id}"
+        self.texts[item.id] = Label(f"object {item.id}", text, top, math.prod(item.size_m))

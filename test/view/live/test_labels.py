@@ -7,7 +7,6 @@ import pytest
 
 from deworldsg_ros.scene.boxes import shared_areas
 from deworldsg_ros.view.live.client_labels import overview
-from deworldsg_ros.view.live.drawing import Label
 from deworldsg_ros.view.live.labels import (
     ANCHORS,
     FRAME_PX,
@@ -16,6 +15,7 @@ from deworldsg_ros.view.live.labels import (
     Camera,
     place,
 )
+from deworldsg_ros.view.live.tables import Label
 
 # Looks along +y, z is up: x right, y down is -z.
 AHEAD = Camera(np.zeros(3), np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]), np.pi / 2, 800.0, 600.0)
