@@ -275,6 +275,10 @@ class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             le=1,
         ),
     ] = 0.5
+    publish_tf: Annotated[
+        bool,
+        option("also publish the boxes of the objects to /tf, as object_ID (needs tf2_msgs)"),
+    ] = False
     include_surface_points: Annotated[
         bool, option("publish the surface points of each node (large messages)")
     ] = False

@@ -18,6 +18,7 @@ from visualization_msgs.msg import MarkerArray
 from deworldsg_ros.ros.detections import TOPIC, VISION_MSGS, detection_array
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode
+from deworldsg_ros.ros.object_transforms import ObjectTransforms
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene import wire
@@ -74,6 +75,9 @@ class WholeGraph:
     Args:
         node: publishes, and counts errors.
         markers: the markers of a snapshot (`view.markers`).
+
+    Raises:
+        ConfigurationError: if TF is configured and tf2_msgs is not installed.
     """
 
     def __init__(self, node: StageNode, markers: MakeMarkers) -> None:
@@ -89,6 +93,8 @@ class WholeGraph:
             self._detections = node.create_publisher(
                 VISION_MSGS.Detection3DArray, TOPIC, reliable(1, latched=True)
             )
+        uses_tf = node.parameters.output.publish_tf
+        self._transforms = ObjectTransforms(node) if uses_tf else None
         self._changed = False
         self._due_s = 0.0
         self._worker = Worker("whole graph", self._work, size=1, on_overrun=lambda snapshot: None)
@@ -121,5 +127,7 @@ class WholeGraph:
             )
             if self._detections is not None:
                 self._detections.publish(detection_array(snapshot, stamp))
+            if self._transforms is not None:
+                self._transforms.publish(snapshot, stamp)
         now_s = time.monotonic()
         self._due_s = max(self._due_s, now_s + (now_s - started_s) / MAX_SHARE)

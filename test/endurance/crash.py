@@ -16,16 +16,14 @@ from deworldsg_ros.map_file import previous_of, read_map
 from deworldsg_ros.scene.errors import ConfigurationError
 from endurance.rig import NODES, Rig
 
-# A node is restarted at once. The graph has to be updated again within this time after the node is
-# ready, in most cases: on a busy machine a single frame can take longer.
+# A node is restarted at once. The graph has to be updated again within this time after the restart.
 WHOLE_WITHIN_S = 5.0
-# A replay whose frames were lost with a node waits for them for 30 s (`STALL_S` of replay_node).
-PATIENCE_S = 60.0
+PATIENCE_S = 30.0
 # Importing, compiled kernels from their cache, weights: on a busy machine with two cores.
 START_LIMIT_S = 120.0
 FIRST_GRAPH_S = 60.0
-# Between two kills.
-LONGEST_LIFE_S = 8.0
+# Between two kills: 50 kills take about five minutes on two idle cores.
+LONGEST_LIFE_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +41,11 @@ class Recovery:
     start_s: float
     whole_s: float
     problem: str = ""
+
+    @property
+    def recovered_s(self) -> float:
+        """From the restart until the graph is updated again."""
+        return self.start_s + self.whole_s
 
 
 def kill_and_restart(rig: Rig, name: str) -> Recovery:
@@ -113,13 +116,15 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         recoveries = crash(options.kills, Path(folder), options.seed)
     problems = [item for item in recoveries if item.problem]
-    times_s = [item.whole_s for item in recoveries]
-    print(
-        f"{len(recoveries)} kills, {len(problems)} problems; updated again after "
-        f"{np.median(times_s):.1f} s (median), {max(times_s):.1f} s (most); ready after "
-        f"{np.median([item.start_s for item in recoveries]):.1f} s (median)"
-    )
-    return 1 if problems or np.median(times_s) > WHOLE_WITHIN_S else 0
+    late = [item for item in recoveries if item.recovered_s > WHOLE_WITHIN_S]
+    print(f"{len(recoveries)} kills, {len(problems)} problems, {len(late)} later than 5 s")
+    for what, times_s in (
+        ("restart to updated graph", [item.recovered_s for item in recoveries]),
+        ("restart to ready", [item.start_s for item in recoveries]),
+        ("ready to updated graph", [item.whole_s for item in recoveries]),
+    ):
+        print(f"  {what}: {np.median(times_s):.1f} s (median), {max(times_s):.1f} s (most)")
+    return 1 if problems or late else 0
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import pytest
 from deworldsg_ros.config import Config
 from deworldsg_ros.ros.options import DebugOptions, NodeOptions, ReplayOptions
 
-# 57: `debug.faults`; 58: `output.objects_tf`. Both were asked for, and replace nothing.
+# 57: `debug.faults`; 58: `output.publish_tf`. Both were asked for, and replace nothing.
 MAX_OPTIONS = 58
 MAX_FUNCTION_LINES = 60
 MAX_CLASS_LINES = 200

@@ -1,4 +1,4 @@
-"""Objects as Detection3DArray. There is no wheel of vision_msgs: where it lacks, it is imitated."""
+"""Objects as Detection3DArray and on /tf. Where vision_msgs lacks, it is imitated."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ from types import SimpleNamespace as Value
 
 import pytest
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Pose, PoseWithCovariance, Vector3
+from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Vector3
 from std_msgs.msg import Header
 from support.view import make_graph, make_node
 
 from deworldsg_ros.ros import detections
+from deworldsg_ros.ros import object_transforms as object_transforms_module
+from deworldsg_ros.ros.object_transforms import object_transforms
 from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.errors import ConfigurationError
 
 IMITATED = Value(
     Detection3DArray=lambda: Value(header=Header(), detections=[]),
@@ -50,3 +53,18 @@ def test_every_object_with_a_box_is_a_detection(installed: bool) -> None:
     assert first.pose.covariance.reshape(6, 6)[:2, :2].tolist() == [[0.04, 0.001], [0.001, 0.01]]
     assert first.pose.covariance[14] == 0.0025
     assert not first.pose.covariance[21:].any()
+
+
+def test_every_object_with_a_box_is_a_frame() -> None:
+    graph = make_graph([boxed(7), make_node(8, "shadow")])
+    (found,) = object_transforms(graph, Time(sec=3), "robot1/")
+    assert (found.header.frame_id, found.child_frame_id) == ("map", "robot1/object_7")
+    assert found.header.stamp.sec == 3
+    assert found.transform.translation == Vector3(x=1.0, y=2.0, z=3.0)
+    assert found.transform.rotation == Quaternion(x=0.0, y=0.0, z=1.0, w=0.0)
+
+
+def test_frames_of_objects_need_tf2_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_transforms_module, "TFMessage", None)
+    with pytest.raises(ConfigurationError, match="output.publish_tf is true, but tf2_msgs"):
+        object_transforms_module.ObjectTransforms(Value())
