@@ -165,8 +165,7 @@ class NodeRecords:
         from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
 
         owners = [self._owners[node_id] for node_id in sorted(self._owners)]
-        balances = self.joint.balances
-        pairs = [[*sorted(map(self.node, pair)), balance] for pair, balance in balances.items()]
+        pairs = [[*sorted(map(self.node, pair)), n] for pair, n in self.joint.balances.items()]
         return {
             "cell_m": np.array(self.map.cell_m),
             # Without the padding between fields, which is memory of the process.
@@ -182,8 +181,8 @@ class NodeRecords:
         """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
         nodes, owner_of = graph.nodes, dict[int, int]()
         for node_id, row in zip(node_ids, map(nodes.row, node_ids)):
-            named_ns = int(nodes.last_seen_ns[row])
-            owner_of[node_id] = self.add(node_id, nodes.class_probabilities[row], named_ns)
+            classes, last_ns = nodes.class_probabilities[row], int(nodes.last_seen_ns[row])
+            owner_of[node_id] = self.add(node_id, classes, last_ns)
         self.place(graph, list(owner_of.values()))
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
