@@ -28,6 +28,7 @@ from deworldsg_ros.scene.limits import RESTART_NS
 from deworldsg_ros.scene.node_states import hidden_node
 from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.seen_frames import FrameMemory
+from deworldsg_ros.scene.seen_space import SeenSpace
 from deworldsg_ros.scene.up import UpEstimator
 
 # Parts of the kernels that take about equally long to compile.
@@ -47,6 +48,7 @@ class GraphBuilder:
         graph: the global graph.
         merging: the association rule.
         frames: from which frames the nodes and edges come.
+        space: the space that the camera has seen as free.
         prior: of class pairs.
     """
 
@@ -75,7 +77,7 @@ class GraphBuilder:
             top_k=output.top_k,
             include_surface_points=output.include_surface_points,
         )
-        self.frames = FrameMemory()
+        self.frames, self.space = FrameMemory(), SeenSpace()
         self._newest_ns: int | None = None
 
     @property
@@ -122,6 +124,7 @@ class GraphBuilder:
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
         self._edges.observe(local, node_ids)
         self.frames.note(self.graph, local, node_ids)
+        self.space.note(local)
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
         return node_ids
@@ -170,6 +173,7 @@ class GraphBuilder:
         for node_id in node_ids:
             self.graph.move_node(node_id, T_correction)
         self.merging.moved(self.graph, node_ids, T_correction)
+        self.space.move(T_correction, since_ns)
         return node_ids
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:

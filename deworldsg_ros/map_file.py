@@ -1,7 +1,7 @@
 """A graph as a map: a file from which a later run continues.
 
-It contains the graph, the state of merging, the priors of class pairs, the up direction, and from
-which frames everything comes.
+It contains the graph, the state of merging, the priors of class pairs, the up direction, from which
+frames everything comes, and the space that the camera saw as free.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ def copy_state(builder: GraphBuilder) -> Arrays:
     arrays = graph_io.to_arrays(builder.graph.state())
     seen = np.frombuffer(msgspec.json.encode(builder.frames.all(builder.graph)), np.uint8)
     up = np.array(builder.up.state())
-    return {**arrays, **memory, "prior": prior, "up": up, "seen_frames": seen}
+    more = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
+    return {**arrays, **memory, **more}
 
 
 def write_state(state: Arrays, path: Path) -> None:
@@ -153,6 +154,7 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     builder.merging.restore(graph, memory)
     if "up" in arrays:  # not in maps of older releases
         builder.up.restore(arrays["up"])
+    builder.space.restore(arrays)
     if "seen_frames" in arrays:  # nor this
         content = checked(arrays, "seen_frames", np.uint8, None).tobytes()
         builder.frames = FrameMemory(parse_json(content, list[SeenFrames]))

@@ -75,6 +75,7 @@ def goal(
             + f"\n{found.distance_m:.2f} m from it; next object {found.clearance_m:.2f} m away; "
             f"it extends {found.along_std_m:.2f} m (1σ) along, {found.across_std_m:.2f} m across "
             "the view"
+            + ("" if found.seen_free is None else f"\nseen as free: {found.seen_free:.0%}")
             + ("" if found.in_known_area else "\nnot sure: the pose is outside of all objects")
             + (f"\nnot sure: {found.blocked_by.name} may hide it" if found.blocked_by else "")
         )

@@ -21,6 +21,7 @@ from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.scene.seen_frames import path_beside
+from deworldsg_ros.scene.seen_space import space_path
 from deworldsg_ros.scene.up import UpEstimator
 
 PICTURE_FILE = "scene_graph.png"
@@ -28,7 +29,8 @@ PAGE_FILE = "scene_graph.html"
 CONFIG_FILE = "config.yaml"
 REPORT_FILE = "run.json"
 FRAMES_FILE = path_beside(Path(GRAPH_FILE)).name
-RESULTS = (CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE, FRAMES_FILE)
+SPACE_FILE = space_path(Path(GRAPH_FILE)).name
+RESULTS = (CONFIG_FILE, GRAPH_FILE, PICTURE_FILE, PAGE_FILE, REPORT_FILE, FRAMES_FILE, SPACE_FILE)
 # Rows of each printed table, to fit a screen; the page shows everything.
 MOST_ROWS = 25
 # Side of the photos in the picture.
@@ -120,6 +122,7 @@ def print_files(console: Console, out: Path) -> None:
         (PICTURE_FILE, "top view"),
         (GRAPH_FILE, "the graph, with surface points"),
         (FRAMES_FILE, "the frames that it comes from"),
+        (SPACE_FILE, "the space that the camera saw as free"),
         (CONFIG_FILE, "the effective configuration"),
         (REPORT_FILE, "frames, drops by reason, times"),
     ):

@@ -42,6 +42,7 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.scene.seen_frames import write_seen
+from deworldsg_ros.scene.seen_space import write_space
 from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
 from deworldsg_ros.view.photos import Album
 from deworldsg_ros.words import counted
@@ -255,6 +256,7 @@ def _write_results(options: RunOptions, ran: _Ran, console: Console) -> None:
         if pipeline.builder is not None:
             seen = pipeline.builder.frames.all(pipeline.builder.graph)
             write_seen(path, wire.ns_from_stamp(graph.stamp), seen)
+            write_space(path, pipeline.builder.space)
         world_up = pipeline.config.inputs.world_up
         frames = processed.album.frames
         outputs.show_graph(staged, graph, console, T_world_cameras, world_up, frames)

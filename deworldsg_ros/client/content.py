@@ -20,6 +20,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.extent import DEFAULT_UP
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
 from deworldsg_ros.scene.seen_frames import SeenFrames
+from deworldsg_ros.scene.seen_space import SeenSpace
 from deworldsg_ros.words import counted
 
 # What an argument of a question may be: an object, its id, or the name of a class.
@@ -32,6 +33,7 @@ class GraphContent:
     def __init__(self, message: wire.SceneGraphMessage, seen: Iterable[SeenFrames] = ()) -> None:
         self.message = message
         self._seen = {(item.node, item.other): item for item in seen}
+        self.space: SeenSpace | None = None
         self.frame_id = message.frame_id
         self.stamp_ns = wire.ns_from_stamp(message.stamp)
         self.sequence = message.sequence

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,16 @@ from deworldsg_ros.client.objects import Point, SceneObject
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.extent import horizontal_axes
+from deworldsg_ros.scene.seen_space import SeenSpace
 
 # Directions around an object that are tried.
 DIRECTIONS = 72
 # Half the width of a robot, and its height. A box above the robot is not in its way.
 ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.3, 1.5
+# Heights above the floor at which the seen space is looked at; below, the floor itself is seen.
+LOWEST_M, HEIGHT_STEP_M = 0.2, 0.3
+# Something is at a spot if more than this share of the robot's volume was seen as occupied.
+MAX_OCCUPIED = 0.05
 # The floor is this quantile of the bottoms of all boxes: few objects seem to be below it.
 FLOOR_QUANTILE = 0.05
 
@@ -43,6 +48,8 @@ class Goal:
         bearing_std_rad: angle of `across_std_m` as seen from here.
         blocked_by: an object that reaches into the line of sight, or None.
         in_known_area: the pose is between the objects of the graph. Outside, there may be a wall.
+        seen_free: share of the robot's volume there that the camera has seen as free; None = the
+            depth images of the run are not at hand.
     """
 
     target: SceneObject
@@ -59,6 +66,7 @@ class Goal:
     bearing_std_rad: float
     blocked_by: SceneObject | None
     in_known_area: bool
+    seen_free: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON, with the fields of a geometry_msgs/PoseStamped."""
@@ -78,6 +86,7 @@ class Goal:
             "bearing_std_deg": round(math.degrees(self.bearing_std_rad), 1),
             "blocked_by": None if self.blocked_by is None else self.blocked_by.id,
             "in_known_area": self.in_known_area,
+            "seen_free": None if self.seen_free is None else round(self.seen_free, 2),
         }
 
     def pose_stamped(self) -> Any:
@@ -95,14 +104,15 @@ def goal_near(
     *,
     radius: float = ROBOT_RADIUS_M,
     towards: Point | None = None,
+    space: SeenSpace | None = None,
 ) -> Goal:
     """A pose at a distance from the box of an object, facing it, on a free side.
 
     Every direction around the object is tried. A direction is free if a disc of the robot's radius
     touches no other box that is lower than the robot. Of the free ones, the best sees the side of
     the object whose surface was seen, past no other object that hides it, is between the objects of
-    the graph, and is nearest to `towards`. Only objects of the graph are known: a wall that is no
-    object is not.
+    the graph, and is nearest to `towards`. Walls are no objects: they are known only from `space`.
+    Then a direction is not free, either, if the camera has seen something there.
 
     Args:
         target: to look at.
@@ -111,6 +121,7 @@ def goal_near(
         stamp_ns: of the graph.
         radius: of the robot, metres.
         towards: preferred position, e.g. where the robot is.
+        space: what the camera has seen as free; None = not known.
 
     Raises:
         ClientError: if the distance is not positive, or no direction is free.
@@ -123,14 +134,19 @@ def goal_near(
     area = _hull(np.concatenate([item.footprint.corners for item in [target, *obstacles]]))
     boxes = np.array([item.footprint.corners for item in low]).reshape(-1, 4, 2)
     best: tuple[float, Goal] | None = None
-    for ray in _rays():
-        spot = _spot(target.footprint, ray, distance)
+    rays = _rays()
+    spots = np.array([_spot(target.footprint, ray, distance) for ray in rays])
+    shares = _seen_free(space, target, spots, floor, radius)
+    for ray, spot, seen_free in zip(rays, spots, shares):
         clearance = float(point_gaps_m(spot, boxes).min(initial=math.inf)) - radius
         if clearance <= 0.0:
+            continue
+        if seen_free is not None and seen_free < 0.0:
             continue
         blocker = _blocker(target, obstacles, spot)
         known = bool(point_gaps_m(spot, area[None])[0] == 0.0)
         goal = _goal(target, ray, spot, floor, stamp_ns, clearance, blocker, known)
+        goal = replace(goal, seen_free=seen_free)
         score = _score(goal, towards)
         if best is None or score > best[0] + 1e-9:
             best = (score, goal)
@@ -145,7 +161,7 @@ def goal_near(
 def _score(goal: Goal, towards: Point | None) -> float:
     """The better, the higher: the order of importance is that of the numbers, chosen by hand."""
     score = 1.0 * goal.in_known_area - 0.5 * (goal.blocked_by is not None) + goal.seen_share
-    score += 0.2 * min(goal.clearance_m, 1.0)
+    score += 0.2 * min(goal.clearance_m, 1.0) + (goal.seen_free or 0.0)
     if towards is not None:
         score -= 0.1 * float(np.linalg.norm(np.subtract(goal.position_m, towards)))
     return score
@@ -186,6 +202,21 @@ def free_direction(
         raise ClientError(f"{of.name} has no free side with {room:g} m of room")
     x, y, z = (best[1] @ horizontal_axes(of.up)[:2] + 0.0).tolist()
     return x, y, z
+
+
+def _seen_free(
+    space: SeenSpace | None, target: SceneObject, spots: Float64, floor: float, radius: float
+) -> list[float | None]:
+    """Share of the robot's volume at each spot that was seen as free; -1 = something is there."""
+    if space is None or not len(space):
+        return [None] * len(spots)
+    disc = np.concatenate([np.zeros((1, 2)), radius * _rays()[::9]])
+    heights = floor + np.arange(LOWEST_M, ROBOT_HEIGHT_M, HEIGHT_STEP_M)
+    plan = np.repeat((spots[:, None] + disc).reshape(-1, 2), len(heights), axis=0)
+    levels = np.tile(heights, len(spots) * len(disc))
+    volume = np.column_stack([plan, levels]) @ horizontal_axes(target.up)
+    free, occupied = (seen.reshape(len(spots), -1).mean(axis=1) for seen in space.look(volume))
+    return np.where(occupied > MAX_OCCUPIED, -1.0, free).tolist()
 
 
 def floor_m(items: Sequence[SceneObject]) -> float:

@@ -22,6 +22,7 @@ from deworldsg_ros.client.paths import cheapest_chain
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
 from deworldsg_ros.scene.seen_frames import read_seen
+from deworldsg_ros.scene.seen_space import SeenSpace, read_space
 
 
 class SceneGraph(GraphContent):
@@ -39,18 +40,22 @@ class SceneGraph(GraphContent):
         stamp_ns: time of the newest frame.
         sequence: number of the update.
         up: unit vector against gravity; +z if the message does not tell it.
+        space: the space that the camera has seen as free, for `goal_near`; None = not known.
     """
 
     @classmethod
     def load(cls, path: str | Path) -> SceneGraph:
-        """The graph of a file, or of the folder of a run, with its frames if they are beside it.
+        """The graph of a file, or of the folder of a run, with its frames and its seen space if
+        they are beside it.
 
         Raises:
             RefusedInput: if the file is missing or contains no scene graph.
         """
         file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
         message = read_graph(file)
-        return cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
+        graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
+        graph.space = read_space(file)
+        return graph
 
     def on(self, support: Which, label: str | None = None) -> list[SceneObject]:
         """Objects that are on another one with a probability of at least one half."""
@@ -82,11 +87,11 @@ class SceneGraph(GraphContent):
         *,
         radius: float = ROBOT_RADIUS_M,
         towards: Point | None = None,
+        space: SeenSpace | None = None,
     ) -> Goal:
         """A pose from which an object is in view; see `goals.goal_near`."""
-        return goal_near(
-            self.one(of), self, distance, self.stamp_ns, radius=radius, towards=towards
-        )
+        options = {"radius": radius, "towards": towards, "space": space or self.space}
+        return goal_near(self.one(of), self, distance, self.stamp_ns, **options)
 
     def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
         """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""

@@ -11,6 +11,7 @@ from deworldsg_ros.ros.map_keeper import MapKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.seen_frames import write_seen
+from deworldsg_ros.scene.seen_space import write_space
 from deworldsg_ros.words import counted
 
 
@@ -57,6 +58,7 @@ class GraphFiles:
             write_atomically(self._save_path, wire.encode(message))
             stamp_ns = wire.ns_from_stamp(message.stamp)
             write_seen(self._save_path, stamp_ns, builder.frames.all(builder.graph))
+            write_space(self._save_path, builder.space)
         except OSError as error:
             return False, f"{self._save_path}: {error}"
         nodes, edges = counted(len(message.nodes), "node"), counted(len(message.edges), "edge")

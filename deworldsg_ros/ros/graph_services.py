@@ -146,7 +146,9 @@ class GraphServices:
     def _goal_near(self, request: GoalNear) -> str:
         x, y, z = request.towards or (0.0, 0.0, 0.0)
         towards = None if request.towards is None else (x, y, z)
-        goal: Goal = self._asked().goal_near(request.object, request.distance_m, towards=towards)
+        goal: Goal = self._asked().goal_near(
+            request.object, request.distance_m, towards=towards, space=self._builder.space
+        )
         self._publish_goal(goal.pose_stamped())
         return _json(goal.to_dict())
 

@@ -1,0 +1,145 @@
+"""Which space the camera has seen as free: some depth images of the run, asked for single points.
+
+No map of cells is kept. The depth grids of a bounded number of different views are, and a question
+projects its points into them. So a frame costs nothing, unless it is such a view.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.scene.array_checks import checked, holds, within
+from deworldsg_ros.scene.array_file import read_arrays, write_arrays
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
+from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.frame_graph import LocalGraph
+
+# Views that are kept, the newest: 1.2 MB of 80 x 60 pixels each.
+MAX_VIEWS = 128
+# A view differs from another one if the camera has moved so far, or turned so far.
+MOVED_M, TURNED_RAD = 0.25, math.radians(15.0)
+# A point is free if the image shows something at least so far behind it, and occupied if it shows
+# something as near to it. Noise of depth cameras and poses is below this.
+NEAR_M, NEAR_FRACTION = 0.08, 0.03
+# Depth cameras measure nothing nearer than this.
+MIN_DEPTH_M = 0.1
+
+_NAMES = ("view_depths_mm", "view_poses", "view_cameras", "view_stamps_ns")
+
+
+class SeenSpace:
+    """Depth grids of different views (k views of h x w pixels).
+
+    Attributes:
+        depths_mm: (k, h, w) uint16, 0 = invalid.
+        poses: (k, 4, 4), T_world_camera.
+        cameras: (k, 4), fx, fy, cx, cy in pixels of the grid.
+        stamps_ns: (k,).
+    """
+
+    def __init__(self) -> None:
+        self.depths_mm: UInt16 = np.zeros((0, 0, 0), np.uint16)
+        self.poses: Float64 = np.zeros((0, 4, 4))
+        self.cameras: Float64 = np.zeros((0, 4))
+        self.stamps_ns: Int64 = np.zeros(0, np.int64)
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def note(self, local: LocalGraph) -> None:
+        """Keep the depth grid of a frame, if no view so far is like it."""
+        grid, pose = local.depth_grid, local.T_world_camera
+        if grid is None or self._has(pose):
+            return
+        if grid.depth_mm.shape != self.depths_mm.shape[1:]:  # of another camera
+            self.__init__()  # type: ignore[misc]
+            self.depths_mm = self.depths_mm.reshape(0, *grid.depth_mm.shape)
+        camera, per_px = grid.intrinsics, 1.0 / grid.stride_px
+        values = per_px * np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        kept = slice(-MAX_VIEWS + 1, None)
+        self.depths_mm = np.concatenate([self.depths_mm[kept], grid.depth_mm[None]])
+        self.poses = np.concatenate([self.poses[kept], pose[None]])
+        self.cameras = np.concatenate([self.cameras[kept], values[None]])
+        self.stamps_ns = np.append(self.stamps_ns[kept], local.stamp_ns)
+
+    def look(self, points_world: Float64) -> tuple[Bool, Bool]:
+        """Whether each point (n, 3) was seen as free, and as occupied; neither = not seen.
+
+        Of views that disagree, the majority counts.
+        """
+        free = np.zeros(len(points_world), np.int64)
+        occupied = np.zeros(len(points_world), np.int64)
+        for depth_mm, pose, (fx, fy, cx, cy) in zip(self.depths_mm, self.poses, self.cameras):
+            T = invert_pose(pose)
+            x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
+            ahead = np.maximum(z, MIN_DEPTH_M)
+            columns = np.floor(fx * x / ahead + cx)
+            rows = np.floor(fy * y / ahead + cy)
+            height, width = depth_mm.shape
+            seen = (z > MIN_DEPTH_M) & (columns >= 0) & (columns < width)
+            seen &= (rows >= 0) & (rows < height)
+            at = np.flatnonzero(seen)
+            measured = 0.001 * depth_mm[rows[at].astype(int), columns[at].astype(int)]
+            behind = measured - z[at]
+            near = NEAR_M + NEAR_FRACTION * z[at]
+            free[at] += (measured > 0) & (behind > near)
+            occupied[at] += (measured > 0) & (np.abs(behind) <= near)
+        return free > occupied, (occupied > 0) & (occupied >= free)
+
+    def move(self, T_correction: Float64, since_ns: int) -> None:
+        """Apply a pose-graph correction (4, 4) to the views since a stamp."""
+        since = self.stamps_ns >= since_ns
+        self.poses[since] = T_correction @ self.poses[since]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Copies by name, for `restore`; empty without views."""
+        values = (self.depths_mm, self.poses, self.cameras, self.stamps_ns)
+        return {name: np.array(value) for name, value in zip(_NAMES, values)} if len(self) else {}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Continue with the `arrays` of an earlier run; ValueError if they are none."""
+        if _NAMES[0] not in arrays:
+            return
+        depths_mm = checked(arrays, _NAMES[0], np.uint16, None, None, None)
+        count = len(depths_mm)
+        holds(_NAMES[0], count <= MAX_VIEWS, f"at most {MAX_VIEWS} views")
+        poses = checked(arrays, _NAMES[1], np.float64, count, 4, 4)
+        cameras = checked(arrays, _NAMES[2], np.float64, count, 4)
+        stamps_ns = checked(arrays, _NAMES[3], np.int64, count)
+        within(_NAMES[1], poses, -1e8, 1e8)
+        within(_NAMES[2], cameras, -1e6, 1e6)
+        self.depths_mm, self.poses, self.cameras = depths_mm, poses, cameras
+        self.stamps_ns = stamps_ns
+
+    def _has(self, pose: Float64) -> bool:
+        moved_m = np.linalg.norm(self.poses[:, :3, 3] - pose[:3, 3], axis=1)
+        # The trace of the rotation between both is 1 + 2 cos(angle).
+        traces = np.einsum("kij,ij->k", self.poses[:, :3, :3], pose[:3, :3])
+        turned = traces < 1.0 + 2.0 * math.cos(TURNED_RAD)
+        return bool(((moved_m < MOVED_M) & ~turned).any())
+
+
+def space_path(graph_path: Path) -> Path:
+    """The file with the seen space of a saved graph: ``scene_graph.space.npz``."""
+    return graph_path.with_name(f"{graph_path.stem}.space.npz")
+
+
+def write_space(graph_path: Path, space: SeenSpace) -> None:
+    """Write the file beside a saved graph; also without views, to replace an older one."""
+    write_arrays(space_path(graph_path), space.arrays())
+
+
+def read_space(graph_path: Path) -> SeenSpace | None:
+    """The space beside a saved graph; None if there is no such file."""
+    space = SeenSpace()
+    try:
+        space.restore(read_arrays(space_path(graph_path)))
+    except (OSError, ValueError, MemoryError):
+        return None
+    return space if len(space) else None
