@@ -50,7 +50,7 @@ def copy_state(builder: GraphBuilder) -> Arrays:
     arrays = graph_io.to_arrays(builder.graph.state())
     seen = np.frombuffer(msgspec.json.encode(builder.frames.all(builder.graph)), np.uint8)
     up = np.array(builder.up.state())
-    more = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
+    more: Arrays = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
     return {**arrays, **memory, **more}
 
 

@@ -90,8 +90,10 @@ class SceneGraph(GraphContent):
         space: SeenSpace | None = None,
     ) -> Goal:
         """A pose from which an object is in view; see `goals.goal_near`."""
-        options = {"radius": radius, "towards": towards, "space": space or self.space}
-        return goal_near(self.one(of), self, distance, self.stamp_ns, **options)
+        target, seen = self.one(of), space or self.space
+        return goal_near(
+            target, self, distance, self.stamp_ns, radius=radius, towards=towards, space=seen
+        )
 
     def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
         """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""

@@ -182,7 +182,7 @@ def test_a_bad_request_is_refused_counted_and_changes_nothing(
 
 
 def test_the_calls_in_the_documentation_work(robot: Robot, root_dir: Path) -> None:
-    page = (root_dir / "docs" / "nodes.md").read_text(encoding="utf-8")
+    page = (root_dir / "docs" / "dev" / "nodes.md").read_text(encoding="utf-8")
     calls = [shlex.split(line) for line in page.splitlines() if "service call" in line[:20]]
     assert {call[3].split("/")[-1] for call in calls} == SERVICES
     kinds = {"std_srvs/srv/Trigger": Trigger, "diagnostic_msgs/srv/AddDiagnostics": AddDiagnostics}
