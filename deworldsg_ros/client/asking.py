@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from deworldsg_ros.client.content import distance_m
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import Relation, SceneObject
@@ -34,7 +35,8 @@ def ask(graph: SceneGraph, question: str) -> Answers:
     pattern = parse(question, {edge.predicate for edge in graph.message.edges})
     if isinstance(pattern, Since):
         return _seen_since(graph, question, pattern)
-    answers = [answer for item in graph if (answer := _answer(graph, pattern, item)) is not None]
+    items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
+    answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
     answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
     things = [pattern.thing, *(condition.thing for condition in pattern.conditions)]
     notes = [
@@ -106,10 +108,14 @@ def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | 
 def _best_part(graph: SceneGraph, item: SceneObject, condition: Condition) -> _Part | None:
     """The most probable way to fulfil a condition."""
     if condition.point is not None:
-        close = graph.objects(near=condition.point, within=condition.within_m)
-        return (1.0, None, f"within {condition.within_m:g} m") if item in close else None
+        is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
+        return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
+    if condition.predicate is None:
+        around = graph.objects(near=item, within=condition.within_m or 0.0)
+    else:
+        around = [found.object for found in graph.relations(item, condition.predicate)]
     others: list[tuple[SceneObject, float]] = []
-    for other in graph:
+    for other in sorted(dict.fromkeys(around), key=lambda other: other.id):
         chance = 1.0 if condition.thing is None else other.probability_of(condition.thing)
         if other.id != item.id and chance >= MIN_PROBABILITY:
             others.append((other, chance))
@@ -122,8 +128,7 @@ def _part(
 ) -> _Part | None:
     of = f"{other.name} {chance:.0%}" if condition.thing is not None else other.name
     if condition.predicate is None:
-        gap = dict(graph.neighbours(item, condition.within_m or 0.0)).get(other)
-        return None if gap is None else (chance, None, f"{gap:.2f} m from {of}")
+        return chance, None, f"{distance_m(item, other):.2f} m from {of}"
     found = graph.relations(item, condition.predicate, other)
     if not found:
         return None

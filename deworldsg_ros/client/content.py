@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
+
+import numpy as np
 
 from deworldsg_ros.client.boxes import footprint, gap_m
 from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.client.index import GraphIndex
 from deworldsg_ros.client.objects import (
     HiddenObject,
     Point,
@@ -93,15 +97,16 @@ class GraphContent:
             min_probability: least probability of being an object of the class. By default an object
                 is of its most probable class.
         """
-        found = [item for item in self if _fits(item, label, min_probability)]
+        if near is None and within is not None:
+            raise ClientError("within needs near: a point or an object")
+        items = map(self.__getitem__, self._candidates(label, near, within, min_probability))
+        found = [item for item in items if _fits(item, label, min_probability)]
         if near is None:
-            if within is not None:
-                raise ClientError("within needs near: a point or an object")
             key = (lambda item: item.probability) if label is None else _chance(label)
             return sorted(found, key=lambda item: (-key(item), item.id))
         origin = near.id if isinstance(near, SceneObject) else None
-        ranked = sorted((_distance_m(item, near), item.id) for item in found if item.id != origin)
-        return [self[i] for distance_m, i in ranked if within is None or distance_m <= within]
+        ranked = sorted((distance_m(item, near), item.id) for item in found if item.id != origin)
+        return [self[i] for gap, i in ranked if within is None or gap <= within]
 
     def relations(
         self,
@@ -124,7 +129,8 @@ class GraphContent:
         is_subject, is_object = self._chooser(subject), self._chooser(object)
         names = None if predicate is None else predicate_names(predicate)
         found = []
-        for (a_id, b_id), edge in self._edges.items():
+        for a_id, b_id in self._pairs(subject, object):
+            edge = self._edges[a_id, b_id]
             if a_id not in self._nodes or b_id not in self._nodes:
                 continue
             if names is not None and not any(plain(i.label) in names for i in edge.predicates):
@@ -180,6 +186,38 @@ class GraphContent:
         """The message of a directed edge; None = there is none."""
         return self._edges.get((subject_id, object_id))
 
+    def _candidates(
+        self,
+        label: str | None,
+        near: Point | SceneObject | None,
+        within: float | None,
+        min_probability: float | None,
+    ) -> Iterable[int]:
+        """The ids of all objects that `objects` may find, and of some others."""
+        if near is not None and within is not None:
+            if not isinstance(near, SceneObject):
+                return self._index.around(near, within)
+            reach_m = within + float(np.linalg.norm(near.size_m)) / 2 + 1e-6
+            return self._index.around(near.position_m, reach_m)
+        if label is None:
+            return self._nodes
+        if min_probability is None:
+            return self._index.called(label)
+        return self._index.perhaps(label) if min_probability > 0 else self._nodes
+
+    def _pairs(self, subject: Which | None, object: Which | None) -> Iterable[tuple[int, int]]:
+        """The relations from or to what is asked for, and some others."""
+        which = object if subject is None else subject
+        if which is None:
+            return self._edges
+        if isinstance(which, str):
+            return self._index.touching(self._index.called(which))
+        return self._index.touching([which if isinstance(which, int) else which.id])
+
+    @cached_property
+    def _index(self) -> GraphIndex:
+        return GraphIndex(self._nodes, self._edges)
+
     def _chooser(self, which: Which | None) -> Callable[[SceneObject], bool]:
         if which is None:
             return lambda item: True
@@ -201,7 +239,7 @@ def _chance(label: str) -> Callable[[SceneObject], float]:
     return lambda item: item.probability_of(label)
 
 
-def _distance_m(item: SceneObject, near: Point | SceneObject) -> float:
+def distance_m(item: SceneObject, near: Point | SceneObject) -> float:
     """Distance of a box from a point, or from another box."""
     if isinstance(near, SceneObject):
         return gap_m(item.footprint, near.footprint)

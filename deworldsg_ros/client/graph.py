@@ -65,8 +65,8 @@ class SceneGraph(GraphContent):
     def neighbours(self, of: Which, within: float = 1.0) -> list[tuple[SceneObject, float]]:
         """The other objects in reach of one, with the gap of the boxes in metres, nearest first."""
         center = self.one(of)
-        gaps = [(gap_m(center.footprint, i.footprint), i.id) for i in self if i.id != center.id]
-        return [(self[i], gap) for gap, i in sorted(gaps) if gap <= within]
+        found = self.objects(near=center, within=within)
+        return [(item, gap_m(center.footprint, item.footprint)) for item in found]
 
     def path(self, start: Which, end: Which) -> list[Relation]:
         """The most probable chain of relations from one object to another; empty if there is none.
