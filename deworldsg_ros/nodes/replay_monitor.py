@@ -52,7 +52,7 @@ POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
 WINDOW_FRAMES = 2
 # DDS announces each endpoint to each participant separately: endpoints that are seen here may be
 # unknown elsewhere for a moment.
-SETTLE_S = 0.3
+SETTLE_S = 1.0
 # Longest delay of evidence after the last local graph.
 EVIDENCE_QUIET_S = 3.0
 # The frames of these nodes have no result if the node is killed.
