@@ -88,6 +88,7 @@ def _ask(uses: Uses, variant: dict[str, Any], replay: dict[str, Any]) -> None:
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     options = dict.fromkeys(NODES, variant)
     options["replay_node"] = replay
+    options["region_node"] = {"use_sim_time": True}
     options["fleet_node"] = {"use_sim_time": True, "listen": endpoint}
     options["fleet_link_node"] = {"use_sim_time": True, "connect": endpoint, "robot": "ada"}
     known, nodes, owners = set(asking.get_node_names()), [], dict[str, str]()
