@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
+from fuzz.cases import make_cases
 from fuzz.harness import CORPUS, corpus_cases, run_parallel
+from fuzz.mutations import MAX_CASE_BYTES
 from fuzz.targets import TARGETS
 from fuzz.worker import Worker
 
@@ -31,6 +35,29 @@ def test_good_files_are_read_and_cases_that_failed_once_no_longer_do(worker, nam
 
 def test_the_corpus_has_cases_of_known_targets_only():
     assert {path.name for path in CORPUS.iterdir() if path.is_dir()} <= set(TARGETS)
+
+
+def test_a_process_that_dies_is_a_failure_and_is_replaced(worker):
+    assert worker.run("set_option", "set.txt", b"output.rate_hz=3") is None
+    os.kill(worker._process.pid, signal.SIGKILL)
+    failure = worker.run("set_option", "set.txt", b"output.rate_hz=3")
+    assert failure is not None and "crash" in failure.text
+    assert worker.run("set_option", "set.txt", b"output.rate_hz=3") is None
+
+
+def test_the_same_seed_makes_the_same_cases_and_none_is_huge():
+    target, good = TARGETS["config_yaml"], {"config.yaml": b"a: [1, x]\nb: {c: 2.5}\n" * 50}
+    made: list[list[bytes]] = [[], []]
+    for cases in made:
+        keep = partial(_keep, cases)
+        for turn in range(20):
+            make_cases(target, good, str(turn), 10, keep)
+    assert made[0] == made[1] and len(set(made[0])) > 50
+    assert max(map(len, made[0])) <= MAX_CASE_BYTES
+
+
+def _keep(cases: list[bytes], name: str, content: bytes) -> None:
+    cases.append(content)
 
 
 @pytest.mark.slow

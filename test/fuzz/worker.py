@@ -72,14 +72,9 @@ class Worker:
         """
         return self._cases(target, ("turn", target, seed, count))
 
-    def ready(self, target: str) -> None:
-        """Make the good files of a target, unless they are made."""
-        self._connection.send(("ready", target))
-        self._answer(START_S)
-
     def members(self, target: str) -> dict[str, bytes]:
         """The good files of a target."""
-        self.ready(target)
+        self._ready(target)
         return good_files(target, self._folder / target)
 
     def close(self) -> None:
@@ -101,10 +96,15 @@ class Worker:
         self._process.start()
         theirs.close()
 
+    def _ready(self, target: str) -> None:
+        """Make the good files of a target, unless they are made."""
+        self._connection.send(("ready", target))
+        self._answer(START_S)
+
     def _cases(self, target: str, order: tuple[object, ...]) -> Iterator[Failure | None]:
         member = ""
         try:
-            self.ready(target)
+            self._ready(target)
             self._connection.send(order)
             while (answer := self._answer(SILENCE_S)) != DONE:
                 if isinstance(answer, str):
