@@ -142,24 +142,28 @@ install_requirements() {
   echo "$expected" >"$stamps/$profile"
 }
 
+pip_install_locked() {
+  local lock
+  for lock in "$@"; do
+    pip_install --require-hashes --no-build-isolation -r "$lock" || return
+  done
+}
+
 # Install the exact files that locks/ names, by their hashes.
 install_locked() {
-  local ros=$1 profile=$2 version locks lock expected
+  local ros=$1 profile=$2 version lock expected
   [ "$ros" = wheels ] || fail "ROS 2 is sourced, and the locks contain the wheels of ROS 2:" \
     "unset DEWORLDSG_LOCKED, or start in a shell without a sourced ROS 2"
   [ "$profile" = run ] || [ -z "${DEWORLDSG_TEST_MODELS:-}" ] || fail "the locks contain no torch:" \
     "unset DEWORLDSG_LOCKED or DEWORLDSG_TEST_MODELS"
   version=$(version_of "$venv/bin/python")
-  # One package of the test profile has no wheel. The run profile has what builds it.
-  locks=("run-$version.txt")
-  [ "$profile" = run ] || locks+=("$profile-$version.txt")
-  expected=$(cd "$root/locks" && sha256sum "${locks[@]}" | sha256sum | cut -d ' ' -f 1)
+  lock="$root/locks/$profile-$version.txt"
+  expected=$(sha256sum <"$lock" | cut -d ' ' -f 1)
   is_current "$profile" "$expected" && return
   rm -f "$stamps/$profile"
-  for lock in "${locks[@]}"; do
-    quietly "installing locks/$lock" pip_install --require-hashes --no-build-isolation \
-      -r "$root/locks/$lock"
-  done
+  # One package has no wheel. What builds it comes first.
+  grep -E '^(packaging|setuptools|wheel)==' "$lock" >"$stamps/build.txt"
+  quietly "installing locks/${lock##*/}" pip_install_locked "$stamps/build.txt" "$lock"
   echo "$expected" >"$stamps/$profile"
 }
 

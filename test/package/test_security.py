@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 
-from deworldsg_ros.ros.options import FleetOptions
+from deworldsg_ros.cli.app import view
+from deworldsg_ros.ros.options import FleetOptions, ViewerOptions
 
 # A loader, and the keyword that it needs.
 LOADERS = {"from_pretrained": "use_safetensors", "load": "weights_only"}
@@ -69,5 +71,7 @@ def test_no_server_listens_to_other_machines_by_default(root_dir: Path) -> None:
                 assert node.value not in ANYWHERE, f"{name}:{node.lineno}"
 
 
-def test_the_fleet_listens_to_this_machine_alone() -> None:
+def test_servers_listen_to_this_machine_alone() -> None:
     assert FleetOptions().listen == "tcp/127.0.0.1:7447"
+    assert ViewerOptions().host == "127.0.0.1"
+    assert inspect.signature(view).parameters["host"].default == "127.0.0.1"

@@ -1,0 +1,121 @@
+"""The lock files: complete, equal to what pyproject.toml asks for, and free of known advisories."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+PROFILES = {"run": ("build", "run", "ros"), "test": ("build", "run", "ros", "test")}
+PINNED = re.compile(r"([a-z0-9-]+)==(\S+) --hash=sha256:([0-9a-f]{64})")
+LOCKS = [(profile, python) for profile in PROFILES for python in PYTHONS]
+PRESENT = f"{sys.version_info[0]}.{sys.version_info[1]}"
+
+
+def locked(root: Path, profile: str, python: str) -> dict[str, Version]:
+    """Versions by name; every line is one package with the hash of one file."""
+    lines = (root / "locks" / f"{profile}-{python}.txt").read_text(encoding="utf-8").splitlines()
+    matches = [PINNED.fullmatch(line) for line in lines]
+    assert all(matches), [line for line, match in zip(lines, matches) if not match]
+    versions = {match[1]: Version(match[2]) for match in matches if match}
+    assert len(versions) == len(lines)
+    return versions
+
+
+def required(root: Path, *extras: str) -> list[Requirement]:
+    script = root / "scripts" / "requirements.py"
+    done = subprocess.run(
+        [sys.executable, script, *extras], capture_output=True, text=True, check=True, timeout=60
+    )
+    return [Requirement(line) for line in done.stdout.split()]
+
+
+def advisories(root: Path) -> list[dict[str, str]]:
+    content = json.loads((root / "locks" / "advisories.json").read_text(encoding="utf-8"))
+    assert content["source"] and re.fullmatch(r"\d{4}-\d\d-\d\d", content["date"])
+    found: list[dict[str, str]] = content["advisories"]
+    return found
+
+
+def name_of(requirement: Requirement) -> str:
+    return re.sub(r"[-_.]+", "-", requirement.name).lower()
+
+
+@pytest.mark.parametrize(("profile", "python"), LOCKS)
+def test_a_lock_satisfies_pyproject(root_dir: Path, profile: str, python: str) -> None:
+    versions = locked(root_dir, profile, python)
+    for requirement in required(root_dir, *PROFILES[profile]):
+        assert requirement.specifier.contains(versions[name_of(requirement)]), requirement
+    assert "torch" not in versions
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+def test_the_locks_of_both_commands_agree(root_dir: Path, python: str) -> None:
+    run, test = (locked(root_dir, profile, python) for profile in PROFILES)
+    assert run.items() <= test.items()
+
+
+@pytest.mark.parametrize(("profile", "python"), LOCKS)
+def test_no_locked_version_has_a_known_advisory(root_dir: Path, profile: str, python: str) -> None:
+    versions = locked(root_dir, profile, python)
+    for advisory in advisories(root_dir):
+        version = versions.get(advisory["package"])
+        if version is not None and version in SpecifierSet(advisory["affected"]):
+            assert advisory.get("accepted"), f"{advisory['package']} {version}: {advisory['id']}"
+
+
+def test_no_lowest_version_of_pyproject_has_a_known_advisory(root_dir: Path) -> None:
+    extras = ("build", "run", "ros", "models", "cluster", "mcp", "networkx")
+    lowest = {
+        name_of(requirement): Version(spec.version)
+        for requirement in required(root_dir, *extras)
+        for spec in requirement.specifier
+        if spec.operator == ">="
+    }
+    assert lowest["torch"] and lowest["numpy"]
+    for advisory in advisories(root_dir):
+        version = lowest.get(advisory["package"])
+        if version is not None and version in SpecifierSet(advisory["affected"]):
+            assert advisory.get("accepted"), f"{advisory['package']}>={version}: {advisory['id']}"
+
+
+def install(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """Let pip check a lock against the package index, without installing it."""
+    path = folder / "lock.txt"
+    path.write_text(text, encoding="utf-8")
+    pip = (sys.executable, "-m", "pip", "install", "--no-input", "--disable-pip-version-check")
+    dry = ("--dry-run", "--ignore-installed", "--no-build-isolation", "--require-hashes")
+    return subprocess.run(
+        [*pip, *dry, *options, "-r", str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=880,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_pip_accepts_the_lock_of_this_python(root_dir: Path, tmp_path: Path) -> None:
+    text = (root_dir / "locks" / f"test-{PRESENT}.txt").read_text(encoding="utf-8")
+    done = install(tmp_path, text)
+    assert done.returncode == 0, done.stdout[-3000:]
+    planned = done.stdout.rpartition("Would install")[2].split()
+    assert len(planned) == len(text.splitlines())
+
+
+@pytest.mark.slow
+def test_pip_refuses_a_file_with_another_hash(root_dir: Path, tmp_path: Path) -> None:
+    text = (root_dir / "locks" / f"run-{PRESENT}.txt").read_text(encoding="utf-8")
+    line = next(line for line in text.splitlines() if line.startswith("sortedcontainers=="))
+    done = install(tmp_path, line[:-1] + ("0" if line[-1] != "0" else "1"), "--no-deps")
+    assert done.returncode != 0
+    assert "DO NOT MATCH THE HASHES" in done.stdout
