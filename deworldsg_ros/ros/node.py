@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import sys
 import threading
 import time
@@ -254,6 +255,10 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
     def body(stop: threading.Event) -> int:
         node = make_node()
         sys.setswitchinterval(SWITCH_S)
+        # A full collection stops all threads. It would look at all objects of the imported modules
+        # each time, which takes 100 ms.
+        gc.collect()
+        gc.freeze()
         try:
             executor = SingleThreadedExecutor()
             executor.add_node(node)
