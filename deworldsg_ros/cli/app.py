@@ -304,6 +304,10 @@ def view(
     port: Annotated[
         int, typer.Option("--port", min=1, max=65535, help="of the page; the next free one is used")
     ] = 8080,
+    foxglove: Annotated[
+        bool,
+        typer.Option("--foxglove", help="serve Foxglove on ws://127.0.0.1:8765 instead of a page"),
+    ] = False,
     config: ConfigFile = None,
     settings: Settings = None,
     rgb: RgbTopic = "",
@@ -327,6 +331,7 @@ def view(
                 path=graph,
                 host=host,
                 port=port,
+                foxglove=foxglove,
                 namespace=namespace,
                 config_path=config,
                 settings=tuple(settings or ()),

@@ -11,6 +11,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -25,7 +26,12 @@ from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.graph_file import read_graph
 
+if TYPE_CHECKING:
+    from deworldsg_ros.view.live.sources import Sink
+
 VIEWER = "viewer_node"
+# Package and extra of each module that shows a graph.
+VIEWERS = {"viser": ("viser", "view"), "foxglove": ("foxglove-sdk", "foxglove")}
 # Surface points are part of what is shown.
 WITH_POINTS = "output.include_surface_points=true"
 EMPTY_FILE = "the graph of this file is empty: no object was seen often enough"
@@ -38,6 +44,7 @@ class ViewOptions:
     Attributes:
         path: graph or recording; None = live.
         host, port: of the page.
+        foxglove: whether Foxglove is served instead.
         namespace: of the robot, for a live graph.
         config_path, settings: configuration of a recording.
         topics, dataset: of a recording.
@@ -47,6 +54,7 @@ class ViewOptions:
     path: Path | None
     host: str
     port: int
+    foxglove: bool
     namespace: str
     config_path: Path | None
     settings: tuple[str, ...]
@@ -61,16 +69,16 @@ def view_graph(options: ViewOptions, console: Console) -> None:
     Raises:
         DeWorldSGError: for unusable input, or without the package viser.
     """
-    require_viser()
+    require("foxglove" if options.foxglove else "viser")
     if options.path is None:
         _become_viewer_node(options)
         return
-    from deworldsg_ros.view.live.server import Viewer
-    from deworldsg_ros.view.live.sources import is_graph
+    from deworldsg_ros.view.live.sources import is_graph, open_sink
 
     graph = read_graph(options.path) if is_graph(options.path) else None
     why_empty = EMPTY_FILE if graph is not None else "loading the models"
-    with closing(Viewer(options.host, options.port, why_empty)) as viewer:
+    sink = open_sink(options.host, options.port, why_empty, foxglove=options.foxglove)
+    with closing(sink) as viewer:
         console.print(f"view: {viewer.url}", highlight=False, soft_wrap=True)
         if graph is not None:
             viewer.reset(graph)
@@ -80,11 +88,12 @@ def view_graph(options: ViewOptions, console: Console) -> None:
         wait_for_interrupt()
 
 
-def require_viser() -> None:
-    """Raise ConfigurationError without the package viser."""
-    if find_spec("viser") is None:
+def require(module: str) -> None:
+    """Raise ConfigurationError if a module of VIEWERS is not installed."""
+    if find_spec(module) is None:
+        package, extra = VIEWERS[module]
         raise ConfigurationError(
-            "the live viewer needs the package viser: pip install 'deworldsg_ros[view]'"
+            f"deworldsg view needs the package {package}: pip install 'deworldsg_ros[{extra}]'"
         )
 
 
@@ -98,6 +107,7 @@ def _become_viewer_node(options: ViewOptions) -> None:
     """Replace this process by viewer_node."""
     command = [*node_command(VIEWER), "--ros-args"]
     command += ["-p", f"host:='{options.host}'", "-p", f"port:={options.port}"]
+    command += ["-p", f"foxglove:={str(options.foxglove).lower()}"]
     if options.namespace:
         command += ["-r", f"__ns:={options.namespace}"]
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
@@ -105,12 +115,11 @@ def _become_viewer_node(options: ViewOptions) -> None:
     os.execvp(command[0], command)
 
 
-def _show_recording(viewer: object, options: ViewOptions, console: Console) -> None:
+def _show_recording(viewer: Sink, options: ViewOptions, console: Console) -> None:
     from deworldsg_ros.cli.run import build_pipeline
-    from deworldsg_ros.view.live.server import Viewer
     from deworldsg_ros.view.live.sources import show_recording
 
-    assert isinstance(viewer, Viewer) and options.path is not None
+    assert options.path is not None
     config = effective_config(options.config_path, [WITH_POINTS, *options.settings])
     poses = PoseChoice(odometry=options.odometry)
     source = open_source(

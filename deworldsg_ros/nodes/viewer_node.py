@@ -14,7 +14,7 @@ from std_msgs.msg import String
 
 from deworldsg_ros.ros.inputs import listen_rgb
 from deworldsg_ros.ros.node import StageNode, run
-from deworldsg_ros.ros.options import ViewerParameters
+from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.codec import local_graph_from_message
@@ -23,7 +23,7 @@ from deworldsg_ros.scene.following import GraphFollower
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import stamp_ns_of
 from deworldsg_ros.view.live.joining import FrameJoiner
-from deworldsg_ros.view.live.sources import Sink
+from deworldsg_ros.view.live.sources import Sink, open_sink
 
 # Frames of the camera are shown at most so often; the others are not decoded.
 VIEW_PERIOD_S = 0.15
@@ -48,8 +48,7 @@ class ViewerNode(StageNode):
         super().__init__("viewer_node", "views", **options)
         topic = self.resolve_topic_name("scene_graph")
         self._viewer = make_viewer(
-            self.parameters.node.host,
-            self.parameters.node.port,
+            self.parameters.node,
             f"waiting for {topic}: is graph_node running, and is ROS_DOMAIN_ID the same?",
         )
         self._follower = GraphFollower(self._viewer)
@@ -118,15 +117,15 @@ class ViewerNode(StageNode):
             self.health.published()
 
 
-def make_viewer(host: str, port: int, why_empty: str) -> Sink:
-    """The page, with its address in the log; raises ConfigurationError without viser."""
+def make_viewer(options: ViewerOptions, why_empty: str) -> Sink:
+    """The page, with its address in the log; raises ConfigurationError without its package."""
     try:
-        from deworldsg_ros.view.live.server import Viewer
+        viewer = open_sink(options.host, options.port, why_empty, foxglove=options.foxglove)
     except ImportError as error:
+        extra = "foxglove" if options.foxglove else "view"
         raise ConfigurationError(
-            f"viewer_node needs the package viser ({error}): pip install 'deworldsg_ros[view]'"
+            f"viewer_node: {error}: pip install 'deworldsg_ros[{extra}]'"
         ) from error
-    viewer = Viewer(host, port, why_empty)
     print(f"view: {viewer.url}", flush=True)
     return viewer
 

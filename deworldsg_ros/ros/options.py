@@ -112,6 +112,9 @@ class ViewerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     port: Annotated[int, option("port of the page; the next free one is used", ge=1, le=65535)] = (
         8080
     )
+    foxglove: Annotated[
+        bool, option("serve Foxglove on port 8765 instead of a page (needs foxglove-sdk)")
+    ] = False
 
 
 class ViewerParameters(Config, frozen=True, forbid_unknown_fields=True):

@@ -19,6 +19,7 @@ from deworldsg_ros.config import Config, load_config, to_mapping
 ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
 # Modules whose distribution has another name.
 DISTRIBUTIONS = {
+    "foxglove": "foxglove-sdk",
     "zenoh": "eclipse-zenoh",
     "cv2": "opencv-python-headless",
     "yaml": "pyyaml",
@@ -77,7 +78,8 @@ def imported_modules(root: Path) -> set[str]:
 def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
     known = {
         *requirements(root_dir),
-        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "view", "store"),
+        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "store"),
+        *requirements(root_dir, "view", "foxglove"),
     }
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()

@@ -16,7 +16,13 @@ from deworldsg_ros.view.live.camera import CameraView, view_of
 
 
 class Sink(Copy, Protocol):
-    """Shows a copy of a graph; its methods may be called from any thread."""
+    """Shows a copy of a graph; its methods may be called from any thread.
+
+    Attributes:
+        url: its address.
+    """
+
+    url: str
 
     def look(self, view: CameraView) -> None:
         """Show a frame of the camera."""
@@ -29,6 +35,20 @@ class Sink(Copy, Protocol):
     def close(self) -> None:
         """End."""
         ...
+
+
+FOXGLOVE_PORT = 8765
+
+
+def open_sink(host: str, port: int, why_empty: str, *, foxglove: bool) -> Sink:
+    """A page of viser, or a server for Foxglove; raises ImportError without its package."""
+    if foxglove:
+        from deworldsg_ros.view.live.foxglove import FoxgloveServer
+
+        return FoxgloveServer(host, FOXGLOVE_PORT)
+    from deworldsg_ros.view.live.server import Viewer
+
+    return Viewer(host, port, why_empty)
 
 
 def is_graph(path: Path) -> bool:
