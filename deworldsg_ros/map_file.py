@@ -18,7 +18,7 @@ from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.files import FileLock, check_writable
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
-from deworldsg_ros.parsing import parse_json
+from deworldsg_ros.parsing import parse_json, paused_collector
 from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
 from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.array_checks import checked
@@ -131,7 +131,8 @@ def read_map(config: Config, path: Path) -> GraphBuilder:
         ConfigurationError: if the file is no map; names the array, the value and what was expected.
     """
     try:
-        return _read(config, path)
+        with paused_collector():
+            return _read(config, path)
     except (RefusedInput, ValueError, MemoryError) as error:
         reason = graph_io.reason_of(error).removeprefix(f"graph file {path}: ")
         raise ConfigurationError(f"map {path} cannot be used: {reason}") from error

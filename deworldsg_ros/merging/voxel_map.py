@@ -93,15 +93,16 @@ class VoxelMap:
         )
 
     def add_scores(self, owner: int, blocks: Int64, scores: Int8) -> None:
-        """Add to the scores of an owner's cells in some blocks (m, 64)."""
+        """Add to the scores of an owner's cells in some blocks (m, 64); each block once."""
         table, limit = self._table, cell_beliefs.MAX_SCORE
         slot_of = {int(table.keys[slot]): slot for slot in self._slots_of(owner).tolist()}
-        for block, more in zip(blocks.tolist(), scores.astype(np.int64)):
-            slot = slot_of.get(block)
-            if slot is not None:
-                table.scores[slot] = np.clip(table.scores[slot] + more, -limit, limit)
-                negative = np.packbits(table.scores[slot] < 0, bitorder="little")
-                table.rejected[slot] = negative.view("<u8")[0]
+        slots = np.array([slot_of.get(block, -1) for block in blocks.tolist()], np.int64)
+        known = slots >= 0
+        slots = slots[known]
+        sums = np.clip(table.scores[slots] + scores[known].astype(np.int64), -limit, limit)
+        table.scores[slots] = sums
+        negative = np.packbits(sums < 0, axis=1, bitorder="little")
+        table.rejected[slots] = negative.view("<u8")[:, 0]
 
     def judge(
         self,

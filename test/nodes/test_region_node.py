@@ -6,12 +6,14 @@ from pathlib import Path
 
 import msgspec
 import pytest
+import rclpy
 from geometry_msgs.msg import PoseStamped
+from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from support.nodes import NodeProcess, peer
 
 from deworldsg_ros.client import SceneGraph, SceneGraphClient
-from deworldsg_ros.nodes.region_node import region_of
+from deworldsg_ros.nodes.region_node import RegionNode, region_of
 from deworldsg_ros.ros.options import RegionOptions
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
@@ -74,6 +76,36 @@ def test_a_client_gets_the_part_and_follows_a_pose(tmp_path: Path) -> None:
         assert node.interrupt() == 0
     finally:
         node.end()
+
+
+def test_the_region_changes_while_the_node_runs() -> None:
+    room = SceneGraph.load(SAVED)
+    center = ",".join(map(str, room[1].mean_m))
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    start = [Parameter("center", value=center), Parameter("radius_m", value=1.0)]
+    node = RegionNode(context=context, parameter_overrides=start)
+    try:
+        node._add(room.message)
+        few = node._part.size
+        assert few == len(ids_near(room, room[1].mean_m, 1.0)) < len(room)
+        changes = [
+            ("radius_m", 1000.0, len(room)),
+            ("classes", "cup", len(room.objects("cup"))),
+            ("center", "1,2", len(room.objects("cup"))),  # counted, and changes nothing
+            ("center", "900,900,0", len(room.objects("cup"))),
+            ("radius_m", 1.0, 0),
+        ]
+        for name, value, size in changes:
+            (result,) = node.set_parameters([Parameter(name, value=value)])
+            assert result.successful and node._part.size == size
+        (result,) = node.set_parameters([Parameter("radius_m", value=-1.0)])
+        assert not result.successful
+        assert node.health.total("invalid_region") == 1
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
 
 
 @pytest.mark.parametrize("center", ["1,2", "a,b,c", "1,2,inf", "1,2,3,4", ","])
