@@ -7,12 +7,13 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
+from support.reference_updates import diff
 from support.view import make_graph, make_node
 
 from deworldsg_ros.client.region import Region, RegionPart
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.change_log import ChangeLog
-from deworldsg_ros.scene.delta import diff, empty_scene_graph
+from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.replica import GraphReplica
 
 HERE = Region((0.0, 0.0, 0.0), 2.0)
