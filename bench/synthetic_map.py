@@ -92,6 +92,7 @@ class RoomMap:
                     graph.add_visual(subject, object_, logits[subject % 64], 0)
         builder = GraphBuilder(config, VOCABULARY, "world", graph=graph)
         builder.merging.restore(graph, {})
+        builder.up.observe(np.eye(4))  # a map knows up
         return builder
 
     def frames(
