@@ -6,6 +6,7 @@ import itertools
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -126,8 +127,7 @@ def run_recording(options: RunOptions, console: Console) -> None:
     """Run, write the results and print a summary; raises DeWorldSGError."""
     # The map is ours from reading to writing: what another process adds to it would be lost.
     with claim_map(options.map_path) if options.map_path else nullcontext():
-        outputs.check_folder(options.out)
-        ran = _run(options, console)
+        ran = _run(options, console, lambda: outputs.check_folder(options.out))
         _write_results(options, ran, console)
     outputs.print_drops(console, ran.recording.losses, ran.drops, ran.recording.reasons)
     _print_summary(options, ran.pipeline, ran.processed, console)
@@ -139,8 +139,17 @@ def examine(options: RunOptions, console: Console) -> list[Finding]:
     return _run(options, console).findings
 
 
-def _run(options: RunOptions, console: Console) -> _Ran:
-    """Process a recording; raises RecordingError if no frame can be used."""
+def _run(options: RunOptions, console: Console, prepare: Callable[[], None] = lambda: None) -> _Ran:
+    """Process a recording.
+
+    Args:
+        options: of the command.
+        console: terminal.
+        prepare: called when the recording is found to be usable, before the work.
+
+    Raises:
+        RecordingError: if no frame can be used.
+    """
     config = effective_config(options.config_path, options.settings)
     if options.poses.odometry and not HAS_ODOMETRY:
         outputs.print_noted(console, "warning:", WITHOUT_ODOMETRY)
@@ -153,6 +162,7 @@ def _run(options: RunOptions, console: Console) -> _Ran:
     )
     try:
         recording = Recording(choose_poses(source, options.poses, config), config.inputs)
+        prepare()
         pipeline = build_pipeline(config, options.map_path, console)
         processed = _process(recording, pipeline, options, console)
     finally:
