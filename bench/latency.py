@@ -49,6 +49,8 @@ WARM_UP_S = 3.0
 DRAIN_S = 2.0
 # A message of these streams that is lost is a frame that is lost.
 LOST_FRAMES = {f"{LOST_PREFIX}{name}" for name in ("rgb", "frame_graph", "local_graph")}
+# Drops of relation evidence in the graph: its frame is in the graph.
+OF_EVIDENCE = {"evidence_overrun", "unknown_frame"}
 USUAL_RATE_HZ = 30.0
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
@@ -103,7 +105,8 @@ def counted_frames(diagnostics: Mapping[str, Mapping[str, str]]) -> int:
         for name, values in diagnostics.items()
         if name != "relation_node"
         for reason, count in counts_in(values, DROPPED).items()
-        if not reason.startswith((UNMATCHED_PREFIX, LOST_PREFIX)) or reason in LOST_FRAMES
+        if reason not in OF_EVIDENCE
+        and (not reason.startswith((UNMATCHED_PREFIX, LOST_PREFIX)) or reason in LOST_FRAMES)
     )
 
 
