@@ -70,7 +70,7 @@ def test_thresholds_and_rates_change_while_the_node_runs(whole: Bench) -> None:
         assert change(node, name, new) == (True, "")
         assert getattr(getattr(node.parameters, section), key) == new
         assert node.get_parameter(name).value == new
-    assert node.graph.wait_idle(5.0)
+    assert node.graph.wait_idle(120.0)  # kernels may be compiled
     assert node._perception.score_threshold == 0.25
     assert node._lifting._config.tau == 0.25
     assert node._relating._reasoner._config.geo_cost_threshold == 0.25
@@ -149,7 +149,13 @@ def test_a_camera_topic_follows_its_override() -> None:
         listening = [item.describe() for item in at.node._subscriptions_to_check]
         assert "/rgb/image_raw [sensor_msgs/msg/Image] best effort" in listening
         assert "/depth/image_raw [sensor_msgs/msg/Image] reliable" in listening
-        works(at, lambda: send_frame(at))
+        # A best-effort reader misses what is sent before it knows the writer.
+        for _ in range(20):
+            send_frame(at)
+            at.peer.spin_for(0.5)
+            if at.products():
+                break
+        assert at.products()
     finally:
         at.close()
 
