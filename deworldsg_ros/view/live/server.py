@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
 import threading
 import time
 from collections import deque
@@ -46,7 +47,7 @@ class Viewer:
     def __init__(self, host: str, port: int, why_empty: str) -> None:
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
             self._server = viser.ViserServer(host, port, label="DeWorldSG", verbose=False)
-        self.url = f"http://{'localhost' if host == '0.0.0.0' else host}:{self._server.get_port()}"
+        self.url = f"http://{_reachable(host)}:{self._server.get_port()}"
         self._lock = threading.RLock()
         self._state = LiveState(why_empty=why_empty)
         self._views: deque[CameraView] = deque(maxlen=WAITING_VIEWS)
@@ -190,3 +191,11 @@ class Viewer:
             camera.up_direction = up
             camera.position, camera.look_at = position, target
         self._fitted[client.client_id] = (position, bounds)
+
+
+def _reachable(host: str) -> str:
+    """A name for the link: an address that means all of this machine's leads nowhere."""
+    with contextlib.suppress(ValueError):
+        if ipaddress.ip_address(host).is_unspecified:
+            return "localhost"
+    return host
