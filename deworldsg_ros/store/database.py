@@ -241,7 +241,7 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
 
     Raises:
         StoreError: the extra is not installed, or another process does not end its work in time.
-        RuntimeError: of ladybug, e.g. if the database is damaged.
+        RuntimeError: of ladybug, e.g. if the database is damaged; also if a writer was killed.
     """
     try:
         import ladybug
@@ -250,6 +250,12 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
             "the store needs the package ladybug: pip install 'deworldsg_ros[store]'"
         ) from error
     with _access(path.with_suffix(".lock"), fcntl.LOCK_SH if read_only else fcntl.LOCK_EX):
+        # After a kill, ladybug can restore a part of a transaction only.
+        being_written = path.with_name(f"{path.name}.writing")
+        if being_written.exists():
+            raise RuntimeError("a writer was killed")
+        if not read_only:
+            being_written.touch()
         database = ladybug.Database(path, buffer_pool_size=BUFFER_BYTES, read_only=read_only)
         with closing(database), closing(ladybug.Connection(database)) as connection:
             if read_only:
@@ -259,6 +265,8 @@ def opened(path: Path, *, read_only: bool) -> Iterator[Database]:
                 # takes a third of a second.
                 connection.execute("CALL force_checkpoint_on_close=false")
             yield Database(connection)
+        if not read_only:
+            being_written.unlink()
 
 
 def stay_of(row: Sequence[Any]) -> Stay:
