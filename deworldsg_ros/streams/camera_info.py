@@ -12,12 +12,15 @@ def intrinsics_from_message(message: Any) -> Intrinsics:
     """Intrinsics from the matrix K of a `sensor_msgs/CameraInfo`.
 
     Raises:
-        RefusedInput: ``invalid_intrinsics`` for a matrix of another size, for NaN, or for zeros,
-            which an uncalibrated camera publishes.
+        RefusedInput: ``invalid_intrinsics`` for a message without K, for a matrix of another size,
+            for NaN, or for zeros, which an uncalibrated camera publishes.
     """
     matrix = getattr(message, "k", None)
     if matrix is None:
-        matrix = message.K  # ROS 1 bags
+        matrix = getattr(message, "K", None)  # ROS 1 bags
+    if matrix is None:
+        kind = type(message).__name__
+        raise RefusedInput("invalid_intrinsics", f"camera_info is a {kind}: expected a CameraInfo")
     if len(matrix) != 9:
         raise RefusedInput(
             "invalid_intrinsics", f"camera_info: K has {len(matrix)} values: expected 9"

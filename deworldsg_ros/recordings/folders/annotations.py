@@ -200,7 +200,7 @@ class Annotations:
                 class_name = self.class_of_label.get(label, "")
                 if class_name in index_of:
                     objects[int(item["id"])] = index_of[class_name]
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise RecordingError(
                 f"{self.root / self.layout.objects}, scan {scan}: expected objects with a label "
                 "and a whole number as id"
