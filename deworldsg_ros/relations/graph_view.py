@@ -182,7 +182,10 @@ class PublishedGraph:
         return max(seen, default=math.inf)
 
     def _resolve(self, node_id: int) -> int:
-        while node_id in self._successors:
+        passed = set()
+        # graph_node never sends a circle of merges, but somebody else may.
+        while node_id in self._successors and node_id not in passed:
+            passed.add(node_id)
             node_id = self._successors[node_id]
         return node_id
 
