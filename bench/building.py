@@ -1,9 +1,10 @@
-"""A graph as large as a building: reading its file and asking it.
+"""A graph as large as a building: its file, questions to it, and its map.
 
     python bench/building.py [--quick]
 
 10^5 objects in a grid, 0.5 m apart, each related to five of the next ones. A question is asked of a
-graph that was asked once before.
+graph that was asked once before. The map has other objects, with surface points and cells
+(`synthetic_map.py`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.figures import Figure, Setup
+from bench.synthetic_map import POINTS, RoomMap
 from deworldsg_ros.client import SceneGraph
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph_builder import GraphBuilder, warm_up
+from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.parsing import paused_collector
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.graph_file import write_graph
@@ -120,7 +125,54 @@ def figures(setup: Setup) -> list[Figure]:
         Figure("building_relations_of", of, "ms", note="of one object"),
         Figure("building_on", on, "ms", note="what is on one object"),
         Figure("building_objects_of_class", cups, "ms", note=f"{count // len(LABELS)} objects"),
+        *map_figures(count),
     ]
+
+
+def map_figures(count: int) -> list[Figure]:
+    """Seconds to write and to read the map file of a graph, and to go on with it."""
+    config = Config()
+    warm_up(config)
+    rooms = RoomMap(count)
+    (frame,) = rooms.frames(1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "building.map"
+        builder = rooms.builder(config, EDGES_PER_NODE)
+        start = time.perf_counter()
+        write_map(builder, path)
+        save_s = time.perf_counter() - start
+        del builder
+        start = time.perf_counter()
+        builder = read_map(config, path)
+        load_s = time.perf_counter() - start
+        size = path.stat().st_size / count
+    start = time.perf_counter()
+    builder.integrate(frame)
+    first_frame_s = time.perf_counter() - start
+    calls_s = [update_s(builder)]
+    while builder.waiting:
+        calls_s.append(update_s(builder))
+    note = f"{count} nodes with {POINTS} surface points, {EDGES_PER_NODE * count} edges"
+    return [
+        Figure("building_save_map", save_s, "s", note=f"{note}; {size / 1e3:.1f} kB a node"),
+        Figure("building_load_map", load_s, "s", target=3, note=note),
+        Figure("building_first_frame", 1e3 * first_frame_s, "ms", note="merged into the map"),
+        Figure(
+            *("building_first_update", sum(calls_s), "s"),
+            note=f"all objects of the map, prepared in {len(calls_s)} calls between frames",
+        ),
+        Figure(
+            *("building_longest_call", 1e3 * max(calls_s), "ms"),
+            note="the longest that a frame waits meanwhile",
+        ),
+    ]
+
+
+def update_s(builder: GraphBuilder) -> float:
+    """Seconds of one call of `update`."""
+    start = time.perf_counter()
+    builder.update()
+    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 from bench.figures import Figure, Setup  # noqa: E402
 from bench.merging import LOCAL_NODES  # noqa: E402
-from bench.synthetic_map import RoomMap  # noqa: E402
+from bench.synthetic_map import RoomMap, publish  # noqa: E402
 from deworldsg_ros.config import Config  # noqa: E402
 from deworldsg_ros.graph_builder import warm_up  # noqa: E402
 from deworldsg_ros.scene import wire  # noqa: E402
@@ -41,7 +41,7 @@ def frame_ms(count: int, rounds: int) -> dict[str, list[float]]:
     """Milliseconds of each part of `rounds` frames in a graph of `count` nodes, ascending."""
     world = RoomMap(count)
     builder = world.builder(Config())
-    builder.update()  # the whole map
+    publish(builder)
     times: dict[str, list[float]] = {"integrate": [], "update": []}
     for local in world.frames(rounds + ROOMS, ROOMS, stay=STAY):
         start = time.thread_time()

@@ -3,11 +3,13 @@
     python bench/memory.py
 
 Nodes stand in rows on the floor, each with its full number of surface points and votes with the
-next nodes. The memory is that of the whole process (resident set), after all nodes were published.
+next nodes. The memory is that of the whole process (resident set, without free memory that malloc
+keeps), after all nodes were published.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import sys
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.figures import Figure, Setup
+from bench.synthetic_map import publish
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -31,7 +34,8 @@ SPACING_M = 0.45
 
 
 def resident_bytes() -> int:
-    """Resident set of this process."""
+    """Resident set of this process, without what malloc keeps for later."""
+    ctypes.CDLL(None).malloc_trim(0)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * 4096
 
@@ -50,7 +54,7 @@ def grow(builder: GraphBuilder, count: int, rng: np.random.Generator) -> None:
         graph.nodes.confirmed[graph.nodes.row(node)] = True
         for other in range(max(1, node - PARTNERS), node):
             graph.add_votes(other, node, votes)
-    builder.update()
+    publish(builder)
     gc.collect()
 
 

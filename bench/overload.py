@@ -11,40 +11,37 @@ from __future__ import annotations
 import argparse
 
 from bench.figures import Figure, Setup
-from bench.latency import Result, measure, show
+from bench.latency import USUAL_RATE_HZ, measure, show
 
 RATES_HZ = (30.0, 60.0, 120.0)
-
-
-def runs(seconds: float, *, one_process: bool) -> dict[float, Result]:
-    """One run at each rate, by the rate."""
-    return {rate: measure(seconds, rate, one_process=one_process) for rate in RATES_HZ}
+# Of the recording: their detections are made anew for each run.
+FRAMES = 60
 
 
 def figures(setup: Setup) -> list[Figure]:
     """Throughput at each rate, and frames that no node counted."""
-    seconds = 3.0 if setup.quick else 10.0
+    seconds = 3.0 if setup.quick else 5.0
     found = []
-    for one_process in (False, True):
-        name = f"overload_{'one_process' if one_process else 'four_processes'}"
-        results = runs(seconds, one_process=one_process)
-        for rate, result in results.items():
-            found += [
-                Figure(
-                    f"{name}_{rate:g}_hz",
-                    len(result.latencies_ms) / seconds,
-                    "frames/s",
-                    more_is_better=True,
-                    note=f"frames that reached the graph, {seconds:g} s, recorded detections",
-                ),
-                Figure(
-                    f"{name}_{rate:g}_hz_uncounted",
-                    abs(result.uncounted),
-                    "frames",
-                    target=0,
-                    note=f"neither in the graph nor counted, of {result.published}",
-                ),
-            ]
+    for rate in RATES_HZ[1:]:  # bench.latency has the rate of a camera
+        result = measure(seconds, rate, max_frames=FRAMES)
+        found += [
+            Figure(
+                f"overload_{rate:g}_hz",
+                len(result.latencies_ms) / seconds,
+                "frames/s",
+                target=USUAL_RATE_HZ,
+                more_is_better=True,
+                note=f"in the graph, {seconds:g} s, four processes, recorded detections; "
+                f"{result.percentile_ms(50):.0f} ms from the stamp to the update",
+            ),
+            Figure(
+                f"overload_{rate:g}_hz_uncounted",
+                abs(result.uncounted),
+                "frames",
+                target=0,
+                note=f"neither in the graph nor counted, of {result.published}",
+            ),
+        ]
     return found
 
 

@@ -22,7 +22,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 from bench.figures import Figure, Setup  # noqa: E402
 from bench.integration import ROOMS, STAY  # noqa: E402
 from bench.merging import CAMERA, LOCAL_NODES, PREDICATES, VOCABULARY  # noqa: E402
-from bench.synthetic_map import OBJECTS_PER_ROOM, RoomMap  # noqa: E402
+from bench.synthetic_map import OBJECTS_PER_ROOM, RoomMap, publish  # noqa: E402
 from deworldsg_ros.config import Config  # noqa: E402
 from deworldsg_ros.graph_builder import warm_up  # noqa: E402
 from deworldsg_ros.perception.stage import Perceived  # noqa: E402
@@ -73,7 +73,7 @@ def boxes_of(instances: np.ndarray, count: int) -> np.ndarray:
 
 
 class Known:
-    """A perceiver that gives what it is told."""
+    """A perceiver that returns the result that was set."""
 
     perceived: Perceived
 
@@ -88,7 +88,7 @@ def step_ms(count: int, rounds: int) -> tuple[list[float], float]:
     pipeline = Pipeline(config, perceiver)
     builder = world.builder(config)
     pipeline.go_on_with(builder)
-    builder.update()  # the whole map
+    publish(builder)
     times, pixels = [], []
     for frame, perceiver.perceived in frames(world, rounds + ROOMS):
         start = time.thread_time()

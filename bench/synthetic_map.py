@@ -137,6 +137,12 @@ class RoomMap:
         return View(rows, T_world_camera, surfaces, others)
 
 
+def publish(builder: GraphBuilder) -> None:
+    """Publish everything that waits: a large map takes several updates."""
+    while builder.update() is not None or builder.waiting:
+        pass
+
+
 class View(NamedTuple):
     """A camera, and the objects before it.
 

@@ -30,6 +30,7 @@ from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.seen_frames import FrameMemory
 from deworldsg_ros.scene.seen_space import SeenSpace
 from deworldsg_ros.scene.up import UpEstimator
+from deworldsg_ros.scene.votes import frame_votes
 
 # Parts of the kernels that take about equally long to compile.
 KERNEL_PARTS = ("merging", "drift", "pairs")
@@ -122,8 +123,9 @@ class GraphBuilder:
             check_fits(self.graph, local)
             local = self._drift.align(local)
         node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
-        self._edges.observe(local, node_ids)
-        self.frames.note(self.graph, local, node_ids)
+        votes = frame_votes(local.relations.logits)
+        self._edges.observe(local, node_ids, votes)
+        self.frames.note(self.graph, local, node_ids, votes)
         self.space.note(local)
         self._newest_ns = local.stamp_ns
         self._publication.note_frame(local.stamp_ns, node_ids)
@@ -180,7 +182,8 @@ class GraphBuilder:
         """The changes since the last call; None if there are none.
 
         It costs as much as what changed, however large the graph is. Of many surfaces and pairs
-        that changed, some are left for the next calls: see `waiting`.
+        that changed, some are left for the next calls: see `waiting`. After a large map was read,
+        the first calls return None and prepare it in parts: the first update has all of it.
         """
         self._publication.set_up(self.up.up_world(exact=False))
         return self._publication.update()

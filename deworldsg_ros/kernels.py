@@ -92,10 +92,12 @@ def _numba() -> ModuleType:
 
 
 def _jit(function: Callable[..., Any]) -> Any:
+    # No C code calls a kernel.
+    options = {"nogil": True, "no_cfunc_wrapper": True}
     try:
-        return _numba().njit(cache=True, nogil=True)(function)
+        return _numba().njit(cache=True, **options)(function)
     except RuntimeError:  # the cache folder is not writable: compile in every process
-        return _numba().njit(nogil=True)(function)
+        return _numba().njit(**options)(function)
 
 
 def read_only(array: NDArray[Any], dtype: DTypeLike | None = None) -> NDArray[Any]:
@@ -109,6 +111,9 @@ def read_only(array: NDArray[Any], dtype: DTypeLike | None = None) -> NDArray[An
         array: any shape.
         dtype: of the result; None keeps the array's own.
     """
-    view = np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"]).view()
+    flags = array.flags
+    if not (flags.c_contiguous and flags.aligned and (dtype is None or array.dtype == dtype)):
+        array = np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"])
+    view = array.view()
     view.flags.writeable = False
     return view

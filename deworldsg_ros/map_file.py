@@ -141,6 +141,8 @@ def read_map(config: Config, path: Path) -> GraphBuilder:
 def _read(config: Config, path: Path) -> GraphBuilder:
     arrays = graph_io.read(path)
     graph = graph_io.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
+    for name in ("surface_points", "class_probabilities"):  # the largest that the graph has copied
+        del arrays[name]
     prior = _prior(arrays, graph.vocabulary)
     for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
         if not graph.edits.hides(node_id):

@@ -22,6 +22,8 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = "deworldsg_ros"
+# A node with an error in its configuration ends at once, and is not started again more often.
+RESPAWN_DELAY_S = 2.0
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 
 # Launch argument, topic in the nodes, content.
@@ -64,6 +66,13 @@ def generate_launch_description() -> LaunchDescription:
             choices=["true", "false"],
             description="start deworldsg_node, which runs all four stages, in place of four nodes",
         ),
+        DeclareLaunchArgument(
+            "respawn",
+            default_value="false",
+            choices=["true", "false"],
+            description="start a node again when its process ended; a node whose model never "
+            "returns then ends by itself",
+        ),
         *(
             DeclareLaunchArgument(name, default_value=topic, description=f"topic of the {content}")
             for name, topic, content in INPUTS
@@ -78,6 +87,8 @@ def generate_launch_description() -> LaunchDescription:
             name=name,
             namespace=LaunchConfiguration("namespace"),
             output="screen",
+            respawn=LaunchConfiguration("respawn"),
+            respawn_delay=RESPAWN_DELAY_S,
             parameters=[{"use_sim_time": use_sim_time}],
             # Given to the node itself, which refuses a missing file; launch would ignore it.
             arguments=["--ros-args", "--params-file", LaunchConfiguration("params_file")],
@@ -99,4 +110,5 @@ def generate_launch_description() -> LaunchDescription:
             default_value=PathJoinSubstitution([share, "config", "fastdds.xml"]),
         ),
     )
-    return LaunchDescription([*arguments, profile, *nodes])
+    respawned = SetEnvironmentVariable("DEWORLDSG_RESPAWN", LaunchConfiguration("respawn"))
+    return LaunchDescription([*arguments, profile, respawned, *nodes])

@@ -102,8 +102,7 @@ def change(builder: GraphBuilder, generator: np.random.Generator) -> None:
     if kind == "see":
         graph.add_visual(one, other, generator.normal(0, 3, 4), 1)
     elif kind == "near":
-        graph.add_neighbour(one, other, 1)
-        graph.add_neighbour(other, one, 1)
+        graph.add_neighbours([(one, other), (other, one)], 1)
     elif kind == "predict":
         builder.prior.update(generator.integers(0, 3, (1, 2)), generator.dirichlet(np.ones(4), 1))
     elif kind == "observe":

@@ -64,6 +64,19 @@ def test_continuing_from_a_map_equals_not_stopping(tmp_path, association, seed):
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
+@pytest.mark.parametrize("association", ["surface", "paper"])
+def test_a_map_that_is_read_is_written_with_the_same_bytes(tmp_path, association):
+    config = config_of(association=association)
+    whole = GraphBuilder(config, VOCABULARY, "world")
+    for local in random_local_graphs(np.random.default_rng(0), 60):
+        whole.integrate(local)
+    assert len(whole.graph) > 64 or len(whole.graph.edges) > 64  # more than the tables begin with
+    whole.graph.take_removals()
+    before = saved(whole, tmp_path).read_bytes()
+    again = read_map(config, tmp_path / "room.map")
+    assert saved(again, tmp_path).read_bytes() == before
+
+
 def upright_frame(stamp: int) -> LocalGraph:
     """A table, a mug on it and a chair, from a level camera in a world whose y axis points up."""
     T = np.diag([1.0, -1.0, -1.0, 1.0])

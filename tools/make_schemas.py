@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import struct
 import sys
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,7 @@ def _lifted(
         covariance_m2=_diagonal(variance),
         depth_m=1.82,
         pixel_count=count,
-        surface_points_m=[[mean[0] - 0.02, mean[1], mean[2]], [mean[0] + 0.02, mean[1], mean[2]]],
+        surface=struct.pack("<6f", mean[0] - 0.02, *mean[1:], mean[0] + 0.02, *mean[1:]),
     )
 
 

@@ -126,12 +126,12 @@ def _best_part(graph: SceneGraph, item: SceneObject, condition: Condition) -> _P
 def _part(
     graph: SceneGraph, item: SceneObject, condition: Condition, other: SceneObject, chance: float
 ) -> _Part | None:
-    of = f"{other.name} {chance:.0%}" if condition.thing is not None else other.name
+    of = f"{other.name} ({chance:.0%})" if condition.thing is not None else other.name
     if condition.predicate is None:
         return chance, None, f"{distance_m(item, other):.2f} m from {of}"
     found = graph.relations(item, condition.predicate, other)
     if not found:
         return None
     relation = found[0]
-    text = f"{relation.predicate} {of} with {relation.probability:.0%}, {relation.evidence}"
+    text = f"{relation.predicate} {of}: {relation.probability:.0%}, {relation.evidence}"
     return chance * relation.probability, relation, text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,8 @@ MOVED_M, MOVED_PART = 0.08, 0.25
 SAME_PLACE_M = 0.3
 # An object of the same class farther away than that has moved, up to this distance.
 REACH_M = 3.0
+# Cost of a pair that is out of reach: more than that of all other pairs together.
+_FAR = 1e6
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,10 @@ def changes_by_place(before: Iterable[SceneObject], after: Iterable[SceneObject]
     in reach are one object that moved.
     """
     first, second = list(before), list(after)
-    pairs = matched(first, second, place_cost)
+    pairs = matched_by_place(first, second)
     first = _without(first, (pair.before for pair in pairs))
     second = _without(second, (pair.after for pair in pairs))
-    moved = matched(first, second, _move_cost)
+    moved = _matched(first, second, _move_cost, lambda _: REACH_M)
     return _changes(
         _without(second, (pair.after for pair in moved)),
         _without(first, (pair.before for pair in moved)),
@@ -128,22 +130,74 @@ def changes_by_place(before: Iterable[SceneObject], after: Iterable[SceneObject]
     )
 
 
-def matched(before: list[SceneObject], after: list[SceneObject], cost: Any) -> list[Pairing]:
-    """The assignment of least total cost; pairs of infinite cost are left out."""
-    from scipy.optimize import linear_sum_assignment  # slow to import, and only for changes
+def matched_by_place(before: list[SceneObject], after: list[SceneObject]) -> list[Pairing]:
+    """Objects at one place, one to one, whatever they are called."""
+    return _matched(before, after, _place_cost, _place_reach_m)
+
+
+def _matched(
+    before: list[SceneObject],
+    after: list[SceneObject],
+    cost: Callable[[SceneObject, SceneObject], float],
+    reach_m: Callable[[SceneObject], float],
+) -> list[Pairing]:
+    """The assignment of least total cost; pairs of infinite cost are left out.
+
+    Args:
+        before: the objects of one graph.
+        after: those of the other one.
+        cost: of a pair; infinite beyond the reach of both.
+        reach_m: of an object.
+    """
+    # Slow to import, and only for changes.
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    costs = {(a, b): cost(before[a], after[b]) for a, b in _near(before, after, reach_m)}
+    costs = {pair: value for pair, value in costs.items() if value < np.inf}
+    if not costs:
+        return []
+    # Objects that no chain of pairs connects are not in each other's way.
+    rows, columns = np.array(list(costs)).T
+    ends, size = (rows, len(before) + columns), len(before) + len(after)
+    group = connected_components(coo_array((np.ones(len(rows)), ends), (size, size)), False)[1]
+    found = []
+    order = np.argsort(group[rows], kind="stable")
+    for pairs in np.split(order, np.flatnonzero(np.diff(group[rows][order])) + 1):
+        of_a, of_b = np.unique(rows[pairs]).tolist(), np.unique(columns[pairs]).tolist()
+        table = [[costs.get((a, b), _FAR) for b in of_b] for a in of_a]
+        found += [(of_a[i], of_b[k]) for i, k in zip(*linear_sum_assignment(table))]
+    return [Pairing(before[a], after[b]) for a, b in sorted(found) if (a, b) in costs]
+
+
+def _near(
+    before: list[SceneObject],
+    after: list[SceneObject],
+    reach_m: Callable[[SceneObject], float],
+) -> set[tuple[int, int]]:
+    """Pairs of indices within the reach of either object."""
+    from scipy.spatial import cKDTree  # slow to import, and only for changes
 
     if not before or not after:
-        return []
-    costs = np.array([[cost(a, b) for b in after] for a in before])
-    finite = np.where(np.isfinite(costs), costs, 1e6)
-    rows, columns = linear_sum_assignment(finite)
-    return [Pairing(before[r], after[c]) for r, c in zip(rows, columns) if costs[r, c] < np.inf]
+        return set()
+    places = [np.array([item.position_m for item in items]) for items in (before, after)]
+    # Beyond rounding.
+    reaches = [1.001 * np.array([reach_m(item) for item in items]) for items in (before, after)]
+    of_a = cKDTree(places[1]).query_ball_point(places[0], reaches[0])
+    of_b = cKDTree(places[0]).query_ball_point(places[1], reaches[1])
+    near = {(a, b) for a, found in enumerate(of_a) for b in found}
+    return near | {(a, b) for b, found in enumerate(of_b) for a in found}
 
 
-def place_cost(a: SceneObject, b: SceneObject) -> float:
+def _place_reach_m(item: SceneObject) -> float:
+    return max(SAME_PLACE_M, max(item.size_m) / 2)
+
+
+def _place_cost(a: SceneObject, b: SceneObject) -> float:
     """Cost of taking two objects for one that did not move; infinite if they are too far apart."""
     distance = float(np.linalg.norm(np.subtract(a.position_m, b.position_m)))
-    reach = max(SAME_PLACE_M, max(*a.size_m, *b.size_m) / 2)
+    reach = max(_place_reach_m(a), _place_reach_m(b))
     # Different classes at one place are rarer than noise of the place.
     if a.label != b.label:
         reach, distance = reach / 2, distance + reach / 2
@@ -159,7 +213,7 @@ def _move_cost(a: SceneObject, b: SceneObject) -> float:
 def _changes(added: list[SceneObject], gone: list[SceneObject], pairs: list[Pairing]) -> Changes:
     moved = [pair for pair in pairs if pair.has_moved]
     relabelled = [pair for pair in pairs if pair.before.label != pair.after.label]
-    same = sum(pair not in moved and pair not in relabelled for pair in pairs)
+    same = sum(not pair.has_moved and pair.before.label == pair.after.label for pair in pairs)
     return Changes(tuple(added), tuple(gone), tuple(moved), tuple(relabelled), same)
 
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from deworldsg_ros.client.align import align
-from deworldsg_ros.client.changes import Pairing, matched, place_cost
+from deworldsg_ros.client.changes import Pairing, matched_by_place
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject, scene_object
@@ -75,7 +75,7 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
     if np.dot(T_a_b[:3, :3] @ b.up, a.up) < np.cos(MAX_TILT_RAD):
         raise ClientError(f"the transform turns up {b.up} away from {a.up}: expected the same up")
     moved = {item.id: moved_object(item, T_a_b, a.frame_id, a.up) for item in b}
-    pairs = matched(list(a), list(moved.values()), place_cost)
+    pairs = matched_by_place(list(a), list(moved.values()))
     merged = {pair.after.id: pair.before.id for pair in pairs}
     first_free = max([*(item.id for item in a), 0]) + 1
     others = [node_id for node_id in moved if node_id not in merged]

@@ -45,7 +45,7 @@ class GraphCommands:
         return self.command("delete", node=node)
 
     def undo(self) -> dict[str, Any]:
-        """Undo the newest edit that holds."""
+        """Undo the newest edit that was not undone yet, of any user."""
         answer: dict[str, Any] = json.loads(self._call("undo", None))
         return answer
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -21,14 +20,43 @@ from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.following import MOST_WAITING, GraphFollower
 from deworldsg_ros.scene.replica import GraphReplica
 
-# Updates that DDS keeps for this client; graph_node keeps as many.
-UPDATE_DEPTH = 50
 SPIN_PERIOD_S = 0.1
 
 Callback = Callable[[SceneGraph, Changes], object]
 GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
+
+
+class _ToldReplica:
+    """A copy of the graph that tells listeners each message that changed it."""
+
+    def __init__(self) -> None:
+        self.graph = GraphReplica()
+        self.listeners: list[Callable[[GraphMessage], object]] = []
+
+    @property
+    def session(self) -> str | None:
+        return self.graph.session
+
+    @property
+    def sequence(self) -> int:
+        return self.graph.sequence
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        self.graph.reset(snapshot)
+        self._tell(snapshot)
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        is_new = self.graph.apply(update)
+        if is_new:
+            self._tell(update)
+        return is_new
+
+    def _tell(self, message: GraphMessage) -> None:
+        for listener in self.listeners:
+            listener(message)
 
 
 class SceneGraphClient(GraphCommands):
@@ -43,23 +71,21 @@ class SceneGraphClient(GraphCommands):
         context: rclpy context, which has to be initialised; None = one of its own.
 
     Attributes:
-        gaps: number of times that updates were lost.
         refused: number of messages that could not be read.
     """
 
     def __init__(self, namespace: str = "", context: Context | None = None) -> None:
-        self.gaps = self.refused = 0
+        self.refused = 0
         self._own_context = context is None
         self._context = context if context is not None else Context()
         self._namespace = namespace.rstrip("/")
-        self._replica = GraphReplica()
+        self._replica = _ToldReplica()
+        self._follower = GraphFollower(self._replica)
         # Made from the copy when somebody asks: a large graph changes more often than that.
         self._graph: SceneGraph | None = None
         self._told: SceneGraph | None = None
-        self._has_graph = self._is_outdated = False
-        self._waiting: deque[wire.SceneGraphUpdateMessage] = deque(maxlen=UPDATE_DEPTH)
+        self._is_outdated = False
         self._callbacks: list[Callback] = []
-        self._listeners: list[Callable[[GraphMessage], object]] = []
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -72,7 +98,7 @@ class SceneGraphClient(GraphCommands):
         )
         for topic, depth, receive in (
             ("/scene_graph", 1, self._snapshot),
-            ("/scene_graph/updates", UPDATE_DEPTH, self._update),
+            ("/scene_graph/updates", MOST_WAITING, self._update),
         ):
             self._node.create_subscription(
                 String, self._namespace + topic, self._guarded(receive), _qos(depth)
@@ -102,14 +128,19 @@ class SceneGraphClient(GraphCommands):
     @property
     def has_graph(self) -> bool:
         """Whether there is a graph to ask."""
-        return self._has_graph
+        return self._follower.has_graph
+
+    @property
+    def gaps(self) -> int:
+        """Number of times that updates were lost."""
+        return self._follower.gaps
 
     @property
     def newest(self) -> SceneGraph | None:
         """The newest graph; None before the first one."""
         with self._changed:
             if self._is_outdated:
-                self._graph = SceneGraph(self._replica.message())
+                self._graph = SceneGraph(self._replica.graph.message())
                 self._is_outdated = False
             return self._graph
 
@@ -130,7 +161,7 @@ class SceneGraphClient(GraphCommands):
         """
         end_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
-            while not self._has_graph or self._replica.sequence < sequence:
+            while not self.has_graph or self._replica.sequence < sequence:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
                     topic = f"{self._namespace}/scene_graph"
@@ -155,7 +186,7 @@ class SceneGraphClient(GraphCommands):
 
         It runs in the thread of the client, so it should be short.
         """
-        self._listeners.append(callback)
+        self._replica.listeners.append(callback)
 
     def _spin(self) -> None:
         while not self._stop.is_set() and self._context.ok():
@@ -167,7 +198,7 @@ class SceneGraphClient(GraphCommands):
                 with self._changed:
                     changed = receive(message.data)
                     if changed:
-                        self._has_graph = self._is_outdated = True
+                        self._is_outdated = True
                         self._changed.notify_all()
             except RefusedInput as refusal:
                 self.refused += 1
@@ -179,36 +210,10 @@ class SceneGraphClient(GraphCommands):
         return call
 
     def _snapshot(self, text: str) -> bool:
-        snapshot = wire.decode(text, wire.SceneGraphMessage)
-        same = self._has_graph and (snapshot.session or None) == self._replica.session
-        if same and snapshot.sequence <= self._replica.sequence:
-            return False
-        self._replica.reset(snapshot)
-        self._tell(snapshot)
-        # Updates that came during the gap, and are newer than the snapshot.
-        waiting, self._waiting = self._waiting, deque(maxlen=UPDATE_DEPTH)
-        for update in waiting:
-            self._apply(update)
-        return True
+        return self._follower.snapshot(wire.decode(text, wire.SceneGraphMessage))
 
     def _update(self, text: str) -> bool:
-        return self._apply(wire.decode(text, wire.SceneGraphUpdateMessage))
-
-    def _apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
-        """Apply an update, or keep it until a snapshot closes the gap before it."""
-        try:
-            is_new = self._replica.apply(update)
-        except RefusedInput:
-            self.gaps += self._has_graph and not self._waiting
-            self._waiting.append(update)
-            return False
-        if is_new:
-            self._tell(update)
-        return is_new
-
-    def _tell(self, message: GraphMessage) -> None:
-        for listener in self._listeners:
-            listener(message)
+        return self._follower.update(wire.decode(text, wire.SceneGraphUpdateMessage))
 
     def _tell_changes(self) -> None:
         before, graph = self._told, self.newest

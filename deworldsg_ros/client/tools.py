@@ -198,7 +198,7 @@ class EditTools:
         return dict(self._client.delete(object))
 
     def undo(self) -> dict[str, Any]:
-        """Undo the newest edit of the graph that holds, whoever made it."""
+        """Undo the newest edit that was not undone yet, of any user."""
         return dict(self._client.undo())
 
 

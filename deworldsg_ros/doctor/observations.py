@@ -47,8 +47,8 @@ class Observations:
         turns: frames by the quarter turns that made them upright.
         checks: of a few frames; None = not made.
         missing: inputs that nodes wait for, in words.
-        silent: topics that a node listens to and nobody publishes, with the topics of the same
-            type that somebody publishes.
+        silent: topics without a publisher that a node subscribes to; each with the published
+            topics of the same type.
         incompatible: topics whose publisher and subscriber never match in QoS, in words.
         behind_s: seconds from the stamp of a topic's newest message to the clock.
         found_nodes: whether nodes of this package run; None = it was not looked for.

@@ -17,6 +17,7 @@ from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.scene.delta import empty_scene_graph
 
 FRAME_ID = "fleet"
 # Two objects of one graph lie on two of another one in many wrong ways. Four do not.
@@ -100,7 +101,7 @@ class Fleet:
         stable = self._stable_ids(of)
         self._owners = {stable[new]: frozenset(names) for new, names in owners.items()}
         self._sequence += 1
-        message = _empty() if whole is None else _renamed(whole.message, stable)
+        message = empty_scene_graph(FRAME_ID) if whole is None else _renamed(whole.message, stable)
         message.session, message.sequence = self._session, self._sequence
         self._objects = {item.id: item for item in SceneGraph(message)}
         self._edges, self._stamp = message.edges, message.stamp
@@ -118,16 +119,16 @@ class Fleet:
         T_world_fleet = invert_pose(member.T_fleet_world)
         graph = member.graph
         own = np.array([item.position_m for item in graph], np.float64).reshape(-1, 3)
-        nodes = {}
-        for item in self._objects.values():
-            if name in self._owners[item.id]:
-                continue
-            moved = moved_object(item, T_world_fleet, graph.frame_id, graph.up)
-            gaps_m = np.linalg.norm(own - np.array(moved.position_m), axis=1)
-            if gaps_m.min(initial=np.inf) <= NEARBY_M:
-                nodes[item.id] = moved.state
+        others = [item for item in self._objects.values() if name not in self._owners[item.id]]
+        places = np.array([item.position_m for item in others], np.float64).reshape(-1, 3)
+        gaps_m = _gaps_m(places @ T_world_fleet[:3, :3].T + T_world_fleet[:3, 3], own)
+        nodes = {
+            item.id: moved_object(item, T_world_fleet, graph.frame_id, graph.up).state
+            for item, gap_m in zip(others, gaps_m.tolist())
+            if gap_m <= NEARBY_M
+        }
         return msgspec.structs.replace(
-            _empty(),
+            empty_scene_graph(FRAME_ID),
             stamp=self._stamp,
             frame_id=graph.frame_id,
             session=self._session,
@@ -179,7 +180,9 @@ def _first(member: Member) -> tuple[SceneGraph | None, dict[int, int]]:
         return None, {}
     if member.T_fleet_world is None:
         member.T_fleet_world, member.confidence, member.reason = np.eye(4), 1.0, ""
-    empty = SceneGraph(msgspec.structs.replace(_empty(), up=_up_in_fleet(member)))
+    empty = SceneGraph(
+        msgspec.structs.replace(empty_scene_graph(FRAME_ID), up=_up_in_fleet(member))
+    )
     return _added(empty, member)
 
 
@@ -222,6 +225,16 @@ def _take(member: Member, found: Alignment) -> None:
     member.confidence, member.matched = found.confidence, found.matched
 
 
+def _gaps_m(places: Float64, others: Float64) -> Float64:
+    """Distance (n,) of each place (n, 3) from the nearest of others (m, 3)."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    if not len(places) or not len(others):
+        return np.full(len(places), np.inf)
+    gaps: Float64 = cKDTree(others).query(places)[0]
+    return gaps
+
+
 def _up_in_fleet(member: Member) -> list[float]:
     assert member.T_fleet_world is not None
     up: list[float] = (member.T_fleet_world[:3, :3] @ member.graph.up).tolist()
@@ -237,15 +250,4 @@ def _renamed(message: wire.SceneGraphMessage, ids: dict[int, int]) -> wire.Scene
         frame_id=FRAME_ID,
         nodes=sorted(nodes, key=lambda node: node.id),
         edges=sorted(edges, key=lambda edge: (edge.subject, edge.object)),
-    )
-
-
-def _empty() -> wire.SceneGraphMessage:
-    return wire.SceneGraphMessage(
-        schema=wire.schema_of(wire.SceneGraphMessage),
-        stamp=wire.stamp_from_ns(0),
-        frame_id=FRAME_ID,
-        sequence=0,
-        nodes=[],
-        edges=[],
     )

@@ -25,7 +25,7 @@ COMPRESSION = 1
 
 
 def open_session(connect: str = "", listen: str = "") -> Any:
-    """A Zenoh session; nobody else is looked for.
+    """A Zenoh session. It does not search the network for other routers.
 
     Args:
         connect: endpoints of routers, e.g. ``tcp/10.0.0.5:7447``, separated by commas.
@@ -102,8 +102,8 @@ class Feed:
         with query:
             if self._refresh is not None:
                 self._refresh()
-            asked = dict(_pairs(str(query.parameters)))
-            number = asked.get("since", "0")
+            asked = query.parameters
+            number = asked.get("since") or "0"
             since = int(number) if number.isdecimal() and len(number) < 19 else 0
             update = self._log.since(asked.get("session"), since)
             # An empty answer: nothing changed.
@@ -172,11 +172,6 @@ def _unpacked(packed: bytes) -> wire.SceneGraphUpdateMessage:
     if update.since is UNSET:
         raise RefusedInput("invalid_message", "an update without `since`: expected a number")
     return update
-
-
-def _pairs(text: str) -> list[tuple[str, str]]:
-    parts = (part.partition("=") for part in text.split(";"))
-    return [(key, value) for key, _, value in parts]
 
 
 class Robots:

@@ -32,6 +32,8 @@ MAX_GAPS = 32
 # Neighbouring pixels often fall into one bucket. So that their counts do not wait for one another,
 # they are counted in turn in this number of tables.
 COUNT_TABLES = 4
+# Above the bits of all depths.
+MOST_BITS = np.int32(np.iinfo(np.int32).max)
 
 
 def dominant_layer(
@@ -50,19 +52,39 @@ def dominant_layer(
         beta: factor of the reference depth.
     """
     lowest, highest = _dominant_layer(depths_m, gamma_base_m, alpha, beta)
-    return float(lowest), float(highest)
+    if lowest > highest:
+        return _by_sorting(depths_m, gamma_base_m, alpha, beta)
+    return lowest, highest
+
+
+def _by_sorting(
+    depths_m: Float32, gamma_base_m: float, alpha: float, beta: float
+) -> tuple[float, float]:
+    """`dominant_layer` as it is defined."""
+    ordered = np.sort(depths_m.astype(np.float64))
+    steps = ordered[1:] - ordered[:-1]
+    reference = _middle(ordered)
+    cuts = steps > max(gamma_base_m, alpha * _middle(np.sort(steps)), beta * reference)
+    lows, highs = ordered[np.append(True, cuts)], ordered[np.append(cuts, True)]
+    lowest, highest = _nearest_cluster(depths_m, lows, highs, reference)
+    return lowest, highest
+
+
+def _middle(ordered: Float64) -> float:
+    """Median of sorted numbers."""
+    return float((ordered[(ordered.size - 1) // 2] + ordered[ordered.size // 2]) / 2.0)
 
 
 @kernel
 def _extremes(depths: Float32) -> tuple[float, float]:
     """Lowest and highest depth; positive floats have the order of their bits."""
-    bits = depths.view(np.int32)
-    least = greatest = bits[0]
-    for index in range(bits.size):
-        least = min(least, bits[index])
-        greatest = max(greatest, bits[index])
-    values = np.array([least, greatest]).view(np.float32)
-    return np.float64(values[0]), np.float64(values[1])
+    least = greatest = np.float32(depths[0]).view(np.int32)
+    for index in range(depths.size):
+        bits = np.float32(depths[index]).view(np.int32)
+        least = min(least, bits)
+        greatest = max(greatest, bits)
+    lowest, highest = np.int32(least).view(np.float32), np.int32(greatest).view(np.float32)
+    return np.float64(lowest), np.float64(highest)
 
 
 @kernel
@@ -84,13 +106,12 @@ def _buckets(depths: Float32, lowest: float, scale: float, count: int) -> UInt16
 def _bucket_counts(buckets: UInt16, count: int) -> Int64:
     """Number of depths in each bucket."""
     tables = np.zeros((COUNT_TABLES, count), np.int64)
-    whole = buckets.size // COUNT_TABLES
-    groups = buckets[: whole * COUNT_TABLES].reshape(whole, COUNT_TABLES)
-    for group in groups:
+    whole = buckets.size // COUNT_TABLES * COUNT_TABLES
+    for index in range(0, whole, COUNT_TABLES):
         for table in range(COUNT_TABLES):
-            tables[table, group[table]] += 1
-    for bucket in buckets[whole * COUNT_TABLES :]:
-        tables[0, bucket] += 1
+            tables[table, buckets[index + table]] += 1
+    for index in range(whole, buckets.size):
+        tables[0, buckets[index]] += 1
     for table in range(1, COUNT_TABLES):
         for bucket in range(count):
             tables[0, bucket] += tables[table, bucket]
@@ -112,18 +133,22 @@ def _members(depths: Float32, buckets: UInt16, bucket: int, count: int) -> Float
 @kernel
 def _least_above(depths: Float32, buckets: UInt16, bucket: int) -> float:
     """The lowest depth in a later bucket."""
-    least = np.int32(np.iinfo(np.int32).max)
-    bits = depths.view(np.int32)
-    for index in range(bits.size):
-        least = min(least, bits[index] if buckets[index] > bucket else least)
-    return np.float64(np.array([least]).view(np.float32)[0])
+    least = MOST_BITS
+    for index in range(depths.size):
+        bits = np.float32(depths[index]).view(np.int32)
+        least = min(least, bits if buckets[index] > bucket else least)
+    return np.float64(np.int32(least).view(np.float32))
 
 
 @kernel
-def _sorted(depths: Float32) -> Float64:
-    """The depths in ascending order. Numba compiles a sort for each type: all here are float64."""
-    ordered: Float64 = np.sort(depths.astype(np.float64))
-    return ordered
+def _sort(depths: Float32) -> None:
+    """Sort a few depths in place."""
+    for index in range(1, depths.size):
+        depth, at = depths[index], index
+        while at > 0 and depths[at - 1] > depth:
+            depths[at] = depths[at - 1]
+            at -= 1
+        depths[at] = depth
 
 
 @kernel
@@ -144,11 +169,11 @@ def _median(depths: Float32, buckets: UInt16, counts: Int64) -> float:
             return lowest
         depths = members
         if depths.size <= 64:
-            ordered = _sorted(depths)
-            middle: float = (ordered[rank] + ordered[next_rank]) / 2.0
-            return middle
-        buckets = _buckets(depths, lowest, 256 / (highest - lowest), 256)
-        counts = _bucket_counts(buckets, 256)
+            _sort(depths)
+            return (np.float64(depths[rank]) + np.float64(depths[next_rank])) / 2.0
+        count = int(np.int64(256))  # the kernels would be compiled once more for a literal
+        buckets = _buckets(depths, lowest, count / (highest - lowest), count)
+        counts = _bucket_counts(buckets, count)
 
 
 @kernel
@@ -167,28 +192,18 @@ def _blocks(
     depths: Float32, buckets: UInt16, starts: Int64, lowest: float, highest: float
 ) -> tuple[Float64, Float64]:
     """Lowest and highest depth of each block; the blocks but the first begin at `starts`."""
-    ends = np.empty((2, starts.size), np.int32)
-    bits = depths.view(np.int32)
+    lows, highs = np.empty(starts.size + 1, np.float64), np.empty(starts.size + 1, np.float64)
+    lows[0], highs[starts.size] = lowest, highest
     for gap in range(starts.size):
         start = np.uint16(starts[gap])
-        below, above = np.int32(0), np.int32(np.iinfo(np.int32).max)
-        for index in range(bits.size):
-            is_above = buckets[index] >= start
-            above = min(above, bits[index] if is_above else above)
-            below = max(below, below if is_above else bits[index])
-        ends[0, gap], ends[1, gap] = above, below
-    lows, highs = np.full(starts.size + 1, lowest), np.full(starts.size + 1, highest)
-    lows[1:], highs[:-1] = ends[0].view(np.float32), ends[1].view(np.float32)
+        below, above = np.int32(0), MOST_BITS
+        for index in range(depths.size):
+            bits, is_above = np.float32(depths[index]).view(np.int32), buckets[index] >= start
+            above = min(above, bits if is_above else above)
+            below = max(below, below if is_above else bits)
+        lows[gap + 1] = np.float64(np.int32(above).view(np.float32))
+        highs[gap] = np.float64(np.int32(below).view(np.float32))
     return lows, highs
-
-
-@kernel
-def _median_step(depths: Float32) -> float:
-    """median(Δz) of the sorted depths."""
-    ordered = _sorted(depths)
-    steps = np.sort(ordered[1:] - ordered[:-1])
-    middle: float = (steps[(steps.size - 1) // 2] + steps[steps.size // 2]) / 2.0
-    return middle
 
 
 @kernel
@@ -243,40 +258,41 @@ def _nearest_cluster(
 def _dominant_layer(
     depths: Float32, gamma_base: float, alpha: float, beta: float
 ) -> tuple[float, float]:
+    """`dominant_layer`; (inf, -inf) if the depths have to be sorted."""
     lowest, highest = _extremes(depths)
     if lowest == highest:
         return lowest, highest
     spread = highest - lowest
-    steps = depths.size - 1
-
-    is_counted = 2.0 * spread / gamma_base < MAX_BUCKETS
-    if is_counted:
-        count = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
-        buckets = _buckets(depths, lowest, count / spread, count)
-        counts = _bucket_counts(buckets, count)
-        starts = _gaps(counts)
-        is_counted = starts.size <= MAX_GAPS
-    if is_counted:
-        reference = _median(depths, buckets, counts)
-        lows, highs = _blocks(depths, buckets, starts, lowest, highest)
-    else:
-        lows = _sorted(depths)
-        highs = lows
-        reference = (lows[steps // 2] + lows[(steps + 1) // 2]) / 2.0
+    if 2.0 * spread / gamma_base >= MAX_BUCKETS:
+        return np.inf, -np.inf
+    count = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
+    buckets = _buckets(depths, lowest, count / spread, count)
+    counts = _bucket_counts(buckets, count)
+    starts = _gaps(counts)
+    if starts.size > MAX_GAPS:
+        return np.inf, -np.inf
+    reference = _median(depths, buckets, counts)
+    lows, highs = _blocks(depths, buckets, starts, lowest, highest)
 
     threshold = max(gamma_base, beta * reference)
     # The bound on median(Δz), and the same bound without the steps between blocks: two distant
     # layers do not loosen the second one.
+    within, steps = 0.0, depths.size - 1
+    for block in range(lows.size):
+        within += highs[block] - lows[block]
     step_bound = 2.0 * spread / steps
-    inside = 0.5 * steps - (lows.size - 1)
+    inside = 0.5 * steps - starts.size
     if inside > 0:
-        step_bound = min(step_bound, (highs - lows).sum() / inside)
+        step_bound = min(step_bound, within / inside)
     if alpha * step_bound * (1.0 + 1e-9) > threshold:
-        threshold = max(threshold, alpha * _median_step(depths))
+        return np.inf, -np.inf
 
-    cut = lows[1:] - highs[:-1] > threshold
-    if not cut.any():
+    last = 0
+    for block in range(1, lows.size):
+        if lows[block] - highs[block - 1] > threshold:
+            last += 1
+            lows[last] = lows[block]
+        highs[last] = highs[block]
+    if last == 0:
         return lowest, highest
-    first = np.append(True, cut)
-    last = np.append(cut, True)
-    return _nearest_cluster(depths, lows[first], highs[last], reference)
+    return _nearest_cluster(depths, lows[: last + 1], highs[: last + 1], reference)

@@ -79,19 +79,20 @@ def _estimate(
     min_pixels: int,
     surface_points: int,
 ) -> tuple[int, Float64, Float64, Float64]:
-    columns, rows = np.empty_like(all_columns), np.empty_like(all_rows)
-    depths_m = np.empty_like(all_depths_m)
+    columns = np.empty(all_columns.size, np.int32)
+    rows, depths_m = np.empty(columns.size, np.int32), np.empty(columns.size, np.float32)
     count = 0
     for index in range(all_depths_m.size):
         z = all_depths_m[index]
         columns[count], rows[count], depths_m[count] = all_columns[index], all_rows[index], z
         count += (z >= lowest_m) & (z <= highest_m)
     if count < min_pixels:
-        return count, np.empty(0), np.empty((0, 0)), np.empty((0, 0))
+        nothing = np.empty((0, 0), np.float64)
+        return count, np.empty(0, np.float64), nothing, nothing
     mean, covariance = _moments(columns[:count], rows[:count], depths_m[:count], fx, fy, cx, cy)
     area_m2 = count * mean[2] ** 2 / (fx * fy)
     by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * surface_points)
-    points = np.empty((min(max(by_area, surface_points), count), 3))
+    points = np.empty((min(max(by_area, surface_points), count), 3), np.float64)
     for index in range(len(points)):
         place = index * count // len(points)
         x, y, z = back_project(
@@ -117,7 +118,8 @@ def _moments(
     sx = sy = sz = 0.0
     sxx = sxy = sxz = syy = syz = szz = 0.0
     # Points are computed in parallel, sums one after the other: their order decides the rounding.
-    xs, ys, zs = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    xs, ys = np.empty(CHUNK, np.float64), np.empty(CHUNK, np.float64)
+    zs = np.empty(CHUNK, np.float64)
     for start in range(0, count, CHUNK):
         u, v = columns[start : start + CHUNK], rows[start : start + CHUNK]
         depths = depths_m[start : start + CHUNK]
@@ -137,9 +139,14 @@ def _moments(
             syy += y * y
             syz += y * z
             szz += z * z
-    mean = np.array([sx / count, sy / count, sz / count])
-    covariance = np.array([[sxx, sxy, sxz], [sxy, syy, syz], [sxz, syz, szz]])
+    mean, covariance = np.empty(3, np.float64), np.empty((3, 3), np.float64)
+    mean[0], mean[1], mean[2] = sx / count, sy / count, sz / count
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = sxx, syy, szz
+    covariance[0, 1] = covariance[1, 0] = sxy
+    covariance[0, 2] = covariance[2, 0] = sxz
+    covariance[1, 2] = covariance[2, 1] = syz
     for i in range(3):
         for j in range(3):
             covariance[i, j] = (covariance[i, j] - count * mean[i] * mean[j]) / (count - 1)
-    return mean + np.array([x0, y0, z0]), covariance
+    mean[0], mean[1], mean[2] = mean[0] + x0, mean[1] + y0, mean[2] + z0
+    return mean, covariance

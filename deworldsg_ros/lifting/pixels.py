@@ -40,18 +40,20 @@ def valid_depth(depth_m: Float32) -> Float32:
 @kernel
 def _is_valid(depth_m: Float32) -> bool:
     """Whether all depths are finite and not negative: their bits are below those of infinity."""
-    bits, greatest = depth_m.reshape(-1).view(np.uint32), np.uint32(0)
-    for index in range(bits.size):
-        greatest = max(greatest, bits[index])
+    greatest = np.uint32(0)
+    for row in range(depth_m.shape[0]):
+        for column in range(depth_m.shape[1]):
+            greatest = max(greatest, np.float32(depth_m[row, column]).view(np.uint32))
     return bool(greatest < 0x7F800000)
 
 
 @kernel
 def _valid_depth(depth_m: Float32) -> Float32:
-    valid = np.empty_like(depth_m)
-    flat_in, flat_out = depth_m.reshape(-1), valid.reshape(-1)
+    height, width = depth_m.shape
+    valid = np.empty((height, width), np.float32)
     zero, infinity = np.float32(0), np.float32(np.inf)
-    for index in range(flat_in.size):
-        depth = flat_in[index]
-        flat_out[index] = depth if (depth > zero) & (depth < infinity) else zero
+    for row in range(height):
+        for column in range(width):
+            depth = depth_m[row, column]
+            valid[row, column] = depth if (depth > zero) & (depth < infinity) else zero
     return valid

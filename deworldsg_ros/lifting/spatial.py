@@ -8,7 +8,7 @@ import numpy as np
 
 from deworldsg_ros.kernels import kernel, read_only
 from deworldsg_ros.lifting.pixels import Pixels
-from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt8, UInt16
+from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt8, UInt16, UInt64
 
 
 class Masks(NamedTuple):
@@ -34,7 +34,9 @@ class Masks(NamedTuple):
 
 def masks_of(instances: UInt16, count: int) -> Masks:
     """The masks in an instance image (H, W) uint16, 0 = no object, k = k-th object of `count`."""
-    return Masks(*_masks_of(read_only(instances, np.uint16), count))
+    # Whether a run begins at a pixel of a row, as bytes and as eight of them.
+    begins = np.zeros((instances.shape[1] + 7) // 8 * 8, np.uint8)
+    return Masks(*_masks_of(read_only(instances, np.uint16), count, begins, begins.view(np.uint64)))
 
 
 def valid_pixel_count(depth_m: Float32, runs: Int32) -> int:
@@ -59,13 +61,12 @@ def spatial_inliers(depth_m: Float32, runs: Int32, tau: float, epsilon_m: float)
 
 
 @kernel
-def _masks_of(instances: UInt16, count: int) -> tuple[Int32, Int64, Int64, int]:
+def _masks_of(
+    instances: UInt16, count: int, begins: UInt8, eights: UInt64
+) -> tuple[Int32, Int64, Int64, int]:
     height, width = instances.shape
-    sizes, numbers, unknown = np.zeros(count, np.int64), np.zeros(count + 1, np.int64), 0
+    sizes, starts, unknown = np.zeros(count, np.int64), np.zeros(count + 1, np.int64), 0
     found, total = np.empty((1024, 4), np.int32), 0
-    # Whether a run begins at a pixel. Runs are long: eight pixels are skipped at once.
-    begins = np.zeros((width + 7) // 8 * 8, np.uint8)
-    eights = begins.view(np.uint64)
     begins[0] = 1
     columns = np.empty(width + 1, np.int32)
     for row in range(height):
@@ -73,6 +74,7 @@ def _masks_of(instances: UInt16, count: int) -> tuple[Int32, Int64, Int64, int]:
         here, before, differs = labels[1:], labels[:-1], begins[1:]
         for index in range(here.size):
             differs[index] = np.uint8(here[index] != before[index])
+        # Runs are long: eight pixels are skipped at once.
         runs = 0
         for eight in range(eights.size):
             if eights[eight] != 0:
@@ -81,7 +83,10 @@ def _masks_of(instances: UInt16, count: int) -> tuple[Int32, Int64, Int64, int]:
                     runs += int(begins[column])
         columns[runs] = width
         if total + runs > len(found):
-            found = np.concatenate((found, np.empty((len(found) + runs, 4), np.int32)))
+            fewer, found = found, np.empty((2 * len(found) + runs, 4), np.int32)
+            for run in range(total):
+                for item in range(4):
+                    found[run, item] = fewer[run, item]
         for run in range(runs):
             start, stop = columns[run], columns[run + 1]
             label = int(labels[start])
@@ -89,15 +94,18 @@ def _masks_of(instances: UInt16, count: int) -> tuple[Int32, Int64, Int64, int]:
                 unknown += int(stop - start)
             elif label > 0:
                 sizes[label - 1] += stop - start
-                numbers[label] += 1
+                starts[label] += 1
                 found[total, 0], found[total, 1], found[total, 2] = row, start, stop
                 found[total, 3] = label - 1
                 total += 1
-    starts = np.cumsum(numbers)
-    ends, ordered = starts[:-1].copy(), np.empty((total, 4), np.int32)
+    ends, ordered = np.empty(count, np.int64), np.empty((total, 4), np.int32)
+    for index in range(count):
+        ends[index] = starts[index]
+        starts[index + 1] += starts[index]
     for run in range(total):
         index = found[run, 3]
-        ordered[ends[index]] = found[run]
+        for item in range(4):
+            ordered[ends[index], item] = found[run, item]
         ends[index] += 1
     return ordered, starts, sizes, unknown
 
@@ -122,37 +130,41 @@ def _ordered(a: np.int32, b: np.int32, c: np.int32) -> tuple[np.int32, np.int32,
 
 
 @kernel
-def _sort_columns(bits: Int32, row: int, start: int, stop: int, columns: Int32) -> None:
+def _sort_columns(depth_m: Float32, row: int, start: int, stop: int, columns: Int32) -> None:
     """Sort the depths of rows row - 1 to row + 1 in each column from start - 1 to stop.
 
     Args:
-        bits: (H, W) depths; positive floats have the order of their bits.
+        depth_m: (H, W); positive floats have the order of their bits.
         row: of a run of pixels.
         start: its first column.
         stop: the column after its last one.
         columns: (3, W + 2), filled from 0 on with the lowest, middle and highest of each column.
     """
-    height, width = bits.shape
+    height, width = depth_m.shape
     first, last = max(start - 1, 0), min(stop + 1, width)
-    above = bits[max(row - 1, 0), first:last]
-    here = bits[row, first:last]
-    below = bits[min(row + 1, height - 1), first:last]
+    above = depth_m[max(row - 1, 0), first:last]
+    here = depth_m[row, first:last]
+    below = depth_m[min(row + 1, height - 1), first:last]
     shift = first - (start - 1)
     count = last - first
     lows, middles, highs = columns[0, shift:], columns[1, shift:], columns[2, shift:]
     for index in range(count):
         lows[index], middles[index], highs[index] = _ordered(
-            above[index], here[index], below[index]
+            np.float32(above[index]).view(np.int32),
+            np.float32(here[index]).view(np.int32),
+            np.float32(below[index]).view(np.int32),
         )
-    if shift:
-        columns[:, 0] = columns[:, 1]
-    if last < stop + 1:
-        columns[:, shift + count] = columns[:, shift + count - 1]
+    end = shift + count
+    for rank in range(3):
+        if shift:
+            columns[rank, 0] = columns[rank, 1]
+        if last < stop + 1:
+            columns[rank, end] = columns[rank, end - 1]
 
 
 @kernel
 def _find_inliers(
-    depths_m: Float32, columns: Int32, medians: Float32, tau: float, epsilon_m: float, found: UInt8
+    depths_m: Float32, columns: Int32, medians: Int32, tau: float, epsilon_m: float, found: UInt8
 ) -> None:
     """Mark the inliers of a run of pixels (Eq. 1).
 
@@ -162,20 +174,22 @@ def _find_inliers(
     Args:
         depths_m: (n,) depths of the run.
         columns: see `_sort_columns`.
-        medians: (W,) space for the medians.
+        medians: (W,) space for the bits of the medians.
         tau: relative tolerance.
         epsilon_m: absolute tolerance, metres.
         found: (W,) filled with 1 for inliers and 0 for other pixels.
     """
-    bits = medians.view(np.int32)
     lows, middles, highs = columns[0], columns[1], columns[2]
     for index in range(depths_m.size):
         low = max(lows[index], max(lows[index + 1], lows[index + 2]))
         _, middle, _ = _ordered(middles[index], middles[index + 1], middles[index + 2])
         high = min(highs[index], min(highs[index + 1], highs[index + 2]))
-        bits[index] = _ordered(low, middle, high)[1]
+        medians[index] = _ordered(low, middle, high)[1]
     for index in range(depths_m.size):
-        depth, median = np.float64(depths_m[index]), np.float64(medians[index])
+        depth, median = (
+            np.float64(depths_m[index]),
+            np.float64(np.int32(medians[index]).view(np.float32)),
+        )
         is_near = abs(depth - median) < tau * median + epsilon_m
         found[index] = np.uint8((depth > 0.0) & is_near)
 
@@ -185,16 +199,17 @@ def _spatial_inliers(
     depth_m: Float32, runs: Int32, tau: float, epsilon_m: float
 ) -> tuple[Int32, Int32, Float32]:
     # One slot more than pixels: rejected pixels are written, too.
-    slots, width = (runs[:, 2] - runs[:, 1]).sum() + 1, depth_m.shape[1]
+    slots, width = 1, depth_m.shape[1]
+    for index in range(len(runs)):
+        slots += int(runs[index, 2] - runs[index, 1])
     columns, rows = np.empty(slots, np.int32), np.empty(slots, np.int32)
     depths_m = np.empty(slots, np.float32)
     sorted_columns = np.empty((3, width + 2), np.int32)
-    medians, found = np.empty(width, np.float32), np.empty(width, np.uint8)
-    bits, end = depth_m.view(np.int32), np.uint64(0)
+    medians, found, end = np.empty(width, np.int32), np.empty(width, np.uint8), np.uint64(0)
     for index in range(len(runs)):
         row, start, stop, _ = runs[index]
         run_m = depth_m[row, start:stop]
-        _sort_columns(bits, row, start, stop, sorted_columns)
+        _sort_columns(depth_m, row, start, stop, sorted_columns)
         _find_inliers(run_m, sorted_columns, medians, tau, epsilon_m, found)
         for step in range(run_m.size):
             columns[end] = start + step

@@ -22,11 +22,22 @@ def assign(scores: Float64) -> Int64:
     Args:
         scores: (n, k) float64, finite. All rows have a column if n <= k, else all columns have one.
     """
-    if scores.shape[0] <= scores.shape[1]:
-        return _columns_of_rows(-scores)
-    rows = _columns_of_rows(-np.ascontiguousarray(scores.T))
-    columns = np.full(scores.shape[0], -1, np.int64)
-    for column in range(rows.size):
+    count, width = scores.shape
+    turned = count > width
+    costs = np.empty((min(count, width), max(count, width)), np.float64)
+    for row in range(count):
+        for column in range(width):
+            if turned:
+                costs[column, row] = -scores[row, column]
+            else:
+                costs[row, column] = -scores[row, column]
+    columns = _columns_of_rows(costs)
+    if not turned:
+        return columns
+    rows, columns = columns, np.empty(count, np.int64)
+    for row in range(count):
+        columns[row] = -1
+    for column in range(width):
         columns[rows[column]] = column
     return columns
 
@@ -35,13 +46,16 @@ def assign(scores: Float64) -> Int64:
 def _columns_of_rows(costs: Float64) -> Int64:
     """The assignment of n <= k rows with the least total cost."""
     count, width = costs.shape
-    row_prices, column_prices = np.zeros(count), np.zeros(width)
-    column_of, row_of = np.full(count, -1, np.int64), np.full(width, -1, np.int64)
-    paths, lengths = np.empty(width, np.int64), np.empty(width)
+    row_prices, column_prices = np.zeros(count, np.float64), np.zeros(width, np.float64)
+    column_of, row_of = np.empty(count, np.int64), np.empty(width, np.int64)
+    for index in range(width):
+        row_of[index] = -1
+    paths, lengths = np.empty(width, np.int64), np.empty(width, np.float64)
     open_columns, closed = np.empty(width, np.int64), np.empty(width, np.bool_)
     for first in range(count):
-        lengths[:], closed[:] = np.inf, False
+        column_of[first] = -1
         for index in range(width):
+            lengths[index], closed[index] = np.inf, False
             open_columns[index] = width - 1 - index
         row, length, end = first, 0.0, -1
         for left in range(width, 0, -1):

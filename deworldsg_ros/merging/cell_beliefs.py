@@ -59,11 +59,17 @@ def judge(
         slot = firsts[owners[index]]
         while slot >= 0:
             marked = masks[slot] & marks[slot]
-            others = masks[slot] & ~marked
             marks[slot] = 0
-            hit, missed = _shown(keys[slot], others, values[index], frame, offsets, cell_m)
-            lost = _score(scores[slot], marked | hit, missed)
-            changed = marked | hit | missed
+            changed, lost = _judge_block(
+                keys[slot],
+                masks[slot],
+                marked,
+                scores[slot],
+                values[index],
+                frame,
+                offsets,
+                cell_m,
+            )
             dropped = (lost & ~rejected[slot]) | (lost & marked)
             rejected[slot] = (rejected[slot] & ~changed) | lost
             if dropped != 0:
@@ -91,30 +97,39 @@ def _offsets(T_camera_world: Float64, cell_m: float) -> Float64:
 
 @kernel
 def _index(bit: np.uint64) -> int:
-    """Index of a single bit."""
-    index = 0
-    index += 32 * int(bit & np.uint64(0xFFFFFFFF00000000) != 0)
-    index += 16 * int(bit & np.uint64(0xFFFF0000FFFF0000) != 0)
-    index += 8 * int(bit & np.uint64(0xFF00FF00FF00FF00) != 0)
-    index += 4 * int(bit & np.uint64(0xF0F0F0F0F0F0F0F0) != 0)
-    index += 2 * int(bit & np.uint64(0xCCCCCCCCCCCCCCCC) != 0)
-    index += int(bit & np.uint64(0xAAAAAAAAAAAAAAAA) != 0)
-    return index
+    """Index of a single bit: the number of bits below it.
+
+    As `_bit_count` of `cell_kernels`: a kernel calls kernels of its own module only.
+    """
+    mask = bit - np.uint64(1)
+    mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    pairs = np.uint64(0x3333333333333333)
+    mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
+    mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
 
 
 @kernel
-def _shown(
+def _judge_block(
     block: np.int64,
     cells: np.uint64,
+    marked: np.uint64,
+    scores: Int8,
     value: int,
     frame: FrameArrays,
     offsets: Float64,
     cell_m: float,
 ) -> tuple[np.uint64, np.uint64]:
-    """Cells of a block that a frame shows: those in a pixel with this value, and the others."""
+    """Update the scores (64,) of the cells of a block that a frame shows.
+
+    A marked cell is hit, and one in a pixel with this value; another one is missed.
+
+    Returns:
+        The cells whose score was updated, and those of them with a negative one.
+    """
     T, depth_mm, instances, (fx, fy, cx, cy) = frame
     rows, columns = depth_mm.shape
-    hit = missed = np.uint64(0)
+    changed = lost = np.uint64(0)
     # Centre of the block's first cell.
     x = cell_m * (4 * (block >> 42) - INDEX_BIAS + 0.5)
     y = cell_m * (4 * ((block >> 21) & INDEX_MASK) - INDEX_BIAS + 0.5)
@@ -126,36 +141,25 @@ def _shown(
         bit = cells & (~cells + np.uint64(1))
         cells ^= bit
         cell = _index(bit)
-        depth_m = ahead + offsets[cell, 2]
-        if depth_m < NEAR_M:
-            continue
-        u = fx * (right + offsets[cell, 0]) / depth_m + cx
-        v = fy * (down + offsets[cell, 1]) / depth_m + cy
-        if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
-            continue
-        row, column = int(v), int(u)
-        measured_mm = depth_mm[row, column]
-        apart_m = abs(0.001 * measured_mm - depth_m)
-        if measured_mm == 0 or apart_m > SHOWN_M + SHOWN_FRACTION * depth_m:
-            continue
-        if instances[row, column] == value:
-            hit |= bit
-        else:
-            missed |= bit
-    return hit, missed
-
-
-@kernel
-def _score(scores: Int8, hit: np.uint64, missed: np.uint64) -> np.uint64:
-    """Update the scores of the cells of a slot (64,); returns those now negative."""
-    lost = np.uint64(0)
-    rest = hit | missed
-    while rest != 0:
-        bit = rest & (~rest + np.uint64(1))
-        rest ^= bit
-        cell = _index(bit)
-        score = scores[cell] + (HIT if hit & bit != 0 else -MISS)
+        step = HIT
+        if marked & bit == 0:
+            depth_m = ahead + offsets[cell, 2]
+            if depth_m < NEAR_M:
+                continue
+            u = fx * (right + offsets[cell, 0]) / depth_m + cx
+            v = fy * (down + offsets[cell, 1]) / depth_m + cy
+            if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+                continue
+            row, column = int(v), int(u)
+            measured_mm = depth_mm[row, column]
+            apart_m = abs(0.001 * measured_mm - depth_m)
+            if measured_mm == 0 or apart_m > SHOWN_M + SHOWN_FRACTION * depth_m:
+                continue
+            if instances[row, column] != value:
+                step = -MISS
+        score = scores[cell] + step
         scores[cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
+        changed |= bit
         if score < 0:
             lost |= bit
-    return lost
+    return changed, lost

@@ -165,7 +165,9 @@ def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt
         while capacity < 2 * (starts[index + 1] - starts[index]):
             capacity *= 2
         # Position of each block in `blocks`, by hash.
-        known = np.full(capacity, -1, np.int64)
+        known = np.empty(capacity, np.int64)
+        for slot in range(capacity):
+            known[slot] = -1
         for point in range(starts[index], starts[index + 1]):
             block, bit = _cell_of(points[point], cells_per_m)
             if block < 0:
@@ -257,17 +259,47 @@ def add(
 
 
 @kernel
+def _slot_of(table: TableArrays, block: np.int64, owner: int) -> int:
+    """The slot of an owner's cells in a block; -1 = none."""
+    keys, _, slot_owners, _, _, _, _ = table
+    slot = _home_slot(keys, block)
+    while keys[slot] != -1:
+        if keys[slot] == block and slot_owners[slot] == owner:
+            return slot
+        slot = (slot + 1) & (len(keys) - 1)
+    return -1
+
+
+@kernel
 def mark(table: TableArrays, owners: Int64, sets: SetArrays) -> None:
     """Mark the cells of each set in the slots of its owner."""
-    keys, _, slot_owners, marks, _, _, _ = table
+    marks = table[3]
     blocks, set_masks, starts = sets
     for index in range(len(owners)):
         for at in range(starts[index], starts[index + 1]):
-            slot = _home_slot(keys, blocks[at])
-            while keys[slot] != -1:
-                if keys[slot] == blocks[at] and slot_owners[slot] == owners[index]:
-                    marks[slot] = set_masks[at]
-                slot = (slot + 1) & (len(keys) - 1)
+            slot = _slot_of(table, blocks[at], owners[index])
+            if slot >= 0:
+                marks[slot] = set_masks[at]
+
+
+@kernel
+def add_scores(
+    table: TableArrays, owners: Int64, sets: SetArrays, scores: Int8, limit: int
+) -> None:
+    """Add to the scores of owners' cells, up to ± `limit`; see `VoxelMap.add_scores`."""
+    blocks, _, starts = sets
+    rejected, known = table[4], table[5]
+    for index in range(len(owners)):
+        for at in range(starts[index], starts[index + 1]):
+            slot = _slot_of(table, blocks[at], owners[index])
+            if slot < 0:
+                continue
+            negative = np.uint64(0)
+            for cell in range(64):
+                score = int(known[slot, cell]) + int(scores[at, cell])
+                known[slot, cell] = min(max(score, -limit), limit)
+                negative |= np.uint64(score < 0) << np.uint64(cell)
+            rejected[slot] = negative
 
 
 @kernel
@@ -324,16 +356,19 @@ def overlaps(
     # For each set and owner that meet: both, and the two numbers of cells.
     found, total = np.empty((64, 4), np.int64), 0
     block_owners = np.empty(MAX_BLOCK_OWNERS, np.int64)
-    most = 0 if set_count == 0 else (starts[1:] - starts[:-1]).max()
+    most = 0
+    for index in range(set_count):
+        most = max(most, int(starts[index + 1] - starts[index]))
     marked = np.empty(min(used, most * MAX_BLOCK_OWNERS), np.int64)
     for index in range(set_count):
-        marked_count, first = 0, total
+        # Numba would compile the kernels that it calls once more for a literal.
+        marked_count, first = int(np.int64(0)), total
         for at in range(starts[index], starts[index + 1]):
             owner_count, marked_count = _meet(
                 table, blocks[at], set_masks[at], on_block, block_owners, marked, marked_count
             )
             while total + owner_count > len(found):
-                found = np.concatenate((found, found))
+                found = _doubled(found)
             for position in range(owner_count):
                 owner = block_owners[position]
                 if on_block[owner] != 0 and on_owner[owner] == 0:
@@ -349,20 +384,58 @@ def overlaps(
             owner = found[row, 1]
             found[row, 2], found[row, 3] = on_owner[owner], of_owner[owner]
             on_owner[owner] = of_owner[owner] = 0
-    columns = np.unique(found[:total, 1])
-    on_fractions = np.zeros((set_count, len(columns)))
-    of_fractions = np.zeros((set_count, len(columns)))
-    cell_counts = np.zeros(set_count)
+    columns = _ascending(found[:total])
+    on_fractions = np.zeros((set_count, len(columns)), np.float64)
+    of_fractions = np.zeros((set_count, len(columns)), np.float64)
+    cell_counts = np.zeros(set_count, np.float64)
     for index in range(set_count):
         for at in range(starts[index], starts[index + 1]):
             cell_counts[index] += _bit_count(set_masks[at])
     for row in range(total):
         index, owner = found[row, 0], found[row, 1]
-        column = np.searchsorted(columns, owner)
+        column = _place(columns, owner)
         on_fractions[index, column] = found[row, 2] / cell_counts[index]
         if counts[owner] >= MIN_OWNER_CELLS:
             of_fractions[index, column] = found[row, 3] / counts[owner]
     return columns, on_fractions, of_fractions
+
+
+@kernel
+def _doubled(rows: Int64) -> Int64:
+    """Rows (n, 4), and space for as many more."""
+    more = np.empty((2 * len(rows), 4), np.int64)
+    for row in range(len(rows)):
+        for item in range(4):
+            more[row, item] = rows[row, item]
+    return more
+
+
+@kernel
+def _ascending(found: Int64) -> Int64:
+    """The owners in column 1, each once."""
+    owners, count = np.empty(len(found), np.int64), 0
+    for row in range(len(found)):
+        owner = found[row, 1]
+        place = _place(owners[:count], owner)
+        if place == count or owners[place] != owner:
+            for later in range(count, place, -1):
+                owners[later] = owners[later - 1]
+            owners[place] = owner
+            count += 1
+    return owners[:count]
+
+
+@kernel
+def _place(numbers: Int64, number: int) -> int:
+    """Index of the first of ascending numbers that is not below a number."""
+    low, high = 0, len(numbers)
+    while low < high:
+        middle = (low + high) // 2
+        if numbers[middle] < number:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel
@@ -433,7 +506,8 @@ def rehash(table: TableArrays, larger: TableArrays, firsts: Int64) -> int:
     keys, masks, slot_owners, _, rejected, scores, _ = table
     new_keys, new_masks, new_owners, _, new_rejected, new_scores, new_nexts = larger
     used = 0
-    firsts[:] = -1
+    for owner in range(len(firsts)):
+        firsts[owner] = -1
     for slot in range(len(keys)):
         owner = slot_owners[slot]
         if owner < 0:
@@ -445,7 +519,8 @@ def rehash(table: TableArrays, larger: TableArrays, firsts: Int64) -> int:
         new_masks[target] = masks[slot]
         new_owners[target] = owner
         new_rejected[target] = rejected[slot]
-        new_scores[target] = scores[slot]
+        for cell in range(64):
+            new_scores[target, cell] = scores[slot, cell]
         new_nexts[target] = firsts[owner]
         firsts[owner] = target
         used += 1

@@ -143,7 +143,7 @@ class SurfaceEditor(Editor):
     def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Editor.apply`."""
         reply = super().apply(graph, request, stamp_ns)
-        for node_id in self.aside.rows["node_id"][self.aside.owners].tolist():
+        for node_id in list(self.aside.owner_of):
             if node_id not in graph.edits.replaced:
                 self.aside.remove(node_id)
         return reply
@@ -210,7 +210,7 @@ class SurfaceEditor(Editor):
 
     def memory(self) -> Memory:
         """The records of replaced nodes, for `restore`; empty without any."""
-        memory = self.aside.memory() if self.aside.owners else {}
+        memory = self.aside.memory() if self.aside.owner_of else {}
         return {_ASIDE + name: values for name, values in memory.items()}
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
@@ -305,5 +305,5 @@ def _transfer(
     target.rows[new] = source.rows[owner]
     target.rows["node_id"][new] = as_id
     target.map.add([new], cells)
-    target.map.add_scores(new, cells.blocks, scores)
+    target.map.add_scores([new], cells, scores)
     target.place(graph, [new])

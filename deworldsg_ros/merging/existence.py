@@ -99,17 +99,18 @@ def prior(fates: Int64) -> float:
     return OFFSET + FATES * math.log(fates[1] / fates[0])
 
 
-def settle(records: NDArray[Any], fates: Int64, owners: list[int], known: Float64) -> None:
+@kernel
+def settle(records: NDArray[Any], fates: Int64, owners: Int64, known: Float64) -> None:
     """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
 
     A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
     """
-    for owner, probability in zip(owners, known.tolist()):
-        record = records[owner]
-        is_error = probability < 1.0 - SETTLED and record["missed_since"] > CLEAR_MISS
-        if not record["is_settled"] and (probability > SETTLED or is_error):
-            record["is_settled"] = True
-            fates[int(not is_error)] += 1
+    for index in range(len(owners)):
+        record, probability = records[owners[index]], known[index]
+        is_error = probability < 1.0 - SETTLED and record.missed_since > CLEAR_MISS
+        if not record.is_settled and (probability > SETTLED or is_error):
+            record.is_settled = True
+            fates[0 if is_error else 1] += 1
 
 
 def frame_weight(step_ns: int | None) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
+from collections.abc import Container
 
 import numpy as np
 
@@ -78,19 +80,27 @@ class JointEvidence:
             camera_world: (3,) camera position, metres.
         """
         sure = dict(zip(object_owners, (detection_scores >= SURE_SCORE).tolist()))
-        nested = matches.touching & (matches.on_nodes >= NESTED_FRACTION)
-        evidence: Counter[Pair] = Counter()
+        evidence: dict[Pair, int] = {}
         taken = set(matches.columns)
-        for row, column in np.argwhere(matches.touching | (matches.scores > 0)).tolist():
-            a, b = sorted((object_owners[row], matches.owners[column]))
-            weight = OVERLAPPING_WEIGHT if matches.scores[row, column] else TOUCHING_WEIGHT
+        rows, columns = np.nonzero(matches.touching | (matches.scores > 0))
+        nested = matches.touching & (matches.on_nodes >= NESTED_FRACTION)
+        for row, column, score, is_nested in zip(
+            rows.tolist(),
+            columns.tolist(),
+            matches.scores[rows, columns].tolist(),
+            nested[rows, columns].tolist(),
+        ):
+            a, b = object_owners[row], matches.owners[column]
+            pair = (a, b) if a < b else (b, a)
             if column not in taken:
                 if matches.columns[row] >= 0:
-                    evidence[a, b] = max(evidence[a, b], weight)
-            elif nested[row, column] and a != b and not (sure[a] and sure[b]):
-                evidence[a, b] = TOUCHING_WEIGHT
+                    weight = OVERLAPPING_WEIGHT if score else TOUCHING_WEIGHT
+                    evidence[pair] = max(evidence.get(pair, 0), weight)
+            elif is_nested and a != b and not (sure[a] and sure[b]):
+                evidence[pair] = TOUCHING_WEIGHT
         self._separate(sure, evidence)
-        step_m = float(np.linalg.norm(camera_world - self._camera_world))
+        step = camera_world - self._camera_world
+        step_m = math.sqrt(step @ step)
         self._camera_world = camera_world.copy()
         factor = WIDE_STEP_FACTOR if step_m > WIDE_STEP_M else 1
         for (a, b), weight in evidence.items():
@@ -127,12 +137,13 @@ class JointEvidence:
         for a in self._smaller.pop(owner, ()):
             self._balances[a].pop(owner, None)
 
-    def _separate(self, sure: dict[int, bool], nested: Counter[Pair]) -> None:
+    def _separate(self, sure: dict[int, bool], nested: Container[Pair]) -> None:
         """Count the pairs of a frame as two objects, except some."""
         ascending = sorted(sure.items())
         for position, (a, a_sure) in enumerate(ascending):
             row = self._balances[a]
             for b, b_sure in ascending[position + 1 :]:
                 if (a, b) not in nested:
-                    self._smaller[b].add(a)
+                    if b not in row:
+                        self._smaller[b].add(a)
                     row[b] -= SEPARATE_WEIGHT if a_sure and b_sure else OVERLAPPING_WEIGHT

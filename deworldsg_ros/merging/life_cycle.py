@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection
 
 import numpy as np
@@ -10,7 +11,7 @@ from deworldsg_ros.merging import existence
 from deworldsg_ros.merging.lost_nodes import LostNodes, moved_object
 from deworldsg_ros.merging.node_records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
-from deworldsg_ros.scene.arrays import Bool
+from deworldsg_ros.scene.arrays import Bool, Int64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -45,7 +46,7 @@ class LifeCycle:
     def restore(self, graph: SceneGraph) -> None:
         """Continue with a graph of an earlier run; call it before the first frame."""
         nodes = graph.nodes
-        improbable = _are_improbable(graph, list(range(len(nodes))))
+        improbable = _are_improbable(graph, np.arange(len(nodes)))
         self._improbable = set(nodes.ids[improbable].tolist())
 
     def observe(
@@ -64,24 +65,22 @@ class LifeCycle:
         scores: dict[int, float] = {}
         for node_id, score in zip(node_ids, local.scores.tolist()):
             scores[node_id] = max(scores.get(node_id, 0.0), score)
-        visible = view.visibilities > NOT_VISIBLE
         shown = {
             node_id: visibility
-            for node_id, visibility in zip(
-                view.ids[visible].tolist(), view.visibilities[visible].tolist()
-            )
-            if node_id in records
+            for node_id, visibility in zip(view.ids.tolist(), view.visibilities.tolist())
+            if visibility > NOT_VISIBLE and node_id in records.owner_of
         }
         ids = sorted(scores.keys() | shown.keys())
+        owners = np.array(records.owners_of(ids), np.int64)
         records.look(
-            [records.owner(node_id) for node_id in ids],
+            owners,
             np.array([scores.get(node_id, 0.0) for node_id in ids]),
             np.array([shown.get(node_id, NOT_VISIBLE) for node_id in ids], np.int64),
-            graph.nodes.means[[graph.nodes.row(node_id) for node_id in ids]].reshape(-1, 3),
+            graph.nodes.means[graph.nodes.rows_at(ids)],
             local.T_world_camera[:3, 3],
             local.stamp_ns,
         )
-        self._publish(graph, ids)
+        self._publish(graph, ids, owners)
         for node_id in self._absent(view, scores.keys()):
             # It may be gone: another absent node of this frame has taken its place.
             if node_id in records and node_id not in graph.edits.deleted:
@@ -91,9 +90,8 @@ class LifeCycle:
         """Nodes that enough consecutive frames have seen through."""
         records, absent = self._records, []
         present = {*detected, *view.ids[view.visibilities >= HALF].tolist()}
-        owners = [records.owner(node_id) for node_id in present if node_id in records]
         frames = records.rows["through_frames"]
-        frames[owners] = 0
+        frames[records.owners_of([node_id for node_id in present if node_id in records])] = 0
         for node_id in view.ids[view.through].tolist():
             if node_id in present or node_id not in records:
                 continue
@@ -109,7 +107,7 @@ class LifeCycle:
         edits = graph.edits
         hidden = [i for i in nodes.ids[~nodes.confirmed].tolist() if i not in edits.replaced]
         ids = [node_id for node_id in hidden if node_id in records]
-        missed = records.are_missed([records.owner(i) for i in ids], self._min_existence)
+        missed = records.are_missed(records.owners_of(ids), self._min_existence)
         reasons = {
             i: "absent from its position" if i in self._lost else "seen too little" for i in hidden
         }
@@ -119,7 +117,7 @@ class LifeCycle:
 
     def publish_again(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish nodes that an edit has hidden, if they are likely to be objects."""
-        owners = [self._records.owner(node_id) for node_id in node_ids]
+        owners = self._records.owners_of(node_ids)
         graph.set_existence(node_ids, self._records.existence(owners), self._min_existence)
 
     def remove(self, graph: SceneGraph, node_id: int) -> None:
@@ -130,16 +128,15 @@ class LifeCycle:
             self._records.remove(node_id)
         graph.remove_node(node_id)
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+    def _publish(self, graph: SceneGraph, node_ids: list[int], owners: Int64) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
         records = self._records
-        owners = [records.owner(node_id) for node_id in node_ids]
         probabilities = records.existence(owners)
         existence.settle(records.rows, records.fates, owners, probabilities)
         new_ids = graph.set_existence(node_ids, probabilities, self._min_existence)
-        improbable = _are_improbable(graph, [graph.nodes.row(node_id) for node_id in node_ids])
+        improbable = _are_improbable(graph, graph.nodes.rows_at(node_ids))
         self._improbable.difference_update(node_ids)
-        self._improbable.update(np.array(node_ids, np.int64)[improbable].tolist())
+        self._improbable.update(itertools.compress(node_ids, improbable.tolist()))
         for node_id in new_ids:
             # A new node that is the object of a lost node takes the id of the lost node.
             lost_id = self._lost.match(graph, node_id)
@@ -153,9 +150,9 @@ class LifeCycle:
         # In the order of the rows, which depends on nothing but the frames.
         ids = sorted((i for i in self._improbable if i in nodes), key=nodes.row)
         self._improbable.intersection_update(ids)
-        rows = [nodes.row(node_id) for node_id in ids]
+        rows = nodes.rows_at(ids)
         old = _are_improbable(graph, rows) & (nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS)
-        for node_id in np.array(ids, np.int64)[old].tolist():
+        for node_id in itertools.compress(ids, old.tolist()):
             if node_id not in self._lost and not graph.edits.hides(node_id):
                 self._improbable.discard(node_id)
                 graph.remove_node(node_id)
@@ -183,7 +180,7 @@ class LifeCycle:
         self._records.rename(new_id, old_id)
 
 
-def _are_improbable(graph: SceneGraph, rows: list[int]) -> Bool:
+def _are_improbable(graph: SceneGraph, rows: Int64) -> Bool:
     """Whether (n,) the nodes of rows are hidden and too improbable to be kept."""
     nodes = graph.nodes
     improbable: Bool = ~nodes.confirmed[rows] & (nodes.existence[rows] < FORGOTTEN)

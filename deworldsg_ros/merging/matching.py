@@ -127,9 +127,10 @@ def _match_scores(
 ) -> tuple[Float64, Bool]:
     means, covariances, classes = objects
     node_means, node_covariances, node_classes = nodes
-    scores = np.zeros(on_nodes.shape)
+    scores = np.zeros(on_nodes.shape, np.float64)
     touching = np.zeros(on_nodes.shape, np.bool_)
-    blur = blur_m2 * np.eye(3)
+    a, b = np.empty((3, 3), np.float64), np.empty((3, 3), np.float64)
+    both = np.empty((3, 3), np.float64)
     for index in range(len(on_nodes)):
         for column in range(len(rows)):
             on_node, cover = on_nodes[index, column], covered[index, column]
@@ -146,8 +147,12 @@ def _match_scores(
                 continue
             if overlap < (overlap_threshold if agree else OVERLAP_THRESHOLD_OTHER_CLASS):
                 continue
-            a = covariances[index] + blur
-            b = node_covariances[row] + blur
+            for i in range(3):
+                for j in range(3):
+                    blur = blur_m2 if i == j else 0.0
+                    a[i, j] = covariances[index, i, j] + blur
+                    b[i, j] = node_covariances[row, i, j] + blur
+                    both[i, j] = (a[i, j] + b[i, j]) / 2
             d0 = means[index, 0] - node_means[row, 0]
             d1 = means[index, 1] - node_means[row, 1]
             d2 = means[index, 2] - node_means[row, 2]
@@ -155,7 +160,7 @@ def _match_scores(
             determinant_b, squared_b = _solve(b, d0, d1, d2)
             if min(squared_a, squared_b) > MAX_DEVIATIONS**2:
                 continue
-            determinant, squared = _solve((a + b) / 2, d0, d1, d2)
+            determinant, squared = _solve(both, d0, d1, d2)
             likeness = math.exp(-squared / 8) * math.sqrt(
                 math.sqrt(determinant_a * determinant_b) / determinant
             )

@@ -20,6 +20,10 @@ MAX_STAMP_NS = 2 * 2**31 * 10**9
 # A block is three indices of 19 bits, 21 bits apart (`cell_kernels`).
 _BLOCK_AXIS = (1 << 19) - 1
 _BLOCK_MASK = _BLOCK_AXIS << 42 | _BLOCK_AXIS << 21 | _BLOCK_AXIS
+# Bits in each byte.
+_BIT_COUNTS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(
+    axis=1, dtype=np.uint8
+)
 
 
 def check_memory(memory: Memory, record: np.dtype[np.void], class_count: int) -> None:
@@ -101,7 +105,7 @@ def _check_cells(memory: Memory, count: int) -> None:
     within("scores", scores, -cell_beliefs.MAX_SCORE, cell_beliefs.MAX_SCORE)
     owners = np.repeat(np.arange(count), counts)
     distinct("blocks of a node", np.stack([owners, blocks], axis=1))
-    bits = np.unpackbits(masks.view(np.uint8).reshape(-1, 8), axis=1).sum(axis=1)
+    bits = _BIT_COUNTS[masks.view(np.uint8)].reshape(-1, 8).sum(axis=1, dtype=np.uint8)
     cells = np.bincount(owners, bits, count)
     holds("masks", (cells <= CELLS_PER_OWNER).all(), f"at most {CELLS_PER_OWNER} cells of a node")
 

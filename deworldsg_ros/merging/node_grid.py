@@ -21,6 +21,10 @@ CUBE_M = 4.0
 # A node is compared if a ball of this many standard deviations around its mean may be in view.
 BALL_DEVIATIONS = 3.0
 
+# Of a frame: the principal point from the right and the lower side of the image, and the lengths of
+# the normals of its four sides.
+_Sides = tuple[float, float, float, float, float, float]
+
 
 class NodeGrid:
     """Owners by the cube that contains the mean of their node."""
@@ -49,7 +53,8 @@ class NodeGrid:
             self._links = np.concatenate((self._links, np.full_like(self._links, -1)))
         keys = np.floor(means_world / CUBE_M).astype(np.int64)
         cubes = np.array([self._cube(key) for key in map(tuple, keys.tolist())])
-        balls = np.column_stack((means_world, BALL_DEVIATIONS * np.sqrt(eigenvalue_bounds)))
+        balls = np.empty((len(owners), 4))
+        balls[:, :3], balls[:, 3] = means_world, BALL_DEVIATIONS * np.sqrt(eigenvalue_bounds)
         _put(self._cubes, self._firsts, self._balls, self._links, np.array(owners), cubes, balls)
 
     def remove(self, owner: int) -> None:
@@ -116,10 +121,10 @@ def _put(
 
 
 @kernel
-def _may_show(ball: Float64, frame: FrameArrays, far_m: float) -> bool:
+def _may_show(ball: Float64, frame: FrameArrays, sides: _Sides, far_m: float) -> bool:
     """Whether a ball, centre and radius, may be in view."""
-    T, depth_mm, _, (fx, fy, cx, cy) = frame
-    right, below = cx - depth_mm.shape[1], cy - depth_mm.shape[0]
+    T, _, _, (fx, fy, cx, cy) = frame
+    right, below, leftwards, rightwards, upwards, downwards = sides
     x, y, z, radius = ball
     ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
     # Some points may lie outside the ball: near the far end, twice its radius counts.
@@ -128,10 +133,10 @@ def _may_show(ball: Float64, frame: FrameArrays, far_m: float) -> bool:
     across = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
     down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
     return not (
-        fx * across + cx * ahead < -radius * math.hypot(fx, cx)
-        or fx * across + right * ahead > radius * math.hypot(fx, right)
-        or fy * down + cy * ahead < -radius * math.hypot(fy, cy)
-        or fy * down + below * ahead > radius * math.hypot(fy, below)
+        fx * across + cx * ahead < -radius * leftwards
+        or fx * across + right * ahead > radius * rightwards
+        or fy * down + cy * ahead < -radius * upwards
+        or fy * down + below * ahead > radius * downwards
     )
 
 
@@ -139,21 +144,25 @@ def _may_show(ball: Float64, frame: FrameArrays, far_m: float) -> bool:
 def _in_view(
     cubes: Float64, firsts: Int64, balls: Float64, links: Int64, frame: FrameArrays
 ) -> Int64:
-    depth_mm, farthest = frame[1], 0
+    depth_mm, farthest = frame[1], np.uint16(0)
     for row in range(depth_mm.shape[0]):
         for column in range(depth_mm.shape[1]):
-            farthest = max(farthest, int(depth_mm[row, column]))
+            farthest = max(farthest, depth_mm[row, column])
+    _, _, _, (fx, fy, cx, cy) = frame
+    right, below = cx - depth_mm.shape[1], cy - depth_mm.shape[0]
+    lengths = math.hypot(fx, cx), math.hypot(fx, right), math.hypot(fy, cy), math.hypot(fy, below)
+    sides = right, below, *lengths
     # Beyond this, no measured depth is within the tolerance of a point.
     far_m = (0.001 * farthest + THROUGH_M) / (1.0 - THROUGH_FRACTION)
     owners, count = np.empty(64, np.int64), 0
     for cube in range(len(cubes)):
         owner = firsts[cube]
-        if owner < 0 or not _may_show(cubes[cube], frame, far_m):
+        if owner < 0 or not _may_show(cubes[cube], frame, sides, far_m):
             continue
         while owner >= 0:
             if count == len(owners):
                 owners = np.concatenate((owners, owners))
             owners[count] = owner
-            count += int(_may_show(balls[owner], frame, far_m))
+            count += int(_may_show(balls[owner], frame, sides, far_m))
             owner = links[owner, 2]
     return owners[:count].copy()

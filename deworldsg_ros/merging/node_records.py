@@ -41,6 +41,7 @@ class NodeRecords:
         map: cells of the surfaces, by owner.
         grid: owners by the position of their node.
         joint: evidence that two owners are one object.
+        owner_of: the owner of each node; read only.
     """
 
     def __init__(self) -> None:
@@ -51,37 +52,36 @@ class NodeRecords:
         self.map = VoxelMap()
         self.grid = NodeGrid()
         self.joint = JointEvidence()
-        self._owners: dict[int, int] = {}
+        self.owner_of: dict[int, int] = {}
         self._free: list[int] = []
 
-    @property
-    def owners(self) -> list[int]:
-        """Owners of all nodes with a record."""
-        return list(self._owners.values())
-
     def __contains__(self, node_id: object) -> bool:
-        return node_id in self._owners
+        return node_id in self.owner_of
 
     def owner(self, node_id: int) -> int:
         """Owner of a node that has a record."""
-        return self._owners[node_id]
+        return self.owner_of[node_id]
 
     def node(self, owner: int) -> int:
         """The node of an owner; 0 if the record is free."""
         return int(self.rows["node_id"][owner])
 
-    def graph_rows(self, graph: SceneGraph, owners: list[int]) -> list[int]:
+    def owners_of(self, node_ids: Sequence[int]) -> list[int]:
+        """Owners of nodes that have a record."""
+        return [self.owner_of[node_id] for node_id in node_ids]
+
+    def graph_rows(self, graph: SceneGraph, owners: Sequence[int] | Int64) -> Int64:
         """Row in the graph of each owner."""
-        return [graph.nodes.row(node_id) for node_id in self.rows["node_id"][owners].tolist()]
+        return graph.nodes.rows_at(self.rows["node_id"][owners].tolist())
 
     def add(self, node_id: int, class_probabilities: Float64, stamp_ns: int) -> int:
         """Add the record of a new node; returns its owner."""
         if not self._free:
-            count = len(self._owners)
+            count = len(self.owner_of)
             if count == len(self.rows):
                 self.rows = np.concatenate((self.rows, np.zeros_like(self.rows)))
             self._free.append(count)
-        owner = self._owners[node_id] = self._free.pop()
+        owner = self.owner_of[node_id] = self._free.pop()
         self.rows[owner] = np.zeros((), RECORD)
         self.rows["node_id"][owner] = node_id
         names.start(self.rows[owner], np.ascontiguousarray(class_probabilities), stamp_ns)
@@ -94,7 +94,7 @@ class NodeRecords:
 
     def look(
         self,
-        owners: list[int],
+        owners: Sequence[int] | Int64,
         scores: Float64,
         visibilities: Int64,
         means_world: Float64,
@@ -107,7 +107,7 @@ class NodeRecords:
         existence.observe(
             self.rows,
             self.looks,
-            np.array(owners, np.int64),
+            np.asarray(owners, np.int64),
             scores,
             visibilities,
             means_world,
@@ -122,10 +122,10 @@ class NodeRecords:
         names.observe(self.rows, np.array(owners, np.int64), seen, stamp_ns, classes)
         return classes
 
-    def existence(self, owners: list[int]) -> Float64:
+    def existence(self, owners: Sequence[int] | Int64) -> Float64:
         """Probability (n,) that each of n owners is an object."""
         prior = existence.prior(self.fates)
-        return existence.probabilities(self.rows, self.looks, np.array(owners, np.int64), prior)
+        return existence.probabilities(self.rows, self.looks, np.asarray(owners, np.int64), prior)
 
     def are_missed(self, owners: list[int], minimum: float) -> Bool:
         """Whether (n,) only misses make the existence of each of n owners less than a minimum."""
@@ -134,7 +134,7 @@ class NodeRecords:
 
     def remove(self, node_id: int) -> CellSets:
         """Drop everything of a node; returns its cells, as one set."""
-        owner = self._owners.pop(node_id)
+        owner = self.owner_of.pop(node_id)
         self.rows["node_id"][owner] = 0
         self._free.append(owner)
         self.joint.forget(owner)
@@ -143,12 +143,12 @@ class NodeRecords:
 
     def rename(self, old_id: int, new_id: int) -> None:
         """Continue the record of a node under another id."""
-        owner = self._owners[new_id] = self._owners.pop(old_id)
+        owner = self.owner_of[new_id] = self.owner_of.pop(old_id)
         self.rows["node_id"][owner] = new_id
 
     def merge(self, graph: SceneGraph, kept_id: int, removed_id: int) -> None:
         """Combine the records of two nodes that the graph has merged."""
-        kept, removed = self._owners[kept_id], self._owners[removed_id]
+        kept, removed = self.owner_of[kept_id], self.owner_of[removed_id]
         record = self.rows[kept]
         existence.merge(record, self.rows[removed])
         classes = graph.nodes.class_probabilities[graph.nodes.row(kept_id)]
@@ -157,52 +157,51 @@ class NodeRecords:
         scores = self.map.scores(removed)
         cells = self.remove(removed_id)
         self.map.add([kept], cells)
-        self.map.add_scores(kept, cells.blocks, scores)
+        self.map.add_scores([kept], cells, scores)
         self.place(graph, [kept])
 
     def memory(self) -> Memory:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
         from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
 
-        owners = [self._owners[node_id] for node_id in sorted(self._owners)]
+        owners = [self.owner_of[node_id] for node_id in sorted(self.owner_of)]
         pairs = [[*sorted(map(self.node, pair)), n] for pair, n in self.joint.balances.items()]
         return {
-            "cell_m": np.array(self.map.cell_m),
             # Without the padding between fields, which is memory of the process.
             "records": repack_fields(self.rows[owners]),
             "looks": self.looks,
             "fates": self.fates,
             "last_ns": np.array(self.last_ns),
-            **_cells(self.map, owners),
+            **self.map.memory(owners),
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
     def restore(self, graph: SceneGraph, memory: Memory, node_ids: Sequence[int]) -> None:
         """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
-        nodes, owner_of = graph.nodes, dict[int, int]()
-        for node_id, row in zip(node_ids, map(nodes.row, node_ids)):
-            classes, last_ns = nodes.class_probabilities[row], int(nodes.last_seen_ns[row])
-            owner_of[node_id] = self.add(node_id, classes, last_ns)
-        self.place(graph, list(owner_of.values()))
+        owners = list(range(len(node_ids)))
+        self.owner_of = owner_of = dict(zip(node_ids, owners))
+        self.rows = np.zeros(max(len(self.rows), len(owners)), RECORD)
+        self.rows["node_id"][owners] = node_ids
+        self.place(graph, owners)
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
-            _rebuild(self, graph, list(owner_of.values()))
+            _rebuild(self, graph, owners)
             return
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
-        records = memory["records"].astype(RECORD)
-        kept = [row for row, node_id in enumerate(records["node_id"]) if node_id in owner_of]
+        records, counts = memory["records"], memory["block_counts"]
+        kept = np.isin(records["node_id"], node_ids)
         owners = [owner_of[node_id] for node_id in records["node_id"][kept].tolist()]
+        _name(self, graph, sorted(set(owner_of.values()) - set(owners)))
         self.rows[owners] = records[kept]
         self.looks[:] = memory["looks"]
         self.fates[:] = memory["fates"]
         self.last_ns = int(memory["last_ns"])
-        counts = memory["block_counts"]
-        stops = np.cumsum(counts)
-        for owner, row in zip(owners, kept):
-            own = slice(stops[row] - counts[row], stops[row])
-            cells = memory["blocks"][own], memory["masks"][own], np.array([0, counts[row]])
-            self.map.add([owner], CellSets(*cells))
-            self.map.add_scores(owner, cells[0], memory["scores"][own])
+        # A slice takes no memory.
+        own = slice(None) if kept.all() else np.repeat(kept, counts)
+        starts = np.append(0, np.cumsum(counts[kept]))
+        cells = CellSets(memory["blocks"][own], memory["masks"][own], starts)
+        self.map.add(owners, cells)
+        self.map.add_scores(owners, cells, memory["scores"][own])
         self.joint.restore(
             {
                 (owner_of[a], owner_of[b]): balance
@@ -219,7 +218,7 @@ class NodeRecords:
         Their scores start again at 0: rotated cells do not lie on cells.
         """
         for node_id in node_ids:
-            owner = self._owners.get(node_id)
+            owner = self.owner_of.get(node_id)
             if owner is None:  # a lost node has no cells
                 continue
             centres = self.map.centres(owner).astype(np.float64)
@@ -232,25 +231,19 @@ class NodeRecords:
             self.place(graph, [owner])
 
 
-def _cells(map_: VoxelMap, owners: list[int]) -> Memory:
-    """The cells and scores of owners as arrays by name; the blocks of each ascend."""
-    sets = [map_.cells(owner) for owner in owners]
-    orders = [np.argsort(cells.blocks) for cells in sets]
-    blocks = [cells.blocks[order] for cells, order in zip(sets, orders)]
-    masks = [cells.masks[order] for cells, order in zip(sets, orders)]
-    scores = [map_.scores(owner)[order] for owner, order in zip(owners, orders)]
-    return {
-        "blocks": np.concatenate([np.zeros(0, np.int64), *blocks]),
-        "masks": np.concatenate([np.zeros(0, np.uint64), *masks]),
-        "block_counts": np.array([len(cells.blocks) for cells in sets], np.int64),
-        "scores": np.concatenate([np.zeros((0, 64), np.int8), *scores]),
-    }
-
-
 def _rebuild(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
     """Make records from the surfaces and observations in the graph."""
     nodes, rows = graph.nodes, records.graph_rows(graph, owners)
+    _name(records, graph, owners)
     surfaces = [nodes.surface(row) for row in rows]
     records.map.add(owners, records.map.cells_of(surfaces))
     for owner, observations in zip(owners, nodes.observations[rows].tolist()):
         existence.assume(records.rows[owner], observations)
+
+
+def _name(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
+    """Begin the names of owners that have none."""
+    nodes = graph.nodes
+    for owner, row in zip(owners, records.graph_rows(graph, owners)):
+        stamp_ns = int(nodes.last_seen_ns[row])
+        names.start(records.rows[owner], nodes.class_probabilities[row], stamp_ns)

@@ -17,7 +17,14 @@ from deworldsg_ros.merging.editing import EditReply, SurfaceEditor
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
 from deworldsg_ros.merging.node_records import NodeRecords
-from deworldsg_ros.merging.views import View, frame_arrays, see, see_nothing
+from deworldsg_ros.merging.views import (
+    FrameArrays,
+    View,
+    frame_arrays,
+    see,
+    see_nothing,
+    with_seen,
+)
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.edits import EditRequest
@@ -80,9 +87,13 @@ class SurfaceMerging:
 
     def _merge_frame(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         cells = self._records.map.cells_of(local.surface_points_world)
-        view = self._see(graph, local)
+        frame = None
+        if local.depth_grid is not None:
+            frame = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
+        view = self._see(graph, local, frame)
         matches = self._associate(graph, local, cells, view)
         node_ids = self._update(graph, local, cells, matches)
+        self._judge_cells(graph, local, cells, node_ids, frame)
         node_ids = self._merge_parts(graph, local, matches, node_ids)
         self._life_cycle.observe(graph, local, view, node_ids)
         return node_ids
@@ -112,13 +123,12 @@ class SurfaceMerging:
         for records in (self._records, self._editor.aside):
             records.apply_correction(graph, node_ids, T_correction)
 
-    def _see(self, graph: SceneGraph, local: LocalGraph) -> View:
+    def _see(self, graph: SceneGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
         """What the frame shows of the nodes that may be in view."""
-        if local.depth_grid is None:
+        if frame is None:
             return see_nothing(local)
-        frame = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
-        owners = self._records.grid.in_view(frame).tolist()
-        rows = np.sort(np.array(self._records.graph_rows(graph, owners), np.int64))
+        rows = self._records.graph_rows(graph, self._records.grid.in_view(frame))
+        rows.sort()
         return see(graph.nodes, rows, local, frame)
 
     def _associate(
@@ -127,13 +137,9 @@ class SurfaceMerging:
         """Match the objects with the nodes whose surfaces they meet."""
         records = self._records
         owners, on_nodes, covered = records.map.overlaps(cells)
-        rows = np.array(records.graph_rows(graph, owners), np.int64)
+        rows = records.graph_rows(graph, owners)
         # If the frame shows enough of a node, its visible part counts, and not the whole node.
-        shown = ~np.isnan(view.covered).any(axis=0)
-        _, columns, places = np.intersect1d(
-            rows, view.rows[shown], assume_unique=True, return_indices=True
-        )
-        covered[:, columns] = view.covered[:, shown][:, places]
+        covered = with_seen(covered, rows, view.covered, view.rows)
         if graph.edits.deleted:
             reject_deleted(graph, local, graph.nodes.ids[rows].tolist(), on_nodes)
         return match(
@@ -182,8 +188,7 @@ class SurfaceMerging:
                 owners[row] = records.add(node_id, classes, local.stamp_ns)
         records.map.add(owners, cells)
         records.place(graph, owners)
-        node_ids = [records.node(owner) for owner in owners]
-        self._judge_cells(graph, local, cells, owners, node_ids)
+        node_ids: list[int] = records.rows["node_id"][owners].tolist()
         return node_ids
 
     def _judge_cells(
@@ -191,16 +196,14 @@ class SurfaceMerging:
         graph: SceneGraph,
         local: LocalGraph,
         cells: CellSets,
-        owners: list[int],
         node_ids: list[int],
+        frame: FrameArrays | None,
     ) -> None:
         """Drop surface points in cells that the frames so far show as something else."""
-        if local.depth_grid is None:
+        if frame is None or local.depth_grid is None or local.depth_grid.instances is None:
             return
-        T_camera_world = invert_pose(local.T_world_camera)
-        rejected = self._records.map.judge(
-            owners, cells, local.instance_ids, T_camera_world, local.depth_grid
-        )
+        owners = self._records.owners_of(node_ids)
+        rejected = self._records.map.judge(owners, cells, local.instance_ids, frame)
         if len(rejected.blocks):
             rows = [graph.nodes.row(node_id) for node_id in node_ids]
             graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, rows))
@@ -210,15 +213,17 @@ class SurfaceMerging:
     ) -> list[int]:
         """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records
-        owners = [records.owner(node_id) for node_id in node_ids]
+        owners = records.owners_of(node_ids)
         records.joint.add_frame(owners, matches, local.scores, local.T_world_camera[:3, 3])
+        merged = False
         while (pair := records.joint.next_merge()) is not None:
             a_id, b_id = (records.node(owner) for owner in pair)
             if graph.edits and not may_merge(graph, a_id, b_id):
                 continue
             kept_id = graph.merge_nodes(a_id, b_id)
             records.merge(graph, kept_id, b_id if kept_id == a_id else a_id)
-        return [graph.resolve(node_id) for node_id in node_ids]
+            merged = True
+        return [graph.resolve(node_id) for node_id in node_ids] if merged else node_ids
 
 
 def _spare_frame(stamp_ns: int) -> LocalGraph:

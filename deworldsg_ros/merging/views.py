@@ -97,6 +97,20 @@ def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
 
 
 @kernel
+def with_seen(covered: Float64, rows: Int64, seen: Float64, seen_rows: Int64) -> Float64:
+    """Fractions (n, k) of some rows, from those (n, m) of a view where the view has a row (k,)."""
+    result = covered.copy()
+    for column in range(len(rows)):
+        place = 0
+        while place < len(seen_rows) and seen_rows[place] != rows[column]:
+            place += 1
+        for index in range(len(seen) if place < len(seen_rows) else 0):
+            if not np.isnan(seen[index, place]):
+                result[index, column] = seen[index, place]
+    return result
+
+
+@kernel
 def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
@@ -110,19 +124,26 @@ def _see(
     points: Float32, counts: Int64, rows: Int64, values: Int64, frame: FrameArrays
 ) -> tuple[Int64, Bool, Float64]:
     """The arrays of a `View` of some rows; values (n,) are those of the objects in the image."""
-    visibilities = np.full(len(rows), NOT_VISIBLE)
-    through = np.zeros(len(rows), np.bool_)
-    covered = np.full((len(values), len(rows)), np.nan)
-    object_of = np.full(max(values.max() if len(values) else 0, 0) + 1, -1, np.int64)
+    visibilities, through = np.empty(len(rows), np.int64), np.zeros(len(rows), np.bool_)
+    covered = np.empty((len(values), len(rows)), np.float64)
+    most = 0
+    for index in range(len(values)):
+        most = max(most, int(values[index]))
+    object_of = np.empty(most + 1, np.int64)
+    for value in range(most + 1):
+        object_of[value] = -1
     for index in range(len(values)):
         object_of[values[index]] = index
     hits = np.empty(len(values), np.int64)
     for column in range(len(rows)):
         count = min(counts[rows[column]], SAMPLED_POINTS)
-        hits[:] = 0
+        visibilities[column] = NOT_VISIBLE
+        for index in range(len(values)):
+            hits[index], covered[index, column] = 0, np.nan
         behind, present, inside = _compare(points[rows[column]], count, object_of, hits, frame)
         if present >= MIN_VISIBLE_POINTS:
-            covered[:, column] = hits / present
+            for index in range(len(values)):
+                covered[index, column] = hits[index] / present
         visible = behind + present
         if visible < MIN_VISIBLE_POINTS or visible < MIN_IN_VIEW_FRACTION * count:
             continue
@@ -144,7 +165,7 @@ def _compare(
     height, width = depth_mm.shape
     behind = present = inside = 0
     for index in range(count):
-        x, y, z = points[index]
+        x, y, z = points[index, 0], points[index, 1], points[index, 2]
         right, down, ahead = _in_camera(T, np.float64(x), np.float64(y), np.float64(z))
         if ahead < NEAR_M:
             continue

@@ -14,9 +14,9 @@ import numpy as np
 
 from deworldsg_ros.merging import cell_beliefs, cell_kernels
 from deworldsg_ros.merging.cell_kernels import INDEX_BIAS, INDEX_MASK, CellSets, SumArrays
-from deworldsg_ros.merging.views import frame_arrays
+from deworldsg_ros.merging.common import Memory
+from deworldsg_ros.merging.views import FrameArrays
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt64
-from deworldsg_ros.scene.frame_graph import DepthGrid
 from deworldsg_ros.scene.nodes import NodeTable
 
 # Edge of a cell. In the rendered rooms, cells of 2 cm lose objects and cells of 5 cm lose relations
@@ -66,6 +66,25 @@ class VoxelMap:
         """Score of each cell in each block of `cells` (m, 64)."""
         return self._table.scores[self._slots_of(owner)]
 
+    def memory(self, owners: Sequence[int]) -> Memory:
+        """The cells and scores of all owners as arrays by name; the blocks of each ascend.
+
+        Args:
+            owners: all owners, in the order of the arrays.
+        """
+        table, places = self._table, np.zeros(max(owners, default=0) + 1, np.int64)
+        places[owners] = np.arange(len(owners))
+        slots = np.flatnonzero(table.owners >= 0)
+        of = places[table.owners[slots]]
+        slots = slots[np.lexsort((table.keys[slots], of))]
+        return {
+            "cell_m": np.array(self.cell_m),
+            "blocks": table.keys[slots],
+            "masks": table.masks[slots],
+            "block_counts": np.bincount(of, minlength=len(owners)),
+            "scores": table.scores[slots],
+        }
+
     def centres(self, owner: int) -> Float32:
         """Centres of an owner's cells, (n, 3) float32, metres."""
         blocks, masks, _ = self.cells(owner)
@@ -92,44 +111,34 @@ class VoxelMap:
             sets[:],
         )
 
-    def add_scores(self, owner: int, blocks: Int64, scores: Int8) -> None:
-        """Add to the scores of an owner's cells in some blocks (m, 64); each block once."""
-        table, limit = self._table, cell_beliefs.MAX_SCORE
-        slot_of = {int(table.keys[slot]): slot for slot in self._slots_of(owner).tolist()}
-        slots = np.array([slot_of.get(block, -1) for block in blocks.tolist()], np.int64)
-        known = slots >= 0
-        slots = slots[known]
-        sums = np.clip(table.scores[slots] + scores[known].astype(np.int64), -limit, limit)
-        table.scores[slots] = sums
-        negative = np.packbits(sums < 0, axis=1, bitorder="little")
-        table.rejected[slots] = negative.view("<u8")[:, 0]
+    def add_scores(self, owners: Sequence[int], sets: CellSets, scores: Int8) -> None:
+        """Add to the scores of owners' cells, (m, 64): those of each block of their sets.
+
+        Blocks without a cell of the owner are left out.
+        """
+        owner_array, limit = np.array(owners, np.int64), cell_beliefs.MAX_SCORE
+        cell_kernels.add_scores(self._table[:], owner_array, sets[:], scores, limit)
 
     def judge(
         self,
         owners: Sequence[int],
         sets: CellSets,
         values: Int64,
-        T_camera_world: Float64,
-        grid: DepthGrid,
+        frame: FrameArrays,
     ) -> CellSets:
         """Update the scores of the cells of owners that a frame shows.
 
         Args:
             owners: n owners.
             sets: cells in which the frame shows each owner, and which it has (`add`).
-            values: (n,) value of each owner in the instances of the grid.
-            T_camera_world: (4, 4) float64.
-            grid: of the frame; without instances, no score changes.
+            values: (n,) value of each owner in the instances of the frame.
+            frame: with instances.
 
         Returns:
             For each owner, the cells that became rejected, and the rejected ones of its set.
         """
-        if grid.instances is None or not len(owners):
-            no_cells = np.zeros(0, np.int64), np.zeros(0, np.uint64)
-            return CellSets(*no_cells, np.zeros(len(owners) + 1, np.int64))
         owner_array = np.array(owners, np.int64)
         cell_kernels.mark(self._table[:], owner_array, sets[:])
-        frame = frame_arrays(T_camera_world, grid)
         changed = cell_beliefs.judge(
             self._table[:], self._firsts, owner_array, values, frame, self.cell_m
         )
@@ -171,8 +180,9 @@ class VoxelMap:
         return cells
 
     def warm_up(self) -> None:
-        """Compile the kernel that the first frames do not need."""
+        """Compile the kernels that the first frames do not need."""
         self._grow(0)
+        self.add_scores([0], self.cells(0), self.scores(0))
 
     def _slots_of(self, owner: int) -> Int64:
         """Slots of an owner."""

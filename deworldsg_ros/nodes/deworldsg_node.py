@@ -66,6 +66,10 @@ class DeworldsgNode(PerceivingNode):
         """Missing inputs, and models that fail or hang, in words."""
         return [*super().waiting_for(now_ns), *self._relating.problems()]
 
+    def hung(self) -> str:
+        """A model that never returns, in words."""
+        return super().hung() or self._relating.hung()
+
     def more_values(self) -> dict[str, str]:
         """The size of the graph, and numbers of clips by their state."""
         return {**super().more_values(), **self._relating.values(), **self.graph.values()}

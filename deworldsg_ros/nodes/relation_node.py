@@ -89,6 +89,10 @@ class RelationNode(JoiningNode[PairingFrame]):
         """Missing inputs, and a world model that fails or hangs, in words."""
         return [*super().waiting_for(now_ns), *self._relating.problems()]
 
+    def hung(self) -> str:
+        """A model that never returns, in words."""
+        return self._relating.hung()
+
     def more_values(self) -> dict[str, str]:
         """Numbers of clips by their state."""
         return {**super().more_values(), **self._relating.values()}

@@ -7,7 +7,7 @@ receives, and /diagnostics.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,14 @@ from std_srvs.srv import Trigger
 
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.pacing import Window
-from deworldsg_ros.ros.health import DROPPED, LOST_PREFIX, UNMATCHED_PREFIX, counts_in, received_in
+from deworldsg_ros.ros.health import (
+    DROPPED,
+    LISTENERS,
+    LOST_PREFIX,
+    UNMATCHED_PREFIX,
+    counts_in,
+    received_in,
+)
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 
@@ -31,7 +38,7 @@ SEGMENTATION, LIFTING, RELATION, GRAPH, ODOMETRY = (
     "odometry_node",
 )
 # relation_node listens to RGB too if its world model reads clips.
-LISTENERS = {
+LISTENERS_OF_INPUTS = {
     Role.RGB: {SEGMENTATION},
     Role.DEPTH: {SEGMENTATION, LIFTING},
     Role.CAMERA_INFO: {SEGMENTATION, LIFTING},
@@ -51,7 +58,7 @@ POSES_OF_ODOMETRY = {"camera/pose": ({ODOMETRY}, {SEGMENTATION, LIFTING})}
 # segmentation_node would drop those that wait too long.
 WINDOW_FRAMES = 2
 # DDS announces each endpoint to each participant separately: endpoints that are seen here may be
-# unknown elsewhere for a moment.
+# unknown elsewhere for a moment. Without word from the nodes, they are known everywhere after this.
 SETTLE_S = 1.0
 # Longest delay of evidence after the last local graph.
 EVIDENCE_QUIET_S = 3.0
@@ -106,6 +113,82 @@ class Restarts:
         return sorted({name for name, _ in found - known}) if known else []
 
 
+class Connections:
+    """The connections between the replay and the nodes, and among the nodes.
+
+    Args:
+        node: node of the replay.
+        diagnostics: newest values of each node, by its name.
+        odometry: whether odometry_node publishes the poses.
+
+    Attributes:
+        between: publishers and subscribers of each topic between the nodes.
+    """
+
+    def __init__(
+        self, node: Node, diagnostics: Mapping[str, Mapping[str, str]], *, odometry: bool
+    ) -> None:
+        self._node = node
+        self._diagnostics = diagnostics
+        self._listening = {
+            role: names | ({ODOMETRY} if odometry and role in ODOMETRY_LISTENS_TO else set())
+            for role, names in LISTENERS_OF_INPUTS.items()
+        }
+        self.between = {**BETWEEN, **(POSES_OF_ODOMETRY if odometry else {})}
+        self._complete_since_s: float | None = None
+
+    def missing(self, endpoints: dict[Role, Endpoint], now_s: float) -> list[str]:
+        """Missing connections, in words.
+
+        Empty once all nodes have told that they are connected, or all endpoints have existed for
+        SETTLE_S.
+        """
+        missing = self._missing_listeners(endpoints) + self.missing_between()
+        if missing:
+            self._complete_since_s = None
+            return missing
+        if self._complete_since_s is None:
+            self._complete_since_s = now_s
+        return self._unconnected() if now_s - self._complete_since_s < SETTLE_S else []
+
+    def _missing_listeners(self, endpoints: dict[Role, Endpoint]) -> list[str]:
+        missing: list[str] = []
+        for role, endpoint in endpoints.items():
+            absent = self._listening[role] - self._listeners(endpoint.topic)
+            missing += [f"{name} to listen to {endpoint.topic}" for name in sorted(absent)]
+            expected = len(self._listening[role])
+            if not missing and endpoint.publisher.get_subscription_count() < expected:
+                missing.append(f"a connection on {endpoint.topic}")
+        return missing
+
+    def missing_between(self) -> list[str]:
+        """Missing connections between the nodes, in words."""
+        missing: list[str] = []
+        for topic, (publishers, listeners) in self.between.items():
+            full_name = self._node.resolve_topic_name(topic)
+            infos = self._node.get_publishers_info_by_topic(full_name)
+            absent = publishers - {info.node_name for info in infos}
+            missing += [f"{name} to publish {full_name}" for name in sorted(absent)]
+            absent = listeners - self._listeners(full_name)
+            missing += [f"{name} to listen to {full_name}" for name in sorted(absent)]
+        return missing
+
+    def _unconnected(self) -> list[str]:
+        """Nodes that have not told that all listeners of their topics are connected."""
+        missing: list[str] = []
+        for topic, (publishers, _) in self.between.items():
+            full_name = self._node.resolve_topic_name(topic)
+            expected = len(self._node.get_subscriptions_info_by_topic(full_name))
+            for name in sorted(publishers):
+                told = self._diagnostics.get(name, {}).get(f"{LISTENERS}{full_name}", "0")
+                if int(told) < expected:
+                    missing.append(f"{name} to connect to the listeners of {full_name}")
+        return missing
+
+    def _listeners(self, topic: str) -> set[str]:
+        return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
+
+
 class PipelineMonitor:
     """Watches the nodes.
 
@@ -116,6 +199,7 @@ class PipelineMonitor:
     Attributes:
         window: frames in flight.
         diagnostics: newest values of each node, by its name.
+        connections: between the nodes.
         poses: T_world_camera of the local graphs, 16 values each, row by row.
     """
 
@@ -123,22 +207,17 @@ class PipelineMonitor:
         self._node = node
         needs = (Role.DEPTH,) if odometry else (Role.DEPTH, Role.POSE)
         self.window = Window(WINDOW_FRAMES, needs)
-        self._listening = {
-            role: names | ({ODOMETRY} if odometry and role in ODOMETRY_LISTENS_TO else set())
-            for role, names in LISTENERS.items()
-        }
-        self._between = {**BETWEEN, **(POSES_OF_ODOMETRY if odometry else {})}
         self.diagnostics: dict[str, dict[str, str]] = {}
+        self.connections = Connections(node, self.diagnostics, odometry=odometry)
         self.poses: list[list[float]] = []
         self._local_graphs = self._evidence = 0
         self._refused: dict[str, int] = {}
         # Messages that graph_node did not receive because it was restarted, by topic.
         self._missed: dict[str, int] = {}
-        self._complete_since_s: float | None = None
         self._progress_s: float | None = None
         self._own_pace = False
         self._looked_s = 0.0
-        self._restarts = Restarts(node, self._between)
+        self._restarts = Restarts(node, self.connections.between)
         self._restarted_s = math.inf
         node.create_subscription(String, LOCAL_GRAPH, self._on_local, reliable(50))
         node.create_subscription(String, EVIDENCE, self._on_evidence, reliable(50))
@@ -149,16 +228,6 @@ class PipelineMonitor:
     def nodes(self) -> int:
         """Number of nodes in the graph, by the newest diagnostics of graph_node."""
         return int(self.diagnostics.get(GRAPH, {}).get("nodes", 0))
-
-    def missing(self, endpoints: dict[Role, Endpoint], now_s: float) -> list[str]:
-        """Missing connections, in words; empty once all have existed for SETTLE_S."""
-        missing = self._missing_listeners(endpoints) + self._missing_between()
-        if missing:
-            self._complete_since_s = None
-            return missing
-        if self._complete_since_s is None:
-            self._complete_since_s = now_s
-        return [] if now_s - self._complete_since_s >= SETTLE_S else ["discovery to settle"]
 
     def has_to_wait(self, stall_s: float, now_s: float) -> bool:
         """Whether the next frame waits for results of the frames in flight.
@@ -198,7 +267,7 @@ class PipelineMonitor:
             self._restarted_s = now_s
             names, lost = " and ".join(restarted), self.window.in_flight
             self._node.get_logger().warning(f"{names} restarted: {lost} frames are lost")
-        missing = self._missing_between()
+        missing = self.connections.missing_between()
         return f"waiting for {missing[0]}" if missing else ""
 
     def silent_for(self, now_s: float) -> float:
@@ -225,30 +294,6 @@ class PipelineMonitor:
     def request_save(self) -> Any:
         """A future of the response of graph_node's service ~/save."""
         return self._save.call_async(Trigger.Request())
-
-    def _missing_listeners(self, endpoints: dict[Role, Endpoint]) -> list[str]:
-        missing: list[str] = []
-        for role, endpoint in endpoints.items():
-            absent = self._listening[role] - self._listeners(endpoint.topic)
-            missing += [f"{name} to listen to {endpoint.topic}" for name in sorted(absent)]
-            expected = len(self._listening[role])
-            if not missing and endpoint.publisher.get_subscription_count() < expected:
-                missing.append(f"a connection on {endpoint.topic}")
-        return missing
-
-    def _missing_between(self) -> list[str]:
-        missing: list[str] = []
-        for topic, (publishers, listeners) in self._between.items():
-            full_name = self._node.resolve_topic_name(topic)
-            infos = self._node.get_publishers_info_by_topic(full_name)
-            absent = publishers - {info.node_name for info in infos}
-            missing += [f"{name} to publish {full_name}" for name in sorted(absent)]
-            absent = listeners - self._listeners(full_name)
-            missing += [f"{name} to listen to {full_name}" for name in sorted(absent)]
-        return missing
-
-    def _listeners(self, topic: str) -> set[str]:
-        return {info.node_name for info in self._node.get_subscriptions_info_by_topic(topic)}
 
     def _on_local(self, message: Any) -> None:
         try:

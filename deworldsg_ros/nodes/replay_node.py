@@ -156,7 +156,7 @@ class ReplayNode(Node):
         }
         missing = ["the four nodes"]
         while wait_s > 0 and time.monotonic() < end_s:
-            missing = self._monitor.missing(endpoints, time.monotonic())
+            missing = self._monitor.connections.missing(endpoints, time.monotonic())
             if not missing:
                 return True
             if time.monotonic() - self._reported_s > 1.0:

@@ -8,10 +8,11 @@ Stein), so that exact poses stay as they are.
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 
 import numpy as np
 
-from deworldsg_ros.poses.surfels import JOINT, SurfelMap, about_camera, difference
+from deworldsg_ros.poses.surfels import JOINT, SurfelMap, about_camera, difference, stepped
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, derived
@@ -63,7 +64,7 @@ class Drift:
         grid = DepthGrid(np.full((40, 40), 1000, np.uint16), 8, camera)
         for _ in range(2):
             spare.register(np.eye(4), grid)
-            spare.add(np.eye(4), grid)
+            spare.add(np.eye(4))
         difference(np.eye(4), about_camera(np.ones(6), np.eye(4)))
 
     def align(self, local: LocalGraph) -> LocalGraph:
@@ -78,10 +79,10 @@ class Drift:
         drift = _shrunk(_squared(mean), SHRINK * mean_noise_m2 + MAP_VARIANCE_M2)
         self.T_graph_poses = about_camera(drift * mean, T_given)
         kept = 1.0 - self._leak(T_given) * (1.0 - drift)
-        self._map.add(_added(rest, about_camera(kept * mean, T_given) @ T_given), grid)
+        self._map.add(stepped(rest, stepped(kept * mean, T_given)))
         if drift == own == 0.0:
             return local
-        T_corrected = _added(own * rest, self.T_graph_poses @ T_given)
+        T_corrected = stepped(own * rest, stepped(drift * mean, T_given))
         return moved(local, T_corrected @ invert_pose(T_given))
 
     def _learn(self, T_given: Float64, fitted: Float64) -> tuple[float, Float64]:
@@ -106,7 +107,8 @@ class Drift:
         """Fraction of an offset that is no drift by which this frame moves the map."""
         motion = np.zeros(6) if self._T_last is None else difference(self._T_last, T_given)
         self._T_last = T_given
-        path = float(np.linalg.norm(motion[:3]) + np.linalg.norm(motion[3:]))
+        turn, step = motion[:3], motion[3:]
+        path = math.sqrt(turn @ turn) + math.sqrt(step @ step)
         first = FIRST_FRAMES / (self._frames + 1) * _shrunk(self._trembling_m2, FIT_VARIANCE_M2)
         return min(1.0, first + path / LEAK_PATH)
 
@@ -120,20 +122,16 @@ def _shrunk(squared: float, noise_squared: float) -> float:
     return 1.0 - min(1.0, noise_squared / max(squared, 1e-12))
 
 
-def _added(step: Float64, T_world_camera: Float64) -> Float64:
-    return about_camera(step, T_world_camera) @ T_world_camera
-
-
 def moved(local: LocalGraph, T: Float64) -> LocalGraph:
     """A local graph with the camera pose T · T_world_camera instead of T_world_camera."""
     means_world, covariances_world = transform(local.means_world, local.covariances_world, T)
-    rotation, translation = T[:3, :3].T.astype(np.float32), T[:3, 3].astype(np.float32)
+    ends = [*accumulate(map(len, local.surface_points_world))]
+    points = np.concatenate([np.zeros((0, 3), np.float32), *local.surface_points_world])
+    points = points @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)
     return derived(
         local,
         T_world_camera=T @ local.T_world_camera,
         means_world=means_world,
         covariances_world=covariances_world,
-        surface_points_world=tuple(
-            points @ rotation + translation for points in local.surface_points_world
-        ),
+        surface_points_world=tuple(points[a:b] for a, b in zip([0, *ends], ends)),
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from deworldsg_ros.kernels import kernel, read_only
@@ -40,9 +42,10 @@ class SurfelMap:
     """Surfels: position, normal (metres, world frame), number of frames, newest frame."""
 
     def __init__(self) -> None:
-        self._rows = np.zeros((0, 8))
+        self._rows = np.zeros((MAX_SURFELS, 8))
         self._count = self._frame = 0
         self._seen = np.zeros(0, np.int64)
+        self._view: _View
 
     def register(self, T_world_camera: Float64, grid: DepthGrid) -> Float64 | None:
         """The pose (4, 4) near a given one at which a frame fits the map; None if unknown.
@@ -50,56 +53,90 @@ class SurfelMap:
         Gauss-Newton on the distances of the frame's depth from the planes of the surfels in view,
         projected into the frame. Directions that these planes leave open are not corrected.
         """
-        view, rows = _view(grid), self._rows[: self._count]
+        self._view = view = _view(grid)
+        rows = self._rows[: self._count]
         self._seen = _in_view(rows, invert_pose(T_world_camera), view)
         # Contiguous: a kernel is compiled for one layout.
         sample = np.ascontiguousarray(self._seen[:: max(1, len(self._seen) // SAMPLES)])
-        T, matches = _fit(rows, sample, T_world_camera, view)
-        return T if matches >= MIN_MATCHES else None
+        is_found, T_fitted = _fit(rows, sample, T_world_camera, view)
+        return T_fitted if is_found else None
 
-    def add(self, T_world_camera: Float64, grid: DepthGrid) -> None:
-        """Fuse a frame; call `register` before."""
-        new = grid.depth_mm.size // 4
+    def add(self, T_world_camera: Float64) -> None:
+        """Fuse the frame of the last `register`."""
+        new = self._view[4].size // 4
         if self._count + new > MAX_SURFELS:
             newest = np.argsort(-self._rows[: self._count, 7], kind="stable")[: MAX_SURFELS // 2]
             self._count = len(newest)
             self._rows[: self._count] = self._rows[newest]
             self._seen = np.zeros(0, np.int64)
-        if self._count + new > len(self._rows):
-            more = np.zeros((len(self._rows) + 4 * new, 8))
-            self._rows = np.concatenate((self._rows, more))
+        if self._count + new > len(self._rows):  # an image with more cells than half of a full map
+            self._rows = np.concatenate((self._rows, np.zeros((new, 8))))
         self._frame += 1
-        arguments = T_world_camera, invert_pose(T_world_camera), _view(grid), self._frame
+        arguments = T_world_camera, invert_pose(T_world_camera), self._view, self._frame
         self._count = _fuse(self._rows, self._count, self._seen, *arguments)
 
 
 @kernel
 def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
     """A rotation vector about the camera and a translation (6,), world axes, as (4, 4)."""
-    T, angle = np.eye(4), np.sqrt((step[:3] ** 2).sum())
-    if angle > 0:
-        x, y, z = step[0] / angle, step[1] / angle, step[2] / angle
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        T[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    T, turn = np.zeros((4, 4), np.float64), _turn(step)
+    T[3, 3] = 1.0
     for i in range(3):
         T[i, 3] = step[3 + i] + T_world_camera[i, 3]
         for j in range(3):
-            T[i, 3] -= T[i, j] * T_world_camera[j, 3]
+            T[i, j] = turn[i, j]
+            T[i, 3] -= turn[i, j] * T_world_camera[j, 3]
     return T
+
+
+@kernel
+def stepped(step: Float64, T_world_camera: Float64) -> Float64:
+    """The camera pose (4, 4) after a step (6,) of `about_camera`."""
+    T, turn = T_world_camera.copy(), _turn(step)
+    for i in range(3):
+        T[i, 3] += step[3 + i]
+        for j in range(3):
+            T[i, j] = 0.0
+            for k in range(3):
+                T[i, j] += turn[i, k] * T_world_camera[k, j]
+    return T
+
+
+@kernel
+def _turn(step: Float64) -> Float64:
+    """The rotation (3, 3) of a rotation vector (Rodrigues)."""
+    turn, cross = np.zeros((3, 3), np.float64), np.zeros((3, 3), np.float64)
+    x, y, z = step[0], step[1], step[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle > 0:
+        x, y, z = x / angle, y / angle, z / angle
+        cross[0, 1], cross[0, 2], cross[1, 2] = -z, y, -x
+        cross[1, 0], cross[2, 0], cross[2, 1] = z, -y, x
+    sine, versine = math.sin(angle), 1 - math.cos(angle)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = sine * cross[i, j] + (1.0 if i == j else 0.0)
+            for k in range(3):
+                turn[i, j] += versine * cross[i, k] * cross[k, j]
+    return turn
 
 
 @kernel
 def difference(T_a: Float64, T_b: Float64) -> Float64:
     """The step (6,) of `about_camera` from camera pose a to b."""
-    R = T_b[:3, :3].copy() @ T_a[:3, :3].T.copy()
-    step, double_sine = np.empty(6), 0.0
+    R, step, double_sine = np.zeros((3, 3), np.float64), np.empty(6, np.float64), 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                R[i, j] += T_b[i, k] * T_a[j, k]
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
         step[i], step[3 + i] = R[k, j] - R[j, k], T_b[i, 3] - T_a[i, 3]
-        double_sine += step[i] ** 2
-    double_sine = np.sqrt(double_sine)
-    angle = np.arctan2(double_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
-    step[:3] *= angle / double_sine if double_sine > 1e-12 else 0.5
+        double_sine += step[i] * step[i]
+    double_sine = math.sqrt(double_sine)
+    angle = math.atan2(double_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    for i in range(3):
+        step[i] *= angle / double_sine if double_sine > 1e-12 else 0.5
     return step
 
 
@@ -158,9 +195,10 @@ def _turned(T: Float64, x: float, y: float, z: float) -> tuple[float, float, flo
 def _system(
     rows: Float64, sample: Int64, T: Float64, view: _View, reach_m: float
 ) -> tuple[Float64, Float64, int]:
-    """Normal equations (6, 6) and (6,) of one point-to-plane step, and the number of matches."""
-    hessian, gradient, jacobian, matches = np.zeros((6, 6)), np.zeros(6), np.empty(6), 0
-    inverse = np.zeros((3, 4))
+    """Damped normal equations (6, 6) and (6,) of a point-to-plane step; the number of matches."""
+    hessian, gradient = np.zeros((6, 6), np.float64), np.zeros(6, np.float64)
+    jacobian, matches = np.empty(6, np.float64), 0
+    inverse = np.zeros((3, 4), np.float64)
     for i in range(3):
         for j in range(3):
             inverse[i, j] = T[j, i]
@@ -192,23 +230,40 @@ def _system(
     for i in range(6):
         for j in range(i):
             hessian[j, i] = hessian[i, j]
+    mean = (hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / 3
+    for i in range(6):
+        hessian[i, i] += DAMPING * mean * (RADIAN_M**2 if i < 3 else 1.0)
     return hessian, gradient, matches
 
 
 @kernel
-def _fit(rows: Float64, sample: Int64, T: Float64, view: _View) -> tuple[Float64, int]:
-    """The pose that fits, and the number of matches in the last step."""
-    matches = 0
+def _solve(matrix: Float64, vector: Float64) -> bool:
+    """Solve positive definite equations in place (Gauss); false if they are singular."""
+    size = len(vector)
+    for k in range(size):
+        if not matrix[k, k] > 0.0:
+            return False
+        for i in range(k + 1, size):
+            factor = matrix[i, k] / matrix[k, k]
+            vector[i] -= factor * vector[k]
+            for j in range(k, size):
+                matrix[i, j] -= factor * matrix[k, j]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            vector[i] -= matrix[i, j] * vector[j]
+        vector[i] /= matrix[i, i]
+    return True
+
+
+@kernel
+def _fit(rows: Float64, sample: Int64, T: Float64, view: _View) -> tuple[bool, Float64]:
+    """Whether enough surfels fit, and the pose at which they do."""
     for reach_m in REACHES_M:
         hessian, gradient, matches = _system(rows, sample, T, view, reach_m)
-        if matches < MIN_MATCHES:
-            break
-        mean = (hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / 3
-        for i in range(6):
-            hessian[i, i] += DAMPING * mean * (RADIAN_M**2 if i < 3 else 1.0)
-        step = np.asarray(np.linalg.solve(hessian, gradient), np.float64)
-        T = about_camera(step, T) @ T
-    return T, matches
+        if matches < MIN_MATCHES or not _solve(hessian, gradient):
+            return False, T
+        T = stepped(gradient, T)
+    return True, T
 
 
 @kernel
@@ -289,7 +344,8 @@ def _fuse(
             surfel[6] *= 0.8
             if surfel[6] < 0.5:
                 count -= 1
-                rows[index] = rows[count]
+                for item in range(8):
+                    rows[index, item] = rows[count, item]
         elif measured <= FAR_M and _update(surfel, row, column, T, view):
             surfel[7] = frame
             _cover(covered, row, column, int(SURFEL_M * view[0] / depth))

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Optional
 
 import numpy as np
 
 from deworldsg_ros.config import Config
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.relations.evidence import (
     OUTLIER_RATE,
     bounded_logits,
     entropy_nats,
     visual_distribution,
 )
+from deworldsg_ros.relations.naming import said_predicates
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.paper_beliefs import PaperBeliefs, edge_state
 from deworldsg_ros.relations.physics_model import load_physics_model
@@ -20,30 +23,28 @@ from deworldsg_ros.relations.predicted_prior import PredictedPrior
 from deworldsg_ros.relations.prior import ClassPairPrior, Prior
 from deworldsg_ros.relations.robust_beliefs import ChangedBeliefs, RobustBeliefs
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Bool, Float64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.beliefs import listed
-from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.edges import EdgeEvidence, Pair, ends_of, key
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
-from deworldsg_ros.scene.publication import MEASURED_A_CALL
+from deworldsg_ros.scene.publication import MEASURED_A_CALL, NEW_A_CALL
 from deworldsg_ros.scene.up import UpEstimator
-from deworldsg_ros.scene.votes import frame_votes
 from deworldsg_ros.scene.waiting import some_of
 
 # Votes of objects whose means are farther apart are not counted.
 MAX_DISTANCE_M = 2.5
-# An edge is published if its best predicate has at least this probability.
-MIN_PROBABILITY = 0.2
 # Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
 # 12 objects changes about 80 pairs.
 JUDGED_A_CALL = 12
-# A symmetric relation is sent once a pair if its probabilities in both directions differ by less.
-SAME_PROBABILITY = 0.01
-# Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
-DECIMALS = 3
 NO_EVIDENCE = EdgeEvidence(np.zeros(0), 0, 0, 0, 0)
+
+# What a message is made from, beside the evidence of its edge: probabilities, as bytes; where they
+# come from; and whether it speaks for both directions. None = no message.
+_Basis = Optional[tuple[bytes, wire.Provenance, bool]]
+_UNSAID: tuple[_Basis, _Basis] = (None, None)
 
 
 class EdgeBeliefs:
@@ -83,8 +84,8 @@ class EdgeBeliefs:
         names = graph.vocabulary.predicates
         self._symmetric = np.array([plain(name) in SYMMETRIC for name in names], np.bool_)
         self._begun = False
-        # What each message was made from, beside the evidence of its edge.
-        self._basis: dict[Pair, tuple[bytes, wire.Provenance, bool]] = {}
+        # Of both directions of the pairs with a message, by key.
+        self._basis: dict[int, tuple[_Basis, _Basis]] = {}
 
     def weigh(self, local: LocalGraph) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
@@ -93,28 +94,24 @@ class EdgeBeliefs:
         logits = bounded_logits(local.relations.logits, OUTLIER_RATE)
         return derived(local, relations=derived(local.relations, logits=logits))
 
-    def observe(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+    def observe(self, local: LocalGraph, node_ids: Sequence[int], votes: Float64) -> None:
         """Count the votes of a merged frame, also for pairs without a relation.
 
         Args:
             local: the frame, with the logits of the relation head.
             node_ids: the node of each of its rows.
+            votes: of the frame, see `frame_votes`.
         """
         self.up.observe(local.T_world_camera)
         if self._robust is None or len(node_ids) < 2:
             return
-        votes = frame_votes(local.relations.logits)
-        counts: dict[tuple[int, int], Float64] = {}
-        for (subject, object_), vote in zip(local.relations.pairs.tolist(), votes):
-            first, second = min(subject, object_), max(subject, object_)
-            pair = counts.setdefault((first, second), np.zeros((2, votes.shape[1])))
-            pair[int(subject > object_)] = vote
-        offsets = local.means_world[:, None] - local.means_world[None]
-        close = (offsets**2).sum(axis=2) < MAX_DISTANCE_M**2
-        for first, second in np.argwhere(np.triu(close, 1)).tolist():
-            a_id, b_id = node_ids[first], node_ids[second]
-            if a_id and b_id and a_id != b_id:
-                self._graph.add_votes(a_id, b_id, counts.get((first, second)))
+        ids = np.array(node_ids, np.int64)
+        close, nodes = _counted(ids, local.means_world)
+        # In the order of the rows; of two relations of one pair of rows, the last one counts.
+        last = {pair: at for at, pair in enumerate(map(tuple, local.relations.pairs.tolist()))}
+        told = sorted((sorted(pair), at) for pair, at in last.items() if close[pair])
+        rows = [at for _, at in told]
+        self._graph.add_frame_votes(nodes, ids[local.relations.pairs[rows]], votes[rows])
 
     def add(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs (Eq. 8) and the world model's predictions.
@@ -133,38 +130,40 @@ class EdgeBeliefs:
             )
         self.prior.update(evidence.pair_classes, evidence.predictions)
         # A pair with a prediction was already named as a neighbour in an earlier message.
-        for subject, object_ in evidence.pairs[~evidence.predicted].tolist():
-            self._graph.add_neighbour(node_ids[subject], node_ids[object_], evidence.stamp_ns)
+        rows = evidence.pairs[~evidence.predicted].tolist()
+        self._graph.add_neighbours([(node_ids[a], node_ids[b]) for a, b in rows], evidence.stamp_ns)
 
     @property
     def waiting(self) -> int:
         """Number of nodes that wait to be measured, and of pairs that wait to be judged."""
         return 0 if self._table is None else self._table.nodes_waiting + self._table.pairs_waiting
 
-    def refresh(self, whole: bool = True) -> list[Pair]:
-        """Bring `states` up to date; returns the pairs with another message, or none.
+    def refresh(self, whole: bool = True) -> tuple[list[Pair], bool]:
+        """Bring `states` up to date.
 
         Args:
-            whole: judge all pairs that wait, as the first call does. False: about `JUDGED_A_CALL`.
-        """
-        prior = self._follow_table(whole or not self._begun)
-        self._begun = True
-        if self._robust is not None:
-            return self._follow(self._robust.refresh(prior))
-        assert self._paper is not None
-        return self._paper.refresh(prior)
+            whole: judge all pairs that wait. False: some of them; `NEW_A_CALL` until all first ones
+                are judged, then about `JUDGED_A_CALL`.
 
-    def _follow_table(self, everything: bool) -> Prior:
+        Returns:
+            The pairs with another message, or none; and whether all first pairs are judged.
+        """
+        prior = self._follow_table(whole)
+        self._begun = self._begun or not self.waiting
+        if self._robust is not None:
+            if self._table is not None and not self._table.begun:
+                return [], False
+            return self._follow(self._robust.refresh(prior)), self._begun
+        assert self._paper is not None
+        return self._paper.refresh(prior), self._begun
+
+    def _follow_table(self, whole: bool) -> Prior:
         """Judge pairs that wait, all of them or some; returns the prior that is used."""
         table, prior = self._table, self.prior
         if table is None:
             return prior
-        limits = (
-            some_of(table.pairs_waiting, JUDGED_A_CALL),
-            some_of(table.nodes_waiting, MEASURED_A_CALL),
-        )
-        up_world = self.up.up_world(exact=everything)
-        table.refresh(up_world, *((None, None) if everything else limits))
+        limits = (None, None) if whole else _limits(table, self._begun)
+        table.refresh(self.up.up_world(exact=whole or not self._begun), *limits)
         if self._predicted is not None:
             self._predicted.follow(table, table.changed_pairs)
         if self._robust is None:
@@ -175,55 +174,62 @@ class EdgeBeliefs:
     def _follow(self, beliefs: ChangedBeliefs) -> list[Pair]:
         """Messages of the edges that are probable enough."""
         evidence_changed = self._graph.take_changed_edges()
-        rounded = np.round(beliefs.probabilities, DECIMALS)
-        said = rounded.max(axis=1, initial=0.0) >= MIN_PROBABILITY
-        mutual = self._mutual(rounded, said)
-        # The beliefs of both directions of a pair follow each other.
-        said[1::2] &= ~mutual[1::2]
-        gone = beliefs.unrelated + [beliefs.pairs[i] for i in np.flatnonzero(~said).tolist()]
-        changed = [pair for pair in gone if self.states.pop(pair, None) is not None]
-        for pair in changed:
-            del self._basis[pair]
-        for index in np.flatnonzero(said).tolist():
-            pair = beliefs.pairs[index]
-            basis = (rounded[index].tobytes(), beliefs.sources[index], bool(mutual[index]))
-            if self._basis.get(pair) != basis or pair in evidence_changed:
-                self._basis[pair] = basis
-                changed.append(pair)
-        changed.extend((evidence_changed & self.states.keys()).difference(changed))
-        self._tell([pair for pair in changed if pair in self._basis])
+        said, mutual = said_predicates(beliefs.probabilities, self._symmetric)
+        changed = []
+        for pair_key in self._basis.keys() & beliefs.unrelated:
+            changed += self._say(pair_key, _UNSAID)
+        for index, (pair_key, ends) in enumerate(zip(beliefs.pairs, said.tolist())):
+            if any(ends) or pair_key in self._basis:
+                there, back = (
+                    _basis(beliefs, index, end, mutual[index]) if ends[end] else None
+                    for end in (0, 1)
+                )
+                changed += self._say(pair_key, (there, back))
+        changed += (evidence_changed & self.states.keys()).difference(changed)
+        self._tell(changed)
         return changed
 
-    def _mutual(self, rounded: Float64, said: Bool) -> Bool:
-        """Whether each belief (m,) is of a symmetric relation that both directions name."""
-        best = rounded.argmax(axis=1).reshape(-1, 2)
-        both = said.reshape(-1, 2).all(axis=1) & (best[:, 0] == best[:, 1])
-        both &= np.ptp(rounded.max(axis=1, initial=0.0).reshape(-1, 2), axis=1) <= SAME_PROBABILITY
-        return np.repeat(both & self._symmetric[best[:, 0]], 2)
+    def _say(self, pair_key: int, now: tuple[_Basis, _Basis]) -> list[Pair]:
+        """Note what the messages of a pair are made from; returns the directions that changed."""
+        before = self._basis.pop(pair_key, _UNSAID)
+        if now != _UNSAID:
+            self._basis[pair_key] = now
+        first, second = ends_of(pair_key)
+        pairs = ((first, second), (second, first))
+        return [pair for pair, old, new in zip(pairs, before, now) if old != new]
+
+    def _basis_of(self, pair: Pair) -> _Basis:
+        return self._basis.get(key(min(pair), max(pair)), _UNSAID)[pair[0] > pair[1]]
 
     def _tell(self, pairs: list[Pair]) -> None:
-        """Write the messages of edges."""
-        if not pairs:
+        """Write the messages of edges, or remove those that are not said any more."""
+        bases = {pair: basis for pair in pairs if (basis := self._basis_of(pair))}
+        for pair in pairs:
+            if pair not in bases:
+                del self.states[pair]
+        if not bases:
             return
         graph = self._graph
-        probabilities = np.array([np.frombuffer(self._basis[pair][0]) for pair in pairs])
-        evidence = [graph.edges.get(pair, NO_EVIDENCE) for pair in pairs]
+        probabilities = np.array([np.frombuffer(basis[0]) for basis in bases.values()])
+        evidence = [graph.edges.get(pair, NO_EVIDENCE) for pair in bases]
         logits = np.zeros(probabilities.shape)
         for row, item in enumerate(evidence):
             if item.frames:
                 logits[row] = item.visual_logits
         entropies = entropy_nats(visual_distribution(logits)).tolist()
         told = listed(probabilities, graph.vocabulary.predicates, self._top_k)
-        for pair, one, item, entropy in zip(pairs, told, evidence, entropies):
-            _, provenance, mutual = self._basis[pair]
-            votes = graph.votes.get((min(pair), max(pair)))
+        shown, _ = graph.votes.of(np.sort(np.array(list(bases)), axis=1))
+        for (pair, basis), one, item, entropy, frames in zip(
+            bases.items(), told, evidence, entropies, shown.tolist()
+        ):
+            _, provenance, mutual = basis
             self.states[pair] = edge_state(
                 pair,
                 one,
                 provenance=provenance,
                 entropy_nats=entropy,
                 observations=item.frames,
-                shown=0 if votes is None else votes.frames,
+                shown=frames,
                 mutual=mutual,
             )
 
@@ -237,6 +243,44 @@ class EdgeBeliefs:
                 f"{len(known.predicates)}, with the same names in the same order (do all nodes "
                 "run with one configuration?)",
             )
+
+
+@kernel
+def _counted(node_ids: Int64, means_world: Float64) -> tuple[Bool, Int64]:
+    """Whether (n, n) frames count for each two rows: two live nodes that are close.
+
+    Also the nodes (k, 2) of these pairs of rows, the smaller id first.
+    """
+    size = len(node_ids)
+    close, nodes = np.zeros((size, size), np.bool_), np.empty((size * size // 2, 2), np.int64)
+    count = 0
+    for a in range(size):
+        for b in range(a + 1, size):
+            squared_m2 = 0.0
+            for axis in range(3):
+                squared_m2 += (means_world[a, axis] - means_world[b, axis]) ** 2
+            live = node_ids[a] > 0 and node_ids[b] > 0 and node_ids[a] != node_ids[b]
+            if live and squared_m2 < MAX_DISTANCE_M**2:
+                close[a, b] = close[b, a] = True
+                nodes[count, 0] = min(node_ids[a], node_ids[b])
+                nodes[count, 1] = max(node_ids[a], node_ids[b])
+                count += 1
+    return close, nodes[:count]
+
+
+def _basis(beliefs: ChangedBeliefs, index: int, end: int, mutual: np.bool_) -> _Basis:
+    """What the message of one direction of a pair is made from."""
+    return beliefs.probabilities[index, end].tobytes(), beliefs.source(index, end), bool(mutual)
+
+
+def _limits(table: PairTable, begun: bool) -> tuple[int, int]:
+    """Numbers of pairs and of nodes that one call of `refresh` works on."""
+    if not begun:
+        return NEW_A_CALL, NEW_A_CALL
+    return (
+        some_of(table.pairs_waiting, JUDGED_A_CALL),
+        some_of(table.nodes_waiting, MEASURED_A_CALL),
+    )
 
 
 def warm_up(config: Config) -> None:

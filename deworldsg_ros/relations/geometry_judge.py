@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.relations.pair_geometry import FEATURES, SHAPE_POINTS, pair_features, upright
+from deworldsg_ros.relations.pair_geometry import (
+    FEATURES,
+    SHAPE_POINTS,
+    centre_steps,
+    pair_features,
+    upright,
+)
+from deworldsg_ros.relations.pair_links import joined
 from deworldsg_ros.relations.pair_rows import PairRows
 from deworldsg_ros.relations.physics_model import PairInputs, PhysicsModel
 from deworldsg_ros.scene.arrays import Float64, Int64
@@ -44,11 +51,10 @@ class GeometryJudge:
     def _judge(self, table: PairRows, rows: Int64, R_up_world: Float64, floor_m: float) -> None:
         shapes, nodes = table.shapes, self._graph.nodes
         ends = table.ends[rows]
-        used = sorted({*ends.ravel().tolist()})
-        places = {row: place for place, row in enumerate(used)}
-        first, second = np.array([[places[row] for row in end] for end in ends.T.tolist()])
+        used = joined(ends, [])
+        first, second = np.searchsorted(used, ends.T)
         low, high = shapes.low[used], shapes.high[used]
-        node_rows = [nodes.places[node_id] for node_id in shapes.ids[used].tolist()]
+        node_rows = np.array([nodes.places[i] for i in shapes.ids[used].tolist()], np.int64)
         features = pair_features(
             first,
             second,
@@ -62,12 +68,10 @@ class GeometryJudge:
         )
         edits, names = self._graph.edits, self._graph.vocabulary
         known = edits.believed_classes(nodes, names, node_rows), nodes.observations[node_rows]
-        both = np.append(first, second), np.append(second, first)
+        both = np.concatenate((first, second)), np.concatenate((second, first))
         inputs = self._inputs.make(features.reshape(2 * len(rows), -1), *known, *both)
         table.state_logits[rows] = self._model.state_logits(*inputs.reshape(2, len(rows), -1))
         table.judged[rows] = True
         table.gaps_m[rows] = features[0, :, _GAP]
         table.bottom_steps_m[rows] = features[0, :, _BOTTOM_STEP]
-        centres = (low[:, :2] + high[:, :2]) / 2.0
-        step_x, step_y = (centres[first] - centres[second]).T
-        table.centre_steps_m[rows] = np.sqrt(step_x * step_x + step_y * step_y)
+        table.centre_steps_m[rows] = centre_steps(first, second, low, high)

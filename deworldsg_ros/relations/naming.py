@@ -20,6 +20,33 @@ MIN_OTHER_VOTES = 0.5
 OTHER_ODDS = 0.02
 # Evidence in nats is limited to this: odds are finite.
 MAX_EVIDENCE = 30.0
+# Pairs that are related with a smaller probability have no beliefs: no edge would be published.
+MIN_RELATED = 0.01
+# An edge is published if its best predicate has at least this probability.
+MIN_PROBABILITY = 0.2
+# A symmetric relation is sent once a pair if its probabilities in both directions differ by less.
+SAME_PROBABILITY = 0.01
+# Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
+DECIMALS = 3
+_SCALE = 10.0**DECIMALS
+
+
+@kernel
+def related_pairs(  # noqa: D417
+    rows: Int64, relations: Float64, other_votes: Float64
+) -> Bool:
+    """Whether pairs may be related, or have votes beyond the physical relations; (k,) bool.
+
+    Args:
+        rows: (k,) of the pairs.
+        relations, other_votes: see `PairRows`.
+    """
+    related = np.empty(len(rows), np.bool_)
+    for index in range(len(rows)):
+        row = rows[index]
+        free = min(relations[row, 0, NONE], relations[row, 1, NONE])
+        related[index] = free < 1.0 - MIN_RELATED or other_votes[row] >= MIN_OTHER_VOTES
+    return related
 
 
 @kernel
@@ -126,3 +153,33 @@ def uncertain(probabilities: Float64, threshold_nats: float) -> Bool:
                     entropy -= value / total * math.log(value / total)
             result[row, end] = total > 0.0 and entropy > threshold_nats
     return result
+
+
+@kernel
+def said_predicates(probabilities: Float64, symmetric: Bool) -> tuple[Bool, Bool]:
+    """Round probabilities (k, 2, R) in place, and find what of them is published.
+
+    Args:
+        probabilities: of the predicates of pairs in both directions.
+        symmetric: (R,) bool, the predicates that hold in both directions or in none.
+
+    Returns:
+        (k, 2) bool, whether a direction is published; and (k,) bool, whether the first direction
+        speaks for both.
+    """
+    count, _, width = probabilities.shape
+    said, mutual = np.empty((count, 2), np.bool_), np.zeros(count, np.bool_)
+    best, most = np.empty(2, np.int64), np.empty(2, np.float64)
+    for row in range(count):
+        for end in range(2):
+            best[end], most[end] = 0, 0.0
+            for name in range(width):
+                value = np.rint(probabilities[row, end, name] * _SCALE) / _SCALE
+                probabilities[row, end, name] = value
+                if value > most[end]:
+                    best[end], most[end] = name, value
+            said[row, end] = most[end] >= MIN_PROBABILITY
+        if said[row, 0] and said[row, 1] and best[0] == best[1] and symmetric[best[0]]:
+            mutual[row] = abs(most[0] - most[1]) <= SAME_PROBABILITY
+            said[row, 1] = not mutual[row]
+    return said, mutual

@@ -27,6 +27,7 @@ MARGIN_M = 0.06
 LAYER_M = 0.035
 # Points of a surface count for its height beside an object by exp(-(distance / this)²).
 SOFT_RADIUS_M = 0.15
+_NO_TURN = np.eye(3)
 
 FEATURES = (
     "gap_m", "overlap_small_m", "overlap_large_m", "overlap_up_m", "covered", "covers",
@@ -94,7 +95,7 @@ class NodeShapes(Columns):
 
 def upright(points_world: Float32, R_up_world: Float64) -> Float32:
     """Points (..., 3) float32 in the upright frame."""
-    if np.array_equal(R_up_world, np.eye(3)):
+    if (R_up_world == _NO_TURN).all():
         return points_world
     turned: Float32 = points_world @ R_up_world.T.astype(np.float32)
     return turned
@@ -212,6 +213,18 @@ def pair_features(  # noqa: D417
         there[20] = _mahalanobis(a, b, means, covariances)
         _reverse(there, back)
     return result
+
+
+@kernel
+def centre_steps(first: Int64, second: Int64, low: Float64, high: Float64) -> Float64:
+    """Horizontal distances (m,) of the centres of the bounds of pairs of rows, (m,) each."""
+    steps = np.empty(len(first), np.float64)
+    for pair in range(len(first)):
+        a, b = first[pair], second[pair]
+        x = (low[a, 0] + high[a, 0]) / 2.0 - (low[b, 0] + high[b, 0]) / 2.0
+        y = (low[a, 1] + high[a, 1]) / 2.0 - (low[b, 1] + high[b, 1]) / 2.0
+        steps[pair] = math.sqrt(x * x + y * y)
+    return steps
 
 
 @kernel

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TypeVar
 
 import numpy as np
 
@@ -13,21 +12,10 @@ from deworldsg_ros.relations.physical_states import NONE, STATE_COUNT
 from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.columns import Columns
+from deworldsg_ros.scene.edges import ends_of
 
 # Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
 APART_LOGIT = -12.0
-
-Ids = TypeVar("Ids", int, Int64)
-
-
-def key(first: Ids, second: Ids) -> Ids:
-    """One number for a pair of ids, the smaller first."""
-    return first << 31 | second
-
-
-def ends_of(pair_key: int) -> tuple[int, int]:
-    """The two ids of a `key`."""
-    return pair_key >> 31, pair_key & 0x7FFFFFFF
 
 
 class PublishedNodes(NodeShapes):

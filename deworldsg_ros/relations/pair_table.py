@@ -10,16 +10,16 @@ from sortedcontainers import SortedList
 from deworldsg_ros.relations.geometry_judge import GeometryJudge
 from deworldsg_ros.relations.pair_geometry import rotation_to_upright
 from deworldsg_ros.relations.pair_links import move_object, pairs_of
-from deworldsg_ros.relations.pair_rows import PairRows, ends_of, key
+from deworldsg_ros.relations.pair_rows import PairRows
 from deworldsg_ros.relations.physical_states import relation_of_predicates
 from deworldsg_ros.relations.physics_model import PhysicsModel
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach
-from deworldsg_ros.relations.vote_model import relation_counts
+from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach, known_reach
+from deworldsg_ros.relations.vote_model import most_other_votes, relation_counts
 from deworldsg_ros.relations.waiting_pairs import WaitingPairs
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.class_kinds import SEATS, TABLES
+from deworldsg_ros.scene.edges import key
 from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.votes import PairVotes
 from deworldsg_ros.scene.waiting import take_first
 
 # The floor is where the lowest objects stand; single nodes may reach below it.
@@ -29,9 +29,6 @@ FLOOR_STEP_M = 0.02
 # Steps of the components of the up direction, so that it changes less often: every change means
 # that all pairs are judged anew. The error is at most half a degree.
 UP_STEP = 0.01
-# Logit of every relation of a pair that is out of reach. The simulated rooms have none there.
-APART_LOGIT = -12.0
-NO_VOTES = PairVotes(0, None, 0)
 
 
 class PairTable(PairRows):
@@ -44,11 +41,14 @@ class PairTable(PairRows):
 
     Attributes:
         floor_m: height of the floor in the upright frame.
+        begun: whether all nodes that there were at first are measured: pairs are judged from then
+            on, because it needs the floor.
     """
 
     def __init__(self, graph: SceneGraph, model: PhysicsModel, *, geometry: bool) -> None:
         super().__init__()
         self.floor_m = 0.0
+        self.begun = False
         self._graph = graph
         self._geometry = geometry
         self._judge_near = GeometryJudge(graph, model)
@@ -56,6 +56,7 @@ class PairTable(PairRows):
         self._seating = np.array([[name in TABLES, name in SEATS] for name in names], np.float64)
         self._relation_of = relation_of_predicates(graph.vocabulary.predicates)
         self._R_up_world, self._up = np.eye(3), [0.0, 0.0, 1.0]
+        self._up_world: Float64 | None = None
         self._touched = graph.watch_nodes()
         # Published nodes that changed since they were measured.
         self._stale: dict[int, None] = {}
@@ -91,22 +92,26 @@ class PairTable(PairRows):
             self.floor_m = floor_m
             self.changed_nodes.update(self.shapes.ids.tolist())
             self._waiting.move(self.ids[np.isfinite(self.gaps_m)])
+        self.begun = self.begun or not self._stale
+        if not self.begun:
+            return
         keys, moved = self._waiting.take(at_most)
         if keys:
             self._judge(keys, moved)
 
     def _follow_nodes(self, up_world: Float64, at_most: int | None) -> list[int]:
         """Measure nodes that changed, and forget those that went; returns ids."""
-        nodes = self._graph.nodes
+        places, confirmed = self._graph.nodes.places, self._graph.nodes.confirmed
         for node_id in sorted(self._touched):
-            if node_id in nodes and nodes.confirmed[nodes.row(node_id)]:
+            row = places.get(node_id)
+            if row is not None and confirmed[row]:
                 self._stale[node_id] = None
             else:
                 self._stale.pop(node_id, None)
                 if node_id in self.shapes:
                     self._forget(node_id)
         self._touched.clear()
-        if self._turn(up_world):
+        if self._turn(up_world) and len(self.shapes):
             # All shapes are in one frame.
             at_most = None
             self._stale.update(dict.fromkeys(self.shapes.ids.tolist()))
@@ -116,7 +121,9 @@ class PairTable(PairRows):
 
     def _turn(self, up_world: Float64) -> bool:
         """Follow the up direction; true if it has made a step."""
-        stepped = stepped_up(up_world)
+        if up_world is self._up_world:  # the estimate is seldom another one
+            return False
+        self._up_world, stepped = up_world, stepped_up(up_world)
         if stepped.tolist() == self._up:
             return False
         self._up, self._R_up_world = stepped.tolist(), rotation_to_upright(stepped)
@@ -150,14 +157,14 @@ class PairTable(PairRows):
         self._came(new)
         if differs:
             others = self.rows_of([node_ids[index] for index in differs])
-            self._waiting.add(map(ends_of, self.ids[others].tolist()))
+            self._waiting.add(self.ids[others].tolist())
         self.changed_nodes.update(node_ids)
 
     def _came(self, node_ids: list[int]) -> None:
         """Count the votes on nodes that are published from now on."""
         for node_id in node_ids:
             partners = self._graph.seen_together(node_id)
-            self._waiting.add((min(node_id, other), max(node_id, other)) for other in partners)
+            self._waiting.add(key(min(node_id, other), max(node_id, other)) for other in partners)
 
     def _forget(self, node_id: int) -> None:
         """Forget a node that is not published any more, and its pairs."""
@@ -184,21 +191,19 @@ class PairTable(PairRows):
             return
         shapes = self.shapes
         at = np.array([shapes.row(node_id) for node_id in changed], np.int64)
-        ends = shapes.ids[self._grid.pairs(at, shapes.low, shapes.high, shapes.counts)]
-        self._waiting.move(key(ends.min(axis=1), ends.max(axis=1)))
+        first, second = shapes.ids[self._grid.pairs(at, shapes.low, shapes.high, shapes.counts)].T
+        self._waiting.move(key(np.minimum(first, second), np.maximum(first, second)))
         # Those that were in reach, and may be no more; and those with too few points until now.
         rows = pairs_of(shapes.first_links, self.links, at)
-        solid = (shapes.counts[self.ends[rows]] >= MIN_SHAPE_POINTS).all(axis=1)
-        self._waiting.move(
-            self.ids[rows[(self.judged[rows] != solid) | np.isfinite(self.gaps_m[rows])]]
-        )
+        known = known_reach(rows, self.ends, self.judged, self.gaps_m, shapes.counts)
+        self._waiting.move(self.ids[rows[known]])
 
     def _judge(self, keys: list[int], moved: Bool) -> None:
         """Take in what is known of pairs now; those without any evidence go."""
         shapes = self.shapes
         known_rows = len(self)
         rows = self.add(keys)
-        self._count(rows, keys)
+        self._count(rows)
         if self._geometry:
             again = rows[moved]
             near = in_reach(self.ends[again], shapes.low, shapes.high, shapes.counts)
@@ -211,18 +216,11 @@ class PairTable(PairRows):
         for pair_key in self.ids[rows[idle]].tolist():
             self.forget_pair(pair_key)
 
-    def _count(self, rows: Int64, keys: list[int]) -> None:
+    def _count(self, rows: Int64) -> None:
         """Take in the votes on pairs."""
-        votes = self._graph.votes
-        found = [votes.get(ends_of(pair_key), NO_VOTES) for pair_key in keys]
-        self.frames[rows] = [pair.frames for pair in found]
-        told = [index for index, pair in enumerate(found) if pair.counts is not None]
-        self.counts[rows], self.other_votes[rows] = 0.0, 0.0
-        if told:
-            counts = np.array([found[index].counts for index in told])
-            self.counts[rows[told]] = relation_counts(counts, self._relation_of)
-            others = counts[:, :, self._relation_of < 0]
-            self.other_votes[rows[told]] = others.max(axis=(1, 2), initial=0.0)
+        self.frames[rows], votes = self._graph.votes.of(self.nodes[rows])
+        self.counts[rows] = relation_counts(votes, self._relation_of)
+        self.other_votes[rows] = most_other_votes(votes, self._relation_of)
 
 
 def floor_height(bottoms_m: Sequence[float]) -> float:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import math
 import zipfile
 from dataclasses import dataclass, fields
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.relations.evidence import entropy_nats
 from deworldsg_ros.relations.pair_geometry import FEATURES
 from deworldsg_ros.relations.physical_states import DIRECTED, states_of_relations
 from deworldsg_ros.relations.vote_model import VoteScales
@@ -31,6 +30,8 @@ PATH = Path(__file__).with_name("weights") / "physics.npz"
 INPUT_COUNT = len(FEATURES) + 2 * len(KINDS) + 7
 # Standardised inputs are limited to this many standard deviations.
 MAX_INPUT = 6.0
+# Odds are finite.
+MAX_FLOOR_LOGIT = 20.0
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,15 @@ class PhysicsModel:
     source_weights: Float64
     floor: Float64
 
-    @property
+    @cached_property
     def votes(self) -> VoteScales:
         """What votes are worth."""
         return VoteScales(*self.vote_scales.tolist())
+
+    @cached_property
+    def state_prior(self) -> Float64:
+        """Logits (STATE_COUNT,) of a pair without geometry."""
+        return np.concatenate([[0.0], np.repeat(self.prior, 2)])
 
     def relation_logits(self, inputs: Float64) -> Float64:
         """Logits (m, len(DIRECTED)) of ordered pairs with inputs (m, INPUT_COUNT)."""
@@ -82,16 +88,28 @@ class PhysicsModel:
         both = self.relation_logits(np.concatenate([there, back]))
         return states_of_relations(both.reshape(2, len(there), -1))
 
-    def floor_logits(self, bottoms_m: Float64, heights_m: Float64) -> Float64:
-        """Logits (n,) that objects stand on the floor.
 
-        Args:
-            bottoms_m: (n,) height of the bottoms over the floor.
-            heights_m: (n,) from bottom to top.
-        """
-        offset, by_bottom, by_height = self.floor
-        rise = np.abs(bottoms_m)
-        return np.asarray(offset + by_bottom * rise + by_height * np.log(heights_m + 0.01))
+@kernel
+def floor_odds(  # noqa: D417
+    rows: Int64, low: Float64, high: Float64, counts: Int64, floor_m: float, floor: Float64
+) -> Float64:
+    """Odds (k,) that objects stand on the floor; 0 for those without points.
+
+    Args:
+        rows: (k,) of the objects.
+        low, high, counts: columns of `NodeShapes`.
+        floor_m: height of the floor.
+        floor: of `PhysicsModel`.
+    """
+    offset, by_bottom, by_height = floor
+    odds = np.zeros(len(rows), np.float64)
+    for index in range(len(rows)):
+        row = rows[index]
+        if counts[row]:
+            rise, height = abs(low[row, 2] - floor_m), high[row, 2] - low[row, 2]
+            logit = offset + by_bottom * rise + by_height * math.log(height + 0.01)
+            odds[index] = math.exp(min(max(logit, -MAX_FLOOR_LOGIT), MAX_FLOOR_LOGIT))
+    return odds
 
 
 def believed_logits(
@@ -110,8 +128,7 @@ def believed_logits(
         independent: (m,) bool; the votes do not come from the embedded head, or the geometry was
             not judged.
     """
-    prior = np.concatenate([[0.0], np.repeat(model.prior, 2)])
-    return _believed(geometry, votes, independent, prior, model.source_weights)
+    return _believed(geometry, votes, independent, model.state_prior, model.source_weights)
 
 
 @kernel
@@ -154,7 +171,7 @@ class PairInputs:
 
     def __init__(self, classes: tuple[str, ...]) -> None:
         self._kinds = kind_table(classes)
-        self._fixed = fixed_table(classes).astype(np.float64)
+        self._fixed = np.argwhere(fixed_table(classes))
 
     def make(
         self,
@@ -173,23 +190,52 @@ class PairInputs:
             subjects: (m,) rows of `class_probabilities`, and
             objects: (m,) rows.
         """
-        kinds = class_probabilities @ self._kinds
-        entropies = entropy_nats(class_probabilities)
-        first, second = class_probabilities[subjects], class_probabilities[objects]
-        return np.column_stack(
-            [
-                features,
-                kinds[subjects],
-                kinds[objects],
-                ((first @ self._fixed) * second).sum(axis=1),
-                ((second @ self._fixed) * first).sum(axis=1),
-                (first * second).sum(axis=1),
-                entropies[subjects],
-                entropies[objects],
-                np.log(observations[subjects]),
-                np.log(observations[objects]),
-            ]
-        )
+        known = (class_probabilities, observations, subjects, objects)
+        return _inputs(features, *known, self._kinds, self._fixed)
+
+
+@kernel
+def _inputs(
+    features: Float64,
+    classes: Float64,
+    observations: Int64,
+    subjects: Int64,
+    objects: Int64,
+    kinds: Float64,
+    fixed: Int64,
+) -> Float64:
+    """See `PairInputs.make`; kinds are those of `kind_table`, fixed (k, 2) are pairs of classes."""
+    count, width = kinds.shape
+    of_nodes = np.zeros((len(classes), width), np.float64)
+    entropies = np.zeros(len(classes), np.float64)
+    for node in range(len(classes)):
+        for name in range(count):
+            probability = classes[node, name]
+            if probability > 0.0:
+                entropies[node] -= probability * math.log(probability)
+                for kind in range(width):
+                    of_nodes[node, kind] += probability * kinds[name, kind]
+    start = features.shape[1]
+    result = np.empty((len(features), start + 2 * width + 7), np.float64)
+    for row in range(len(features)):
+        a, b = subjects[row], objects[row]
+        there, back, same = 0.0, 0.0, 0.0
+        for index in range(len(fixed)):
+            name, other = fixed[index]
+            there += classes[a, name] * classes[b, other]
+            back += classes[b, name] * classes[a, other]
+        for name in range(count):
+            same += classes[a, name] * classes[b, name]
+        for place in range(start):
+            result[row, place] = features[row, place]
+        for kind in range(width):
+            result[row, start + kind] = of_nodes[a, kind]
+            result[row, start + width + kind] = of_nodes[b, kind]
+        last = result[row, start + 2 * width :]
+        last[0], last[1], last[2] = there, back, same
+        last[3], last[4] = max(entropies[a], 0.0), max(entropies[b], 0.0)
+        last[5], last[6] = math.log(observations[a]), math.log(observations[b])
+    return result
 
 
 @cache

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import numpy as np
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.relations.pair_table import PairTable
-from deworldsg_ros.relations.physical_states import NONE, RELATIONS_OF_STATE, canonical_predicates
+from deworldsg_ros.relations.physical_states import (
+    NONE,
+    RELATIONS_OF_STATE,
+    STATE_COUNT,
+    canonical_predicates,
+)
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.softmax import softmax
 
 # A prediction of a pair enters the prior of its classes if the model says, with this probability,
 # that the pair is related in this direction. Otherwise it abstains.
@@ -20,6 +26,37 @@ MIN_RELATED = 0.5
 UNIT = 2.0**-40
 
 ClassPair = tuple[int, int]
+
+
+@kernel
+def _predictions(
+    rows: Int64, judged: Bool, state_logits: Float64, named: Float64
+) -> tuple[Int64, Bool]:
+    """Predictions (k, 2, NONE) of pairs in both directions, in `UNIT`s; and which there are."""
+    values = np.zeros((len(rows), 2, NONE), np.int64)
+    told = np.zeros((len(rows), 2), np.bool_)
+    weights = np.empty(STATE_COUNT, np.float64)
+    predictions = np.empty(NONE, np.float64)
+    for index in range(len(rows)):
+        logits, best, total = state_logits[rows[index]], 0.0, 0.0
+        for state in range(STATE_COUNT):
+            best = max(best, logits[state])  # the first one is 0
+        for state in range(STATE_COUNT):
+            weights[state] = math.exp(logits[state] - best)
+            total += weights[state]
+        if not judged[rows[index]] or weights[0] / total >= 1.0 - MIN_RELATED:
+            continue
+        for end in range(2):
+            related = 0.0
+            for relation in range(NONE):
+                predictions[relation] = 0.0
+                for state in range(STATE_COUNT):
+                    predictions[relation] += weights[state] / total * named[end, state, relation]
+                related += predictions[relation]
+            told[index, end] = related > MIN_RELATED
+            for relation in range(NONE if told[index, end] else 0):
+                values[index, end, relation] = np.rint(predictions[relation] / (related * UNIT))
+    return values, told
 
 
 class PredictedPrior:
@@ -56,22 +93,18 @@ class PredictedPrior:
             for pair, values in self._told.pop(pair_key, ()):
                 self._add(pair, -values, -1)
         rows = np.array([table.row(pair_key) for pair_key in keys if pair_key in table], np.int64)
-        rows = rows[table.judged[rows]]
-        states = softmax(table.state_logits[rows])
-        related = states[:, 0] < 1.0 - MIN_RELATED
-        rows, states = rows[related], states[related]
-        if not len(rows):
+        values, told = _predictions(rows, table.judged, table.state_logits, self._named)
+        places, ends = np.nonzero(told)
+        if not len(places):
             return
-        classes = table.shapes.best_classes[table.ends[rows]]
-        for end in (0, 1):
-            predictions = states @ self._named[end]
-            total = predictions.sum(axis=1)
-            for index in np.flatnonzero(total > MIN_RELATED).tolist():
-                first, second = classes[index, end], classes[index, 1 - end]
-                values = np.rint(predictions[index] / (total[index] * UNIT)).astype(np.int64)
-                pair = (int(first), int(second))
-                self._told.setdefault(int(table.ids[rows[index]]), []).append((pair, values))
-                self._add(pair, values, 1)
+        of_rows = rows[places]
+        classes = table.shapes.best_classes[table.ends[of_rows]].tolist()
+        for place, end, pair_key, both in zip(
+            places.tolist(), ends.tolist(), table.ids[of_rows].tolist(), classes
+        ):
+            pair = (both[end], both[1 - end])
+            self._told.setdefault(pair_key, []).append((pair, values[place, end]))
+            self._add(pair, values[place, end], 1)
 
     def _add(self, classes: ClassPair, values: Int64, count: int) -> None:
         sums, known = self._sums.get(classes, (np.zeros(NONE, np.int64), 0))

@@ -85,6 +85,8 @@ class ClassPairPrior:
             self._check(classes, values)
         except ValueError as error:
             raise RefusedInput("invalid_prediction", str(error)) from error
+        if not len(classes):
+            return
         pairs = np.unique(classes, axis=0)
         self._add_rows(pairs[self._rows[pairs[:, 0], pairs[:, 1]] < 0])
         rows = self._rows[classes[:, 0], classes[:, 1]]

@@ -243,6 +243,18 @@ def in_reach(pairs: Int64, low: Float64, high: Float64, counts: Int64) -> Bool:
 
 
 @kernel
+def known_reach(rows: Int64, ends: Int64, judged: Bool, gaps_m: Float64, counts: Int64) -> Bool:
+    """Which of some rows of `PairRows` were in reach, or have new or lost bounds; (k,) bool."""
+    found = np.empty(len(rows), np.bool_)
+    for index in range(len(rows)):
+        row = rows[index]
+        a, b = ends[row]
+        solid = counts[a] >= MIN_SHAPE_POINTS and counts[b] >= MIN_SHAPE_POINTS
+        found[index] = judged[row] != solid or np.isfinite(gaps_m[row])
+    return found
+
+
+@kernel
 def _in_reach(a: int, b: int, low: Float64, high: Float64) -> bool:
     x = max(low[a, 0], low[b, 0]) - min(high[a, 0], high[b, 0])
     y = max(low[a, 1], low[b, 1]) - min(high[a, 1], high[b, 1])

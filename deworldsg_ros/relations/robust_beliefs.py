@@ -16,44 +16,44 @@ import numpy as np
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
-from deworldsg_ros.relations.naming import MIN_OTHER_VOTES, predicate_probabilities, uncertain
+from deworldsg_ros.relations.naming import predicate_probabilities, related_pairs, uncertain
 from deworldsg_ros.relations.pair_links import joined
-from deworldsg_ros.relations.pair_rows import ends_of
 from deworldsg_ros.relations.pair_table import PairTable
-from deworldsg_ros.relations.physical_states import (
-    NONE,
-    canonical_predicates,
-    relation_of_predicates,
-)
+from deworldsg_ros.relations.physical_states import canonical_predicates, relation_of_predicates
 from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.relations.settled_relations import SettledRelations
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
-from deworldsg_ros.scene.edges import Pair
 from deworldsg_ros.scene.graph import SceneGraph
-
-# Pairs that are related with a smaller probability have no beliefs: no edge would be published.
-MIN_RELATED = 0.01
 
 ClassPair = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class ChangedBeliefs:
-    """Beliefs of the ordered pairs (subject id, object id) that were computed anew.
+    """Beliefs of pairs of nodes that were computed anew; pairs have the keys of the table.
 
     Attributes:
         unrelated: pairs without a belief.
         pairs: k pairs with one.
-        probabilities: (k, R) that the predicate holds; row sums are at most 1.
-        sources: where each belief comes from.
+        probabilities: (k, 2, R) that the predicate holds, in both directions; sums over R are at
+            most 1.
+        judged: (k, 2) bool, whether a world model spoke, and
+        voted: (k, 2) bool, whether frames voted.
     """
 
-    unrelated: list[Pair]
-    pairs: list[Pair]
+    unrelated: list[int]
+    pairs: list[int]
     probabilities: Float64
-    sources: list[wire.Provenance]
+    judged: Bool
+    voted: Bool
+
+    def source(self, index: int, end: int) -> wire.Provenance:
+        """Where a belief comes from."""
+        if not self.judged[index, end]:
+            return "visual"
+        return "fused" if self.voted[index, end] else "prior"
 
 
 class RobustBeliefs:
@@ -86,15 +86,12 @@ class RobustBeliefs:
             prior: of class pairs, from the predictions of a world model.
         """
         table = self._table
-        keys = sorted(table.changed_pairs)
         places = table.places
-        rows = np.array([places[one] for one in keys if one in places], np.int64)
-        gone = [one for one in keys if one not in places]
-        changed = self._settled.settle(rows)
-        for pair_key in gone:
-            self._index(pair_key, set())
+        gone = [one for one in table.changed_pairs if one not in places]
+        rows = [places[one] for one in table.changed_pairs if one in places]
+        changed = self._settled.settle(np.array(rows, np.int64))
         again = set().union(*(self._by_classes.get(pair, ()) for pair in prior.changed))
-        changed = joined(rows, [*changed.tolist(), *(table.row(one) for one in again)])
+        changed = joined(changed, rows + [places[one] for one in again.difference(gone)])
         table.changed_pairs.clear()
         table.changed_nodes.clear()
         prior.changed.clear()
@@ -103,15 +100,11 @@ class RobustBeliefs:
     def _beliefs(self, rows: Int64, gone: list[int], prior: Prior) -> ChangedBeliefs:
         """Beliefs of pairs in both directions: few of those in reach are related."""
         t = self._table
-        related = t.relations[rows, :, NONE].min(axis=1) < 1.0 - MIN_RELATED
-        related |= t.other_votes[rows] >= MIN_OTHER_VOTES
-        for pair_key in t.ids[rows[~related]].tolist():
+        related = related_pairs(rows, t.relations, t.other_votes)
+        gone += t.ids[rows[~related]].tolist()
+        for pair_key in self._classes_of.keys() & gone:
             self._index(pair_key, set())
-            gone.append(pair_key)
         rows = rows[related]
-        if not len(rows):
-            none = np.zeros((0, len(self._relation_of)))
-            return ChangedBeliefs([pair for one in gone for pair in _both(one)], [], none, [])
         votes = self._votes(rows)
         probabilities = predicate_probabilities(
             t.relations[rows],
@@ -126,23 +119,13 @@ class RobustBeliefs:
         )
         judged = np.repeat(t.judged[rows][:, None], 2, axis=1)
         self._add_prior(rows, probabilities, judged, prior)
-        voted = votes.any(axis=2)
-        return ChangedBeliefs(
-            [pair for one in gone for pair in _both(one)],
-            [pair for one in t.ids[rows].tolist() for pair in _both(one)],
-            probabilities.reshape(-1, len(self._relation_of)),
-            [_source(*known) for known in zip(judged.ravel().tolist(), voted.ravel().tolist())],
-        )
+        voted = np.asarray(votes.any(axis=2))
+        return ChangedBeliefs(gone, t.ids[rows].tolist(), probabilities, judged, voted)
 
     def _votes(self, rows: Int64) -> Float32:
         """The votes (k, 2, R) on pairs."""
-        known = self._graph.votes
-        result = np.zeros((len(rows), 2, len(self._relation_of)), np.float32)
-        for index, pair in enumerate(map(tuple, self._table.nodes[rows].tolist())):
-            votes = known.get(pair)
-            if votes is not None and votes.counts is not None:
-                result[index] = votes.counts
-        return result
+        _, votes = self._graph.votes.of(self._table.nodes[rows])
+        return votes.astype(np.float32)
 
     def _add_prior(self, rows: Int64, probabilities: Float64, judged: Bool, prior: Prior) -> None:
         """Eq. 10 with the prior of class pairs, in place; and whether a world model spoke."""
@@ -152,9 +135,10 @@ class RobustBeliefs:
         for pair_key, (first, second), ends in zip(
             table.ids[rows].tolist(), best.tolist(), open_.tolist()
         ):
-            pairs = [(first, second), (second, first)]
-            # Two objects of one class have the same class pair in both directions.
-            self._index(pair_key, set(itertools.compress(pairs, ends)))
+            if any(ends) or pair_key in self._classes_of:
+                pairs = [(first, second), (second, first)]
+                # Two objects of one class have the same class pair in both directions.
+                self._index(pair_key, set(itertools.compress(pairs, ends)))
         places, ends = np.nonzero(open_)
         if not len(places):
             return
@@ -174,8 +158,6 @@ class RobustBeliefs:
 
     def _index(self, pair_key: int, classes: Set[ClassPair]) -> None:
         """Note the class pairs whose prior may enter a pair."""
-        if not classes and pair_key not in self._classes_of:
-            return
         for known in self._classes_of.pop(pair_key, ()):
             self._by_classes[known].discard(pair_key)
             if not self._by_classes[known]:
@@ -184,17 +166,6 @@ class RobustBeliefs:
             self._classes_of[pair_key] = classes
             for pair in classes:
                 self._by_classes.setdefault(pair, set()).add(pair_key)
-
-
-def _both(pair_key: int) -> tuple[Pair, Pair]:
-    first, second = ends_of(pair_key)
-    return (first, second), (second, first)
-
-
-def _source(judged: bool, voted: bool) -> wire.Provenance:
-    if not judged:
-        return "visual"
-    return "fused" if voted else "prior"
 
 
 def fuse_prior(

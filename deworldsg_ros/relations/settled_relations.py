@@ -7,7 +7,7 @@ import numpy as np
 from deworldsg_ros.config import Config
 from deworldsg_ros.relations.pair_links import joined, pairs_of
 from deworldsg_ros.relations.pair_table import PairTable
-from deworldsg_ros.relations.physics_model import believed_logits, load_physics_model
+from deworldsg_ros.relations.physics_model import believed_logits, floor_odds, load_physics_model
 from deworldsg_ros.relations.settling import (
     find_neighbours,
     rank_neighbours,
@@ -16,7 +16,7 @@ from deworldsg_ros.relations.settling import (
     take_in,
 )
 from deworldsg_ros.relations.vote_model import near_logits, vote_logits
-from deworldsg_ros.scene.arrays import Float64, Int64
+from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.graph import SceneGraph
 
 
@@ -52,7 +52,10 @@ class SettledRelations:
             return objects
         self._judge(rows)
         objects = self._reopen_circles(objects)
-        shapes.floor_odds[objects] = self._floor_odds(objects)
+        if self._geometry:
+            shapes.floor_odds[objects] = floor_odds(
+                objects, shapes.low, shapes.high, shapes.counts, t.floor_m, self._model.floor
+            )
         lists = (t.ends, t.links, shapes.first_links)
         cut = share_supports(
             objects, t.carried, t.kept, shapes.floor_odds, shapes.on_floor, shapes.totals, *lists
@@ -97,10 +100,10 @@ class SettledRelations:
             return
         t, model = self._table, self._model
         counts, frames = t.counts[rows], t.frames[rows]
-        geometry = t.state_logits[rows]
-        geometry[~t.judged[rows]] = 0.0
+        geometry, unknown = t.state_logits[rows], ~t.judged[rows]
+        geometry[unknown] = 0.0
         votes = vote_logits(counts, frames, model.votes)
-        independent = ~t.judged[rows] | (not self._own_head)
+        independent = unknown if self._own_head else np.ones_like(unknown)
         take_in(
             rows,
             believed_logits(model, geometry, votes, independent),
@@ -122,16 +125,6 @@ class SettledRelations:
             t.with_,
             t.live,
         )
-
-    def _floor_odds(self, objects: Int64) -> Float64:
-        """Odds (n,) that nodes stand on the floor; 0 without surfaces or a world model."""
-        if not self._geometry:
-            return np.zeros(len(objects))
-        shapes = self._table.shapes
-        low, high = shapes.low[objects, 2], shapes.high[objects, 2]
-        logits = self._model.floor_logits(low - self._table.floor_m, high - low)
-        known = shapes.counts[objects] > 0
-        return np.where(known, np.exp(np.clip(logits, -20.0, 20.0)), 0.0)
 
     def _reopen_circles(self, objects: Int64) -> Int64:
         """The objects, and those of the circles that contain one of them."""

@@ -13,7 +13,7 @@ without votes. The four numbers are fitted to simulated rooms (tools/physics_mod
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,7 @@ _STATES = RELATIONS_OF_STATE
 _NAMED = (_STATES != NONE).sum(axis=1).astype(np.float64)
 
 
-@dataclass(frozen=True)
-class VoteScales:
+class VoteScales(NamedTuple):
     """The numbers of the formula above.
 
     Attributes:
@@ -48,12 +47,6 @@ class VoteScales:
     floor: float
     even: float
 
-    def evidence(self, votes: Float64, frames: Float64) -> Float64:
-        """Evidence in nats of votes among frames; 0 without frames."""
-        fraction = votes / np.maximum(frames, 1e-9)
-        ratio = np.log((fraction + self.floor) / (self.even + self.floor))
-        return np.asarray(frames / (frames + self.n_half) * self.slope * ratio)
-
 
 def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
     """Votes by relation.
@@ -65,8 +58,31 @@ def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
     Returns:
         (..., NONE) float64.
     """
-    names = (relation_of[:, None] == np.arange(NONE)).astype(np.float64)
-    return np.asarray(votes @ names)
+    flat = np.ascontiguousarray(votes, np.float64).reshape(-1, len(relation_of))
+    counts: Float64 = _relation_counts(flat, relation_of).reshape(*votes.shape[:-1], NONE)
+    return counts
+
+
+@kernel
+def _relation_counts(votes: Float64, relation_of: Int64) -> Float64:
+    counts = np.zeros((len(votes), NONE), np.float64)
+    for row in range(len(votes)):
+        for name in range(len(relation_of)):
+            if relation_of[name] >= 0:
+                counts[row, relation_of[name]] += votes[row, name]
+    return counts
+
+
+@kernel
+def most_other_votes(votes: Float64, relation_of: Int64) -> Float64:
+    """Most of the votes (m, 2, R) on a predicate that names no physical relation, (m,)."""
+    most = np.zeros(len(votes), np.float64)
+    for row in range(len(votes)):
+        for end in range(2):
+            for name in range(len(relation_of)):
+                if relation_of[name] < 0:
+                    most[row] = max(most[row], votes[row, end, name])
+    return most
 
 
 def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
@@ -79,31 +95,49 @@ def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64
         frames: (m,) number of frames that showed both objects.
         scales: of the evidence.
     """
-    slopes = (scales.slope, scales.n_half, scales.floor, scales.even)
-    return _vote_logits(counts, frames, *slopes)
+    return _vote_logits(counts, frames, *scales)
+
+
+def near_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
+    """Logits (m,) of near against "not related"; arguments as in `vote_logits`."""
+    return _near_logits(counts, frames, *scales)
 
 
 @kernel
 def _vote_logits(
     counts: Float64, frames: Float64, slope: float, n_half: float, floor: float, even: float
 ) -> Float64:
-    logits = np.zeros((len(counts), STATE_COUNT))
+    logits = np.zeros((len(counts), STATE_COUNT), np.float64)
     for row in range(len(counts)):
-        known = max(frames[row], 1e-9)
-        worth = frames[row] / (frames[row] + n_half) * slope
         for state in range(1, STATE_COUNT):
             votes = 0.0
             for end in range(2):
                 relation = _STATES[state, end]
                 if relation != NONE:
                     votes += counts[row, end, relation] / _NAMED[state]
-            logits[row, state] = worth * math.log((votes / known + floor) / (even + floor))
+            logits[row, state] = evidence(votes, frames[row], slope, n_half, floor, even)
     return logits
 
 
-def near_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
-    """Logits (m,) of near against "not related"; arguments as in `vote_logits`."""
-    return scales.evidence(counts[..., NEAR].mean(axis=1), frames)
+@kernel
+def _near_logits(
+    counts: Float64, frames: Float64, slope: float, n_half: float, floor: float, even: float
+) -> Float64:
+    logits = np.empty(len(counts), np.float64)
+    for row in range(len(counts)):
+        votes = (counts[row, 0, NEAR] + counts[row, 1, NEAR]) / 2.0
+        logits[row] = evidence(votes, frames[row], slope, n_half, floor, even)
+    return logits
+
+
+@kernel
+def evidence(
+    votes: float, frames: float, slope: float, n_half: float, floor: float, even: float
+) -> float:
+    """Evidence in nats of votes among frames, 0 without frames: the formula above."""
+    fraction = votes / max(frames, 1e-9)
+    ratio = math.log((fraction + floor) / (even + floor))
+    return float(frames / (frames + n_half) * slope * ratio)
 
 
 assert len(RELATIONS) == NONE + 1

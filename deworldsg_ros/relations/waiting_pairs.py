@@ -6,9 +6,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from deworldsg_ros.relations.pair_rows import ends_of, key
 from deworldsg_ros.scene.arrays import Bool, Int64
-from deworldsg_ros.scene.edges import Pair
+from deworldsg_ros.scene.edges import ends_of
 from deworldsg_ros.scene.waiting import take_first
 
 
@@ -31,19 +30,20 @@ class WaitingPairs:
     def __len__(self) -> int:
         return len(self._new) + len(self._again)
 
-    def add(self, pairs: Iterable[Pair]) -> None:
+    def add(self, keys: Iterable[int]) -> None:
         """Let pairs wait. Those with a node that is not published count when it is."""
-        for first, second in pairs:
-            pair_key = key(first, second)
-            if pair_key in self._known:
-                self._again[pair_key] = None
-            elif first in self._published and second in self._published:
-                self._new[pair_key] = None
+        known, new, again = self._known, self._new, self._again
+        for pair_key in keys:
+            if pair_key in known:
+                again[pair_key] = None
+            elif self._are_published(pair_key):
+                new[pair_key] = None
 
     def move(self, keys: Int64) -> None:
         """Let pairs wait that have another geometry."""
-        self._moved.update(keys.tolist())
-        self.add(map(ends_of, keys.tolist()))
+        moved = keys.tolist()
+        self._moved.update(moved)
+        self.add(moved)
 
     def forget(self, pair_key: int) -> None:
         """A pair has left the table."""
@@ -54,8 +54,7 @@ class WaitingPairs:
         """Keys (k,) of the pairs to judge now; and (k,) which have another geometry."""
         due = []
         for pair_key in take_first(self._new, at_most):
-            first, second = ends_of(pair_key)
-            if first in self._published and second in self._published:
+            if self._are_published(pair_key):
                 due.append(pair_key)
             else:  # a node went since
                 self._moved.discard(pair_key)
@@ -63,3 +62,7 @@ class WaitingPairs:
         moved = np.array([pair_key in self._moved for pair_key in due], np.bool_)
         self._moved.difference_update(due)
         return due, moved
+
+    def _are_published(self, pair_key: int) -> bool:
+        first, second = ends_of(pair_key)
+        return first in self._published and second in self._published

@@ -142,7 +142,7 @@ class GraphKeeper:
         """Continue with another graph: clients see a new session."""
         self._builder, self._session = builder, secrets.token_hex(8)
         self.newest_ns, self._clock, self._pending = 0, ClockGate(), PendingEvidence()
-        self._whole.changed()
+        self._whole.changed(not builder.confirmed)  # objects appear with their first update
         self.changed()
 
     def changed(self) -> None:
@@ -170,7 +170,7 @@ class GraphKeeper:
             if lost:
                 self._node.drop("unmatched_evidence", "the clock was set back", lost)
         self.newest_ns = local.stamp_ns
-        self._times.changed(self._running_s, time.monotonic())
+        self.changed()
         for evidence in self._pending.take(local.stamp_ns):
             with self._node.refusing():
                 self._builder.add_evidence(evidence)
@@ -209,13 +209,14 @@ class GraphKeeper:
         return min((wait_s for wait_s in waits if wait_s is not None), default=None)
 
     def _publish_changes(self) -> None:
-        changed_s = self._times.published(time.monotonic())
+        now_s, changed_s = time.monotonic(), self._times.taken()
         assert self._builder is not None
         update = self._builder.update()
+        if update is not None:
+            self._times.book(now_s)
         if self._builder.waiting:
-            # The next update brings the edges that wait, also if no frame comes.
-            now_s = time.monotonic()
-            self._times.changed(now_s, now_s, can_wait=True)
+            # Edges wait for the next update, also if no frame comes. Parts of a map do not wait.
+            self._times.changed(now_s, now_s, can_wait=update is not None)
         if update is None:
             return
         update.session = self._session

@@ -20,6 +20,8 @@ UNMATCHED_PREFIX = "unmatched_"
 # Reasons with this prefix count messages that the node never had.
 LOST_PREFIX = "lost_"
 DROPPED, LEFT_OUT, RECEIVED = "dropped ", "objects left out ", "received "
+# Connected subscriptions of a topic that the node publishes.
+LISTENERS = "listeners of "
 # Nodes of the graph that are not published.
 HIDDEN = "hidden, "
 TOTAL = re.compile(r"(\d+) in total")
@@ -98,7 +100,12 @@ class Health:
             return self._published
 
     def report(
-        self, now_s: float, waiting_for: Sequence[str] = (), values: Mapping[str, str] | None = None
+        self,
+        now_s: float,
+        waiting_for: Sequence[str] = (),
+        values: Mapping[str, str] | None = None,
+        *,
+        in_turn: bool = True,
     ) -> Report:
         """Summarise the time since the last report.
 
@@ -106,6 +113,7 @@ class Health:
             now_s: monotonic clock, seconds.
             waiting_for: missing inputs, in words.
             values: further values, by name.
+            in_turn: False: the next report counts from the same time on as this one.
         """
         with self._lock:
             elapsed_s = max(now_s - self._reported_s, 1e-9) if self._reported_s is not None else 0.0
@@ -120,7 +128,8 @@ class Health:
             for reason, count in drops.items():
                 example = self._examples.get(reason, "no example")
                 message += f"; dropped {count} {reason}: {example}"
-            self._begin_period(now_s)
+            if in_turn:
+                self._begin_period(now_s)
         missing = {f"waiting for {at}": text for at, text in enumerate(waiting_for, 1)}
         level = WARN if waiting_for or drops else OK
         return Report(

@@ -7,20 +7,21 @@ import time
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from deworldsg_ros.ros.node import CHECK_PERIOD_S, StageNode
+from deworldsg_ros.ros.node import CHECK_PERIOD_S, SPIN_PERIOD_S, StageNode
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.streams.assembler import Assembler
 from deworldsg_ros.streams.posed import TOPICS
 
 # A third of a second of a 30 Hz camera: a longer queue of a slow node adds latency only.
 QUEUE_FRAMES = 10
-# A frame of the slowest node waits for at most a frame period at 20 Hz if a newer one waits. Poses
-# that come at 10 Hz complete three frames of a 30 Hz camera at once: a shorter wait would drop some
-# of them although the node keeps up.
-MAX_QUEUE_S = 0.05
-# While a frame waits for the worker, images are taken from DDS at the rate of a usual camera. DDS
-# drops the oldest of those that come faster. They cost the node no time.
-TAKE_PERIOD_S = 1 / 30
+# A node that has worked for so long without a pause does not keep up, and takes the newest frame
+# each time. One that keeps up loses none, although poses at 10 Hz complete three frames of a 30 Hz
+# camera at once.
+MAX_BUSY_S = 0.2
+# While a frame waits for the worker, images are taken from DDS at this period, all that are there.
+# DDS drops the oldest of those that come faster. They cost the node no time. A camera at 30 Hz is
+# slower: each of its images is taken when it arrives.
+TAKE_PERIOD_S = 1 / 40
 # Messages that no frame waits for are taken together after this time. It is less than the 83 ms in
 # which a camera at 120 Hz fills the `IMAGE_DEPTH` of DDS.
 COLLECT_PERIOD_S = 0.05
@@ -37,8 +38,8 @@ class JoiningNode(StageNode, Generic[Out]):
     Args:
         name: node name.
         product: name of the output in /diagnostics.
-        max_queue_s: a complete frame that has waited longer for the worker is dropped if a newer
-            one waits; of more than QUEUE_FRAMES, the oldest is dropped in any case.
+        max_busy_s: a node without a pause for longer processes the newest frame, and drops the
+            others; of more than QUEUE_FRAMES, the oldest is dropped in any case.
         max_wait_s: maximum time a frame waits for depth, camera_info or pose.
         options: arguments of rclpy's Node.
     """
@@ -48,17 +49,20 @@ class JoiningNode(StageNode, Generic[Out]):
         name: str,
         product: str,
         *,
-        max_queue_s: float = math.inf,
+        max_busy_s: float = math.inf,
         max_wait_s: float = MAX_WAIT_S,
         **options: Any,
     ) -> None:
         super().__init__(name, product, **options)
-        self._max_queue_s = max_queue_s
+        self._max_busy_s = max_busy_s
         self._max_wait_s = max_wait_s
         self._assembler: Assembler[Any, Out] | None = None
         self._worker: Worker[tuple[Callable[[], Out], float]] | None = None
         self._collecting = True
         self._collected_s = 0.0
+        # While messages are taken: whether images are. A frame that is complete changes nothing, so
+        # that the newest image is taken, too.
+        self._taking_images: bool | None = None
 
     def assembler_options(self) -> dict[str, Any]:
         """Arguments of every assembler: topic names, maximum wait, counter of drops."""
@@ -82,7 +86,7 @@ class JoiningNode(StageNode, Generic[Out]):
             self.get_name(),
             process,
             size=QUEUE_FRAMES,
-            max_wait_s=self._max_queue_s,
+            max_busy_s=self._max_busy_s,
             on_overrun=self._overrun,
             after=self.wake,
         )
@@ -105,9 +109,19 @@ class JoiningNode(StageNode, Generic[Out]):
             self._worker.submit((joined, time.monotonic()))
 
     def wants_images(self) -> bool:
-        """Whether to take another image from DDS: not while a fresh frame waits for the worker."""
+        """Whether to take images from DDS: not while a fresh frame waits for the worker."""
+        if self._taking_images is not None:
+            return self._taking_images
+        return self._images_wanted_in_s() <= 0
+
+    def longest_wait_s(self) -> float:
+        """Seconds until waiting messages are looked at again, if none comes that is wanted."""
+        wanted_in_s = self._images_wanted_in_s()
+        return min(SPIN_PERIOD_S, wanted_in_s) if wanted_in_s > 0 else SPIN_PERIOD_S
+
+    def _images_wanted_in_s(self) -> float:
         submitted_s = 0.0 if self._worker is None else self._worker.youngest_s()
-        return time.monotonic() - submitted_s > TAKE_PERIOD_S
+        return submitted_s + TAKE_PERIOD_S - time.monotonic()
 
     def wants_depth(self) -> bool:
         """The same for depth images, which follow the RGB images."""
@@ -122,6 +136,7 @@ class JoiningNode(StageNode, Generic[Out]):
 
     def before_taking(self) -> None:
         """Take all messages now and then."""
+        self._taking_images = self._images_wanted_in_s() <= 0
         now_s = time.monotonic()
         self._collecting = now_s - self._collected_s >= COLLECT_PERIOD_S
         if self._collecting:
@@ -130,6 +145,7 @@ class JoiningNode(StageNode, Generic[Out]):
     def after_taking(self) -> None:
         """Take only what frames wait for."""
         self._collecting = False
+        self._taking_images = None
 
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, in words."""

@@ -25,6 +25,9 @@ WORLD_MODEL_LIMIT_S = 300.0
 RELOAD_AFTER_FAILURES = 3
 # Between two attempts to load a model again, which takes seconds.
 RELOAD_PERIOD_S = 5.0
+# A call that takes longer than this many times its limit counts as hung. Python cannot end a
+# thread: the process has to be started again.
+HUNG_LIMITS = 2
 # /diagnostics warns about a call that takes longer.
 SLOW_S = 5.0
 # Methods whose result a stage waits for.
@@ -134,8 +137,20 @@ class Supervised:
         self._faults.before_load()
         self._model, self._lost, self._failures = model, False, 0
 
+    def hung(self) -> str:
+        """What is wrong with a model that never returns, in words; "" = it may return."""
+        call, busy_s = self._call, time.monotonic() - self._since_s
+        if call is None or call.done() or busy_s < HUNG_LIMITS * self._limit_s:
+            return ""
+        return (
+            f"the {self._name} ({type(self._model).__name__}) has given no result for "
+            f"{busy_s:.0f} s: start the node again"
+        )
+
     def problem(self) -> str:
         """What is wrong, in words; "" = nothing."""
+        if hung := self.hung():
+            return hung
         call, busy_s = self._call, time.monotonic() - self._since_s
         if call is not None and busy_s > SLOW_S:
             return f"the {self._name} has given no result for {busy_s:.0f} s"

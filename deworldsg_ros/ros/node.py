@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import gc
+import os
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -19,13 +22,13 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import String
 
 from deworldsg_ros.kernels import COMPILING, on_compilation
-from deworldsg_ros.ros.diagnosing import DropLog, diagnostic_array
-from deworldsg_ros.ros.health import INTERNAL_ERROR, LOST_PREFIX, Health
+from deworldsg_ros.ros.diagnosing import LOG_PERIOD_S, DropLog, diagnostic_array
+from deworldsg_ros.ros.health import ERROR, INTERNAL_ERROR, LISTENERS, LOST_PREFIX, Health
 from deworldsg_ros.ros.live_parameters import LiveParameters
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.overrides import OverridableNode
 from deworldsg_ros.ros.parameters import declare
-from deworldsg_ros.ros.process import run_process
+from deworldsg_ros.ros.process import EXIT_HUNG, RESPAWN_VARIABLE, run_process
 from deworldsg_ros.ros.qos import AutoSubscription, LossCounter, Source, reliable
 from deworldsg_ros.ros.waiting import Waiting, take_waiting
 from deworldsg_ros.scene import wire
@@ -35,8 +38,13 @@ from deworldsg_ros.scene.errors import RefusedInput
 CHECK_PERIOD_S = 0.25
 # The usual rate of /diagnostics; diagnostic_aggregator calls a status stale after 5 s.
 DIAGNOSTICS_PERIOD_S = 1.0
+# Topics of every node, whose listeners it does not report.
+NOT_ITS_WORK = ("/diagnostics", "/parameter_events")
 # Longest delay until a signal is noticed, and until messages are taken that nothing waits for.
 SPIN_PERIOD_S = 0.05
+# A node that serves nothing for so long is taken as lost: a call in it holds the lock of Python's
+# interpreter, which loading a library or compiling a kernel holds for seconds.
+STUCK_S = 60.0
 # A thread of Python code lets the others run after this time (Python's default is 5 ms), so that a
 # message does not wait for the stage's thread.
 SWITCH_S = 0.001
@@ -75,12 +83,13 @@ class StageNode(OverridableNode):
         self._drop_log = DropLog(self.get_logger())
         self._subscriptions_to_check: list[AutoSubscription] = []
         self._json_losses: dict[str, LossCounter] = {}
+        self._listeners: dict[str, str] = {}
         self._woken = self.create_guard_condition(lambda: None)
         # Real time: with use_sim_time, timers on the node's clock would stop without /clock.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.every(CHECK_PERIOD_S, self._check_publishers)
-        self.every(DIAGNOSTICS_PERIOD_S, self._diagnose)
+        self.every(DIAGNOSTICS_PERIOD_S, self.diagnose)
 
     def configure(self) -> None:
         """Take changed `parameters`, those of `LIVE`; for subclasses."""
@@ -88,6 +97,10 @@ class StageNode(OverridableNode):
     def waiting_for(self, now_ns: int) -> list[str]:
         """Missing inputs, in words; for subclasses."""
         return []
+
+    def hung(self) -> str:
+        """What never returns, in words; "" = nothing; for subclasses."""
+        return ""
 
     def more_values(self) -> dict[str, str]:
         """Further values of /diagnostics, by name; for subclasses."""
@@ -98,6 +111,10 @@ class StageNode(OverridableNode):
 
     def after_taking(self) -> None:
         """Called when waiting messages were taken; for subclasses."""
+
+    def longest_wait_s(self) -> float:
+        """How long to wait for messages at most; for subclasses."""
+        return SPIN_PERIOD_S
 
     def wake(self) -> None:
         """Let the executor's thread look again which messages are wanted; from any thread."""
@@ -172,7 +189,7 @@ class StageNode(OverridableNode):
         kind: type[wire.M],
         callback: Callable[[wire.M], None],
         depth: int,
-        submit: Callable[[Callable[[], None]], None] | None = None,
+        submit: Callable[[Callable[[], None]], None] = lambda call: call(),
     ) -> None:
         """Subscribe to JSON messages of one type.
 
@@ -190,10 +207,7 @@ class StageNode(OverridableNode):
         def received(message: Any, info: dict[str, Any]) -> None:
             losses.count(info)
             self.health.received(topic)
-            if submit is None:
-                callback(wire.decode(message.data, kind))
-            else:
-                submit(lambda: callback(wire.decode(message.data, kind)))
+            submit(lambda: callback(wire.decode(message.data, kind)))
 
         guarded = self.guarded(received)
         # rclpy gives the information to a callback of two arguments only.
@@ -225,35 +239,74 @@ class StageNode(OverridableNode):
         for subscription in self._subscriptions_to_check:
             if subscription.check():
                 self.get_logger().info(f"listening to {subscription.describe()}")
+        before, self._listeners = self._listeners, _listeners_of(self)
+        if self._listeners != before:
+            self.diagnose(in_turn=False)  # who has just connected learns the state
 
-    def _diagnose(self) -> None:
-        now_ns = time.monotonic_ns()
-        listening = {
-            f"listening to {index + 1}": subscription.describe()
-            for index, subscription in enumerate(self._subscriptions_to_check)
-        }
-        report = self.health.report(
-            now_ns / 1e9, self.waiting_for(now_ns), {**listening, **self.more_values()}
-        )
-        message = diagnostic_array(report, self.get_name(), self.get_fully_qualified_name())
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(message)
+    def diagnose(self, in_turn: bool = True) -> None:
+        """Publish the state of the node on /diagnostics; `in_turn` as in `Health.report`."""
+        described = _described(self._subscriptions_to_check)
+        values = {**described, **self._listeners, **self.more_values()}
+        if hung := self.hung():
+            self.get_logger().error(hung, throttle_duration_sec=LOG_PERIOD_S)
+        self._diagnostics.publish(_diagnostic_message(self, values, bool(hung), in_turn))
+
+
+def _described(subscriptions: Sequence[AutoSubscription]) -> dict[str, str]:
+    return {
+        f"listening to {number}": subscription.describe()
+        for number, subscription in enumerate(subscriptions, 1)
+    }
+
+
+def _diagnostic_message(
+    node: StageNode, values: dict[str, str], is_error: bool, in_turn: bool
+) -> DiagnosticArray:
+    now_ns = time.monotonic_ns()
+    missing = node.waiting_for(now_ns)
+    report = node.health.report(now_ns / 1e9, missing, values, in_turn=in_turn)
+    if is_error:
+        report = replace(report, level=ERROR)
+    message = diagnostic_array(report, node.get_name(), node.get_fully_qualified_name())
+    message.header.stamp = node.get_clock().now().to_msg()
+    return message
+
+
+def _listeners_of(node: StageNode) -> dict[str, str]:
+    return {
+        f"{LISTENERS}{publisher.topic_name}": str(publisher.get_subscription_count())
+        for publisher in node.publishers
+        if publisher.topic_name not in NOT_ITS_WORK
+    }
 
 
 def serve(node: StageNode, waiting: Waiting) -> None:
-    """Wait for messages, timers and services, and serve them; at most `SPIN_PERIOD_S`."""
+    """Wait for messages, timers and services, and serve them; at most `longest_wait_s`."""
     with node.refusing():
-        waiting.spin_once(SPIN_PERIOD_S)
+        waiting.spin_once(node.longest_wait_s())
         node.before_taking()
         take_waiting(node)
         node.after_taking()
 
 
+def end_if_stuck() -> None:
+    """End the process, with the stacks of its threads, if this is not called again in STUCK_S.
+
+    A thread of C does it, which does not need the lock of Python's interpreter.
+    """
+    faulthandler.dump_traceback_later(STUCK_S, exit=True)
+
+
 def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> int:
-    """Run a node until SIGINT or SIGTERM; return the exit code of `run_process`."""
+    """Run a node until SIGINT or SIGTERM; return the exit code of `run_process`.
+
+    A node whose model never returns also ends, if something starts it again; so does one that
+    serves nothing for STUCK_S.
+    """
 
     def body(stop: threading.Event) -> int:
         node = make_node()
+        is_respawned, hung = os.environ.get(RESPAWN_VARIABLE) == "true", ""
         sys.setswitchinterval(SWITCH_S)
         # A full collection stops all threads. It would look at all objects of the imported modules
         # each time, which takes 100 ms.
@@ -265,13 +318,24 @@ def run(make_node: Callable[[], StageNode], args: list[str] | None = None) -> in
             waiting = Waiting(node, executor)
             for override in node.unused_overrides():
                 node.get_logger().warning(f"{override} has no effect: there is no such topic yet")
+            if is_respawned:
+                node.every(DIAGNOSTICS_PERIOD_S, end_if_stuck)
             node.get_logger().info("ready")
-            while not stop.is_set() and rclpy.ok():
+            while not (stop.is_set() or hung) and rclpy.ok():
                 serve(node, waiting)
+                hung = node.hung() if is_respawned else ""
+            if hung:
+                node.diagnose()
             executor.shutdown(timeout_sec=1.0)
         finally:
+            faulthandler.cancel_dump_traceback_later()
             node.close()
             node.destroy_node()
-        return 0
+        if hung:
+            print(f"error: {hung}", file=sys.stderr, flush=True)
+        return EXIT_HUNG if hung else 0
 
-    return run_process(body, args)
+    code = run_process(body, args)
+    if code == EXIT_HUNG:
+        os._exit(code)  # the interpreter's own end could wait for the model
+    return code

@@ -109,18 +109,26 @@ class ViewerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     host: Annotated[
         str, option("address of the page; 0.0.0.0 lets other machines see the images, too")
     ] = "127.0.0.1"
-    port: Annotated[int, option("port of the page; the next free one is used", ge=1, le=65535)] = (
-        8080
+    port: Annotated[
+        int,
+        option(
+            "the next free port from this one on is used; 0 = 8080, with foxglove 8765",
+            ge=0,
+            le=65535,
+        ),
+    ] = 0
+    foxglove: Annotated[bool, option("serve Foxglove instead of a page (needs foxglove-sdk)")] = (
+        False
     )
-    foxglove: Annotated[
-        bool, option("serve Foxglove on port 8765 instead of a page (needs foxglove-sdk)")
-    ] = False
 
 
 class ViewerParameters(Config, frozen=True, forbid_unknown_fields=True):
     """Parameters of viewer_node; of the configuration, `inputs` chooses the type of the images."""
 
     node: ViewerOptions = ViewerOptions()
+
+
+PeriodS = Annotated[float, option("seconds between two requests for changes", gt=0, le=60)]
 
 
 class FleetOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -137,9 +145,7 @@ class FleetOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "other machines; not used with connect"
         ),
     ] = "tcp/127.0.0.1:7447"
-    period_s: Annotated[float, option("seconds between two questions for changes", gt=0, le=60)] = (
-        0.5
-    )
+    period_s: PeriodS = 0.5
 
 
 class FleetParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -157,9 +163,7 @@ class FleetLinkOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     connect: Annotated[str, option("endpoints of Zenoh routers, separated by commas")] = (
         "tcp/127.0.0.1:7447"
     )
-    period_s: Annotated[float, option("seconds between two questions for changes", gt=0, le=60)] = (
-        0.5
-    )
+    period_s: PeriodS = 0.5
 
 
 class FleetLinkParameters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -20,7 +20,7 @@ from deworldsg_ros.ros.inputs import (
     listen_pose,
     listen_rgb,
 )
-from deworldsg_ros.ros.joining import MAX_QUEUE_S, JoiningNode
+from deworldsg_ros.ros.joining import MAX_BUSY_S, JoiningNode
 from deworldsg_ros.ros.models import PERCEPTION_LIMIT_S, Supervised, parse_faults
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.streams.frame_assemblers import FrameAssembler
@@ -38,7 +38,7 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
     LIVE: tuple[str, ...] = ("perception.score_threshold", "perception.max_relations")
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
-        super().__init__(name, product, max_queue_s=MAX_QUEUE_S, **options)
+        super().__init__(name, product, max_busy_s=MAX_BUSY_S, **options)
         inputs = self.parameters.inputs
         require_checkpoints(self.parameters.perception)
         self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
@@ -72,6 +72,10 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         """Missing inputs, and models that fail or hang, in words."""
         problems = [model.problem() for model in self._models.values()]
         return [*super().waiting_for(now_ns), *filter(None, problems)]
+
+    def hung(self) -> str:
+        """A model that never returns, in words."""
+        return next(filter(None, (model.hung() for model in self._models.values())), "")
 
     def _reload(self) -> None:
         """Load all models again, on the CPU: a GPU that failed once fails for this process."""

@@ -15,6 +15,10 @@ from deworldsg_ros.memory import keep_freed_memory
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 EXIT_USAGE = 2
+# A model never returns: EX_SOFTWARE of sysexits.h.
+EXIT_HUNG = 70
+# "true": a launch file or systemd starts the process again when it ends.
+RESPAWN_VARIABLE = "DEWORLDSG_RESPAWN"
 NO_SECURITY = ConfigurationError(
     "ROS_SECURITY_ENABLE is true, but this middleware was built without security, as the wheels of "
     "ROS 2 are: source a ROS 2 Jazzy of the system, or unset ROS_SECURITY_ENABLE"

@@ -65,6 +65,10 @@ class Relating:
         """What is wrong with the world model, in words."""
         return [] if self._model is None else list(filter(None, [self._model.problem()]))
 
+    def hung(self) -> str:
+        """A world model that never returns, in words."""
+        return "" if self._model is None else str(self._model.hung())
+
     def _reload(self) -> None:
         """Load the world model again, on the CPU."""
         self._model.replace(build_world_model(self._config, "cpu"))

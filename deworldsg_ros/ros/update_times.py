@@ -43,8 +43,11 @@ class UpdateTimes:
         """Seconds until the changes are due, 0 = now; None if nothing has changed."""
         return None if self._due_s is None else max(0.0, self._due_s - now_s)
 
-    def published(self, now_s: float) -> float:
-        """Note that all changes are published; returns when the cause of the first arrived."""
+    def taken(self) -> float:
+        """Note that all changes are taken; returns when the cause of the first arrived."""
         self._due_s = None
-        self._booked_s = max(self._booked_s, now_s) + self._period_s
         return self._since_s
+
+    def book(self, now_s: float) -> None:
+        """Note that an update is published."""
+        self._booked_s = max(self._booked_s, now_s) + self._period_s

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Hashable, Iterable
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from builtin_interfaces.msg import Time
@@ -18,10 +18,12 @@ from visualization_msgs.msg import MarkerArray
 from deworldsg_ros.ros.detections import TOPIC, VISION_MSGS, detection_array
 from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.node import StageNode
-from deworldsg_ros.ros.object_transforms import ObjectTransforms
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.worker import Worker
 from deworldsg_ros.scene import wire
+
+if TYPE_CHECKING:
+    from deworldsg_ros.ros.object_transforms import ObjectTransforms
 
 # A client that joins waits for at most this time, and RViz redraws at this rate.
 PERIOD_S = 1.0
@@ -93,15 +95,19 @@ class WholeGraph:
             self._detections = node.create_publisher(
                 VISION_MSGS.Detection3DArray, TOPIC, reliable(1, latched=True)
             )
-        uses_tf = node.parameters.output.publish_tf
-        self._transforms = ObjectTransforms(node) if uses_tf else None
+        self._transforms: ObjectTransforms | None = None
+        if node.parameters.output.publish_tf:
+            # Rare, and it imports OpenCV and the messages of cameras.
+            from deworldsg_ros.ros.object_transforms import ObjectTransforms
+
+            self._transforms = ObjectTransforms(node)
         self._changed = False
         self._due_s = 0.0
         self._worker = Worker("whole graph", self._work, size=1, on_overrun=lambda snapshot: None)
 
-    def changed(self) -> None:
-        """Note that the graph differs from the last snapshot."""
-        self._changed = True
+    def changed(self, is_changed: bool = True) -> None:
+        """Note that the graph differs from the last snapshot; False: nothing is to be published."""
+        self._changed = is_changed
 
     def wait_s(self, now_s: float) -> float | None:
         """Seconds until the next snapshot is due, 0 = now; None without a change."""

@@ -20,7 +20,8 @@ class Worker(Generic[T]):
         work: must not raise.
         size: items that may wait.
         on_overrun: called with each item that is dropped: the oldest, when a new one replaces it.
-        max_wait_s: an item that has waited longer is dropped if a newer one waits.
+        max_busy_s: a worker without a pause for longer does not keep up: it works on the newest
+            item, and drops the others.
         after: called after each item, and again when the seconds that it returned have passed;
             None = only after the next item. It must not raise.
     """
@@ -32,14 +33,15 @@ class Worker(Generic[T]):
         *,
         size: int,
         on_overrun: Callable[[T], None],
-        max_wait_s: float = math.inf,
+        max_busy_s: float = math.inf,
         after: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._work = work
         self._size = size
         self._on_overrun = on_overrun
         self._after = after
-        self._max_wait_s = max_wait_s
+        self._max_busy_s = max_busy_s
+        self._rested_s = time.monotonic()  # the end of the last pause
         self._items: deque[tuple[T, float]] = deque()  # with the time of `submit`
         self._changed = threading.Condition()
         self._stopping = False
@@ -88,7 +90,9 @@ class Worker(Generic[T]):
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._items or self._stopping, wait_s)
+                if not self._items:
+                    self._changed.wait_for(lambda: self._items or self._stopping, wait_s)
+                    self._rested_s = time.monotonic()
                 if self._stopping:
                     return
                 late, items = self._take()
@@ -100,9 +104,9 @@ class Worker(Generic[T]):
             wait_s = self._after()
 
     def _take(self) -> tuple[list[T], list[T]]:
-        """The waiting items that are too old, and the next one."""
+        """The waiting items that are dropped, and the next one."""
         late = []
-        end_s = time.monotonic() - self._max_wait_s
-        while len(self._items) > 1 and self._items[0][1] < end_s:
-            late.append(self._items.popleft()[0])
+        if time.monotonic() - self._rested_s > self._max_busy_s:
+            while len(self._items) > 1:
+                late.append(self._items.popleft()[0])
         return late, [self._items.popleft()[0]] if self._items else []

@@ -42,9 +42,9 @@ def checked(
 
 def within(name: str, values: NDArray[Any], low: float, high: float) -> None:
     """ValueError unless all values are finite numbers from low to high."""
-    # The negated comparison also catches NaN.
-    wrong = ~((values >= low) & (values <= high))
-    if wrong.any():
+    # The negated comparisons also catch NaN, which is the minimum of an array that has one.
+    if values.size and not low <= values.min() <= values.max() <= high:
+        wrong = ~((values >= low) & (values <= high))
         refuse(name, values[wrong][0], f"{low:g} to {high:g}")
 
 
@@ -60,8 +60,11 @@ def refuse(name: str, seen: Any, expected: str) -> None:
 
 
 def distinct(name: str, rows: NDArray[Any]) -> None:
-    """ValueError if two rows are equal."""
-    if len(np.unique(rows, axis=0)) < len(rows):
+    """ValueError if two rows, (n,) or (n, k), are equal."""
+    columns = np.atleast_2d(rows.T)
+    # `np.unique` of rows compares them as bytes, which takes ten times as long.
+    ordered = columns[:, np.lexsort(columns)]
+    if (ordered[:, 1:] == ordered[:, :-1]).all(axis=0).any():
         raise ValueError(f"{name} contains a value twice: expected each once")
 
 

@@ -28,6 +28,9 @@ MAX_HEADER_BYTES = 10_000
 # numpy's own limit is 64. No array here has more than four axes.
 MAX_AXES = 8
 
+# Bytes that are read at a time.
+_PART = 1 << 20
+
 _MAGIC = re.compile(rb"\x93NUMPY([\x01-\x03])\x00")
 _HEADER = re.compile(
     r"\{'descr': ('[^']*'|\[.*\]), 'fortran_order': (False|True), 'shape': \(([\d, ]*)\), \} *\n"
@@ -83,12 +86,23 @@ def _read_archive(file: BinaryIO) -> Arrays:
         if not stored or sum(member.file_size for member in members) > size:
             raise ValueError("its arrays are compressed: expected them as `np.savez` stores them")
         return {
-            name: _parse(name, bytearray(archive.read(member)))
-            for name, member in zip(names, members)
+            name: _parse(name, _content(archive, member)) for name, member in zip(names, members)
         }
 
 
-def _parse(name: str, content: bytearray) -> NDArray[Any]:
+def _content(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> memoryview:
+    """The bytes of a stored member."""
+    # Not a bytearray, which is filled with zeros first.
+    content = np.empty(member.file_size, np.uint8).data
+    # In parts: `archive.read` takes the memory twice.
+    with archive.open(member) as file:
+        for start in range(0, len(content), _PART):
+            part = file.read(_PART)
+            content[start : start + len(part)] = part
+    return content
+
+
+def _parse(name: str, content: memoryview) -> NDArray[Any]:
     """The array of a .npy file, a view of its bytes."""
     magic = _MAGIC.match(content)
     width = 2 if magic and magic[1] == b"\x01" else 4
@@ -96,7 +110,7 @@ def _parse(name: str, content: bytearray) -> NDArray[Any]:
     start = 8 + width + length
     if not magic or length > MAX_HEADER_BYTES:
         raise ValueError(f"array {name} has no header of numpy")
-    header = _HEADER.fullmatch(content[8 + width : start].decode("latin1"))
+    header = _HEADER.fullmatch(str(content[8 + width : start], "latin1"))
     if header is None:
         raise ValueError(f"array {name} has a header that is not understood")
     dtype, shape = _dtype(header[1]), _shape(header[3])

@@ -204,7 +204,8 @@ def quaternion_from_rotation(rotation: Float64) -> Float64:
 
 def invert_pose(T: Float64) -> Float64:
     """Inverse of a rigid transform (4, 4)."""
-    inverse = np.eye(4)
+    inverse = np.zeros((4, 4))
+    inverse[3, 3] = 1.0
     inverse[:3, :3] = T[:3, :3].T
     inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
     return inverse

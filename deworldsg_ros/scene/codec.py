@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import msgspec
 import numpy as np
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64, UInt16
+from deworldsg_ros.scene.arrays import Float32, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
@@ -138,7 +139,7 @@ def local_graph_to_message(graph: LocalGraph) -> wire.LocalGraphMessage:
                 covariance_m2=graph.covariances_world[row].ravel().tolist(),
                 depth_m=float(graph.depths_m[row]),
                 pixel_count=int(graph.pixel_counts[row]),
-                surface_points_m=graph.surface_points_world[row].tolist(),
+                surface=graph.surface_points_world[row].astype("<f4").tobytes(),
             )
             for row in range(len(graph))
         ],
@@ -173,15 +174,25 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             ).reshape(-1, 3, 3),
             depths_m=np.array([item.depth_m for item in objects], np.float64),
             pixel_counts=np.array([item.pixel_count for item in objects], np.int64),
-            surface_points_world=tuple(
-                np.array(item.surface_points_m, np.float32).reshape(-1, 3) for item in objects
-            ),
+            surface_points_world=tuple(_surface(item, message.schema) for item in objects),
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             drops=message.drops,
             depth_grid=_depth_grid_from_wire(message),
         )
     except ValueError as error:
         raise RefusedInput("invalid_message", f"local graph: {error}") from error
+
+
+def _surface(item: wire.LiftedObject, schema: wire.Schema) -> Float32:
+    """The surface points (k, 3) of an object in a message of any version."""
+    if (item.surface_points_m is msgspec.UNSET) != (schema.version > 1):
+        raise ValueError(
+            f"object {item.instance} of version {schema.version}: version 1 has surface_points_m, "
+            "and later ones have surface"
+        )
+    if item.surface_points_m is msgspec.UNSET:
+        return np.frombuffer(item.surface, "<f4").reshape(-1, 3).astype(np.float32)
+    return np.array(item.surface_points_m, np.float32).reshape(-1, 3)
 
 
 def _depth_grid_to_wire(grid: DepthGrid | None) -> wire.DepthGridState | None:

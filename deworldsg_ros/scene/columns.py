@@ -53,6 +53,14 @@ class Columns:
         except KeyError:
             raise KeyError(f"node {node_id} is not in the graph") from None
 
+    def rows_at(self, ids: Sequence[int]) -> Int64:
+        """The present row of each id (n,); KeyError if there is none."""
+        rows = self._rows
+        try:
+            return np.array([rows[node_id] for node_id in ids], np.int64)
+        except KeyError as missing:
+            raise KeyError(f"node {missing} is not in the graph") from None
+
     def append(self, node_id: int) -> int:
         """Add a row of zeros for a new id and return it."""
         self.extend([node_id])
@@ -63,14 +71,14 @@ class Columns:
         if not ids:
             return
         first, count = len(self._rows), len(self._rows) + len(ids)
-        while count > len(self._storage["ids"]):
-            for name, column in self._storage.items():
-                # Zeros that were never written take no memory; a copy of zeros would.
-                larger = np.zeros((2 * len(column), *column.shape[1:]), column.dtype)
-                larger[: len(column)] = column
-                self._storage[name] = larger
-        for column in self._storage.values():
-            column[first:count] = 0
+        capacity = known = len(self._storage["ids"])
+        while count > capacity:
+            capacity *= 2
+        for name, column in self._storage.items() if capacity > known else ():
+            # Zeros that were never written take no memory; a copy of zeros would.
+            larger = np.zeros((capacity, *column.shape[1:]), column.dtype)
+            larger[:first] = column[:first]
+            self._storage[name] = larger
         self._rows.update(zip(ids, range(first, count)))
         self._show(count)
         self.ids[first:] = ids
@@ -81,6 +89,7 @@ class Columns:
         moved = int(self.ids[last])
         for column in self._storage.values():
             column[row] = column[last]
+            column[last] = 0  # free rows are zeros
         self._rows[moved] = row
         del self._rows[node_id]
         self._show(last)

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 Pair = tuple[int, int]
+Ids = TypeVar("Ids", int, Int64)
+
+
+def key(first: Ids, second: Ids) -> Ids:
+    """One number for a pair of ids, the smaller first."""
+    return first << 31 | second
+
+
+def ends_of(pair_key: int) -> Pair:
+    """The two ids of a `key`."""
+    return pair_key >> 31, pair_key & 0x7FFFFFFF
 
 
 class EdgeEvidence(NamedTuple):
@@ -45,7 +57,10 @@ class EdgeMap:
 
     @property
     def evidence(self) -> Mapping[Pair, EdgeEvidence]:
-        """The map itself, read only."""
+        """The map itself, read only.
+
+        Pairs with `frames == 0` are geometric neighbours without visual evidence.
+        """
         return MappingProxyType(self._evidence)
 
     def partners(self, node_id: int) -> Collection[int]:
@@ -67,11 +82,37 @@ class EdgeMap:
             raise ValueError(
                 f"relation logits have shape {logits.shape}: expected {self._no_logits.shape}"
             )
-        self.add(pair, EdgeEvidence(logits, 1, stamp_ns, 0, revision))
+        known = self._evidence.get(pair)
+        if known is None:
+            self.add(pair, EdgeEvidence(logits, 1, stamp_ns, 0, revision))
+            return
+        self._changed.add(pair)
+        summed, frames, last_ns, neighbour_frames, _ = known
+        last_ns = max(last_ns, stamp_ns)
+        self._evidence[pair] = EdgeEvidence(
+            summed + logits, frames + 1, last_ns, neighbour_frames, revision
+        )
 
-    def add_neighbour(self, pair: Pair, stamp_ns: int, revision: int) -> None:
-        """Count a frame in which a pair was a geometric neighbour (Eq. 8)."""
-        self.add(pair, EdgeEvidence(self._no_logits, 0, stamp_ns, 1, revision))
+    def add_neighbours(self, pairs: Sequence[Pair], stamp_ns: int, revision: int) -> None:
+        """Count a frame in which pairs were geometric neighbours (Eq. 8).
+
+        Args:
+            pairs: subject and object of each.
+            stamp_ns: of the frame.
+            revision: of the graph before the first pair; each pair adds one.
+        """
+        evidence = self._evidence
+        self._changed.update(pairs)
+        for pair in pairs:
+            revision += 1
+            known = evidence.get(pair)
+            if known is None:
+                self.add(pair, EdgeEvidence(self._no_logits, 0, stamp_ns, 1, revision))
+                continue
+            summed, frames, last_ns, neighbour_frames, _ = known
+            evidence[pair] = EdgeEvidence(
+                summed, frames, max(last_ns, stamp_ns), neighbour_frames + 1, revision
+            )
 
     def add(self, pair: Pair, more: EdgeEvidence) -> None:
         """Add evidence to a pair: logits and frames are summed."""
@@ -88,6 +129,19 @@ class EdgeMap:
             known.neighbour_frames + more.neighbour_frames,
             more.revision,
         )
+
+    def restore(self, evidence: Mapping[Pair, EdgeEvidence]) -> None:
+        """Fill an empty map with the `evidence` of another one."""
+        self._evidence, self._changed = dict(evidence), set(evidence)
+        # Grouped by node; the partners of each stay in the order of the pairs.
+        ends = np.fromiter(chain.from_iterable(evidence), np.int64, 2 * len(evidence))
+        others = ends.reshape(-1, 2)[:, ::-1].ravel()
+        order = ends.argsort(kind="stable")
+        node_ids, starts = np.unique(ends[order], return_index=True)
+        flat = others[order].tolist()
+        ends_of = [*starts[1:].tolist(), None]
+        for node_id, start, stop in zip(node_ids.tolist(), starts.tolist(), ends_of):
+            self._partners[node_id] = dict.fromkeys(flat[start:stop])
 
     def repoint(self, old_id: int, new_id: int, revision: int) -> None:
         """Move all edges of one node to another, summing evidence; O(degree of `old_id`).

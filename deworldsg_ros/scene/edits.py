@@ -61,7 +61,7 @@ class DeleteNode(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Undo(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Undo the newest edit that holds."""
+    """Undo the newest edit that was not undone yet, of any user."""
 
 
 EditRequest = Union[SetLabel, MergeNodes, SplitNode, DeleteNode, Undo]

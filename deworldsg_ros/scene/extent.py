@@ -29,29 +29,31 @@ DIRECTIONS = 45
 MOST_POINTS = 256
 # The up of the world frame if nothing tells it (REP 103).
 DEFAULT_UP = (0.0, 0.0, 1.0)
+# Decimals of numbers in messages: positions to 0.1 mm, variances to (0.3 mm)², so that a thin
+# object keeps its thickness.
+POSITION_DECIMALS, VARIANCE_DECIMALS = 4, 7
+BOX_DECIMALS, QUATERNION_DECIMALS = 3, 4
 # Points in messages are int16 millimetres.
 _MOST_MM = 32767
 
 
-class Extents(NamedTuple):
-    """Extents of n surfaces.
+class Extent(NamedTuple):
+    """The extent of one surface, as messages have it.
 
     Attributes:
-        means: (n, 3) metres, and
-        covariances: (n, 3, 3) square metres; see `even_moments`.
-        centers: (n, 3) metres, of the boxes;
-        sizes: (n, 3) metres, along the axes of the boxes; and
-        quats_xyzw: (n, 4), axes of the boxes to world, w >= 0.
+        mean_m: (3,) and
+        covariance_m2: (9,); see `even_moments`.
+        box: without outliers.
     """
 
-    means: Float64
-    covariances: Float64
-    centers: Float64
-    sizes: Float64
-    quats_xyzw: Float64
+    mean_m: list[float]
+    covariance_m2: list[float]
+    box: wire.GravityBox
 
 
-def extents_of(points_world: Float32, counts: Int64, rows: Int64, up: Sequence[float]) -> Extents:
+def extents_of(
+    points_world: Float32, counts: Int64, rows: Int64, up: Sequence[float]
+) -> list[Extent]:
     """Extents of the surfaces of some rows.
 
     Args:
@@ -60,7 +62,17 @@ def extents_of(points_world: Float32, counts: Int64, rows: Int64, up: Sequence[f
         rows: (n,).
         up: unit vector against gravity.
     """
-    return Extents(*_measure(points_world, counts, rows, *_frame_of(tuple(up))))
+    measured = _measure(points_world, counts, rows, *_frame_of(tuple(up)))
+    return [
+        Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
+        for row in measured.tolist()
+    ]
+
+
+def rounded_gaussians(means: Float64, covariances: Float64, rows: Int64) -> list[list[float]]:
+    """Mean and covariance (12,) of some rows of (N, 3) and (N, 3, 3), as messages have them."""
+    found: list[list[float]] = _gaussians(means, covariances, rows).tolist()
+    return found
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
@@ -87,13 +99,11 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
     columns = np.ascontiguousarray(points_world[:MOST_POINTS].T, np.float64)
     _box(columns, *_frame_of(tuple(up)), *box)
     center, size, quat_xyzw = box
-    return wire.GravityBox(rounded(center, 3), rounded(size, 3), rounded(quat_xyzw, 4))
-
-
-def boxes(extents: Extents) -> list[wire.GravityBox]:
-    """The messages of the boxes."""
-    parts = ((extents.centers, 3), (extents.sizes, 3), (extents.quats_xyzw, 4))
-    return [wire.GravityBox(*box) for box in zip(*(rounded_rows(*part) for part in parts))]
+    return wire.GravityBox(
+        rounded(center, BOX_DECIMALS),
+        rounded(size, BOX_DECIMALS),
+        rounded(quat_xyzw, QUATERNION_DECIMALS),
+    )
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -109,19 +119,14 @@ def horizontal_axes(up: Sequence[float]) -> Float64:
 def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
     """`horizontal_axes`, and their quaternion: every box needs them, and up changes seldom."""
     axes = horizontal_axes(up)
-    return axes, quaternion_from_rotation(axes.T)
+    # A column of eigenvectors has another layout than its opposite: one kernel is enough.
+    return axes, np.ascontiguousarray(quaternion_from_rotation(axes.T))
 
 
 def rounded(values: Float64, decimals: int) -> list[float]:
     """Flat list of rounded values, without negative zeros."""
     flat: list[float] = (np.round(values, decimals) + 0.0).ravel().tolist()
     return flat
-
-
-def rounded_rows(values: Float64, decimals: int) -> list[list[float]]:
-    """`rounded` for each row of values (n, ...)."""
-    rows: list[list[float]] = (np.round(values, decimals) + 0.0).reshape(len(values), -1).tolist()
-    return rows
 
 
 def surface_bytes(points_world: Float32, mean_m: Sequence[float]) -> bytes:
@@ -144,20 +149,52 @@ def surface_points(node: wire.NodeState) -> Float64:
 @kernel
 def _measure(
     points_world: Float32, counts: Int64, rows: Int64, axes: Float64, quat_axes: Float64
-) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-    means, covariances = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
-    centers, sizes = np.empty((len(rows), 3)), np.empty((len(rows), 3))
-    quats = np.empty((len(rows), 4))
+) -> Float64:
+    """Mean, covariance, and centre, size and quaternion of the box of each row; rounded."""
+    result = np.empty((len(rows), 22), np.float64)
+    covariance = np.empty((3, 3), np.float64)
     for index in range(len(rows)):
         count = counts[rows[index]]
-        columns = np.empty((3, count))
+        columns = np.empty((3, count), np.float64)
+        first = np.empty((3, min(count, MOST_POINTS)), np.float64)
         for place in range(count):
             for axis in range(3):
                 columns[axis, place] = points_world[rows[index], place, axis]
-        _even_moments(columns, means[index], covariances[index])
-        first = np.ascontiguousarray(columns[:, :MOST_POINTS])
-        _box(first, axes, quat_axes, centers[index], sizes[index], quats[index])
-    return means, covariances, centers, sizes, quats
+                if place < MOST_POINTS:
+                    first[axis, place] = columns[axis, place]
+        row = result[index]
+        _even_moments(columns, row[:3], covariance)
+        _write_gaussian(row, row, covariance)
+        _box(first, axes, quat_axes, row[12:15], row[15:18], row[18:])
+        _round(row, 12, 18, BOX_DECIMALS)
+        _round(row, 18, 22, QUATERNION_DECIMALS)
+    return result
+
+
+@kernel
+def _gaussians(means: Float64, covariances: Float64, rows: Int64) -> Float64:
+    result = np.empty((len(rows), 12), np.float64)
+    for index in range(len(rows)):
+        _write_gaussian(result[index], means[rows[index]], covariances[rows[index]])
+    return result
+
+
+@kernel
+def _write_gaussian(row: Float64, mean: Float64, covariance: Float64) -> None:
+    for i in range(3):
+        row[i] = mean[i]
+        for j in range(3):
+            row[3 + 3 * i + j] = covariance[i, j]
+    _round(row, 0, 3, POSITION_DECIMALS)
+    _round(row, 3, 12, VARIANCE_DECIMALS)
+
+
+@kernel
+def _round(values: Float64, start: int, end: int, decimals: int) -> None:
+    """As `rounded`, in place."""
+    scale = 10.0**decimals
+    for index in range(start, end):
+        values[index] = np.rint(values[index] * scale) / scale + 0.0
 
 
 @kernel
@@ -189,7 +226,7 @@ def _along_widest(columns: Float64) -> tuple[Float64, int]:
             order[at] = order[at - 1]
             at -= 1
         order[at] = place
-    ordered = np.empty((3, count))
+    ordered = np.empty((3, count), np.float64)
     for axis in range(3):
         for index in range(count):
             ordered[axis, index] = columns[axis, order[index]]
@@ -202,7 +239,7 @@ def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
     ordered, widest = _along_widest(columns)
     x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
     count = len(along)
-    weights = np.empty(count)
+    weights = np.empty(count, np.float64)
     first, last, total = 0, 0, 0.0
     for a in range(count):
         while along[a] - along[first] > EVEN_RADIUS_M:
@@ -246,11 +283,12 @@ def _box(
     quat_xyzw: Float64,
 ) -> None:
     """See `box_of`; points are columns (3, n) of the world frame, and the results are written."""
-    upright = np.zeros(columns.shape)
+    upright = np.zeros(columns.shape, np.float64)
     for axis in range(3):
         for k in range(3):
             if axes[axis, k] != 0.0:
-                upright[axis] += axes[axis, k] * columns[k]
+                for place in range(columns.shape[1]):
+                    upright[axis, place] += axes[axis, k] * columns[k, place]
     corners = _outer(_without_outliers(upright))
     best, heading = np.inf, 0.0
     for step in range(DIRECTIONS):
@@ -262,7 +300,9 @@ def _box(
             best, heading = area, angle
     cos, sin = math.cos(heading), math.sin(heading)
     left, right, back, front = _bounds(corners, cos, sin)
-    low, high = corners[2].min(), corners[2].max()
+    low, high = corners[2, 0], corners[2, 0]
+    for place in range(1, corners.shape[1]):
+        low, high = min(low, corners[2, place]), max(high, corners[2, place])
     size[0], size[1], size[2] = right - left, front - back, high - low
     u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2
     for axis in range(3):
@@ -272,7 +312,7 @@ def _box(
             + w * axes[2, axis]
         )
     # The turn about the third axis, after the axes.
-    qx, qy, qz, qw = quat_axes
+    qx, qy, qz, qw = quat_axes[0], quat_axes[1], quat_axes[2], quat_axes[3]
     cos, sin = math.cos(heading / 2), math.sin(heading / 2)
     sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
     quat_xyzw[0], quat_xyzw[1] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
@@ -310,7 +350,7 @@ def _outer(points: Float64) -> Float64:
             other = outermost[side]
             if _reach(side, x[place], y[place]) > _reach(side, x[other], y[other]):
                 outermost[side] = place
-    kept = np.empty((3, count))
+    kept = np.empty((3, count), np.float64)
     size = 0
     for place in range(count):
         inside = True
@@ -349,9 +389,10 @@ def _without_outliers(columns: Float64) -> Float64:
         return columns
     ordered, widest = _along_widest(columns)
     x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
-    last = np.empty(count)
+    last, sorted_partly = np.empty(count, np.float64), np.empty(count, np.float64)
     for row in range(count):
-        # Squared distances of the three nearest points so far.
+        # Squared distances of the three nearest points so far. Without branches: on new points, no
+        # processor predicts them.
         near_1 = near_2 = near_3 = np.inf
         for step in (1, -1):
             other = row + step
@@ -361,14 +402,13 @@ def _without_outliers(columns: Float64) -> Float64:
                     break
                 step_x, step_y, step_z = x[other] - x[row], y[other] - y[row], z[other] - z[row]
                 squared = step_x * step_x + step_y * step_y + step_z * step_z
-                if squared < near_3:
-                    near_3 = max(near_2, squared)
-                    near_2 = min(near_2, max(near_1, squared))
-                    near_1 = min(near_1, squared)
+                near_3 = min(near_3, max(near_2, squared))
+                near_2 = min(near_2, max(near_1, squared))
+                near_1 = min(near_1, squared)
                 other += step
-        last[row] = near_3
-    most = OUTLIER_FACTOR**2 * np.median(last)
-    kept = np.empty((3, count))
+        last[row] = sorted_partly[row] = near_3
+    most = OUTLIER_FACTOR**2 * _median(sorted_partly)
+    kept = np.empty((3, count), np.float64)
     size = 0
     for row in range(count):
         if last[row] <= most:
@@ -376,3 +416,32 @@ def _without_outliers(columns: Float64) -> Float64:
                 kept[axis, size] = ordered[axis, row]
             size += 1
     return kept[:, :size]
+
+
+@kernel
+def _median(values: Float64) -> float:
+    """Median; the values are moved (Hoare's selection)."""
+    low, high, middle = 0, len(values) - 1, len(values) // 2
+    while low < high:
+        pivot, left, right = values[(low + high) // 2], low, high
+        while left <= right:
+            while values[left] < pivot:
+                left += 1
+            while values[right] > pivot:
+                right -= 1
+            if left <= right:
+                values[left], values[right] = values[right], values[left]
+                left, right = left + 1, right - 1
+        if middle <= right:
+            high = right
+        elif middle >= left:
+            low = left
+        else:
+            high = low
+    median: float = values[middle]
+    if len(values) % 2 == 0:
+        before = values[0]
+        for place in range(1, middle):
+            before = max(before, values[place])
+        median = (before + median) / 2.0
+    return median

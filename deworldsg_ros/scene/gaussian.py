@@ -88,6 +88,25 @@ def log_determinant(covariance: Float64) -> float:
     raise ValueError(f"covariance {covariance.tolist()} is not positive definite")
 
 
+def log_determinants(covariances: Float64) -> Float64:
+    """`log_determinant` of each of n covariances (n, 3, 3), with the same bits.
+
+    Raises:
+        ValueError: if one is not positive definite.
+    """
+    (c00, _, _), (c10, c11, _), (c20, c21, c22) = covariances.transpose(1, 2, 0)
+    with np.errstate(all="ignore"):  # NaN is refused below
+        pivot_1 = c11 - c10 / c00 * c10
+        rest = c21 - c20 / c00 * c10
+        pivot_2 = c22 - c20 / c00 * c20 - rest / pivot_1 * rest
+        refused = ~((c00 > 0.0) & (pivot_1 > 0.0) & (pivot_2 > 0.0))
+    if refused.any():
+        seen = covariances[refused][0].tolist()
+        raise ValueError(f"covariance {seen} is not positive definite")
+    # The logarithm of numpy may differ in the last bit.
+    return np.array(list(map(math.log, (c00 * pivot_1 * pivot_2).tolist())))
+
+
 def eigenvalue_bound(covariance: Float64) -> float:
     """An upper bound of the largest eigenvalue of a covariance (3, 3).
 
@@ -97,3 +116,11 @@ def eigenvalue_bound(covariance: Float64) -> float:
     for value in covariance.ravel().tolist():
         squares += value * value
     return math.sqrt(squares)
+
+
+def eigenvalue_bounds(covariances: Float64) -> Float64:
+    """`eigenvalue_bound` of each of n covariances (n, 3, 3), with the same bits."""
+    squares = np.zeros(len(covariances))
+    for column in covariances.reshape(-1, 9).T:
+        squares += column * column
+    return np.sqrt(squares)

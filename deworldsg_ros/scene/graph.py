@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
 
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float32, Float64
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
 from deworldsg_ros.scene.edits import Edit, EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -17,7 +17,7 @@ from deworldsg_ros.scene.node_ids import IdState, NodeIds
 from deworldsg_ros.scene.node_states import NodeStates
 from deworldsg_ros.scene.node_store import NodeStore
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
-from deworldsg_ros.scene.votes import PairVotes, VoteMap
+from deworldsg_ros.scene.votes import PairVotes, VoteMap, VotesByPair
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class GraphState:
         surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
         revision: number of changes so far.
         nodes: arrays of n rows, by their names in `NodeTable`.
-        surfaces: n arrays (k, 3) float32 of surface points, metres.
+        surface_points: (m, 3) float32, metres, those of one node after those of another.
+        surface_counts: (n,) int64, number of points of each node.
         edges: evidence of each directed pair of ids.
         votes: votes of frames on each unordered pair of ids.
         ids: the id memory.
@@ -39,7 +40,8 @@ class GraphState:
     vocabulary: Vocabulary
     frame_id: str
     nodes: Mapping[str, NDArray[Any]]
-    surfaces: Sequence[Float32]
+    surface_points: Float32
+    surface_counts: Int64
     edges: Mapping[Pair, EdgeEvidence]
     votes: Mapping[Pair, PairVotes]
     ids: IdState
@@ -84,11 +86,9 @@ class SceneGraph(NodeStore):
             state.remembered_frames,
             state.even_gaussians,
         )
-        graph.nodes.restore(state.nodes, state.surfaces)
-        for pair, evidence in state.edges.items():
-            graph._edges.add(pair, evidence)
-        for pair, votes in state.votes.items():
-            graph._votes.add(pair, votes.frames, votes.counts, votes.revision)
+        graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
+        graph._edges.restore(state.edges)
+        graph._votes.restore(state.votes)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.edits = EditLog(state.edits)
         graph.revision = state.revision
@@ -101,9 +101,10 @@ class SceneGraph(NodeStore):
             vocabulary=self.vocabulary,
             frame_id=self.frame_id,
             nodes={name: getattr(nodes, name).copy() for name in SAVED_COLUMNS},
-            surfaces=[nodes.surface(row).copy() for row in range(len(nodes))],
+            surface_points=nodes.surface_points(),
+            surface_counts=nodes.surface_counts.copy(),
             edges=dict(self.edges),
-            votes={pair: replace(votes) for pair, votes in self.votes.items()},
+            votes=dict(self.votes),
             ids=self._ids.state(),
             revision=self.revision,
             surface_point_capacity=self.surface_point_capacity,
@@ -168,23 +169,20 @@ class SceneGraph(NodeStore):
 
     @property
     def edges(self) -> Mapping[Pair, EdgeEvidence]:
-        """Evidence of each directed pair (subject id, object id); read only.
-
-        Pairs with `frames == 0` are geometric neighbours without visual evidence.
-        """
+        """Evidence of each directed pair (subject id, object id); read only."""
         return self._edges.evidence
 
     @property
-    def votes(self) -> Mapping[Pair, PairVotes]:
+    def votes(self) -> VotesByPair:
         """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
         return self._votes.pairs
 
-    def take_changed_votes(self) -> set[Pair]:
-        """Pairs whose votes changed since the last call; some may have been removed."""
+    def take_changed_votes(self) -> set[int]:
+        """Keys of the pairs whose votes changed since the last call; some may be removed."""
         return self._votes.take_changed()
 
     def seen_together(self, node_id: int) -> set[int]:
-        """Ids of the nodes that frames showed together with a node; do not change it."""
+        """Ids of the nodes that frames showed together with a node."""
         return self._votes.partners(node_id)
 
     def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
@@ -192,39 +190,41 @@ class SceneGraph(NodeStore):
         self.revision += 1
         self._votes.add((a_id, b_id), 1, counts, self.revision)
 
+    def add_frame_votes(self, seen: Int64, voted: Int64, votes: Float64) -> None:
+        """Count a frame that showed pairs of live nodes; see `VoteMap.add_frame`."""
+        self._votes.add_frame(seen, voted, votes, self.revision + 1)
+        self.revision += len(seen)
+
     def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
         """Sum a frame's visual relation logits (R,) into an edge (Eq. 9).
 
         Returns False if, by now, one of the nodes was removed or both have become one node.
         """
-        pair = self._live_pair(subject_id, object_id)
-        if pair is not None:
-            self._edges.add_visual(pair, logits, stamp_ns, self.revision + 1)
-            self.revision += 1
-        return pair is not None
-
-    def add_neighbour(self, subject_id: int, object_id: int, stamp_ns: int) -> bool:
-        """Count a frame in which the pair was a geometric neighbour (Eq. 8); as `add_visual`."""
-        pair = self._live_pair(subject_id, object_id)
-        if pair is not None:
-            self.revision += 1
-            self._edges.add_neighbour(pair, stamp_ns, self.revision)
-        return pair is not None
-
-    def _live_pair(self, subject_id: int, object_id: int) -> Pair | None:
         pair = (self.resolve(subject_id), self.resolve(object_id))
-        return None if 0 in pair or pair[0] == pair[1] else pair
+        if 0 in pair or pair[0] == pair[1]:
+            return False
+        self._edges.add_visual(pair, logits, stamp_ns, self.revision + 1)
+        self.revision += 1
+        return True
+
+    def add_neighbours(self, pairs: Iterable[Pair], stamp_ns: int) -> None:
+        """Count a frame in which pairs of nodes (0 = removed) were geometric neighbours (Eq. 8).
+
+        Pairs without two different nodes are left out.
+        """
+        live = [pair for pair in pairs if pair[0] and pair[1] and pair[0] != pair[1]]
+        self._edges.add_neighbours(live, stamp_ns, self.revision)
+        self.revision += len(live)
 
     def node_states(self, top_k: int, with_points: bool = False) -> dict[int, wire.NodeState]:
         """Messages of the confirmed nodes by ascending id.
 
         Messages without points of nodes that did not change are the same objects as before.
         """
-        if top_k not in self._states:
-            self._states[top_k] = NodeStates(self, top_k, self.even_gaussians)
-        states = self._states[top_k]
+        if (states := self._states.get(top_k)) is None:
+            states = self._states[top_k] = NodeStates(self, top_k, self.even_gaussians)
         states.refresh()
-        known = {node_id: states.states[node_id] for node_id in sorted(states.states)}
+        known = dict(sorted(states.states.items()))
         if not with_points:
             return known
         return {node_id: states.with_points(state) for node_id, state in known.items()}

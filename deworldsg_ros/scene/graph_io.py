@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -59,8 +60,8 @@ def to_arrays(state: GraphState) -> Arrays:
     return {
         "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
         **state.nodes,
-        "surface_points": np.concatenate([np.zeros((0, 3), np.float32), *state.surfaces]),
-        "surface_point_counts": np.array([len(points) for points in state.surfaces], np.int64),
+        "surface_points": state.surface_points,
+        "surface_point_counts": state.surface_counts,
         **_edge_arrays(state),
         **_vote_arrays(state),
         **_id_arrays(state.ids),
@@ -75,13 +76,13 @@ def _edit_arrays(state: GraphState) -> Arrays:
 
 
 def _edge_arrays(state: GraphState) -> Arrays:
-    edges = state.edges.values()
-    counts = [(e.frames, e.last_seen_ns, e.neighbour_frames, e.revision) for e in edges]
-    logits = np.array([edge.visual_logits for edge in edges], np.float64)
+    count, width = len(state.edges), len(state.vocabulary.predicates)
+    pairs = np.fromiter(chain.from_iterable(state.edges), np.int64, 2 * count)
+    logits, *counts = zip(*state.edges.values()) if count else [()] * 5
     return {
-        "edge_pairs": np.array(list(state.edges), np.int64).reshape(-1, 2),
-        "edge_visual_logits": logits.reshape(-1, len(state.vocabulary.predicates)),
-        "edge_counts": np.array(counts, np.int64).reshape(-1, 4),
+        "edge_pairs": pairs.reshape(-1, 2),
+        "edge_visual_logits": np.concatenate([np.zeros(0), *logits]).reshape(count, width),
+        "edge_counts": np.array(counts, np.int64).T.copy(),
     }
 
 
@@ -134,7 +135,8 @@ def _state(arrays: Arrays) -> GraphState:
         vocabulary=Vocabulary(tuple(header.classes), tuple(header.predicates)),
         frame_id=header.frame_id,
         nodes={name: _column(arrays, name) for name in SAVED_COLUMNS},
-        surfaces=_split(arrays["surface_points"], arrays["surface_point_counts"]),
+        surface_points=arrays["surface_points"],
+        surface_counts=arrays["surface_point_counts"],
         edges=_edges(arrays),
         votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
         ids=_ids(arrays, header.next_id),
@@ -168,14 +170,12 @@ def _column(arrays: Arrays, name: str) -> NDArray[Any]:
 
 
 def _edges(arrays: Arrays) -> dict[Pair, EdgeEvidence]:
-    edges = {}
-    for (subject, object_), logits, (frames, last_seen_ns, neighbour_frames, revision) in zip(
-        arrays["edge_pairs"].tolist(), arrays["edge_visual_logits"], arrays["edge_counts"].tolist()
-    ):
-        edges[subject, object_] = EdgeEvidence(
-            logits, frames, last_seen_ns, neighbour_frames, revision
-        )
-    return edges
+    logits, (frames, *others) = arrays["edge_visual_logits"], arrays["edge_counts"].T.tolist()
+    # All pairs without frames share one row.
+    none = np.zeros(logits.shape[1])
+    rows = [row if count else none for row, count in zip(logits, frames)]
+    pairs = zip(*arrays["edge_pairs"].T.tolist())
+    return dict(zip(pairs, map(EdgeEvidence, rows, frames, *others)))
 
 
 def _votes(arrays: Arrays) -> dict[Pair, PairVotes]:

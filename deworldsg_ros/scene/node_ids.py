@@ -74,6 +74,8 @@ class NodeIds:
 
     def resolve(self, node_id: int) -> int:
         """The live node that an id stands for, following merges; 0 = none."""
+        if node_id in self._live:
+            return node_id
         path = []
         while node_id in self._successors:
             path.append(node_id)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.edits import EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import NodeIds
@@ -124,7 +125,7 @@ class NodeStore:
         weights: Float64,
     ) -> None:
         """Fuse one more observation into each of n different live nodes, as `observe` does."""
-        rows = [self.nodes.row(node_id) for node_id in node_ids]
+        rows = self.nodes.rows_at(node_ids)
         classes = class_probabilities / class_probabilities.sum(axis=1, keepdims=True)
         counts = np.ones(len(rows), np.int64)
         self.nodes.fuse(
@@ -144,12 +145,11 @@ class NodeStore:
 
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
-        rows = [self.nodes.row(node_id) for node_id in node_ids]
-        self._changed(self.nodes.drop_points(rows, dropped))
+        self._changed(self.nodes.drop_points(self.nodes.rows_at(node_ids), dropped))
 
     def set_classes(self, node_ids: Sequence[int], class_probabilities: Float64) -> None:
         """Replace the class distributions of n live nodes, (n, C)."""
-        rows = [self.nodes.row(node_id) for node_id in node_ids]
+        rows = self.nodes.rows_at(node_ids)
         self.nodes.class_probabilities[rows] = class_probabilities
         self._changed(rows)
 
@@ -164,16 +164,16 @@ class NodeStore:
             The ids of the nodes that were not confirmed before, and are now.
         """
         nodes = self.nodes
-        rows = np.array([nodes.row(node_id) for node_id in node_ids], np.int64)
+        rows = nodes.rows_at(node_ids)
         existence = np.round(existence, 2)
         confirmed = existence >= minimum
         if self.edits:
             confirmed &= [not self.edits.hides(node_id) for node_id in node_ids]
-        differs = (nodes.existence[rows] != existence) | (nodes.confirmed[rows] != confirmed)
-        new: list[int] = nodes.ids[rows[confirmed & ~nodes.confirmed[rows]]].tolist()
+        known = nodes.confirmed[rows]
+        differs = (nodes.existence[rows] != existence) | (known != confirmed)
         nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed
-        self._changed(rows[differs].tolist())
-        return new
+        self._changed(rows[differs])
+        return list(itertools.compress(node_ids, (confirmed & ~known).tolist()))
 
     def move_node(self, node_id: int, T_correction: Float64) -> None:
         """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
@@ -206,10 +206,11 @@ class NodeStore:
         self._watchers.append(watcher)
         return watcher
 
-    def _changed(self, rows: list[int]) -> None:
+    def _changed(self, rows: Sequence[int] | Int64) -> None:
         """Count one change for each row."""
-        self.nodes.revisions[rows] = self.revision + 1 + np.arange(len(rows))
+        first = self.revision + 1
         self.revision += len(rows)
+        self.nodes.revisions[rows] = np.arange(first, self.revision + 1)
         ids = self.nodes.ids[rows].tolist()
         for watcher in self._watchers:
             watcher.update(ids)

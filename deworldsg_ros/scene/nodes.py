@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,9 +14,17 @@ from numpy.typing import NDArray
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.columns import Columns
-from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant, transform
-from deworldsg_ros.scene.surface import add_points, drop_points
+from deworldsg_ros.scene.gaussian import (
+    eigenvalue_bound,
+    eigenvalue_bounds,
+    log_determinant,
+    log_determinants,
+    transform,
+)
+from deworldsg_ros.scene.surface import add_flat, add_points, drop_points
 
+# Surface points for which a table has room at first.
+FIRST_POINTS = 64
 # A covariance with a pivot below this fraction of its trace is singular up to rounding.
 SINGULAR = 1e-13
 # Saved columns of a node, beside its surface points; the other columns follow from these.
@@ -76,7 +85,7 @@ class NodeTable(Columns):
         revisions: (n,) int64, graph revision at which the node last changed.
         existence: (n,) float64, probability that it is an object; -1 = not estimated.
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
-        surface_counts: (n,) int64 points; see `surface`.
+        surface_counts: (n,) int64 points; see `surface`. K grows up to the capacity.
         surface_revisions: (n,) int64, number of changes of the surface so far.
     """
 
@@ -97,6 +106,7 @@ class NodeTable(Columns):
     surface_revisions: Int64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
+        first_points = min(FIRST_POINTS, surface_point_capacity)
         super().__init__(
             {
                 "means": (np.float64, (3,)),
@@ -111,11 +121,12 @@ class NodeTable(Columns):
                 "first_seen_ns": (np.int64, ()),
                 "last_seen_ns": (np.int64, ()),
                 "revisions": (np.int64, ()),
-                "surface_points_world": (np.float32, (surface_point_capacity, 3)),
+                "surface_points_world": (np.float32, (first_points, 3)),
                 "surface_counts": (np.int64, ()),
                 "surface_revisions": (np.int64, ()),
             }
         )
+        self._surface_point_capacity = surface_point_capacity
 
     def put(
         self,
@@ -139,14 +150,14 @@ class NodeTable(Columns):
         self.weights[row] = weight
         self.observations[row] = observations
 
-    def fuse(self, rows: list[int], seen: Observations) -> None:
+    def fuse(self, rows: Int64, seen: Observations) -> None:
         """Fuse one observation into each of n different rows (Eq. 7).
 
         Raises:
             ValueError: if a covariance is not positive definite; rows before it were fused.
         """
         refused = _fuse(
-            np.array(rows, np.int64),
+            rows,
             self.means,
             self.covariances,
             self.class_probabilities,
@@ -171,20 +182,7 @@ class NodeTable(Columns):
 
     def merge(self, row: int, other: int) -> None:
         """Fuse everything that was observed of another row into a row."""
-        one = [other]
-        self.fuse(
-            [row],
-            Observations(
-                self.means[one],
-                self.covariances[one],
-                self.class_probabilities[one],
-                self.weights[one],
-                self.observations[one],
-                [self.surface(other)],
-                int(self.first_seen_ns[other]),
-                int(self.last_seen_ns[other]),
-            ),
-        )
+        self.fuse(np.array([row]), _observed(self, other))
         self.confirmed[row] |= self.confirmed[other]
         self.existence[row] = max(self.existence[row], self.existence[other])
 
@@ -203,13 +201,9 @@ class NodeTable(Columns):
 
     def move(self, row: int, T: Float64) -> None:
         """Apply a rigid transform (4, 4) to the Gaussian and the surface points of a row."""
-        self.put(
-            row,
-            *transform(self.means[row], self.covariances[row], T),
-            self.class_probabilities[row].copy(),
-            float(self.weights[row]),
-            int(self.observations[row]),
-        )
+        gaussian = transform(self.means[row], self.covariances[row], T)
+        classes, weight = self.class_probabilities[row].copy(), float(self.weights[row])
+        self.put(row, *gaussian, classes, weight, int(self.observations[row]))
         points = self.surface(row).astype(np.float64) @ T[:3, :3].T
         points += T[:3, 3]
         self.set_surface(row, points.astype(np.float32))
@@ -222,39 +216,72 @@ class NodeTable(Columns):
         """Replace the surface points of a row by a sample of these (k, 3)."""
         self.surface_counts[row] = 0
         self.surface_revisions[row] += 1
-        self._add_surfaces([row], [points_world])
+        self._add_surfaces(np.array([row]), [points_world])
 
-    def drop_points(self, rows: list[int], dropped: Bool) -> list[int]:
+    def drop_points(self, rows: Int64, dropped: Bool) -> Int64:
         """Remove some of the surface points of n rows, (n, K); but never all points of a row.
 
         Returns:
             The rows of which some were to be removed.
         """
-        at = np.array(rows, np.int64)
-        drop_points(self.surface_points_world, self.surface_counts, at, dropped)
-        changed: list[int] = at[dropped.any(axis=1)].tolist()
+        drop_points(self.surface_points_world, self.surface_counts, rows, dropped)
+        changed = rows[dropped.any(axis=1)]
         self.surface_revisions[changed] += 1
         return changed
 
-    def restore(self, columns: Mapping[str, NDArray[Any]], surfaces: Sequence[Float32]) -> None:
-        """Fill an empty table with saved columns and the surface points of each row."""
-        for index, node_id in enumerate(columns["ids"].tolist()):
-            row = self.append(node_id)
-            self.put(
-                row,
-                columns["means"][index],
-                columns["covariances"][index],
-                columns["class_probabilities"][index],
-                float(columns["weights"][index]),
-                int(columns["observations"][index]),
-            )
-            self.set_surface(row, surfaces[index])
-            for name in ("confirmed", "existence", "first_seen_ns", "last_seen_ns", "revisions"):
-                getattr(self, name)[row] = columns[name][index]
+    def surface_points(self) -> Float32:
+        """The surface points (m, 3) of all rows, one row after the other, metres."""
+        known = np.arange(self.surface_points_world.shape[1]) < self.surface_counts[:, None]
+        return self.surface_points_world[known]
 
-    def _add_surfaces(self, rows: list[int], point_sets: Sequence[Float32]) -> None:
+    def restore(self, columns: Mapping[str, NDArray[Any]], points: Float32, counts: Int64) -> None:
+        """Fill an empty table with saved columns and `surface_points`, some for each row."""
+        self.extend(columns["ids"].tolist())
+        for name in SAVED_COLUMNS:
+            getattr(self, name)[:] = columns[name]
+        self.log_determinants[:] = log_determinants(self.covariances)
+        self.eigenvalue_bounds[:] = eigenvalue_bounds(self.covariances)
+        self._make_room(int(counts.max(initial=0)))
+        add_flat(self.surface_points_world, self.surface_counts, points, counts)
+
+    def _make_room(self, count: int) -> None:
+        """Make room for this many surface points in each row, or for as many as a row may have."""
+        known = self._storage["surface_points_world"]
+        if known.shape[1] < min(count, self._surface_point_capacity):
+            larger = _widened(known, count, self._surface_point_capacity)
+            larger[: len(self), : known.shape[1]] = known[: len(self)]
+            self._storage["surface_points_world"] = larger
+            self._show(len(self))
+
+    def _add_surfaces(self, rows: Int64, point_sets: Sequence[Float32]) -> None:
+        if self.surface_points_world.shape[1] < self._surface_point_capacity:
+            counts = self.surface_counts[rows].tolist()
+            self._make_room(max(map(operator.add, counts, map(len, point_sets)), default=0))
         surfaces = self.surface_points_world, self.surface_counts
         self.surface_revisions[rows] += add_points(*surfaces, rows, point_sets)
+
+
+def _observed(table: NodeTable, row: int) -> Observations:
+    """Everything that was observed of a row, as one observation."""
+    one = [row]
+    return Observations(
+        table.means[one],
+        table.covariances[one],
+        table.class_probabilities[one],
+        table.weights[one],
+        table.observations[one],
+        [table.surface(row)],
+        int(table.first_seen_ns[row]),
+        int(table.last_seen_ns[row]),
+    )
+
+
+def _widened(known: Float32, count: int, most: int) -> Float32:
+    """Zeros for rows of at least this many points, or of `most`. Unwritten, they take no memory."""
+    width = known.shape[1]
+    while width < count:
+        width *= 2
+    return np.zeros((len(known), min(width, most), 3), np.float32)
 
 
 @kernel

@@ -18,11 +18,15 @@ from deworldsg_ros.scene.waiting import some_of
 
 # Surfaces that changed and are measured anew in a call that may leave some for the next one.
 MEASURED_A_CALL = 2
+# First messages of nodes that a call makes, and first pairs of nodes that it judges. So many take
+# about 35 ms. A frame has fewer; a large map has more.
+NEW_A_CALL = 1024
 
 Key = TypeVar("Key", int, Pair)
 Message = TypeVar("Message", wire.NodeState, wire.EdgeState)
-# Brings the messages of the edges up to date, and returns the pairs whose message is another.
-EdgeRefresh = Callable[[bool], Iterable[Pair]]
+# Brings the messages of the edges up to date; returns the pairs whose message is another, and
+# whether the first messages of the edges are all there.
+EdgeRefresh = Callable[[bool], tuple[Iterable[Pair], bool]]
 
 
 class Publication:
@@ -73,16 +77,17 @@ class Publication:
 
     @property
     def waiting(self) -> int:
-        """Number of nodes whose extent the next updates measure; `full` leaves none."""
-        return self._nodes.waiting
+        """Number of nodes that the next updates measure; `full` leaves none."""
+        return self._nodes.new + self._nodes.waiting
 
     def update(self) -> wire.SceneGraphUpdateMessage | None:
-        """The changes since the last call; None if there are none.
+        """The changes since the last call; None without any, or while a large map is prepared.
 
         It costs as much as what changed, however large the graph is. Of many surfaces that
         changed, some are left for the next calls.
         """
-        self._refresh(whole=False)
+        if not self._refresh(whole=False):
+            return None
         nodes, gone_nodes = _take(self._touched_nodes, self._known_nodes, self._touched_states())
         edges, gone_edges = _take(self._touched_edges, self._known_edges, self._edges)
         removed = self._graph.take_removals()
@@ -122,10 +127,13 @@ class Publication:
         nodes = [self._nodes.with_points(node) for node in _ordered(self._nodes.states)]
         return self._message(self._updated.sequence, nodes, _ordered(self._edges))
 
-    def _refresh(self, whole: bool) -> None:
-        limit = None if whole else some_of(self._nodes.waiting, MEASURED_A_CALL)
-        self._touched_nodes.update(self._nodes.refresh(limit))
-        self._touched_edges.update(self._refresh_edges(whole))
+    def _refresh(self, whole: bool) -> bool:
+        """Bring the messages up to date; false if a part of the first ones is missing."""
+        limits = some_of(self._nodes.waiting, MEASURED_A_CALL), NEW_A_CALL
+        self._touched_nodes.update(self._nodes.refresh(*((None, None) if whole else limits)))
+        edges, all_edges = self._refresh_edges(whole)
+        self._touched_edges.update(edges)
+        return all_edges and not self._nodes.new
 
     def _touched_states(self) -> dict[int, wire.NodeState]:
         """Messages of the touched nodes as they are published."""

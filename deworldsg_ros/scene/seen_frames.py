@@ -17,7 +17,6 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.limits import MAX_INT
-from deworldsg_ros.scene.votes import frame_votes
 
 # Clearest frames that are kept of a node, and of a directed pair of nodes.
 CLEAREST = 3
@@ -74,10 +73,12 @@ class FrameMemory:
         self._seen: dict[Key, SeenFrames] = {(item.node, item.other): item for item in seen}
         self._frames = 0
 
-    def note(self, graph: SceneGraph, local: LocalGraph, node_ids: Sequence[int]) -> None:
-        """Note a merged frame, and the node of each of its rows."""
+    def note(
+        self, graph: SceneGraph, local: LocalGraph, node_ids: Sequence[int], votes: Float64
+    ) -> None:
+        """Note a merged frame, the node of each of its rows, and its `frame_votes`."""
         names, stamp_ns = graph.vocabulary, local.stamp_ns
-        classes, votes = local.class_probabilities, frame_votes(local.relations.logits)
+        classes = local.class_probabilities
         strengths = (local.scores * classes.max(axis=1, initial=0.0)).tolist()
         for node_id, label, strength in zip(node_ids, _best(classes), strengths):
             if node_id:  # 0 = this frame removed it
@@ -106,10 +107,16 @@ class FrameMemory:
         seen = self._seen.get(key)
         if seen is None:
             seen = self._seen[key] = SeenFrames(*key, stamp_ns, stamp_ns, [])
-        seen.first_ns = min(seen.first_ns, stamp_ns)
-        seen.last_ns = max(seen.last_ns, stamp_ns)
+        if stamp_ns < seen.first_ns:
+            seen.first_ns = stamp_ns
+        if stamp_ns > seen.last_ns:
+            seen.last_ns = stamp_ns
+        clearest = seen.clearest
+        # Most frames are not among the clearest; to round takes longer than this.
+        if len(clearest) == CLEAREST and strength <= clearest[-1].strength:
+            return
         strength = round(strength, 3)
-        if len(seen.clearest) < CLEAREST or strength > seen.clearest[-1].strength:
+        if len(clearest) < CLEAREST or strength > clearest[-1].strength:
             _insert(seen, SeenFrame(strength, stamp_ns, name))
 
     def _follow(self, graph: SceneGraph) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.array_checks import checked, holds, within
 from deworldsg_ros.scene.array_file import read_arrays, write_arrays
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
@@ -24,6 +25,7 @@ from deworldsg_ros.scene.frame_graph import LocalGraph
 MAX_VIEWS = 128
 # A view differs from another one if the camera has moved so far, or turned so far.
 MOVED_M, TURNED_RAD = 0.25, math.radians(15.0)
+LEAST_TRACE = 1.0 + 2.0 * math.cos(TURNED_RAD)
 # A point is free if the image shows something at least so far behind it, and occupied if it shows
 # something as near to it. Noise of depth cameras and poses is below this.
 NEAR_M, NEAR_FRACTION = 0.08, 0.03
@@ -118,11 +120,22 @@ class SeenSpace:
         self.stamps_ns = stamps_ns
 
     def _has(self, pose: Float64) -> bool:
-        moved_m = np.linalg.norm(self.poses[:, :3, 3] - pose[:3, 3], axis=1)
+        return _has_like(self.poses, np.ascontiguousarray(pose))
+
+
+@kernel
+def _has_like(poses: Float64, pose: Float64) -> bool:
+    """Whether a pose (4, 4) differs little from one of some others."""
+    for known in poses[::-1]:  # the newest is most like it
+        squared_m2 = trace = 0.0
+        for i in range(3):
+            squared_m2 += (known[i, 3] - pose[i, 3]) ** 2
+            for j in range(3):
+                trace += known[i, j] * pose[i, j]
         # The trace of the rotation between both is 1 + 2 cos(angle).
-        traces = np.einsum("kij,ij->k", self.poses[:, :3, :3], pose[:3, :3])
-        turned = traces < 1.0 + 2.0 * math.cos(TURNED_RAD)
-        return bool(((moved_m < MOVED_M) & ~turned).any())
+        if math.sqrt(squared_m2) < MOVED_M and trace >= LEAST_TRACE:
+            return True
+    return False
 
 
 def space_path(graph_path: Path) -> Path:

@@ -11,9 +11,3 @@ def softmax(logits: Float64) -> Float64:
     """The distributions of logits (..., C) float64; each sums to 1."""
     exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
     return np.asarray(exponentials / exponentials.sum(axis=-1, keepdims=True))
-
-
-def log_softmax(logits: Float64) -> Float64:
-    """The logarithm of `softmax`, exact for small probabilities, too."""
-    shifted = logits - logits.max(axis=-1, keepdims=True)
-    return np.asarray(shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True)))

@@ -14,7 +14,7 @@ from itertools import accumulate
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt32
+from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt32, UInt64
 
 # The constants of SplitMix64.
 _GOLDEN_GAMMA = np.uint64(0x9E3779B97F4A7C15)
@@ -28,7 +28,7 @@ NO_POINTS: Float32 = np.zeros((0, 3), np.float32)
 def add_points(
     points_world: Float32,
     counts: Int64,
-    rows: Sequence[int],
+    rows: Int64,
     point_sets: Sequence[Float32],
 ) -> Bool:
     """Add a set of points (k, 3) to each of n different samples; returns which changed, (n,).
@@ -46,10 +46,17 @@ def add_points(
     return _add(
         points_world.view(np.uint32),
         counts,
-        np.array(rows, np.int64),
+        rows,
         points.view(np.uint32),
         np.array([0, *accumulate(map(len, point_sets))]),
     )
+
+
+def add_flat(points_world: Float32, counts: Int64, points: Float32, lengths: Int64) -> None:
+    """As `add_points`, to all samples; the sets (m, 3) lie one after the other, of some lengths."""
+    rows, starts = np.arange(len(counts)), np.append(0, np.cumsum(lengths))
+    if points_world.size:
+        _add(points_world.view(np.uint32), counts, rows, points.view(np.uint32), starts)
 
 
 @kernel
@@ -67,16 +74,17 @@ def _hash(bits: UInt32) -> np.uint64:
 
 
 @kernel
-def _place(bits: UInt32, known: int, point_hash: np.uint64) -> int:
-    """Index of the first of the known points whose hash is not below a hash."""
-    low, high = 0, known
-    while low < high:
-        middle = (low + high) // 2
-        if _hash(bits[middle]) < point_hash:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def _sort(hashes: UInt64, points: Int64, count: int) -> None:
+    """Sort the first hashes, and their points with them (Shell sort)."""
+    gap = count // 2
+    while gap > 0:
+        for index in range(gap, count):
+            one, point, place = hashes[index], points[index], index
+            while place >= gap and hashes[place - gap] > one:
+                hashes[place], points[place] = hashes[place - gap], points[place - gap]
+                place -= gap
+            hashes[place], points[place] = one, point
+        gap //= 2
 
 
 @kernel
@@ -84,8 +92,8 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
     capacity = bits.shape[1]
     changed = np.zeros(len(rows), np.bool_)
     # The points that enter a sample, their hashes, and the known points that they come before.
-    entering, places = np.empty((2, len(new_bits)), np.int64)
-    hashes = np.empty(len(new_bits), np.uint64)
+    entering, places = np.empty(len(new_bits), np.int64), np.empty(len(new_bits), np.int64)
+    hashes, known_hashes = np.empty(len(new_bits), np.uint64), np.empty(capacity, np.uint64)
     for index in range(len(rows)):
         row = rows[index]
         known = counts[row]
@@ -97,19 +105,22 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
         # Most frames add nothing to a full sample.
         if count == 0:
             continue
-        order, fresh = np.argsort(hashes[:count]), 0
-        chosen = np.empty(count, np.int64)
-        for new in order:
-            place = _place(bits[row], known, hashes[new])
+        _sort(hashes, entering, count)
+        for place in range(known):
+            known_hashes[place] = _hash(bits[row, place])
+        place = fresh = 0
+        for new in range(count):
+            while place < known and known_hashes[place] < hashes[new]:
+                place += 1
             # Equal hashes mean equal points: with 64 bits, collisions within a node are negligible.
-            if place < known and _hash(bits[row, place]) == hashes[new]:
+            if place < known and known_hashes[place] == hashes[new]:
                 continue
-            if fresh and hashes[chosen[fresh - 1]] == hashes[new]:
+            if new and hashes[new - 1] == hashes[new]:
                 continue
-            chosen[fresh], places[fresh] = new, place
+            entering[fresh], places[fresh] = entering[new], place
             fresh += 1
         changed[index] = fresh > 0
-        _insert(bits[row], known, new_bits, entering[chosen[:fresh]], places)
+        _insert(bits[row], known, new_bits, entering[:fresh], places)
         counts[row] = min(capacity, known + fresh)
     return changed
 

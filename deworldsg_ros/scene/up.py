@@ -73,7 +73,7 @@ class UpEstimator:
         x_axis = T_world_camera[:3, 0]
         if self._count == 0:
             self._began_on_side = quarter_turns(T_world_camera[2, :3]) in (1, 3)
-        self._rows += np.outer(x_axis, x_axis)
+        self._rows += x_axis[:, None] * x_axis
         self._image_up -= T_world_camera[:3, 1]
         self._count += 1
 

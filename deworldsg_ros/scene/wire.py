@@ -32,9 +32,9 @@ from deworldsg_ros.scene.limits import (
 from deworldsg_ros.scene.names import checked_frame_id
 
 # A reader of version N reads N - 1 too. Version 2 of the graph added up, boxes, remainders, compact
-# surfaces and mutual edges.
+# surfaces and mutual edges; that of a local graph has compact surfaces.
 VERSION = 1
-VERSIONS = {"scene_graph": 2, "scene_graph_updates": 2}
+VERSIONS = {"local_graph": 2, "scene_graph": 2, "scene_graph_updates": 2}
 
 NonNegative = Annotated[int, msgspec.Meta(ge=0, le=MAX_INT)]
 Positive = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
@@ -51,6 +51,7 @@ Matrix3 = Annotated[
 Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Point = Annotated[list[Coordinate], msgspec.Meta(min_length=3, max_length=3)]
 Points = Annotated[list[Point], msgspec.Meta(max_length=MAX_POINTS)]
+POINT_BYTES = 12
 Side = Annotated[int, msgspec.Meta(ge=1, le=MAX_SIDE_PX, description="pixels")]
 Pixel = Annotated[float, msgspec.Meta(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)]
 Focal = Annotated[float, msgspec.Meta(ge=-MAX_FOCAL_PX, le=MAX_FOCAL_PX)]
@@ -95,8 +96,7 @@ class Stamp(msgspec.Struct, frozen=True, gc=False):
 
 def stamp_from_ns(stamp_ns: int) -> Stamp:
     """Stamp of a time in nanoseconds."""
-    sec, nanosec = divmod(stamp_ns, 10**9)
-    return Stamp(sec=sec, nanosec=nanosec)
+    return Stamp(*divmod(stamp_ns, 10**9))
 
 
 def ns_from_stamp(stamp: Stamp) -> int:
@@ -163,7 +163,17 @@ class LiftedObject(msgspec.Struct):
     covariance_m2: Covariance
     depth_m: Annotated[float, msgspec.Meta(ge=0.0, le=MAX_COORDINATE_M)]
     pixel_count: Annotated[int, msgspec.Meta(ge=1, le=MAX_SIDE_PX**2)]
-    surface_points_m: Points
+    surface_points_m: Annotated[
+        Union[Points, msgspec.UnsetType], msgspec.Meta(description="of version 1")
+    ] = msgspec.UNSET
+    surface: Annotated[
+        bytes,
+        msgspec.Meta(
+            max_length=POINT_BYTES * MAX_POINTS,
+            description="points of the surface: x y z of each, float32 little-endian, metres, "
+            "base64; replaces surface_points_m",
+        ),
+    ] = b""
 
 
 class DepthGridState(msgspec.Struct, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 
 import msgspec
 
@@ -85,7 +86,7 @@ class Batch:
         for node in message.nodes:
             self._history.see(node, stamp_ns)
             self._nodes[node.id] = node
-        self._edges.update(((edge.subject, edge.object), edge) for edge in message.edges)
+        self._edges.update(zip(map(attrgetter("subject", "object"), message.edges), message.edges))
         self.head = Head(
             self.head.position,
             stamp_ns,

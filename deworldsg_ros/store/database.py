@@ -8,9 +8,10 @@ from __future__ import annotations
 import fcntl
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,7 @@ _HEAD = {"key": "INT64", "version": "INT64", "position": "INT64", "stamp_ns": "I
 
 # Values of the columns of a table, in their order.
 _Row = tuple[Any, ...]
+_edge_row: Callable[[wire.EdgeState], _Row] = attrgetter(*_ENDS, *_RELATION)
 
 
 @dataclass
@@ -202,9 +204,11 @@ class Database:
     def _copy(self, table: str, columns: Mapping[str, str], rows: Iterable[_Row]) -> None:
         """Load rows at once. Strings go as one list of parameters, and their numbers as a file."""
         names = _Numbers()
-        values = [list(column) for column in zip(*rows)]
-        if not values:
+        rows = list(rows)
+        if not rows:
             return
+        # Not `zip(*rows)`, which is slow with many arguments.
+        values = [list(map(itemgetter(number), rows)) for number in range(len(columns))]
         for number, kind in enumerate(columns.values()):
             if kind == "STRING":
                 values[number] = [names[text] for text in values[number]]
@@ -282,13 +286,6 @@ def _object_row(node: wire.NodeState) -> _Row:
     first, last = wire.ns_from_stamp(node.first_seen), wire.ns_from_stamp(node.last_seen)
     return (
         node.id, node.label, share * existence, *center, *size, node.observations, first, last
-    )  # fmt: skip
-
-
-def _edge_row(edge: wire.EdgeState) -> _Row:
-    return (
-        edge.subject, edge.object, edge.predicate, edge.probability, edge.provenance,
-        edge.observations,
     )  # fmt: skip
 
 

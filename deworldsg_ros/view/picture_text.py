@@ -16,6 +16,7 @@ from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.view.colours import QUIET, shade
 from deworldsg_ros.view.labelling import Placement, boxes_at, nearest_on_box, place, place_if_free
 from deworldsg_ros.view.top_view import BACKGROUND, FAINT, INK, Drawing
+from deworldsg_ros.words import counted
 
 # Side of a photo, and the line below it.
 PHOTO_IN, CAPTION_IN = 1.1, 0.3
@@ -90,7 +91,7 @@ def draw_frame(drawing: Drawing, strip_in: float = 0.0) -> None:
     pad = 0.25 / figure.get_figwidth()
     top, bottom = 1 - 0.27 / height_in, (0.27 + strip_in) / height_in
     graph = drawing.graph
-    title = f"{_counted(len(graph.nodes), 'object')}, {_counted(len(graph.edges), 'relation')}"
+    title = f"{counted(len(graph.nodes), 'object')}, {counted(len(graph.edges), 'relation')}"
     figure.text(pad, top, title, fontsize=12, fontweight="bold", color=INK, va="center")
     note = "seen from above"
     if any(edge.predicate in QUIET for edge in graph.edges):
@@ -125,10 +126,6 @@ def draw_photos(drawing: Drawing, photos: Mapping[int, UInt8]) -> None:
         middle = left + PHOTO_IN / 2 / width_in
         style: dict[str, Any] = {"fontsize": 8, "color": INK, "ha": "center", "va": "center"}
         figure.text(middle, CAPTION_IN / 2 / height_in, text, **style)
-
-
-def _counted(number: int, word: str) -> str:
-    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def _draw_scale(drawing: Drawing, pad: float, bottom: float) -> None:

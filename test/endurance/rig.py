@@ -12,6 +12,7 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from support.nodes import ROOT, Camera, NodeProcess, Peer
 
+from deworldsg_ros.cli.installation import dds_environment
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.recordings.source import RawRoleMessage
@@ -44,6 +45,8 @@ class Rig:
     """
 
     def __init__(self, folder: Path) -> None:
+        # A domain of its own, and shared memory for images, also outside of pytest.
+        os.environ.update(dds_environment())
         self._folder = folder
         self.map_path = folder / "room.map"
         self.peer = Peer("endurance")

@@ -268,7 +268,7 @@ def test_the_fate_of_a_node_is_counted_once_and_only_after_a_clear_miss() -> Non
     records = records_of(3)
     records.rows["missed_since"][:3] = 0.0, 2.0, 0.0
     for _ in range(2):
-        existence.settle(records.rows, records.fates, [0, 1, 2], np.array([0.95, 0.05, 0.05]))
+        existence.settle(records.rows, records.fates, np.arange(3), np.array([0.95, 0.05, 0.05]))
         assert records.fates.tolist() == [11, 11]
 
 

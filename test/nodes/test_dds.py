@@ -19,6 +19,7 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.ros.health import LISTENERS
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.extent import surface_points
@@ -40,6 +41,15 @@ def recording_path(root_dir: Path, request: pytest.FixtureRequest) -> Path:
     return request.getfixturevalue("shared_dir") / "data" / "redkitchen"
 
 
+# Listeners of the topics between the nodes; the test listens to the evidence, too.
+BETWEEN = {
+    "/deworldsg/frame_graph": 1,
+    "/deworldsg/instances": 1,
+    "/deworldsg/local_graph": 2,
+    "/deworldsg/relation_evidence": 2,
+}
+
+
 @dataclass
 class Run:
     """The output of four nodes for the first frames of a recording."""
@@ -55,6 +65,16 @@ class Run:
     def watch_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self.diagnostics[status.name.split(":")[0]] = status
+
+    def are_nodes_connected(self) -> bool:
+        """Whether all listeners of the topics between the nodes are connected."""
+        told = {
+            value.key: int(value.value)
+            for status in self.diagnostics.values()
+            for value in status.values
+            if value.key.startswith(LISTENERS)
+        }
+        return all(told.get(f"{LISTENERS}{topic}", 0) >= n for topic, n in BETWEEN.items())
 
     def latest(self) -> wire.SceneGraphMessage:
         return wire.decode(self.graphs[-1], wire.SceneGraphMessage)
@@ -98,6 +118,7 @@ def run(tmp_path_factory: pytest.TempPathFactory, recording_path: Path) -> Itera
             )
             camera = Camera(me, messages)
             camera.wait_for_subscribers()
+            me.spin_until(result.are_nodes_connected, LIMIT_S, "the nodes to connect")
             for count, _ in enumerate(camera.frames(), 1):
                 # Nodes that fall behind drop frames: one at a time, and the next for its pose.
                 me.spin_until(lambda n=count: len(result.evidence) >= n - 1, LIMIT_S, "evidence")

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 from support.failing_backend import Backend
@@ -17,8 +22,9 @@ from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.perception import Perception
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.ros import models, perceiving, relating
-from deworldsg_ros.ros.health import WARN
+from deworldsg_ros.ros.health import ERROR, WARN
 from deworldsg_ros.ros.models import Faults, parse_faults
+from deworldsg_ros.ros.process import EXIT_HUNG, RESPAWN_VARIABLE
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -98,6 +104,82 @@ def test_a_segmenter_that_hangs_gives_frames_without_objects(segmentation: MakeB
     at.peer.spin_for(HANG_S)
     assert objects_after(at, texts) > 0
     assert not warns(at, "the segmenter")
+
+
+def test_a_detector_that_never_returns_is_an_error(segmentation: MakeBench) -> None:
+    at = segmentation("detector:hang:1e9")
+    at.refuses("detector_error", lambda: send_frame(at))
+    at.expect(lambda: bool(at.node.hung()), "a hung detector")
+    assert re.search(r"the detector \(Backend\) has given no result for \d+ s", at.node.hung())
+    statuses: list[DiagnosticArray] = []
+    at.peer.node.create_subscription(DiagnosticArray, "/diagnostics", statuses.append, 10)
+    at.expect(lambda: bool(statuses), "diagnostics")
+    assert ord(statuses[-1].status[0].level) == ERROR
+    assert "the detector (Backend)" in statuses[-1].status[0].message
+
+
+STUCK = """
+import sys, threading
+from deworldsg_ros.ros.node import StageNode, run
+
+class Stuck(StageNode):
+    def __init__(self):
+        super().__init__("stuck_node", "frames")
+        threading.Thread(target=threading.Event().wait).start()  # not even a daemon
+
+    def hung(self):
+        return "the detector never returns"
+
+sys.exit(run(Stuck))
+"""
+
+
+@pytest.mark.parametrize("respawn", ["true", "false"])
+def test_a_node_with_a_hung_model_ends_if_it_is_started_again(respawn: str) -> None:
+    environment = {**os.environ, RESPAWN_VARIABLE: respawn}
+    with subprocess.Popen(
+        [sys.executable, "-c", STUCK], env=environment, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            lines = iter(process.stderr.readline, "")
+            assert any("the detector never returns" in line for line in lines)
+            if respawn == "true":
+                assert "error: the detector never returns\n" in lines
+                assert process.wait(20) == EXIT_HUNG
+            else:
+                with pytest.raises(subprocess.TimeoutExpired):
+                    process.wait(3)
+        finally:
+            process.kill()
+
+
+HOLDS_THE_LOCK = """
+import ctypes, sys
+from deworldsg_ros.ros import node
+
+class Holds(node.StageNode):
+    def __init__(self):
+        super().__init__("holding_node", "frames")
+        # PyDLL keeps the interpreter's lock, unlike CDLL.
+        self.every(2.0, lambda: ctypes.PyDLL(None).sleep(1000))
+
+node.STUCK_S = 3.0
+sys.exit(node.run(Holds))
+"""
+
+
+def test_a_node_whose_model_holds_the_interpreter_ends_if_it_is_started_again() -> None:
+    environment = {**os.environ, RESPAWN_VARIABLE: "true"}
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDS_THE_LOCK], env=environment, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            _, errors = process.communicate(timeout=30)
+            assert process.returncode == 1
+            assert "Timeout" in errors
+            assert "in <lambda>" in errors
+        finally:
+            process.kill()
 
 
 def test_a_lost_detector_is_loaded_again_on_the_cpu(segmentation: MakeBench) -> None:

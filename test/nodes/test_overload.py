@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -35,7 +35,7 @@ from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.ros import perceiving, relating
 from deworldsg_ros.ros.graph_keeper import QUEUE_JOBS
 from deworldsg_ros.ros.health import received_in
-from deworldsg_ros.ros.joining import COLLECT_PERIOD_S
+from deworldsg_ros.ros.joining import COLLECT_PERIOD_S, MAX_BUSY_S
 from deworldsg_ros.ros.node import serve
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.ros.waiting import Waiting
@@ -153,6 +153,42 @@ def test_one_process_builds_and_publishes_the_graph(whole: Bench) -> None:
     for text in updates:
         assert wire.decode(text, wire.SceneGraphUpdateMessage).associations
     assert whole.node.health.drops == {}
+
+
+def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(
+    whole: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes all images that wait in DDS at once: a frame is not old when its turn comes."""
+    begin, begun = threading.Event(), list[int]()
+    perceive = whole.node._perception.perceive
+
+    def wait(frame: Any) -> Any:
+        begun.append(frame.stamp_ns)
+        assert begin.wait(4 * LIMIT_S)
+        return perceive(frame)
+
+    monkeypatch.setattr(whole.node._perception, "perceive", wait)
+    waiting = Waiting(whole.node, whole._executor)
+    whole.peer.also_spin.clear()
+
+    def serve_until(condition: Callable[[], bool]) -> None:
+        end_s = time.monotonic() + LIMIT_S
+        while not condition():
+            assert time.monotonic() < end_s
+            serve(whole.node, waiting)
+
+    send_frame(whole)
+    serve_until(lambda: len(begun) == 1)
+    worker = whole.node._worker
+    for _ in range(3):
+        send_frame(whole)
+    time.sleep(2 * MAX_BUSY_S)  # DDS has them all
+    serve_until(lambda: worker.waiting > 0)
+    assert worker.waiting == 3
+    begin.set()
+    serve_until(lambda: len(begun) == 2)
+    assert begun[1] == whole.stamp_ns
+    assert whole.node.health.drops == {"overrun": 2}
 
 
 def test_messages_that_no_frame_waits_for_are_taken_together() -> None:

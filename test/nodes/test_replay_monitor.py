@@ -13,7 +13,7 @@ from deworldsg_ros.nodes.replay_monitor import (
     BETWEEN,
     EVIDENCE_QUIET_S,
     FIRST_RESULT_S,
-    LISTENERS,
+    LISTENERS_OF_INPUTS,
     SETTLE_S,
     WINDOW_FRAMES,
     PipelineMonitor,
@@ -58,7 +58,7 @@ def monitor_with_full_window(first_ns=1):
 def fill(monitor, first_ns):
     for stamp_ns in range(first_ns, first_ns + WINDOW_FRAMES):
         monitor.window.publish(stamp_ns)
-        for role in LISTENERS:
+        for role in LISTENERS_OF_INPUTS:
             monitor.window.passed(role, stamp_ns)
     assert monitor.window.is_full
 
@@ -123,6 +123,30 @@ def diagnostics(monitor, name, **values):
         KeyValue(key=key.replace("__", " "), value=value) for key, value in values.items()
     ]
     monitor._on_diagnostics(DiagnosticArray(status=[status]))
+
+
+def test_a_replay_starts_when_the_nodes_have_told_that_they_are_connected():
+    node = FakeNode()
+    node.get_namespace.return_value = "/"
+    monitor = PipelineMonitor(node, odometry=False)
+    for topic, (publishers, listeners) in BETWEEN.items():
+        first = monitor.connections.missing({}, 100.0)[0]
+        assert first == f"{min(publishers)} to connect to the listeners of {topic}"
+        told = {f"listeners__of__{topic}": str(len(listeners))}
+        for name in publishers:
+            known = {key.replace(" ", "__"): text for key, text in
+                     monitor.diagnostics.get(name, {}).items()}  # fmt: skip
+            diagnostics(monitor, name, **known, **told)
+    assert monitor.connections.missing({}, 100.0) == []
+    node.gone = ("lifting_node",)
+    assert monitor.connections.missing({}, 100.1) != []
+
+
+def test_nodes_that_tell_nothing_are_given_time_to_connect():
+    monitor = PipelineMonitor(FakeNode(), odometry=False)
+    assert monitor.connections.missing({}, 100.0) != []
+    assert monitor.connections.missing({}, 99.9 + SETTLE_S) != []
+    assert monitor.connections.missing({}, 100.0 + SETTLE_S) == []
 
 
 def test_counts_of_a_restarted_node_begin_again():

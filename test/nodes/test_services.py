@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -23,6 +24,7 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraphClient
 from deworldsg_ros.client.tools import EditTools
+from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.ros.options import Parameters
@@ -128,6 +130,28 @@ def test_load_and_clear_begin_a_new_session(robot: Robot, tmp_path: Path) -> Non
             robot.ask(lambda: client.load(str(tmp_path / "a.json")))
         assert labels(client) == {1: "cup", 2: "table"}
         assert robot.refusals() == 1
+
+
+def test_the_graph_before_stays_until_a_loaded_map_is_prepared(
+    robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graphs = robot.bench.peer.collect("scene_graph")
+    with SceneGraphClient() as client:
+        robot.ask(lambda: client.wait(1, LIMIT_S))
+        robot.ask(client.save)
+        copy = tmp_path / "copy.map"
+        copy.write_bytes((tmp_path / "a.map").read_bytes())
+        robot.see(3)  # so that a whole graph is to be published when the map is loaded
+        update, ready_s = GraphBuilder.update, time.monotonic() + 2.0
+        monkeypatch.setattr(
+            GraphBuilder, "update", lambda it: update(it) if time.monotonic() > ready_s else None
+        )
+        robot.ask(lambda: client.load(str(copy)))
+        robot.bench.expect(lambda: time.monotonic() > ready_s, "the end of the preparation")
+        before = len(graphs)
+        robot.see()
+        robot.bench.expect(lambda: len(graphs) > before, "the map")
+    assert all(json.loads(text)["nodes"] for text in graphs)
 
 
 def test_questions_are_answered_and_the_goal_is_published(robot: Robot) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from bench import results
 from bench.__main__ import main, run_all
 from bench.entries import ENTRIES, Entry
 from bench.figures import Figure, Setup, in_turn
@@ -93,3 +94,44 @@ def test_the_page_of_figures_shows_every_figure_and_what_was_not_measured() -> N
     text = page(report)
     assert "| `fast` |  | 2 ms ✓ | ≤ 2.5 ms |" in text
     assert "Not measured: OSError: gone" in text
+
+
+def test_the_tables_of_results_come_from_their_runs(root_dir: Path) -> None:
+    """A table without a run stays, and so does the text around the tables."""
+    text = (
+        "A\n<!-- table: methods -->\nold\n<!-- end -->\nB\n<!-- table: poses -->\nold\n<!-- end -->"
+    )
+    row = {name: 0.5 for _, name, _, _ in results.COLUMNS} | {"name": "fross", "failed": {}}
+    reports = {
+        "rooms": {"rows": [row]},
+        "rooms_flip": {"rows": [row | {"complete_edge_precision": None}]},
+    }
+    made = results.page(text, reports, "abc")
+    assert made.startswith(
+        "A\n<!-- table: methods -->\n```\n# commit abc\ndeworldsg evaluate table main"
+    )
+    assert "| a tenth of the labels is wrong | FROSS | 50.0 | 50.0 |" in made
+    assert "| 0 | – | 50.0 |" in made
+    assert made.endswith("<!-- end -->\nB\n<!-- table: poses -->\nold\n<!-- end -->")
+    assert results.page(made, reports, "abc") == made
+    places = results.PLACE.findall(results.PAGE.read_text(encoding="utf-8"))
+    assert set(places) <= set(results.TABLES)
+    assert {name for runs in results.TABLES.values() for name in runs} == set(results.RUNS)
+
+
+def test_a_failed_scan_and_other_code_make_no_table(tmp_path: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(SystemExit, match="FROSS: .*no depth"):
+        results.cells_of({"title": "FROSS", "failed": {"rooms_0": "no depth"}})
+    (tmp_path / "commit").write_text("HEAD")
+    monkeypatch.setattr(results, "git", lambda *words: " deworldsg_ros/config.py | 2 +-")
+    with pytest.raises(SystemExit, match="config.py"):
+        results.run(tmp_path, {}, 1)
+
+
+def test_predicates_are_summed_over_the_scans() -> None:
+    on = dict(zip(results.SUMS, (4, 3, 2, 1)))
+    scans = [{"measures": {"edges_by_predicate": {"on": on}}}] * 2
+    report = {"rows": [{"name": "default", "scans": scans}]}
+    lines = results.predicates({"rooms_boxes": report, "simulated_boxes": report})
+    assert "| on | 8 | 75.0 | 4 | 50.0 | 8 | 75.0 | 4 | 50.0 |" in lines
+    assert "| in | 0 | – | 0 | – | 0 | – | 0 | – |" in lines

@@ -15,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from deworldsg_ros.ros.process import RESPAWN_VARIABLE
+
 
 class Kept:
     """Test double of a class of launch: it keeps its arguments."""
@@ -90,6 +92,19 @@ def test_every_node_has_the_parameter_file_and_the_remappings(
         }
 
 
+def test_a_node_knows_whether_it_is_started_again(
+    root_dir: Path, launch_classes: dict[str, type[Kept]]
+) -> None:
+    path = root_dir / "launch" / "deworldsg.launch.py"
+    for node in describe(path, launch_classes, "Node"):
+        assert node.kwargs["respawn"].args == ("respawn",)
+    variables = {
+        entity.args[0]: entity.args[1]
+        for entity in describe(path, launch_classes, "SetEnvironmentVariable")
+    }
+    assert variables[RESPAWN_VARIABLE].args == ("respawn",)
+
+
 def test_every_launch_configuration_is_a_declared_argument(
     root_dir: Path, launch_classes: dict[str, type[Kept]]
 ) -> None:
@@ -98,7 +113,7 @@ def test_every_launch_configuration_is_a_declared_argument(
         entity.args[0] for entity in describe(path, launch_classes, "DeclareLaunchArgument")
     }
     assert declared == {
-        *("params_file", "use_sim_time", "namespace", "odometry", "one_process"),
+        *("params_file", "use_sim_time", "namespace", "odometry", "one_process", "respawn"),
         *("rgb", "camera_info", "depth", "pose"),
     }
 

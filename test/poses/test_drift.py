@@ -107,7 +107,7 @@ def test_a_single_plane_is_no_reason_to_slide() -> None:
     surfels, T = SurfelMap(), np.eye(4)
     for _ in range(3):
         surfels.register(T, depth_of(T, wall))
-        surfels.add(T, depth_of(T, wall))
+        surfels.add(T)
     fitted = surfels.register(pose((0, 0, 2), (0.05, 0.03, 0.04)), depth_of(T, wall))
     assert fitted is not None
     assert fitted[:2, 3] == pytest.approx((0.05, 0.03), abs=0.01)
@@ -134,13 +134,13 @@ def test_the_map_is_bounded_and_forgets_surfaces_that_are_gone() -> None:
         there = pose(shift_m=(0, 0, step))
         planes = [*ROOM[:2], ((0, 0, 1), 3.0 + step), *ROOM[3:]]
         surfels.register(there, depth_of(there, planes))
-        surfels.add(there, depth_of(there, planes))
+        surfels.add(there)
     assert 0 < surfels._count <= MAX_SURFELS
     near, far = [((0, 0, 1), 1.0)], [((0, 0, 1), 3.0)]
     surfels = SurfelMap()
     for planes in [near] * 3 + [far] * 12:
         surfels.register(T, depth_of(T, planes))
-        surfels.add(T, depth_of(T, planes))
+        surfels.add(T)
     assert surfels._rows[: surfels._count, 2].min() > 2.8
 
 

@@ -27,19 +27,17 @@ from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations.edge_beliefs import (
-    DECIMALS,
-    MAX_DISTANCE_M,
-    MIN_PROBABILITY,
-    EdgeBeliefs,
-)
+from deworldsg_ros.relations import edge_beliefs
+from deworldsg_ros.relations.edge_beliefs import MAX_DISTANCE_M, EdgeBeliefs
 from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
+from deworldsg_ros.relations.naming import DECIMALS, MIN_PROBABILITY
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.predicted_prior import PredictedPrior
 from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.relations.robust_beliefs import RobustBeliefs, fuse_prior
-from deworldsg_ros.scene import wire
+from deworldsg_ros.scene import publication, wire
+from deworldsg_ros.scene.edges import ends_of
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Relations
 from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.scene.votes import frame_votes
@@ -73,7 +71,11 @@ def beliefs_of(builder: GraphBuilder, of: Config) -> dict[tuple[int, int], np.nd
         prior = PredictedPrior(builder.graph.vocabulary)
         prior.follow(table, table.changed_pairs)
     found = RobustBeliefs(of, builder.graph, table).refresh(prior)
-    return dict(zip(found.pairs, found.probabilities))
+    return {
+        pair[::step]: found.probabilities[index, end]
+        for index, pair in enumerate(map(ends_of, found.pairs))
+        for end, step in ((0, 1), (1, -1))
+    }
 
 
 def edges_of(builder: GraphBuilder) -> dict[tuple[int, int], wire.EdgeState]:
@@ -270,7 +272,7 @@ def test_the_paper_does_not_count_votes(world_model: str) -> None:
     def told(votes: bool) -> list[wire.EdgeState]:
         builder, ids = room(DINNER, config(world_model=world_model, edge_belief="paper"))
         builder.graph.add_visual(ids["cup"], ids["table"], np.eye(WIDTH)[30] * 4.0, 1)
-        builder.graph.add_neighbour(ids["bowl"], ids["table"], 1)
+        builder.graph.add_neighbours([(ids["bowl"], ids["table"])], 1)
         if votes:
             vote_at_random(builder, np.random.default_rng(0))
         return builder.full().edges
@@ -283,7 +285,7 @@ def test_the_paper_completes_neighbours_with_the_prior_of_the_physical_model() -
     builder, ids = room(DESK, config(edge_belief="paper"))
     assert builder.full().edges == []
     for pair in ((ids["cup"], ids["table"]), (ids["table"], ids["cup"])):
-        builder.graph.add_neighbour(*pair, 1)
+        builder.graph.add_neighbours([pair], 1)
     # The physical model says nothing of the table on the cup: there is no prior of that direction.
     (edge,) = builder.full().edges
     assert (edge.subject, edge.object) == (ids["cup"], ids["table"])
@@ -302,7 +304,7 @@ def test_the_paper_states_both_directions_of_a_pair(seen: tuple[str, ...]) -> No
     prediction[PREDICATES.index("on")] += 0.5
     builder.prior.update(np.array([ends, ends[::-1]]), np.stack([prediction] * 2))
     for subject, pair in pairs.items():
-        builder.graph.add_neighbour(*pair, 1)
+        builder.graph.add_neighbours([pair], 1)
         if subject in seen:
             builder.graph.add_visual(*pair, np.zeros(WIDTH), 1)
     edges = {(edge.subject, edge.object): edge for edge in builder.full().edges}
@@ -539,6 +541,29 @@ def _moved(item: Thing, x: float) -> Thing:
         return (corner[0] + x, corner[1], corner[2])
 
     return Thing(item.label, [type(part)(*map(shift, part)) for part in item.parts])
+
+
+def test_a_large_graph_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first update has all of it, as if it had been prepared at once."""
+    things = {
+        f"{row} {column}": thing("cup", 0.25 * row, 0.25 * column, 0.74, 0.09, 0.09, 0.1)
+        for row in range(4)
+        for column in range(4)
+    }
+    things["table"] = table(0.4, 0.4, 1.2, 1.2)
+    at_once = room(things, config())[0].update()
+    for module in (publication, edge_beliefs):
+        monkeypatch.setattr(module, "NEW_A_CALL", 3)
+    builder, ids = room(things, config())
+    calls = 0
+    while (update := builder.update()) is None:
+        assert builder.waiting and builder.snapshot().nodes == []
+        calls += 1
+    assert 6 < calls < 60  # 17 nodes; then their pairs
+    assert update == at_once and len(update.nodes) == 17 and len(update.edges) == 16
+    assert builder.waiting == 0 and builder.update() is None
+    builder.graph.remove_node(ids["table"])
+    assert len(builder.update().removed_edges) == 16
 
 
 def test_many_changes_are_told_in_several_updates() -> None:

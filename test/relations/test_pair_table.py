@@ -26,7 +26,6 @@ from support.room_nodes import (
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations.pair_geometry import NodeShapes
-from deworldsg_ros.relations.pair_rows import key
 from deworldsg_ros.relations.pair_table import (
     FLOOR_QUANTILE,
     FLOOR_STEP_M,
@@ -44,6 +43,7 @@ from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.predicted_prior import MIN_RELATED, PredictedPrior
 from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS
 from deworldsg_ros.relations.vote_model import relation_counts
+from deworldsg_ros.scene.edges import key
 from deworldsg_ros.scene.graph import SceneGraph
 
 seeds = st.integers(0, 10_000)

@@ -23,6 +23,7 @@ from deworldsg_ros.relations.physics_model import (
     PairInputs,
     PhysicsModel,
     believed_logits,
+    floor_odds,
     load_physics_model,
 )
 from deworldsg_ros.relations.world_model import build_world_model, world_model_names
@@ -145,12 +146,23 @@ def test_the_states_of_a_swapped_pair_are_swapped(seed: int) -> None:
     np.testing.assert_array_equal(other[:, 2::2], one[:, 1::2])
 
 
+def odds_of(bottoms_m: np.ndarray, points: int = 9) -> np.ndarray:
+    """Odds that objects of 0.8 m with these bottoms stand on a floor at 1 m."""
+    low = np.column_stack([np.zeros((len(bottoms_m), 2)), bottoms_m]) + 1.0
+    high, counts = low + 0.8, np.full(len(low), points)
+    return floor_odds(np.arange(len(low)), low, high, counts, 1.0, MODEL.floor)
+
+
 def test_what_stands_on_the_floor() -> None:
     bottoms = np.array([0.0, 0.03, 0.2, 0.74, 1.5])
-    logits = MODEL.floor_logits(bottoms, np.full(5, 0.8))
-    assert (np.diff(logits) < 0).all() and logits[0] > 0 > logits[3]
-    np.testing.assert_array_equal(MODEL.floor_logits(-bottoms, np.full(5, 0.8)), logits)
-    assert MODEL.floor_logits(np.zeros(0), np.zeros(0)).shape == (0,)
+    odds = odds_of(bottoms)
+    assert (np.diff(odds) < 0).all() and odds[0] > 1.0 > odds[3]
+    offset, by_bottom, by_height = MODEL.floor
+    logits = offset + by_bottom * bottoms + by_height * np.log(0.81)
+    np.testing.assert_allclose(odds, np.exp(np.clip(logits, -20, 20)), rtol=1e-12)
+    np.testing.assert_array_equal(odds_of(-bottoms), odds)
+    assert odds_of(np.zeros(0)).shape == (0,)
+    assert (odds_of(bottoms, points=0) == 0).all()
 
 
 # --- inputs --------------------------------------------------------------------------------------

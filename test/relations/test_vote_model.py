@@ -23,6 +23,7 @@ from deworldsg_ros.relations.physical_states import (
 from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.vote_model import (
     VoteScales,
+    most_other_votes,
     near_logits,
     relation_counts,
     vote_logits,
@@ -38,6 +39,13 @@ def evidence_of(votes: float, frames: float, scales: VoteScales = SCALES) -> flo
         return 0.0
     told = math.log((votes / frames + scales.floor) / (scales.even + scales.floor))
     return frames / (frames + scales.n_half) * scales.slope * told
+
+
+def evidence_on_near(fractions: np.ndarray, frames: np.ndarray, scales: VoteScales) -> np.ndarray:
+    """Evidence of these fractions of votes, by the relation whose evidence has no other part."""
+    counts = np.zeros((len(frames), 2, NONE))
+    counts[:, :, NEAR] = (fractions * frames)[:, None]
+    return near_logits(counts, frames, scales)
 
 
 def random_counts(seed: int, count: int = 4) -> tuple[np.ndarray, np.ndarray]:
@@ -71,9 +79,10 @@ def test_the_evidence_is_that_of_the_formula(seed: int) -> None:
 def test_it_grows_with_the_fraction_and_is_0_at_even(scales: VoteScales) -> None:
     fractions = np.linspace(0, 1, 21)
     for frames in (1.0, 5.0, 100.0):
-        values = scales.evidence(fractions * frames, np.full(21, frames))
+        values = evidence_on_near(fractions, np.full(21, frames), scales)
         assert (np.diff(values) > 0).all()
-        assert scales.evidence(np.array(scales.even * frames), np.array(frames)) == pytest.approx(0)
+        even = evidence_on_near(np.array([scales.even]), np.array([frames]), scales)
+        assert even == pytest.approx(0)
         assert values[0] < 0 < values[-1]
 
 
@@ -81,10 +90,10 @@ def test_it_grows_with_the_fraction_and_is_0_at_even(scales: VoteScales) -> None
 @pytest.mark.parametrize("fraction", [0.0, 0.9])
 def test_it_saturates_with_the_frames(scales: VoteScales, fraction: float) -> None:
     frames = np.array([1.0, 2, 4, 8, 1000, 1e6])
-    values = np.abs(scales.evidence(fraction * frames, frames))
+    values = np.abs(evidence_on_near(np.full(6, fraction), frames, scales))
     assert (np.diff(values) > 0).all()
     assert values[-1] - values[-2] < 0.01 * values[-1]
-    half = scales.evidence(np.array(fraction * scales.n_half), np.array(scales.n_half))
+    (half,) = evidence_on_near(np.array([fraction]), np.array([scales.n_half]), scales)
     assert abs(half) == pytest.approx(values[-1] / 2, rel=1e-3)
 
 
@@ -136,3 +145,12 @@ def test_votes_are_summed_by_relation(count: int) -> None:
     np.testing.assert_allclose(counts[:, NEAR], votes[:, 3] + votes[:, 4])
     np.testing.assert_allclose(counts[:, UNDER], votes[:, 5])
     np.testing.assert_allclose(counts.sum(), votes.sum() - votes[:, 2].sum())
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_votes_beyond_the_relations(count: int) -> None:
+    votes = np.random.default_rng(count).uniform(0, 5, (count, 2, 6))
+    relation_of = np.array([ON, -1, NEAR, -1, -1, ABOVE])
+    most = most_other_votes(votes, relation_of)
+    np.testing.assert_array_equal(most, votes[:, :, relation_of < 0].max(axis=(1, 2), initial=0))
+    assert (most_other_votes(votes, np.full(6, ON)) == 0).all()

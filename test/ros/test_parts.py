@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -80,6 +81,31 @@ def test_a_worker_keeps_the_order_and_drops_the_oldest() -> None:
     begin.set()
     assert worker.wait_idle(10)
     assert done == [0, 3, 4, 5]
+    assert worker.stop(10)
+
+
+def test_a_worker_that_does_not_keep_up_takes_the_newest() -> None:
+    """One that had a pause processes all."""
+    begin, done, overruns = threading.Event(), [], []
+
+    def work(item: int) -> None:
+        assert begin.wait(10)
+        done.append(item)
+
+    worker: Worker[int] = Worker("test", work, size=9, on_overrun=overruns.append, max_busy_s=0.2)
+    worker.submit(0)
+    while worker.waiting:  # taken by the thread
+        time.sleep(0.001)
+    for item in range(1, 5):
+        worker.submit(item)
+    time.sleep(0.3)
+    begin.set()
+    assert worker.wait_idle(10)
+    assert (done, overruns) == ([0, 4], [1, 2, 3])
+    for item in range(5, 9):
+        worker.submit(item)
+    assert worker.wait_idle(10)
+    assert (done, overruns) == ([0, 4, 5, 6, 7, 8], [1, 2, 3])
     assert worker.stop(10)
 
 

@@ -24,7 +24,8 @@ def delays_s(arrivals_s: list[float], *, evidence_after_s: float | None = None) 
         due_s = 0.0
         while (wait_s := times.wait_s(due_s)) is not None and due_s + wait_s <= end_s:
             due_s += wait_s
-            times.published(due_s)
+            times.taken()
+            times.book(due_s)
             delays.extend(due_s - at_s for at_s in waiting)
             waiting.clear()
 
@@ -58,7 +59,8 @@ def test_evidence_alone_is_published_soon() -> None:
     times = UpdateTimes(RATE_HZ)
     times.changed(1.0, 1.0)
     assert times.wait_s(1.0) == 0.0
-    assert times.published(1.0) == 1.0
+    assert times.taken() == 1.0
+    times.book(1.0)
     times.changed(1.01, 1.01, can_wait=True)
     wait_s = times.wait_s(1.01)
     assert wait_s is not None
@@ -71,6 +73,17 @@ def test_the_mean_rate_is_limited() -> None:
     for now_s in np.arange(0, 10, 0.001):
         times.changed(now_s, now_s)
         if times.wait_s(now_s) == 0.0:
-            times.published(now_s)
+            times.taken()
+            times.book(now_s)
             published += 1
     assert 10 * RATE_HZ * 0.95 < published <= 10 * RATE_HZ * RATE_SLACK + 2
+
+
+def test_what_is_not_published_takes_no_place() -> None:
+    times = UpdateTimes(RATE_HZ)
+    times.book(1.0)
+    for part in range(100):
+        now_s = 1.0 + 0.001 * part
+        times.changed(now_s, now_s)
+        assert times.wait_s(now_s) == 0.0
+        times.taken()

@@ -11,9 +11,11 @@ from support.merging import random_covariances, random_pose, seeds
 from deworldsg_ros.scene.gaussian import (
     bhattacharyya_distance,
     eigenvalue_bound,
+    eigenvalue_bounds,
     fuse,
     hellinger_distance,
     log_determinant,
+    log_determinants,
     transform,
 )
 
@@ -143,6 +145,14 @@ def test_log_determinant_and_eigenvalue_bound(seed: int) -> None:
     assert largest * (1 - 1e-12) <= eigenvalue_bound(covariance) <= 1.7321 * largest
 
 
+@given(seeds)
+def test_many_covariances_give_the_same_bits_as_each(seed: int) -> None:
+    many = random_covariances(np.random.default_rng(seed), 20, 1e-4, 10.0)
+    assert log_determinants(many).tolist() == [log_determinant(one) for one in many]
+    assert eigenvalue_bounds(many).tolist() == [eigenvalue_bound(one) for one in many]
+    assert not log_determinants(many[:0]).size and not eigenvalue_bounds(many[:0]).size
+
+
 @pytest.mark.parametrize(
     "covariance",
     [
@@ -156,3 +166,5 @@ def test_log_determinant_and_eigenvalue_bound(seed: int) -> None:
 def test_only_positive_definite_covariances_have_a_log_determinant(covariance: np.ndarray) -> None:
     with pytest.raises(ValueError, match="not positive definite"):
         log_determinant(covariance)
+    with pytest.raises(ValueError, match="not positive definite"):
+        log_determinants(np.stack([np.eye(3), covariance]))

@@ -17,6 +17,7 @@ from support.merging import (
 )
 
 from deworldsg_ros.scene import graph_io, wire
+from deworldsg_ros.scene.edges import EdgeMap
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
@@ -131,9 +132,9 @@ def test_a_merge_moves_edges_and_sums_their_evidence() -> None:
     graph.add_visual(1, 2, 8 * ones, 40)
     graph.add_visual(2, 1, 8 * ones, 40)
     graph.add_visual(3, 4, 16 * ones, 50)
-    graph.add_neighbour(1, 3, 60)
-    graph.add_neighbour(2, 3, 15)
-    graph.add_neighbour(2, 4, 70)
+    graph.add_neighbours([(1, 3)], 60)
+    graph.add_neighbours([(2, 3)], 15)
+    graph.add_neighbours([(2, 4)], 70)
     assert graph.merge_nodes(2, 1) == 1
     found = {
         pair: (edge.visual_logits[0], edge.frames, edge.neighbour_frames, edge.last_seen_ns)
@@ -147,6 +148,20 @@ def test_a_merge_moves_edges_and_sums_their_evidence() -> None:
     }
 
 
+def test_the_neighbours_of_a_frame_count_once_each() -> None:
+    graph = graph_of(3)
+    graph.add_visual(1, 2, np.ones(3), 30)
+    graph.take_changed_edges()
+    revision = graph.revision
+    graph.add_neighbours([(1, 2), (2, 1), (0, 3)], 20)
+    assert graph.take_changed_edges() == {(1, 2), (2, 1)}
+    graph.add_neighbours([(2, 1)], 40)
+    assert graph.revision == revision + 3
+    found = {pair: edge[1:] for pair, edge in graph.edges.items()}
+    assert found == {(1, 2): (1, 30, 1, revision + 1), (2, 1): (0, 40, 2, revision + 3)}
+    assert graph.edges[1, 2].visual_logits.tolist() == [1.0] * 3
+
+
 def test_evidence_for_removed_ids_reaches_their_successors() -> None:
     graph = graph_of(5)
     graph.merge_nodes(3, 4)
@@ -158,10 +173,33 @@ def test_evidence_for_removed_ids_reaches_their_successors() -> None:
     revision = graph.revision
     assert not graph.add_visual(4, 3, np.ones(3), 0)  # became one node
     assert not graph.add_visual(1, 5, np.ones(3), 0)
-    assert not graph.add_neighbour(6, 1, 0)
+    graph.add_neighbours([(0, 1), (1, 0), (1, 1)], 0)
     assert graph.revision == revision
     assert graph.take_removals() == {4: 2, 3: 2, 5: None}
     assert graph.take_removals() == {}
+
+
+@given(seeds)
+@settings(max_examples=10)
+def test_restored_edges_are_in_the_order_in_which_they_came(seed: int) -> None:
+    graph = SceneGraph(VOCABULARY, "world")
+    edit_at_random(graph, np.random.default_rng(seed), 40)
+    one, other = EdgeMap(len(VOCABULARY.predicates)), EdgeMap(len(VOCABULARY.predicates))
+    for pair, evidence in graph.edges.items():
+        one.add(pair, evidence)
+    other.restore(graph.edges)
+    assert list(one.evidence) == list(other.evidence)
+    assert one.take_changed() == other.take_changed()
+    for node_id in graph.nodes.ids.tolist():
+        assert list(one.partners(node_id)) == list(other.partners(node_id))
+
+
+def test_rows_that_were_removed_are_added_as_zeros() -> None:
+    graph = graph_of(3)
+    graph.remove_node(3)
+    table = graph.nodes
+    table.extend(list(range(4, 100)))
+    assert not table.weights[2:].any() and not table.covariances[2:].any()
 
 
 def test_removing_a_node_removes_its_edges() -> None:
@@ -244,6 +282,22 @@ def test_the_message_of_a_node() -> None:
     assert state.first_seen == state.last_seen == wire.Stamp(1, 500_000_000)
     assert len(surface_points(state)) == 2
     assert len(surface_points(graph.node_states(3)[1])) == 0
+
+
+def test_room_for_surface_points_grows_with_the_largest_surface() -> None:
+    graph, once = SceneGraph(VOCABULARY, "world"), SceneGraph(VOCABULARY, "world")
+    points = np.random.default_rng(0).uniform(size=(700, 3)).astype(np.float32)
+    for node_points in (points[:40], points[40:90]):
+        graph.add_node(np.zeros(3), np.eye(3), SURE, 0, node_points)
+    assert graph.nodes.surface_points_world.shape == (2, 64, 3)
+    other = graph.nodes.surface(1).copy()
+    graph.observe(1, np.zeros(3), np.eye(3), SURE, 1, points[40:140])
+    assert graph.nodes.surface_points_world.shape == (2, 256, 3)
+    graph.observe(1, np.zeros(3), np.eye(3), SURE, 2, points)
+    once.add_node(np.zeros(3), np.eye(3), SURE, 0, points)
+    assert graph.nodes.surface_points_world.shape == (2, 512, 3)
+    np.testing.assert_array_equal(graph.nodes.surface(0), once.nodes.surface(0))
+    np.testing.assert_array_equal(graph.nodes.surface(1), other)
 
 
 def test_class_distributions_are_scaled_to_one() -> None:

@@ -14,6 +14,7 @@ from deworldsg_ros.map_file import copy_state, read_map, write_map
 from deworldsg_ros.scene import graph_io, wire
 from deworldsg_ros.scene.edits import MergeNodes
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.graph_file import write_graph
 from deworldsg_ros.scene.seen_frames import (
@@ -23,6 +24,7 @@ from deworldsg_ros.scene.seen_frames import (
     path_beside,
     write_seen,
 )
+from deworldsg_ros.scene.votes import frame_votes
 
 CONFIG = Config(output=OutputConfig(min_existence=0.0))
 FLOOR = slab((0, 0, 0.95), (1.2, 0.8, 0.01))
@@ -50,10 +52,14 @@ def seen_at(stamp_ns: int, strength: float, logit: float = 2.0):
     )
 
 
+def note(memory: FrameMemory, graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> None:
+    memory.note(graph, local, node_ids, frame_votes(local.relations.logits))
+
+
 def test_first_last_and_the_clearest_few_are_kept() -> None:
     graph, memory = graph_of(2), FrameMemory()
     for stamp_ns, strength in enumerate([0.5, 0.9, 0.6, 0.8, 0.7, 0.9], start=1):
-        memory.note(graph, seen_at(stamp_ns, strength, strength), [1, 2])
+        note(memory, graph, seen_at(stamp_ns, strength, strength), [1, 2])
     node, pair, other = memory.all(graph)
     assert (node.node, node.other, pair.node, pair.other, other.node) == (1, 0, 1, 2, 2)
     assert (node.first_ns, node.last_ns) == (1, 6)
@@ -66,8 +72,8 @@ def test_first_last_and_the_clearest_few_are_kept() -> None:
 
 def test_frames_follow_merges_and_removals_and_do_not_grow() -> None:
     graph, memory = graph_of(3), FrameMemory()
-    memory.note(graph, seen_at(1, 0.5), [1, 2])
-    memory.note(graph, seen_at(2, 0.9), [3, 2])
+    note(memory, graph, seen_at(1, 0.5), [1, 2])
+    note(memory, graph, seen_at(2, 0.9), [3, 2])
     graph.merge_nodes(1, 3)
     assert [(s.node, s.other, s.first_ns, s.last_ns) for s in memory.all(graph)] == [
         (1, 0, 1, 2), (1, 2, 1, 2), (2, 0, 1, 2),
@@ -76,7 +82,7 @@ def test_frames_follow_merges_and_removals_and_do_not_grow() -> None:
     assert [(s.node, s.other) for s in memory.all(graph)] == [(1, 0)]
     for stamp_ns in range(3, 3 * PRUNE_FRAMES):
         new_id = graph.add_node(np.zeros(3), np.eye(3), np.full(4, 0.25), stamp_ns)
-        memory.note(graph, seen_at(stamp_ns, 0.9), [1, new_id])
+        note(memory, graph, seen_at(stamp_ns, 0.9), [1, new_id])
         graph.remove_node(new_id)
         assert len(memory._seen) <= 2 * PRUNE_FRAMES + 1
     (node,) = memory.all(graph)
@@ -85,8 +91,8 @@ def test_frames_follow_merges_and_removals_and_do_not_grow() -> None:
 
 def test_a_removed_row_and_faint_votes_are_not_noted() -> None:
     graph, memory = graph_of(2), FrameMemory()
-    memory.note(graph, seen_at(1, 0.5, -9.0), [0, 2])
-    memory.note(graph, seen_at(1, 0.5, -9.0), [1, 2])
+    note(memory, graph, seen_at(1, 0.5, -9.0), [0, 2])
+    note(memory, graph, seen_at(1, 0.5, -9.0), [1, 2])
     assert [(s.node, s.other) for s in memory.all(graph)] == [(1, 0), (2, 0)]
 
 

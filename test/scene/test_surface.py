@@ -20,7 +20,7 @@ class Samples:
         self.counts = np.zeros(count, np.int64)
 
     def add(self, rows: list[int], point_sets: list[np.ndarray]) -> None:
-        add_points(self.points_world, self.counts, rows, point_sets)
+        add_points(self.points_world, self.counts, np.array(rows, np.int64), point_sets)
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         return self.points_world, self.counts

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Callable
 from dataclasses import fields
@@ -38,7 +39,7 @@ from deworldsg_ros.scene.frame_graph import (
     RelationEvidence,
     Relations,
 )
-from deworldsg_ros.scene.limits import MAX_OBJECTS
+from deworldsg_ros.scene.limits import MAX_OBJECTS, MAX_POINTS
 
 
 def random_relations(rng: np.random.Generator, count: int) -> Relations:
@@ -190,6 +191,11 @@ def _set(path: str, value: object) -> Callable[[dict], None]:
     return change
 
 
+def _base64(*numbers: float) -> str:
+    """The numbers as float32."""
+    return base64.b64encode(np.array(numbers, "<f4").tobytes()).decode()
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -217,6 +223,11 @@ def _set(path: str, value: object) -> Callable[[dict], None]:
         (_set("objects.0.depth_m", -1.0), "invalid_message"),
         (_set("objects.0.mean_m", [0.0, 1.0, 1e300]), "invalid_message"),
         (_set("objects.0.surface_points_m", [[0.0, 1.0, 1e39]]), "invalid_message"),
+        (_set("objects.0.surface", _base64(0.0, 1.0, np.nan)), "invalid_message"),
+        (_set("objects.0.surface", _base64(0.0, 1.0, 1e38)), "invalid_message"),
+        (_set("objects.0.surface", _base64(0.0, 1.0)), "invalid_message"),
+        (_set("objects.0.surface", "AAAAAAAAAAAAAAA="), "invalid_message"),
+        (_set("objects.0.surface", _base64(*[0.0] * 3 * (MAX_POINTS + 1))), "invalid_message"),
         (_set("objects.0.covariance_m2", [1e300, 0, 0, 0, 1, 0, 0, 0, 1.0]), "invalid_message"),
         (_set("objects.0.covariance_m2", [1.0, 0, 0, 0, 1, 0, 0, 0, 1e-300]), "invalid_message"),
         (_set("objects.0.covariance_m2", [1.0, 1, 0, 1, 1, 0, 0, 0, 1.0]), "invalid_message"),
@@ -239,7 +250,7 @@ def _set(path: str, value: object) -> Callable[[dict], None]:
         (_set("T_world_camera", [0.0] * 15), "invalid_message"),
         (_set("classes", "cup"), "invalid_message"),
         (_set("schema.name", "scene_graph"), "unknown_schema"),
-        (_set("schema.version", wire.VERSION + 1), "unknown_schema"),
+        (_set("schema.version", 3), "unknown_schema"),
     ],
 )
 def test_inconsistent_messages_are_refused(change: Callable[[dict], None], reason: str) -> None:
@@ -248,6 +259,28 @@ def test_inconsistent_messages_are_refused(change: Callable[[dict], None], reaso
     with pytest.raises(RefusedInput) as refused:
         local_graph_from_message(wire.decode(json.dumps(content), wire.LocalGraphMessage))
     assert refused.value.reason == reason
+
+
+def test_a_local_graph_of_version_1_is_read() -> None:
+    message = local_message()
+    expected = local_graph_from_message(message)
+    content = json.loads(wire.encode(message))
+    content["schema"]["version"] = 1
+    for item, points in zip(content["objects"], expected.surface_points_world):
+        del item["surface"]
+        item["surface_points_m"] = points.tolist()
+    assert any(len(points) for points in expected.surface_points_world)
+    read = wire.decode(json.dumps(content), wire.LocalGraphMessage)
+    assert_same(local_graph_from_message(read), expected)
+
+
+def test_points_of_another_version_are_refused() -> None:
+    content = json.loads(wire.encode(local_message()))
+    content["schema"]["version"] = 1
+    assert refused_reason(content) == "invalid_message"
+    content["schema"]["version"] = 2
+    content["objects"][0]["surface_points_m"] = [[0.0, 1.0, 2.0]]
+    assert refused_reason(content) == "invalid_message"
 
 
 def refused_reason(content: dict) -> str:
@@ -363,4 +396,4 @@ def test_errors_name_the_field_and_its_row() -> None:
 def test_times_are_never_one_number() -> None:
     content = msgspec.json.decode(wire.encode(local_message()))
     assert set(content["stamp"]) == {"sec", "nanosec"}
-    assert content["schema"] == {"name": "local_graph", "version": wire.VERSION}
+    assert content["schema"] == {"name": "local_graph", "version": 2}

@@ -144,7 +144,8 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
             pair = rng.integers(1, ever + 1, 2).tolist()
             graph.add_visual(*pair, rng.normal(size=3), stamp_ns)
         elif action == "neighbour":
-            graph.add_neighbour(*rng.integers(1, ever + 1, 2).tolist(), stamp_ns)
+            first, second = map(graph.resolve, rng.integers(1, ever + 1, 2).tolist())
+            graph.add_neighbours([(first, second)], stamp_ns)
         elif action == "votes":
             counts = rng.uniform(0, 1, (2, 3)) if rng.integers(2) else None
             graph.add_votes(*rng.choice(live, 2, replace=False).tolist(), counts)

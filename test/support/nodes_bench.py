@@ -101,7 +101,6 @@ def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
                 covariance_m2=(0.01 * np.eye(3)).ravel().tolist(),
                 depth_m=1.0,
                 pixel_count=50,
-                surface_points_m=[],
             )
         ],
         relations=[],

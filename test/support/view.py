@@ -48,14 +48,14 @@ def make_graph(nodes=(), edges=(), frame_id="map"):
     )
 
 
-def make_room(count=25, points=40):
-    """A graph of large and small objects with three predicates."""
+def make_room(count=25, points=40, spread=1.0):
+    """A graph of large and small objects with three predicates; of a wide floor with `spread`."""
     rng = np.random.default_rng(0)
     labels = ["cup", "table", "chair", "book", "lamp", "<shelf>", "plant & pot"]
     nodes = []
     for index in range(count):
         shape = rng.normal(size=(3, 3)) * rng.uniform(0.03, 0.25)
-        mean = rng.normal(size=3) * [1.5, 1.5, 0.4]
+        mean = rng.normal(size=3) * [1.5 * spread, 1.5 * spread, 0.4]
         cloud = mean + rng.normal(size=(points, 3)) @ shape
         nodes.append(
             make_node(

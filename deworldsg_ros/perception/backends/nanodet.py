@@ -1,4 +1,7 @@
-"""NanoDet-g 416 on ONNX Runtime: the embedded detector, COCO's 80 classes."""
+"""NanoDet-g 416 with integers of 8 bits on ONNX Runtime: the embedded detector, 80 classes of COCO.
+
+`tools/calibration/quantize_detector.py` makes the weights.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from deworldsg_ros.scene.boxes import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES
 
-WEIGHTS = Path(__file__).parents[1] / "weights" / "nanodet_g_416_coco.onnx"
+WEIGHTS = Path(__file__).parents[1] / "weights" / "nanodet_g_416_coco_int8.onnx"
 # Side of the network's input and strides of its outputs, pixels.
 INPUT_SIZE = 416
 STRIDES = (8, 16, 32)

@@ -95,8 +95,8 @@ def _surfaces_beneath(
     """`surfaces_beneath`, for the height coefficients and the downward step of the image."""
     rows, columns = instances.shape
     count = len(low_m)
-    edge = np.zeros(count)
-    beneath = np.zeros((count, count))
+    edge = np.zeros(count, np.float64)
+    beneath = np.zeros((count, count), np.float64)
     # Both ends of a step from inside the mask to the surface beneath are inside the image.
     margin_v, margin_u = REACH_PX * abs(down[0]), REACH_PX * abs(down[1])
     for v in range(margin_v, rows - margin_v):
@@ -118,5 +118,6 @@ def _surfaces_beneath(
             if level and other_z < z + DEPTH_STEP_M and 0 < other <= count:
                 beneath[label - 1, other - 1] += 1.0
     for row in range(count):
-        beneath[row] /= edge[row] if edge[row] >= MIN_EDGE_PX else np.nan
+        for other in range(count):
+            beneath[row, other] /= edge[row] if edge[row] >= MIN_EDGE_PX else np.nan
     return beneath

@@ -180,14 +180,16 @@ def _fraction(overlap_m: Float64, length_m: Float64) -> Float64:
 def _contacts(points: Float64, owners: Int64, low: Float64, high: Float64, valid: Bool) -> Float64:
     """`Layout.contact_m`."""
     count = len(low)
-    contact = np.full((count, count), np.inf)
+    contact = np.empty((count, count), np.float64)
     for row in range(count):
+        for other in range(count):
+            contact[row, other] = np.inf
         if not valid[row]:
             continue
         left, right = low[row, 0] - SUPPORT_MARGIN_M, high[row, 0] + SUPPORT_MARGIN_M
         front, back = low[row, 1] - SUPPORT_MARGIN_M, high[row, 1] + SUPPORT_MARGIN_M
         for index in range(len(points)):
-            x, y, z = points[index]
+            x, y, z = points[index, 0], points[index, 1], points[index, 2]
             if owners[index] != row and left < x < right and front < y < back:
                 distance = abs(z - low[row, 2])
                 contact[row, owners[index]] = min(contact[row, owners[index]], distance)

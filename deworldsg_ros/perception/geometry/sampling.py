@@ -66,12 +66,13 @@ def sample_pixels(
             if 0 < label <= count and 0 < depth_m[y, x] < np.inf:
                 sizes[label - 1] += 1
     # Only some pixels are examined, because examining all takes too long.
-    quotas = np.minimum(sizes, CANDIDATES_PER_POINT * most)
-    ends = np.cumsum(quotas)
-    candidates = np.empty((ends[-1], 2), np.int64)
-    inner = np.empty(ends[-1], np.bool_)
-    seen = np.zeros(count, np.int64)
-    taken = np.zeros(count, np.int64)
+    quotas, ends, total = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for row in range(count):
+        quotas[row] = min(sizes[row], CANDIDATES_PER_POINT * most)
+        total += int(quotas[row])
+        ends[row] = total
+    candidates, inner = np.empty((total, 2), np.int64), np.empty(total, np.bool_)
+    seen, taken = np.zeros(count, np.int64), np.zeros(count, np.int64)
     for y in range(height):
         for x in range(width):
             label = instances[y, x]
@@ -91,16 +92,20 @@ def sample_pixels(
     end = 0
     for row in range(count):
         first = ends[row] - quotas[row]
-        usable = inner[first : ends[row]]
-        if usable.sum() < MIN_INNER_FRACTION * quotas[row]:
-            usable[:] = True
-        left = usable.sum()
+        left = 0
+        for slot in range(first, ends[row]):
+            left += int(inner[slot])
+        if left < MIN_INNER_FRACTION * quotas[row]:
+            left = quotas[row]
+            for slot in range(first, ends[row]):
+                inner[slot] = True
         quota = min(left, most)
         passed = kept = 0
         for slot in range(first, ends[row]):
             if inner[slot]:
                 if passed * quota >= kept * left:
-                    pixels[end], owners[end] = candidates[slot], row
+                    pixels[end, 0], pixels[end, 1] = candidates[slot, 0], candidates[slot, 1]
+                    owners[end] = row
                     end += 1
                     kept += 1
                 passed += 1

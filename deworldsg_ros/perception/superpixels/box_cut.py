@@ -54,6 +54,9 @@ TIGHTNESS_WEIGHT = 1.0
 FILL_EXPECTED = 0.4
 FILL_WEIGHT = 0.5
 
+# `valid`, `flatness`, `point`, `normal` and `lab` of `Regions`.
+_Planes = tuple[Float64, Float64, Float64, Float64, Float64]
+
 
 def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
     """The object of each region, (c,) int32: row of the box, or -1.
@@ -73,44 +76,34 @@ def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
     return owner
 
 
-@kernel
 def _cut_box(regions: Regions, box: Int64, owner: Int32, row: int) -> None:
     """Set `owner` to `row` for the regions of the object in the box."""
     area = regions.area
     inside, loosely, bounds = _count_inside(regions.labels, len(area), box)
-    distance = np.full(len(area), np.inf)
-    candidate = np.zeros(len(area), np.bool_)
-    for r in range(len(area)):
-        if owner[r] >= 0:
-            continue
-        if inside[r] > INSIDE_FRACTION * area[r]:
-            candidate[r] = True
-        elif loosely[r] <= INSIDE_FRACTION * area[r]:
-            distance[r] = 0.0
+    free = owner < 0
+    candidate = free & (inside > INSIDE_FRACTION * area)
     members = np.flatnonzero(candidate)
     if len(members) == 0:
         return
-    _reach_by_planes(regions, members, distance, owner)
+    background = free & ~candidate & (loosely <= INSIDE_FRACTION * area)
+    distance = np.where(background, 0.0, np.inf)
+    planes = regions.valid, regions.flatness, regions.point, regions.normal, regions.lab
+    _reach_by_planes(planes, members, distance, owner)
     _reach_by_borders(regions.pairs, regions.strength, distance, owner)
     distance = np.minimum(distance, MAX_DISTANCE)
-    order = members[np.argsort(-distance[members], kind="mergesort")]
-    free = 0.0
-    for r in range(len(area)):
-        if inside[r] > 0 and owner[r] < 0:
-            free += inside[r]
-    x1, y1, x2, y2 = box
+    order = members[np.argsort(-distance[members], kind="stable")]
+    x1, y1, x2, y2 = box.tolist()
     box_area = (x2 - x1 + 1) * (y2 - y1 + 1)
-    kept = _best_cut(order, distance, area, bounds, free, box_area)
-    for i in range(kept):
-        owner[order[i]] = row
+    kept = _best_cut(order, distance, area, bounds, float(inside[free].sum()), box_area)
+    owner[order[:kept]] = row
 
 
 @kernel
 def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int32, Int32, Int32]:
     """For each region: its cells in the box, and in the box with slack; its bounds in the box."""
-    x1, y1, x2, y2 = box
+    x1, y1, x2, y2 = box[0], box[1], box[2], box[3]
     rows, columns = labels.shape
-    inside = np.zeros(count, np.int32)
+    inside, loosely = np.zeros(count, np.int32), np.empty(count, np.int32)
     bounds = np.zeros((count, 4), np.int32)
     for y in range(y1, y2 + 1):
         for x in range(x1, x2 + 1):
@@ -121,7 +114,8 @@ def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int32, Int32, 
             bounds[r, 0] = min(bounds[r, 0], x)
             bounds[r, 2] = max(bounds[r, 2], x)
             bounds[r, 3] = max(bounds[r, 3], y)
-    loosely = inside.copy()
+    for r in range(count):
+        loosely[r] = inside[r]
     slack_x = int(SLACK_CELLS + SLACK_FRACTION * (x2 - x1) + 0.5)
     slack_y = int(SLACK_CELLS + SLACK_FRACTION * (y2 - y1) + 0.5)
     for y in range(max(y1 - slack_y, 0), min(y2 + slack_y, rows - 1) + 1):
@@ -132,22 +126,22 @@ def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int32, Int32, 
 
 
 @kernel
-def _reach_by_planes(regions: Regions, members: Int64, distance: Float64, owner: Int32) -> None:
+def _reach_by_planes(planes: _Planes, members: Int64, distance: Float64, owner: Int32) -> None:
     """Lower the distance of members that continue a plane of the background."""
-    valid, flatness = regions.valid, regions.flatness
+    valid, flatness, _, _, _ = planes
     for q in range(len(valid)):
         if distance[q] > 0.0 or owner[q] >= 0:
             continue
         if valid[q] >= PLANE_MIN_CELLS and flatness[q] >= PLANE_MIN_FLATNESS:
-            _reach_by_plane(regions, q, members, distance)
+            _reach_by_plane(planes, q, members, distance)
 
 
 @kernel
-def _reach_by_plane(regions: Regions, q: int, members: Int64, distance: Float64) -> None:
+def _reach_by_plane(planes: _Planes, q: int, members: Int64, distance: Float64) -> None:
     """Lower the distance of members that continue the plane of region q."""
-    point, normal, lab = regions.point, regions.normal, regions.lab
+    valid, _, point, normal, lab = planes
     for r in members:
-        if regions.valid[r] < POINT_MIN_CELLS:
+        if valid[r] < POINT_MIN_CELLS:
             continue
         offset = 0.0
         for k in range(3):
@@ -173,7 +167,7 @@ def _reach_by_borders(pairs: Int32, strength: Float64, distance: Float64, owner:
     relevant = np.empty(len(pairs), np.int32)
     found = 0
     for i in range(len(pairs)):
-        a, b = pairs[i]
+        a, b = pairs[i, 0], pairs[i, 1]
         if owner[a] < 0 and owner[b] < 0 and (distance[a] > 0.0 or distance[b] > 0.0):
             relevant[found] = i
             found += 1
@@ -183,7 +177,7 @@ def _reach_by_borders(pairs: Int32, strength: Float64, distance: Float64, owner:
         changed = False
         for k in range(found):
             i = relevant[k]
-            a, b = pairs[i]
+            a, b = pairs[i, 0], pairs[i, 1]
             if distance[b] + strength[i] < distance[a] - 1e-9:
                 distance[a] = distance[b] + strength[i]
                 changed = True
@@ -202,7 +196,8 @@ def _best_cut(
         total += area[r] * distance[r]
         total_square += area[r] * distance[r] ** 2
     variance = max(total_square / free - (total / free) ** 2, 1e-9)
-    left, top, right, bottom = bounds[order[0]]
+    left, top = bounds[order[0], 0], bounds[order[0], 1]
+    right, bottom = bounds[order[0], 2], bounds[order[0], 3]
     far, weight, best, kept = 0.0, 0.0, -np.inf, 0
     for i in range(len(order)):
         r = order[i]

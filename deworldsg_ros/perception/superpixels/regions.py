@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, Int64, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
 # An edge weight is the root of summed squares. Each of these differences between neighbouring cells
@@ -173,9 +173,10 @@ def _geometry(
 def _edge_weights(lab: Float32, points: Float32, normals: Float32) -> Float32:
     """(2, h, w): weights of the edges to the cells on the right and below; inf at the border."""
     height, width = lab.shape[:2]
-    weights = np.full((2, height, width), np.float32(np.inf))
+    weights = np.empty((2, height, width), np.float32)
     for y in range(height):
         for x in range(width):
+            weights[0, y, x] = weights[1, y, x] = np.inf
             if x + 1 < width:
                 weights[0, y, x] = _edge_weight(lab, points, normals, y, x, y, x + 1)
             if y + 1 < height:
@@ -226,8 +227,9 @@ def _merge(weights: Float32) -> tuple[Int32, int]:
     flat = weights.reshape(2 * cells)
     order = _order_edges(flat)
     total = len(order)
-    parent = np.arange(cells).astype(np.int32)
-    size = np.ones(cells, np.int32)
+    parent, size = np.empty(cells, np.int32), np.empty(cells, np.int32)
+    for cell in range(cells):
+        parent[cell], size[cell] = cell, 1
     internal = np.zeros(cells, np.float32)
     # The first sweep joins similar cells. The second joins each region that is still too small
     # with its most similar neighbour.
@@ -287,14 +289,14 @@ def _order_edges(flat: Float32) -> Int32:
 def _number_regions(parent: Int32) -> tuple[Int32, int]:
     """Region of each cell, numbered from 0 in scan order, and the number of regions."""
     labels = np.empty(len(parent), np.int32)
-    number = np.full(len(parent), -1, np.int32)
+    number = np.zeros(len(parent), np.int32)
     count = 0
     for cell in range(len(parent)):
         root = _root(parent, cell)
-        if number[root] < 0:
-            number[root] = count
+        if number[root] == 0:
             count += 1
-        labels[cell] = number[root]
+            number[root] = count
+        labels[cell] = number[root] - 1
     return labels, count
 
 
@@ -303,7 +305,7 @@ def _region_sums(
     labels: Int32, count: int, lab: Float32, points: Float32, normals: Float32
 ) -> Float64:
     """(count, 11) sums per region: cells; Lab (3); cells with depth; points (3); normals (3)."""
-    sums = np.zeros((count, 11))
+    sums = np.zeros((count, 11), np.float64)
     height, width = labels.shape
     for y in range(height):
         for x in range(width):
@@ -319,9 +321,30 @@ def _region_sums(
     return sums
 
 
-@kernel
 def _adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
     """Adjacent regions (m, 2), and the mean edge weight (m,) along each border."""
+    keys, values = _border_edges(labels, count, weights)
+    order = np.argsort(keys, kind="stable")
+    found, starts = np.unique(keys[order], return_index=True)
+    pairs = np.stack((found // count, found % count), axis=1).astype(np.int32)
+    return pairs, _means(values[order], np.append(starts, len(keys)))
+
+
+@kernel
+def _means(values: Float32, starts: Int64) -> Float64:
+    """Means of groups of values; group k is values[starts[k] : starts[k + 1]]."""
+    means = np.empty(len(starts) - 1, np.float64)
+    for group in range(len(means)):
+        total = 0.0
+        for index in range(starts[group], starts[group + 1]):
+            total += values[index]
+        means[group] = total / (starts[group + 1] - starts[group])
+    return means
+
+
+@kernel
+def _border_edges(labels: Int32, count: int, weights: Float32) -> tuple[Int64, Float32]:
+    """Edges between regions: a number (k,) of the pair of regions, and the weight (k,)."""
     height, width = labels.shape
     keys = np.empty(2 * height * width, np.int64)
     values = np.empty(2 * height * width, np.float32)
@@ -337,19 +360,4 @@ def _adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Floa
                     keys[found] = np.int64(min(a, b)) * count + max(a, b)
                     values[found] = weights[direction, y, x]
                     found += 1
-    order = np.argsort(keys[:found], kind="mergesort")
-    pairs = np.empty((found, 2), np.int32)
-    strength = np.zeros(found)
-    length = np.zeros(found)
-    m = -1
-    last = np.int64(-1)
-    for i in order:
-        if keys[i] != last:
-            m += 1
-            last = keys[i]
-            pairs[m, 0] = last // count
-            pairs[m, 1] = last % count
-        strength[m] += values[i]
-        length[m] += 1
-    m += 1
-    return pairs[:m].copy(), strength[:m] / length[:m]
+    return keys[:found], values[:found]

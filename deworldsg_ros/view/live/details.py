@@ -9,6 +9,7 @@ from html import escape
 
 from deworldsg_ros.client.explain import explain_relation
 from deworldsg_ros.client.objects import Relation, SceneObject, odds_of
+from deworldsg_ros.words import counted
 
 # A second class is worth a word from this share of the first one's probability on, and as likely
 # as the first from the other.
@@ -86,11 +87,6 @@ def image_html(jpeg_file: bytes | None, description: str) -> str:
         f'<img alt="{escape(description)}" style="max-width:100%;border-radius:4px;display:block;'
         f'margin:.3em 0" src="data:image/jpeg;base64,{data}">'
     )
-
-
-def counted(number: int, noun: str) -> str:
-    """A number with its noun: 1 frame, 2 frames."""
-    return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def note_html(lines: Sequence[str]) -> str:

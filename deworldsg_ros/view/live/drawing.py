@@ -22,7 +22,7 @@ from deworldsg_ros.view.live.tables import Label, ObjectTable
 Shape = Literal["boxes", "ellipsoids"]
 
 # Unsure objects are fainter.
-OPACITIES = (0.16, 0.34, 0.62)  # not sure, sure, selected
+OPACITIES = (0.16, 0.42, 0.7)  # not sure, sure, selected
 # Arrows end where the box of the object begins, but are not shorter than this fraction.
 SHORTEST_ARROW = 0.7
 # Two relations in opposite directions are drawn so far apart, metres.

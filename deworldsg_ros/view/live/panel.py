@@ -14,6 +14,11 @@ from deworldsg_ros.view.live.details import image_html, note_html
 from deworldsg_ros.view.live.state import LiveState
 
 NONE = "none"
+# On a phone the image is small, so that the panel does not cover the scene.
+IMAGE_STYLE = (
+    "<style>@media (max-width:600px) {.deworldsg-camera img {max-height:11vh}}</style>"
+    '<div class="deworldsg-camera" style="padding:0 .8em">'
+)
 
 
 class Panel:
@@ -54,14 +59,15 @@ class Panel:
 
     def _add_show(self, fit: Callable[[Any], None]) -> None:
         gui = self._gui
-        with gui.add_folder("Show"):
+        view_all = gui.add_button("View everything")
+        # Open, the folders would cover the scene on a phone.
+        with gui.add_folder("Show", expand_by_default=False):
             self.shape = gui.add_dropdown("Objects", ("boxes", "ellipsoids"))
             self.labels = gui.add_checkbox("Labels", True)
             self.points = gui.add_checkbox("Surface points", True)
             self.camera = gui.add_checkbox("Camera", True)
             self.floor = gui.add_checkbox("Floor grid", True)
             dark = gui.add_checkbox("Dark", False)
-            view_all = gui.add_button("View everything")
         self.shape.on_update(
             lambda _: self._change(lambda state: setattr(state, "shape", self.shape.value))
         )
@@ -74,11 +80,11 @@ class Panel:
         gui = self._gui
         with gui.add_folder("Filter", expand_by_default=False):
             least = gui.add_slider(
-                "Object", min=0, max=1, step=0.05, initial_value=0,
+                "Objects ≥", min=0, max=1, step=0.05, initial_value=0,
                 hint="least probability that it exists and is of its class",
             )  # fmt: skip
             least_relation = gui.add_slider(
-                "Relation", min=0, max=1, step=0.05, initial_value=0,
+                "Relations ≥", min=0, max=1, step=0.05, initial_value=0,
                 hint="least probability of a relation",
             )  # fmt: skip
             self._predicates = _Names(gui, "Predicates", QUIET, self._filter)
@@ -109,7 +115,7 @@ class Panel:
     def show_image(self, jpeg_file: bytes) -> None:
         """Show the image of the camera; empty = none."""
         html = image_html(jpeg_file, "image of the camera with the masks of the objects")
-        _set(self._camera, content=f'<div style="padding:0 .8em">{html}</div>', visible=bool(html))
+        _set(self._camera, content=f"{IMAGE_STYLE}{html}</div>", visible=bool(html))
 
     def _slid(self, event: Any) -> None:
         if event.client is not None:  # and not the viewer itself

@@ -16,7 +16,7 @@ from deworldsg_ros.view.live.camera import Shot
 from deworldsg_ros.view.live.drawing import Drawing, Shape
 
 ARROW = {"shaft_radius": 0.009, "head_radius": 0.03, "head_length": 0.08}
-OUTLINE_PX, LINE_PX, TRAIL_PX = 1.6, 2.0, 2.0
+OUTLINE_PX, LINE_PX, TRAIL_PX = 2.0, 2.0, 2.0
 POINT_M = 0.012
 TRAIL_RGB, FRUSTUM_RGB, GRID_RGB = (216, 120, 40), (216, 120, 40), (150, 154, 166)
 GRID_MARGIN_M = 1.5
@@ -51,6 +51,7 @@ class ViserScene:
                 batched_colors=np.zeros((1, 3), np.uint8),
                 batched_opacities=np.ones(1),
                 lod="off",
+                flat_shading=shape == "boxes",
                 cast_shadow=False,
                 receive_shadow=False,
                 visible=False,
@@ -84,7 +85,7 @@ class ViserScene:
             solids.batched_positions = drawing.positions
             solids.batched_wxyzs = drawing.wxyzs
             solids.batched_scales = drawing.scales
-            solids.batched_colors = drawing.colours
+            solids.batched_colors = _linear(drawing.colours)
             solids.batched_opacities = drawing.opacities
         _put_segments(self._outlines, drawing.outlines, _both_ends(drawing.outline_colours))
         _put_segments(self._arrows, drawing.arrows, drawing.arrow_colours)
@@ -193,7 +194,13 @@ def _put_segments(handle: Any, segments: Float64, colours: UInt8 | None) -> None
     if len(segments):
         handle.points = segments.astype(np.float32)
         if colours is not None:
-            handle.colors = colours
+            handle.colors = _linear(colours)
+
+
+def _linear(colours: UInt8) -> UInt8:
+    """sRGB as linear light: viser takes the colours of lines and batches so, but not of points."""
+    share = colours / 255
+    return np.round(255 * ((share + 0.055) / 1.055) ** 2.4).astype(np.uint8)
 
 
 def _both_ends(colours: UInt8) -> UInt8:

@@ -28,6 +28,10 @@ PERIOD_S = 0.1
 POINTS_PERIOD_S = 1.0
 # Of the view; viser's own 75 degrees distort what is near.
 FOV_RAD = 0.85
+# The view follows the objects if they grow by more than this part of their extent.
+GROWTH = 0.03
+# The browser's camera is exact to less than this.
+MOVED_M = 0.01
 # Frames of the camera that wait to be shown; older ones are left out.
 WAITING_VIEWS = 2
 
@@ -174,11 +178,18 @@ class Viewer:
 
     def _follow_growth(self, key: int, client: Any) -> None:
         """Keep everything in view until the user moves the camera."""
+        bounds = self._state.bounds()
+        if bounds is None:
+            return
         fitted = self._fitted.get(key)
-        if fitted is None or np.allclose(client.camera.position, fitted[0], atol=1e-3):
-            bounds = self._state.bounds()
-            if bounds is not None and (fitted is None or not np.allclose(bounds, fitted[1])):
-                self._fit(client)
+        if fitted is not None:
+            position, old, aspect = fitted
+            moved = not np.allclose(client.camera.position, position, atol=MOVED_M)
+            grown_m = np.abs(np.subtract(bounds, old)).max()
+            same = grown_m < GROWTH * np.ptp(old, axis=0).max() and client.camera.aspect == aspect
+            if moved or same:
+                return
+        self._fit(client)
 
     def _fit(self, client: Any) -> None:
         with self._lock:
@@ -186,11 +197,12 @@ class Viewer:
         if bounds is None:
             return
         camera = client.camera
-        position, target = overview(*bounds, horizontal_axes(up), camera.fov, camera.aspect)
+        aspect = camera.aspect
+        position, target = overview(*bounds, horizontal_axes(up), camera.fov, aspect)
         with client.atomic():
             camera.up_direction = up
             camera.position, camera.look_at = position, target
-        self._fitted[client.client_id] = (position, bounds)
+        self._fitted[client.client_id] = (position, bounds, aspect)
 
 
 def _reachable(host: str) -> str:

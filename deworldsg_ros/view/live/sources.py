@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import socket
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from pathlib import Path
@@ -9,7 +11,7 @@ from typing import Protocol
 
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.following import Copy
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.view.live.camera import CameraView, view_of
@@ -37,18 +39,47 @@ class Sink(Copy, Protocol):
         ...
 
 
-FOXGLOVE_PORT = 8765
+PAGE_PORT, FOXGLOVE_PORT = 8080, 8765
+# So many ports are tried.
+MOST_PORTS = 100
 
 
 def open_sink(host: str, port: int, why_empty: str, *, foxglove: bool) -> Sink:
-    """A page of viser, or a server for Foxglove; raises ImportError without its package."""
+    """A page of viser, or a server for Foxglove.
+
+    Args:
+        host: address to listen on.
+        port: the next free port from this one on is taken; 0 = the usual one.
+        why_empty: shown while there are no objects.
+        foxglove: whether Foxglove is served.
+
+    Raises:
+        ImportError: without the package.
+        ConfigurationError: if this machine cannot listen there.
+    """
+    port = _free_port(host, port or (FOXGLOVE_PORT if foxglove else PAGE_PORT))
     if foxglove:
         from deworldsg_ros.view.live.foxglove import FoxgloveServer
 
-        return FoxgloveServer(host, FOXGLOVE_PORT)
+        return FoxgloveServer(host, port)
     from deworldsg_ros.view.live.server import Viewer
 
     return Viewer(host, port, why_empty)
+
+
+def _free_port(host: str, first: int) -> int:
+    for port in range(first, min(first + MOST_PORTS, 2**16)):
+        try:
+            socket.create_server((host, port)).close()
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise ConfigurationError(
+                    f"cannot listen on host {host}, port {port}: {error.strerror}; expected an "
+                    "address of this machine"
+                ) from error
+        else:
+            return port
+    raise ConfigurationError(f"no port of {host} from {first} on is free: give another port")
 
 
 def is_graph(path: Path) -> bool:
@@ -82,3 +113,7 @@ def show_recording(
                 sink.apply(update)
             sink.look(view_of(result.local, result.node_ids, frame.rgb, result.perceived.instances))
             yield pipeline.builder.confirmed
+    builder = pipeline.builder
+    while builder is not None and builder.waiting:  # a map in parts, or surfaces
+        if (update := builder.update()) is not None:
+            sink.apply(update)

@@ -14,16 +14,18 @@ from deworldsg_ros.scene.extent import DEFAULT_UP
 from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.view.live.camera import CameraView, Shot, Shots, jpeg, with_masks
 from deworldsg_ros.view.live.crops import BestViews
-from deworldsg_ros.view.live.details import counted
-from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours, rgb_of
+from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours, rgb_of, rotations
 from deworldsg_ros.view.live.filters import Filter
 from deworldsg_ros.view.live.history import History
 from deworldsg_ros.view.live.tables import ObjectTable
+from deworldsg_ros.words import counted
 
 # Points of an object that are collected from the frames, if the messages of the graph have none.
 POINTS_OF_OBJECT = 256
 # Points of the scene: more slow down a phone.
 MOST_POINTS = 100_000
+# Hidden predicates that are named above the controls; of more it says the number.
+MOST_NAMES = 3
 # The floor is drawn below the lowest objects, of which a few may be wrong.
 FLOOR_PERCENTILE = 5.0
 
@@ -134,9 +136,15 @@ class LiveState:
         if not objects:
             return ["no objects", self.why_empty]
         shown = len(drawing.arrows) + len(drawing.lines)
+        hidden = sorted(
+            self.filter.hidden_predicates & {edge.predicate for edge in self.edges.values()}
+        )
+        names = ", ".join(hidden) if len(hidden) <= MOST_NAMES else f"{len(hidden)} predicates"
+        without = f" ({names} {'is' if len(hidden) == 1 else 'are'} hidden)" if hidden else ""
         lines = [
             f"{counted(objects, 'object')}, {counted(relations, 'relation')}",
-            f"shown: {len(drawing.ids)} and {shown}; world frame {self.shown.frame_id!r}",
+            f"shown: {counted(len(drawing.ids), 'object')}, {counted(shown, 'relation')}" + without,
+            f"world frame: {self.shown.frame_id}",
         ]
         if self.moment is not None:
             late_s = (self.history.newest.stamp_ns - self.shown.stamp_ns) / 1e9
@@ -147,7 +155,7 @@ class LiveState:
         """Lower and upper corner (3,) of what is drawn; None = nothing."""
         if not len(self.table):
             return None
-        half = np.linalg.norm(self.table.sizes, axis=1, keepdims=True) / 2
+        half = np.einsum("nij,nj->ni", np.abs(rotations(self.table.wxyzs)), self.table.sizes / 2)
         return (self.table.centres - half).min(axis=0), (self.table.centres + half).max(axis=0)
 
     def floor_m(self) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from safetensors.torch import load_file, save_file
 from support.torch_models import (
     CLASSES,
     LAYERS,
@@ -206,6 +205,8 @@ def test_another_decoder_is_refused(tmp_path):
 
 
 def test_missing_class_pair_statistics_are_refused(tmp_path):
+    from safetensors.torch import load_file, save_file
+
     save_paper_checkpoint(tmp_path)
     path = tmp_path / "egtr_head.safetensors"
     parameters = load_file(path)
