@@ -63,7 +63,8 @@ def page(report: dict[str, Any]) -> str:
         for reason in ("missing", "error"):
             if reason in done:
                 lines.append(f"Not measured: {done[reason].splitlines()[-1]}")
-    return TEXT.read_text(encoding="utf-8").replace("(the tables)", "\n".join(lines))
+    text = TEXT.read_text(encoding="utf-8").replace("](../docs/dev/", "](")
+    return text.replace("(the tables)", "\n".join(lines))
 
 
 if __name__ == "__main__":
