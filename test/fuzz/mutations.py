@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from deworldsg_ros.parsing import check_yaml
+
 Mutation = Callable[[bytes, random.Random], bytes]
 
 # Numbers that a format allows in its text and few programs expect.
@@ -123,6 +125,7 @@ def yaml_tree(content: bytes, rng: random.Random) -> bytes:
         )
     if b"&a0" in content:  # written out, the aliases would fill the memory
         return raw_bytes(content, rng)
+    check_yaml(content)  # a mutation before may have nested it so deeply that libyaml crashes
     tree = _tree(yaml.load(content, yaml.CSafeLoader), rng)
     try:
         text = yaml.dump(tree, Dumper=yaml.CSafeDumper, allow_unicode=True)

@@ -224,7 +224,7 @@ class Annotations:
                         notes.append(
                             f"{scan}: predicate '{name}' is in no list: it counts as never found"
                         )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise RecordingError(
                 f"{self.root / self.layout.relations}, scan {scan}: expected relationships "
                 "[subject, object, number, name]"
