@@ -25,8 +25,9 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from endurance.rig import NODES, Rig
 
-# Models, kernels, buffers and the graph of the room are there after this time.
-SETTLE_S = 120.0
+# Models, kernels, buffers and the graph of the room are there after two minutes. Python then fills up
+# its own lists of free tuples (2000 of each length) and names of attributes (4096) for some more.
+SETTLE_S = 600.0
 SAMPLE_PERIOD_S = 1.0
 # A node that waits for a busy machine holds more messages at once, and keeps that memory for the
 # next time. So each node stands still once, for so long that its queues are full.
@@ -210,7 +211,7 @@ def main() -> int:
     if options.minutes:
         with tempfile.TemporaryDirectory() as folder:
             memory, latencies = replay(options.minutes, Path(folder))
-        settle_s = min(SETTLE_S, 20 * options.minutes)
+        settle_s = min(SETTLE_S, 12 * options.minutes)
         for name, series in memory.items():
             settled = series.settled(settle_s)
             slope = settled.slope_per_h()
