@@ -30,7 +30,10 @@ def kernel(function: F) -> F:
 
 
 class _Kernel:
-    """Stands for a kernel until one of its module is called; then numba's dispatchers do."""
+    """Stands for a kernel until one of its module is called; then numba's dispatchers do.
+
+    Modules that imported it before get the dispatcher, too: a call of this object takes longer.
+    """
 
     _waiting: ClassVar[dict[ModuleType, list[_Kernel]]] = {}
     _lock = threading.Lock()
@@ -43,7 +46,7 @@ class _Kernel:
         self._waiting.setdefault(self._module, []).append(self)
 
     def __call__(self, *args: Any) -> Any:
-        # Other modules that imported the kernel keep this object, and call it in every frame.
+        # Some keep this object: under another name, or in a container.
         return (self._dispatcher or self.dispatcher)(*args)
 
     @property
@@ -51,15 +54,28 @@ class _Kernel:
         """Numba's."""
         if self._dispatcher is None:
             with self._lock:
-                for item in self._waiting.pop(self._module, ()):
+                items = self._waiting.pop(self._module, [])
+                for item in items:
                     item._dispatcher = _jit(item._function)
-                    setattr(self._module, item._function.__name__, item._dispatcher)
+                _replace(items)
         return self._dispatcher
 
     @property
     def signatures(self) -> Any:
         """The types of arguments for which it is compiled."""
         return self.dispatcher.signatures
+
+
+def _replace(items: list[_Kernel]) -> None:
+    """Put numba's dispatchers in place of kernels, in all modules of the package."""
+    package = __name__.partition(".")[0]
+    for module_name, module in list(sys.modules.items()):
+        if module_name.partition(".")[0] == package or module is items[0]._module:
+            content = vars(module)
+            for item in items:
+                name = item._function.__name__
+                if content.get(name) is item:
+                    content[name] = item.dispatcher
 
 
 # Functions to call when the first kernel is compiled.

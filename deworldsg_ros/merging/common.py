@@ -26,7 +26,8 @@ def warm_up_graph() -> None:
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:
     """Raise RefusedInput: ``vocabulary_mismatch`` or ``wrong_frame`` if a local graph differs."""
-    if local.vocabulary != graph.vocabulary:
+    # Identity first: to compare all names takes long.
+    if local.vocabulary is not graph.vocabulary and local.vocabulary != graph.vocabulary:
         raise RefusedInput(
             "vocabulary_mismatch",
             f"local graph has {len(local.vocabulary.classes)} classes and "
@@ -46,12 +47,11 @@ def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> 
     Args:
         graph: changed.
         local: the frame.
-        node_ids: node of each row of the frame.
+        node_ids: the live node of each row of the frame; 0 = none.
     """
     # Summed by pair first: a frame counts once even if two of its rows are one node.
     sums: dict[tuple[int, int], Float64] = {}
     for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
         pair = (node_ids[subject], node_ids[object_])
         sums[pair] = sums[pair] + logits if pair in sums else logits
-    for (subject_id, object_id), logits in sums.items():
-        graph.add_visual(subject_id, object_id, logits, local.stamp_ns)
+    graph.add_frame_visual(sums, local.stamp_ns)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Container
+from collections import defaultdict
+from collections.abc import Collection
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class JointEvidence:
 
     def __init__(self) -> None:
         # Evidence for one object minus evidence for two: by the smaller owner, then the greater.
-        self._balances: defaultdict[int, Counter[int]] = defaultdict(Counter)
+        self._balances: defaultdict[int, dict[int, int]] = defaultdict(dict)
         # The smaller owners that have evidence about a greater one.
         self._smaller: defaultdict[int, set[int]] = defaultdict(set)
         self._due: list[Pair] = []
@@ -104,8 +104,7 @@ class JointEvidence:
         self._camera_world = camera_world.copy()
         factor = WIDE_STEP_FACTOR if step_m > WIDE_STEP_M else 1
         for (a, b), weight in evidence.items():
-            self._balances[a][b] += weight * factor
-            self._smaller[b].add(a)
+            self._add(a, b, weight * factor)
             if self._balances[a][b] >= MERGE_THRESHOLD:
                 self._due.append((a, b))
 
@@ -114,7 +113,7 @@ class JointEvidence:
         while self._due:
             a, b = self._due.pop()
             # An earlier merge may have changed the evidence since the pair became due.
-            if self._balances[a][b] >= MERGE_THRESHOLD:
+            if self._balances[a].get(b, 0) >= MERGE_THRESHOLD:
                 return a, b
         return None
 
@@ -122,13 +121,13 @@ class JointEvidence:
         """Combine the evidence against one object of two owners that are one."""
         against = {b: balance for b, balance in self._balances[removed].items() if balance < 0}
         for a in self._smaller[removed]:
-            if self._balances[a][removed] < 0:
-                against[a] = self._balances[a][removed]
+            balance = self._balances[a].get(removed, 0)
+            if balance < 0:
+                against[a] = balance
         self.forget(removed)
         for other, balance in against.items():
             if other != kept:
-                self._balances[min(kept, other)][max(kept, other)] += balance
-                self._smaller[max(kept, other)].add(min(kept, other))
+                self._add(min(kept, other), max(kept, other), balance)
 
     def forget(self, owner: int) -> None:
         """Drop the evidence of a removed owner."""
@@ -137,13 +136,22 @@ class JointEvidence:
         for a in self._smaller.pop(owner, ()):
             self._balances[a].pop(owner, None)
 
-    def _separate(self, sure: dict[int, bool], nested: Container[Pair]) -> None:
+    def _add(self, a: int, b: int, balance: int) -> None:
+        row = self._balances[a]
+        row[b] = row.get(b, 0) + balance
+        self._smaller[b].add(a)
+
+    def _separate(self, sure: dict[int, bool], nested: Collection[Pair]) -> None:
         """Count the pairs of a frame as two objects, except some."""
         ascending = sorted(sure.items())
         for position, (a, a_sure) in enumerate(ascending):
             row = self._balances[a]
             for b, b_sure in ascending[position + 1 :]:
-                if (a, b) not in nested:
-                    if b not in row:
-                        self._smaller[b].add(a)
-                    row[b] -= SEPARATE_WEIGHT if a_sure and b_sure else OVERLAPPING_WEIGHT
+                if nested and (a, b) in nested:
+                    continue
+                balance = row.get(b)
+                if balance is None:
+                    self._smaller[b].add(a)
+                    balance = 0
+                weight = SEPARATE_WEIGHT if a_sure and b_sure else OVERLAPPING_WEIGHT
+                row[b] = balance - weight

@@ -72,15 +72,16 @@ class LifeCycle:
         }
         ids = sorted(scores.keys() | shown.keys())
         owners = np.array(records.owners_of(ids), np.int64)
+        rows = graph.nodes.rows_at(ids)
         records.look(
             owners,
             np.array([scores.get(node_id, 0.0) for node_id in ids]),
             np.array([shown.get(node_id, NOT_VISIBLE) for node_id in ids], np.int64),
-            graph.nodes.means[graph.nodes.rows_at(ids)],
+            graph.nodes.means[rows],
             local.T_world_camera[:3, 3],
             local.stamp_ns,
         )
-        self._publish(graph, ids, owners)
+        self._publish(graph, ids, rows, owners)
         for node_id in self._absent(view, scores.keys()):
             # It may be gone: another absent node of this frame has taken its place.
             if node_id in records and node_id not in graph.edits.deleted:
@@ -128,15 +129,15 @@ class LifeCycle:
             self._records.remove(node_id)
         graph.remove_node(node_id)
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int], owners: Int64) -> None:
+    def _publish(self, graph: SceneGraph, node_ids: list[int], rows: Int64, owners: Int64) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
         records = self._records
         probabilities = records.existence(owners)
         existence.settle(records.rows, records.fates, owners, probabilities)
         new_ids = graph.set_existence(node_ids, probabilities, self._min_existence)
-        improbable = _are_improbable(graph, graph.nodes.rows_at(node_ids))
+        improbable = _are_improbable(graph, rows).tolist()
         self._improbable.difference_update(node_ids)
-        self._improbable.update(itertools.compress(node_ids, improbable.tolist()))
+        self._improbable.update(itertools.compress(node_ids, improbable))
         for node_id in new_ids:
             # A new node that is the object of a lost node takes the id of the lost node.
             lost_id = self._lost.match(graph, node_id)
@@ -147,16 +148,18 @@ class LifeCycle:
     def _forget(self, graph: SceneGraph, stamp_ns: int) -> None:
         """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
         nodes = graph.nodes
-        # In the order of the rows, which depends on nothing but the frames.
-        ids = sorted((i for i in self._improbable if i in nodes), key=nodes.row)
-        self._improbable.intersection_update(ids)
-        rows = nodes.rows_at(ids)
-        old = _are_improbable(graph, rows) & (nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS)
-        for node_id in itertools.compress(ids, old.tolist()):
-            if node_id not in self._lost and not graph.edits.hides(node_id):
-                self._improbable.discard(node_id)
-                graph.remove_node(node_id)
-                self._records.remove(node_id)
+        if self._improbable:
+            # In the order of the rows, which depends on nothing but the frames.
+            ids = sorted((i for i in self._improbable if i in nodes), key=nodes.row)
+            self._improbable.intersection_update(ids)
+            rows = nodes.rows_at(ids)
+            old = _are_improbable(graph, rows)
+            old &= nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS
+            for node_id in itertools.compress(ids, old.tolist()):
+                if node_id not in self._lost and not graph.edits.hides(node_id):
+                    self._improbable.discard(node_id)
+                    graph.remove_node(node_id)
+                    self._records.remove(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
 

@@ -47,6 +47,8 @@ class LostNodes:
 
     def take_expired(self, stamp_ns: int) -> list[int]:
         """Remove and return the nodes that have been lost for too long."""
+        if stamp_ns - min(self._lost_ns.values(), default=stamp_ns) <= self._memory_ns:
+            return []
         expired = [
             node_id
             for node_id, lost_ns in self._lost_ns.items()

@@ -31,31 +31,43 @@ class NodeGrid:
 
     def __init__(self) -> None:
         self._cube_of: dict[tuple[int, ...], int] = {}
-        # Of each cube: a ball around the balls of all nodes ever in it, and its first owner.
-        self._cubes = np.zeros((16, 4))
+        # Of each cube: its place in cubes, a ball around the balls of all nodes ever in it, and its
+        # first owner.
+        self._keys, self._cubes = np.zeros((16, 3)), np.zeros((16, 4))
         self._firsts = np.full(16, -1)
         # Of each owner: the ball of its node, its cube, and the owners before and after it there.
         self._balls = np.zeros((64, 4))
         self._links = np.full((64, 3), -1)
 
-    def put(self, owners: Sequence[int], means_world: Float64, eigenvalue_bounds: Float64) -> None:
+    def put(
+        self,
+        owners: Sequence[int],
+        rows: Int64,
+        means_world: Float64,
+        eigenvalue_bounds: Float64,
+    ) -> None:
         """Set the Gaussians of n owners, new or known.
 
         Args:
             owners: n owners.
-            means_world: (n, 3) metres.
-            eigenvalue_bounds: (n,) square metres, see `NodeTable`.
+            rows: (n,) row of each in
+            means_world: (N, 3) metres, and
+            eigenvalue_bounds: (N,) square metres, see `NodeTable`.
         """
         if not len(owners):
             return
         while max(owners) >= len(self._balls):
             self._balls = np.concatenate((self._balls, np.zeros_like(self._balls)))
             self._links = np.concatenate((self._links, np.full_like(self._links, -1)))
-        keys = np.floor(means_world / CUBE_M).astype(np.int64)
-        cubes = np.array([self._cube(key) for key in map(tuple, keys.tolist())])
-        balls = np.empty((len(owners), 4))
-        balls[:, :3], balls[:, 3] = means_world, BALL_DEVIATIONS * np.sqrt(eigenvalue_bounds)
-        _put(self._cubes, self._firsts, self._balls, self._links, np.array(owners), cubes, balls)
+        moved = np.zeros(len(owners), np.int64)
+        at = np.array(owners, np.int64)
+        known = self._keys, self._cubes, self._balls, self._links
+        count = _stay(*known, at, rows, means_world, eigenvalue_bounds, moved)
+        if count:
+            moved = moved[:count]
+            keys = np.floor(means_world[rows[moved]] / CUBE_M).astype(np.int64)
+            cubes = np.array([self._cube(key) for key in map(tuple, keys.tolist())])
+            _put(self._cubes, self._firsts, self._balls, self._links, at[moved], cubes)
 
     def remove(self, owner: int) -> None:
         """Remove an owner, if it is in the grid."""
@@ -76,8 +88,10 @@ class NodeGrid:
         if cube is None:
             cube = self._cube_of[key] = len(self._cube_of)
             if cube == len(self._cubes):
+                self._keys = np.concatenate((self._keys, np.zeros_like(self._keys)))
                 self._cubes = np.concatenate((self._cubes, np.zeros_like(self._cubes)))
                 self._firsts = np.concatenate((self._firsts, np.full_like(self._firsts, -1)))
+            self._keys[cube] = key
             self._cubes[cube, :3] = [CUBE_M * (index + 0.5) for index in key]
         return cube
 
@@ -97,6 +111,36 @@ def _remove(firsts: Int64, links: Int64, owner: int) -> None:
 
 
 @kernel
+def _stay(
+    keys: Float64,
+    cubes: Float64,
+    balls: Float64,
+    links: Int64,
+    owners: Int64,
+    rows: Int64,
+    means: Float64,
+    eigenvalue_bounds: Float64,
+    moved: Int64,
+) -> int:
+    """Set the balls of owners. The number of those in another cube; their places are written."""
+    count = 0
+    for index in range(len(owners)):
+        owner, row, is_same = owners[index], rows[index], True
+        cube = links[owner, 0]
+        for axis in range(3):
+            balls[owner, axis] = means[row, axis]
+            is_same &= cube >= 0 and math.floor(means[row, axis] / CUBE_M) == keys[cube, axis]
+        balls[owner, 3] = BALL_DEVIATIONS * math.sqrt(eigenvalue_bounds[row])
+        if is_same:
+            reach = math.sqrt(0.75) * CUBE_M + balls[owner, 3]
+            cubes[cube, 3] = max(cubes[cube, 3], reach)
+        else:
+            moved[count] = index
+            count += 1
+    return count
+
+
+@kernel
 def _put(
     cubes: Float64,
     firsts: Int64,
@@ -104,12 +148,11 @@ def _put(
     links: Int64,
     owners: Int64,
     new_cubes: Int64,
-    new_balls: Float64,
 ) -> None:
+    """Put owners, whose balls are known, into other cubes."""
     for index in range(len(owners)):
         owner, cube = owners[index], new_cubes[index]
-        balls[owner] = new_balls[index]
-        reach = math.sqrt(0.75) * CUBE_M + new_balls[index, 3]
+        reach = math.sqrt(0.75) * CUBE_M + balls[owner, 3]
         cubes[cube, 3] = max(cubes[cube, 3], reach)
         if links[owner, 0] == cube:
             continue

@@ -66,13 +66,19 @@ class NodeRecords:
         """The node of an owner; 0 if the record is free."""
         return int(self.rows["node_id"][owner])
 
+    def nodes_of(self, owners: Sequence[int] | Int64) -> list[int]:
+        """The node of each owner."""
+        node_ids: list[int] = self.rows["node_id"][owners].tolist()
+        return node_ids
+
     def owners_of(self, node_ids: Sequence[int]) -> list[int]:
         """Owners of nodes that have a record."""
-        return [self.owner_of[node_id] for node_id in node_ids]
+        owner_of = self.owner_of
+        return [owner_of[node_id] for node_id in node_ids]
 
     def graph_rows(self, graph: SceneGraph, owners: Sequence[int] | Int64) -> Int64:
         """Row in the graph of each owner."""
-        return graph.nodes.rows_at(self.rows["node_id"][owners].tolist())
+        return graph.nodes.rows_at(self.nodes_of(owners))
 
     def add(self, node_id: int, class_probabilities: Float64, stamp_ns: int) -> int:
         """Add the record of a new node; returns its owner."""
@@ -89,8 +95,9 @@ class NodeRecords:
 
     def place(self, graph: SceneGraph, owners: list[int]) -> None:
         """Note where the nodes of owners are, after a change of their Gaussians."""
-        nodes, rows = graph.nodes, self.graph_rows(graph, owners)
-        self.grid.put(owners, nodes.means[rows], nodes.eigenvalue_bounds[rows])
+        nodes = graph.nodes
+        rows = self.graph_rows(graph, owners)
+        self.grid.put(owners, rows, nodes.means, nodes.eigenvalue_bounds)
 
     def look(
         self,

@@ -79,8 +79,12 @@ class SurfaceMerging:
         frame, rows = local, list(range(len(local)))
         if graph.edits.merged or graph.edits.separate:
             frame, rows = as_edited(graph, local, self._records)
-        node_ids = [graph.resolve(node_id) for node_id in self._merge_frame(graph, frame)]
-        node_ids = [node_ids[row] for row in rows]
+        live = graph.nodes.places
+        merged = [
+            node_id if node_id in live else graph.resolve(node_id)
+            for node_id in self._merge_frame(graph, frame)
+        ]
+        node_ids = [merged[row] for row in rows]
         graph.remember_frame(local.stamp_ns, node_ids)
         add_relations(graph, local, node_ids)
         return node_ids
@@ -161,18 +165,17 @@ class SurfaceMerging:
         owners = [matches.owners[column] if column >= 0 else -1 for column in matches.columns]
         known = [row for row, owner in enumerate(owners) if owner >= 0]
         known_owners = [owners[row] for row in known]
-        known_ids = [records.node(owner) for owner in known_owners]
+        at, seen = np.array(known, np.int64), local.class_probabilities[known]
         graph.observe_each(
-            known_ids,
-            local.means_world[known],
-            local.covariances_world[known],
-            local.class_probabilities[known],
+            records.nodes_of(known_owners),
+            local.means_world[at],
+            local.covariances_world[at],
+            seen,
             local.stamp_ns,
             [local.surface_points_world[row] for row in known],
-            weights[known],
+            weights[at],
+            records.name(known_owners, seen, local.stamp_ns),
         )
-        classes = records.name(known_owners, local.class_probabilities[known], local.stamp_ns)
-        graph.set_classes(known_ids, classes)
         for row, owner in enumerate(owners):
             if owner < 0:
                 classes = local.class_probabilities[row]
@@ -188,8 +191,7 @@ class SurfaceMerging:
                 owners[row] = records.add(node_id, classes, local.stamp_ns)
         records.map.add(owners, cells)
         records.place(graph, owners)
-        node_ids: list[int] = records.rows["node_id"][owners].tolist()
-        return node_ids
+        return records.nodes_of(owners)
 
     def _judge_cells(
         self,

@@ -207,6 +207,16 @@ class SceneGraph(NodeStore):
         self.revision += 1
         return True
 
+    def add_frame_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int) -> None:
+        """Sum a frame's visual relation logits (R,) into edges, by live nodes (0 = removed).
+
+        Pairs without two different nodes are left out.
+        """
+        for pair, summand in logits.items():
+            if pair[0] and pair[1] and pair[0] != pair[1]:
+                self._edges.add_visual(pair, summand, stamp_ns, self.revision + 1)
+                self.revision += 1
+
     def add_neighbours(self, pairs: Iterable[Pair], stamp_ns: int) -> None:
         """Count a frame in which pairs of nodes (0 = removed) were geometric neighbours (Eq. 8).
 

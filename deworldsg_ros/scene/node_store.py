@@ -123,8 +123,12 @@ class NodeStore:
         stamp_ns: int,
         surfaces: Sequence[Float32],
         weights: Float64,
+        classes_after: Float64 | None = None,
     ) -> None:
-        """Fuse one more observation into each of n different live nodes, as `observe` does."""
+        """Fuse one more observation into each of n different live nodes, as `observe` does.
+
+        With `classes_after` (n, C), as `set_classes` with these afterwards.
+        """
         rows = self.nodes.rows_at(node_ids)
         classes = class_probabilities / class_probabilities.sum(axis=1, keepdims=True)
         counts = np.ones(len(rows), np.int64)
@@ -141,6 +145,9 @@ class NodeStore:
                 stamp_ns,
             ),
         )
+        if classes_after is not None:
+            self.nodes.class_probabilities[rows] = classes_after
+            self.revision += len(rows)  # each counts as two changes
         self._changed(rows)
 
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
@@ -165,7 +172,7 @@ class NodeStore:
         """
         nodes = self.nodes
         rows = nodes.rows_at(node_ids)
-        existence = np.round(existence, 2)
+        existence = existence.round(2)
         confirmed = existence >= minimum
         if self.edits:
             confirmed &= [not self.edits.hides(node_id) for node_id in node_ids]

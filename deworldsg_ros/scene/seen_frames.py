@@ -24,6 +24,8 @@ CLEAREST = 3
 PRUNE_FRAMES = 256
 # A fainter vote for a relation is not noted.
 MIN_VOTE = 0.05
+# Decimals of how clear a frame is. What exceeds a number by less is rounded to it, or below it.
+DECIMALS, _ROUNDED_OFF = 3, 0.0004
 # 10^5 nodes and their pairs have 100 MB.
 MAX_BYTES = 1 << 30
 
@@ -113,9 +115,9 @@ class FrameMemory:
             seen.last_ns = stamp_ns
         clearest = seen.clearest
         # Most frames are not among the clearest; to round takes longer than this.
-        if len(clearest) == CLEAREST and strength <= clearest[-1].strength:
+        if len(clearest) == CLEAREST and strength <= clearest[-1].strength + _ROUNDED_OFF:
             return
-        strength = round(strength, 3)
+        strength = round(strength, DECIMALS)
         if len(clearest) < CLEAREST or strength > clearest[-1].strength:
             _insert(seen, SeenFrame(strength, stamp_ns, name))
 

@@ -5,6 +5,7 @@ because JSON numbers cannot hold 64-bit nanoseconds. Floats keep full precision 
 decimal that reads back as the same float64), so that a graph over DDS equals one in process.
 """
 
+from functools import cache
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union
 
 import msgspec
@@ -433,6 +434,7 @@ MESSAGES: dict[str, type[Message]] = {
 M = TypeVar("M", bound=Message)
 
 
+@cache
 def schema_of(kind: type[Message]) -> Schema:
     """The schema header of messages of this type."""
     name = next(name for name, known in MESSAGES.items() if known is kind)

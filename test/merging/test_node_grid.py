@@ -43,7 +43,7 @@ def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
         count = int(rng.integers(0, 30))
         owners = rng.choice(150, count, replace=False)
         means, bounds = rng.uniform(-12, 12, (count, 3)), rng.uniform(0.01, 0.6, count) ** 2
-        grid.put(owners.tolist(), means, bounds)
+        grid.put(owners.tolist(), np.arange(count), means, bounds)
         known.update(zip(owners.tolist(), zip(means, BALL_DEVIATIONS * bounds**0.5)))
         for owner in rng.choice(200, 10).tolist():
             grid.remove(owner)
@@ -62,9 +62,9 @@ def test_nodes_elsewhere_are_not_compared() -> None:
     assert grid.in_view(frame).tolist() == []
     before, beside, behind_the_wall, behind = [0, 0, 2], [50, 0, 2], [0, 0, 30], [0, 0, -30]
     means = np.array([before, beside, behind_the_wall, behind], np.float64)
-    grid.put([3, 5, 7, 9], means, np.full(4, 0.01))
+    grid.put([3, 5, 7, 9], np.arange(4), means, np.full(4, 0.01))
     assert grid.in_view(frame).tolist() == [3]
-    grid.put([5], means[:1], np.full(1, 0.01))
+    grid.put([5], np.array([0]), means, np.full(4, 0.01))
     assert sorted(grid.in_view(frame).tolist()) == [3, 5]
     grid.remove(3)
     grid.remove(3)
