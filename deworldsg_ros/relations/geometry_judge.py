@@ -54,7 +54,7 @@ class GeometryJudge:
         used = joined(ends, [])
         first, second = np.searchsorted(used, ends.T)
         low, high = shapes.low[used], shapes.high[used]
-        node_rows = np.array([nodes.places[i] for i in shapes.ids[used].tolist()], np.int64)
+        node_rows = nodes.rows_at(shapes.ids[used].tolist())
         features = pair_features(
             first,
             second,
@@ -70,7 +70,7 @@ class GeometryJudge:
         known = edits.believed_classes(nodes, names, node_rows), nodes.observations[node_rows]
         both = np.concatenate((first, second)), np.concatenate((second, first))
         inputs = self._inputs.make(features.reshape(2 * len(rows), -1), *known, *both)
-        table.state_logits[rows] = self._model.state_logits(*inputs.reshape(2, len(rows), -1))
+        table.state_logits[rows] = self._model.states_of(inputs)
         table.judged[rows] = True
         table.gaps_m[rows] = features[0, :, _GAP]
         table.bottom_steps_m[rows] = features[0, :, _BOTTOM_STEP]

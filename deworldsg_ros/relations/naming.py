@@ -51,8 +51,9 @@ def related_pairs(  # noqa: D417
 
 @kernel
 def predicate_probabilities(
+    rows: Int64,
     relations: Float64,
-    votes: Float32,
+    votes: Float64,
     frames: Float64,
     by_votes: Float64,
     with_: Bool,
@@ -60,8 +61,10 @@ def predicate_probabilities(
     canonical: Int64,
     with_index: int,
     scales: Float64,
-) -> Float64:
+) -> tuple[Float64, Bool]:
     """Probabilities (k, 2, R) of the predicates of pairs in both directions.
+
+    Also (k, 2) bool: whether frames voted.
 
     Each relation's probability is divided among its predicates by their votes. Without votes, a
     relation has the name that comes first in `PREDICATES`; a table is "with" the seats that are
@@ -69,26 +72,29 @@ def predicate_probabilities(
     those on "on" are.
 
     Args:
-        relations: (k, 2, NONE + 1) probabilities.
-        votes: (k, 2, R) sums of the votes.
-        frames: (k,) number of frames that showed both.
-        by_votes: (k,) exponent of the votes.
-        with_: (k, 2) bool; a table and a seat in its reach.
+        rows: (k,) of the pairs.
+        relations: (m, 2, NONE + 1) probabilities.
+        votes: (k, 2, R) sums of the votes; they count as float32.
+        frames: (m,) number of frames that showed both.
+        by_votes: (m,) exponent of the votes.
+        with_: (m, 2) bool; a table and a seat in its reach.
         relation_of: (R,) relation of each predicate; -1 = it names none.
         canonical: (NONE,) predicate that names each relation; -1 = there is none.
         with_index: of the predicate "with"; -1 = there is none.
         scales: (4,) of `VoteScales`.
     """
     count, _, width = votes.shape
-    result = np.zeros((count, 2, width))
-    sums = np.empty(NONE)
-    for row in range(count):
+    result, voted = np.zeros((count, 2, width)), np.zeros((count, 2), np.bool_)
+    sums, told = np.empty(NONE), np.empty(width, np.float32)
+    for index in range(count):
+        row = rows[index]
         for end in range(2):
-            told = votes[row, end]
-            out = result[row, end]
+            out = result[index, end]
             sums[:] = NAMING_VOTES
             others = 0.0
             for name in range(width):
+                told[name] = votes[index, end, name]
+                voted[index, end] |= told[name] != 0.0
                 if relation_of[name] >= 0:
                     sums[relation_of[name]] += told[name]
                 elif told[name] > others:
@@ -106,7 +112,7 @@ def predicate_probabilities(
             if others >= MIN_OTHER_VOTES:
                 free = relations[row, end, NONE]
                 _add_others(out, free, told, frames[row], by_votes[row], relation_of, scales)
-    return result
+    return result, voted
 
 
 @kernel

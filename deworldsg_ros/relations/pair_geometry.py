@@ -27,6 +27,8 @@ MARGIN_M = 0.06
 LAYER_M = 0.035
 # Points of a surface count for its height beside an object by exp(-(distance / this)²).
 SOFT_RADIUS_M = 0.15
+# Nodes in arrays of turned points at once, so that a whole map needs no large ones.
+TURNED_AT_ONCE = 256
 _NO_TURN = np.eye(3)
 
 FEATURES = (
@@ -89,13 +91,23 @@ class NodeShapes(Columns):
         """
         self.counts[rows] = np.minimum(counts[point_rows], SHAPE_POINTS)
         shapes = (self.low, self.high, self.means, self.covariances, self.counts)
-        for row, point_row in zip(rows.tolist(), point_rows.tolist()):
-            _measure(row, upright(points_world[point_row], R_up_world), *shapes)
+        if is_upright(R_up_world):
+            _measure(rows, points_world, point_rows, *shapes)
+            return
+        for start in range(0, len(rows), TURNED_AT_ONCE):
+            part = slice(start, start + TURNED_AT_ONCE)
+            turned = upright(points_world[point_rows[part]], R_up_world)
+            _measure(rows[part], turned, np.arange(len(turned)), *shapes)
+
+
+def is_upright(R_up_world: Float64) -> bool:
+    """Whether the world frame is the upright frame."""
+    return bool((R_up_world == _NO_TURN).all())
 
 
 def upright(points_world: Float32, R_up_world: Float64) -> Float32:
     """Points (..., 3) float32 in the upright frame."""
-    if (R_up_world == _NO_TURN).all():
+    if is_upright(R_up_world):
         return points_world
     turned: Float32 = points_world @ R_up_world.T.astype(np.float32)
     return turned
@@ -103,6 +115,23 @@ def upright(points_world: Float32, R_up_world: Float64) -> Float32:
 
 @kernel
 def _measure(
+    rows: Int64,
+    points: Float32,
+    point_rows: Int64,
+    low: Float64,
+    high: Float64,
+    means: Float64,
+    covariances: Float64,
+    counts: Int64,
+) -> None:
+    """The shape of each of some rows, from the first of its points in (S, K, 3)."""
+    for index in range(len(rows)):
+        cloud = points[point_rows[index]]
+        _measure_row(rows[index], cloud, low, high, means, covariances, counts)
+
+
+@kernel
+def _measure_row(
     row: int,
     points: Float32,
     low: Float64,

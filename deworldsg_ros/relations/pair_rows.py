@@ -136,7 +136,8 @@ class PairRows(Columns):
 
     def add(self, keys: Sequence[int]) -> Int64:
         """Rows of the pairs with these keys; missing ones are added, as not judged."""
-        new = [pair_key for pair_key in keys if pair_key not in self]
+        known = self.places
+        new = [pair_key for pair_key in keys if pair_key not in known]
         if new:
             shapes = self.shapes
             self.extend(new)
@@ -146,7 +147,7 @@ class PairRows(Columns):
             self.gaps_m[added] = np.inf
             for row in added.tolist():
                 link(shapes.first_links, self.links, self.ends, row)
-        return np.array([self.row(pair_key) for pair_key in keys], np.int64)
+        return self.rows_at(keys)
 
     def forget_pair(self, pair_key: int) -> None:
         """Remove a pair; its nodes and its key count as changed."""

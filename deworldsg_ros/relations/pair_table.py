@@ -134,10 +134,10 @@ class PairTable(PairRows):
         if not node_ids:
             return
         shapes, nodes = self.shapes, self._graph.nodes
-        rows = np.array([nodes.row(node_id) for node_id in node_ids], np.int64)
+        rows = nodes.rows_at(node_ids)
         new = [node_id for node_id in node_ids if node_id not in shapes]
         shapes.extend(new)
-        at = np.array([shapes.row(node_id) for node_id in node_ids], np.int64)
+        at = shapes.rows_at(node_ids)
         for shape in at.tolist():
             self._forget_bottom(shape)
         surfaces = nodes.surface_points_world, nodes.surface_counts
@@ -190,7 +190,7 @@ class PairTable(PairRows):
         if not self._geometry or not changed:
             return
         shapes = self.shapes
-        at = np.array([shapes.row(node_id) for node_id in changed], np.int64)
+        at = shapes.rows_at(changed)
         first, second = shapes.ids[self._grid.pairs(at, shapes.low, shapes.high, shapes.counts)].T
         self._waiting.move(key(np.minimum(first, second), np.maximum(first, second)))
         # Those that were in reach, and may be no more; and those with too few points until now.
@@ -205,16 +205,20 @@ class PairTable(PairRows):
         rows = self.add(keys)
         self._count(rows)
         if self._geometry:
+            if len(self) > known_rows:
+                self.set_apart(rows[rows >= known_rows])
             again = rows[moved]
-            near = in_reach(self.ends[again], shapes.low, shapes.high, shapes.counts)
-            for apart in (rows[rows >= known_rows], again[~near]):
-                if len(apart):
-                    self.set_apart(apart)
-            self._judge_near(self, again[near], self._R_up_world, self.floor_m)
+            if len(again):
+                near = in_reach(self.ends[again], shapes.low, shapes.high, shapes.counts)
+                if not near.all():
+                    self.set_apart(again[~near])
+                self._judge_near(self, again[near], self._R_up_world, self.floor_m)
         self.changed_pairs.update(keys)
-        idle = (self.frames[rows] == 0) & ~(self.judged[rows] & np.isfinite(self.gaps_m[rows]))
-        for pair_key in self.ids[rows[idle]].tolist():
-            self.forget_pair(pair_key)
+        unseen = rows[self.frames[rows] == 0]
+        if len(unseen):
+            idle = ~(self.judged[unseen] & np.isfinite(self.gaps_m[unseen]))
+            for pair_key in self.ids[unseen[idle]].tolist():
+                self.forget_pair(pair_key)
 
     def _count(self, rows: Int64) -> None:
         """Take in the votes on pairs."""

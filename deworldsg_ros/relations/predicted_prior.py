@@ -92,7 +92,8 @@ class PredictedPrior:
         for pair_key in keys:
             for pair, values in self._told.pop(pair_key, ()):
                 self._add(pair, -values, -1)
-        rows = np.array([table.row(pair_key) for pair_key in keys if pair_key in table], np.int64)
+        known = table.places
+        rows = np.array([known[pair_key] for pair_key in keys if pair_key in known], np.int64)
         values, told = _predictions(rows, table.judged, table.state_logits, self._named)
         places, ends = np.nonzero(told)
         if not len(places):
@@ -118,10 +119,13 @@ class PredictedPrior:
         """The priors of many class pairs; see `ClassPairPrior.lookup`."""
         priors = np.zeros((len(pair_classes), self._predicate_count))
         has_prior = np.zeros(len(pair_classes), np.bool_)
+        if not self._sums:
+            return priors, has_prior
         named = np.flatnonzero(self._canonical >= 0)
+        names = self._canonical[named]
         for row, classes in enumerate(map(tuple, pair_classes.tolist())):
             if classes in self._sums:
                 sums, count = self._sums[classes]
-                priors[row, self._canonical[named]] = sums[named] * UNIT / count
+                priors[row, names] = sums[named] * UNIT / count
                 has_prior[row] = True
         return priors, has_prior

@@ -24,7 +24,7 @@ from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.prior import Prior
 from deworldsg_ros.relations.settled_relations import SettledRelations
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.graph import SceneGraph
 
 ClassPair = tuple[int, int]
@@ -105,27 +105,21 @@ class RobustBeliefs:
         for pair_key in self._classes_of.keys() & gone:
             self._index(pair_key, set())
         rows = rows[related]
-        votes = self._votes(rows)
-        probabilities = predicate_probabilities(
-            t.relations[rows],
-            votes,
-            t.frames[rows],
-            t.by_votes[rows],
-            t.with_[rows],
+        probabilities, voted = predicate_probabilities(
+            rows,
+            t.relations,
+            self._graph.votes.of(t.nodes[rows])[1],
+            t.frames,
+            t.by_votes,
+            t.with_,
             self._relation_of,
             self._canonical,
             self._with,
             self._model.vote_scales,
         )
-        judged = np.repeat(t.judged[rows][:, None], 2, axis=1)
+        judged = t.judged[rows].repeat(2).reshape(-1, 2)
         self._add_prior(rows, probabilities, judged, prior)
-        voted = np.asarray(votes.any(axis=2))
         return ChangedBeliefs(gone, t.ids[rows].tolist(), probabilities, judged, voted)
-
-    def _votes(self, rows: Int64) -> Float32:
-        """The votes (k, 2, R) on pairs."""
-        _, votes = self._graph.votes.of(self._table.nodes[rows])
-        return votes.astype(np.float32)
 
     def _add_prior(self, rows: Int64, probabilities: Float64, judged: Bool, prior: Prior) -> None:
         """Eq. 10 with the prior of class pairs, in place; and whether a world model spoke."""
@@ -135,10 +129,13 @@ class RobustBeliefs:
         for pair_key, (first, second), ends in zip(
             table.ids[rows].tolist(), best.tolist(), open_.tolist()
         ):
-            if any(ends) or pair_key in self._classes_of:
+            known = self._classes_of.get(pair_key)
+            if known is not None or any(ends):
                 pairs = [(first, second), (second, first)]
                 # Two objects of one class have the same class pair in both directions.
-                self._index(pair_key, set(itertools.compress(pairs, ends)))
+                uncertain_ones = set(itertools.compress(pairs, ends))
+                if uncertain_ones != known:
+                    self._index(pair_key, uncertain_ones)
         places, ends = np.nonzero(open_)
         if not len(places):
             return

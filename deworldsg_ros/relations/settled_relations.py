@@ -5,16 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.relations.pair_links import joined, pairs_of
+from deworldsg_ros.relations.pair_links import joined
 from deworldsg_ros.relations.pair_table import PairTable
 from deworldsg_ros.relations.physics_model import believed_logits, floor_odds, load_physics_model
-from deworldsg_ros.relations.settling import (
-    find_neighbours,
-    rank_neighbours,
-    relate,
-    share_supports,
-    take_in,
-)
+from deworldsg_ros.relations.settling import settle, take_in
 from deworldsg_ros.relations.vote_model import near_logits, vote_logits
 from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.graph import SceneGraph
@@ -56,43 +50,33 @@ class SettledRelations:
             shapes.floor_odds[objects] = floor_odds(
                 objects, shapes.low, shapes.high, shapes.counts, t.floor_m, self._model.floor
             )
-        lists = (t.ends, t.links, shapes.first_links)
-        cut = share_supports(
-            objects, t.carried, t.kept, shapes.floor_odds, shapes.on_floor, shapes.totals, *lists
-        )
-        self._note_circles(cut.tolist())
-        ranked = find_neighbours(
+        cut, changed = settle(
             objects,
             t.states,
             t.carried,
             t.kept,
+            shapes.floor_odds,
             shapes.on_floor,
+            shapes.totals,
             t.gaps_m,
             t.bottom_steps_m,
+            t.centre_steps_m,
             t.with_,
             t.near,
             t.eligible,
             shapes.shares,
             shapes.marks,
-            *lists,
-        )
-        moved = rank_neighbours(
-            ranked, t.gaps_m, t.centre_steps_m, t.eligible, t.close, t.links, shapes.first_links
-        )
-        around = joined(pairs_of(shapes.first_links, t.links, objects), moved)
-        around = around[t.live[around]]
-        changed = relate(
-            around,
-            t.states,
-            t.carried,
-            t.kept,
-            t.near,
             t.close,
-            t.with_,
             t.near_votes,
+            t.live,
             t.relations,
+            t.ends,
+            t.links,
+            shapes.first_links,
         )
-        return around[changed]
+        if len(cut):
+            self._note_circles(cut.tolist())
+        return changed
 
     def _judge(self, rows: Int64) -> None:
         """What the evidence on each changed pair alone says."""

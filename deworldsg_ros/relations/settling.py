@@ -105,6 +105,104 @@ def take_in(  # noqa: D417
 
 
 @kernel
+def settle(  # noqa: D417
+    objects: Int64,
+    states: Float64,
+    carried: Float64,
+    kept: Float64,
+    floor_odds: Float64,
+    on_floor: Float64,
+    totals: Float64,
+    gaps_m: Float64,
+    bottom_steps_m: Float64,
+    centre_steps_m: Float64,
+    with_: Bool,
+    near: Float64,
+    eligible: Bool,
+    shares: Float64,
+    marks: Bool,
+    close: Bool,
+    near_votes: Float64,
+    live: Bool,
+    relations: Float64,
+    ends: Int64,
+    links: Int64,
+    first_links: Int64,
+) -> tuple[Int64, Int64]:
+    """All rules, around some objects; arguments as in the kernels below.
+
+    Args:
+        objects: (k,) different rows.
+        live: (m,) bool; other pairs are not related.
+
+    Returns:
+        Places of the supports that were cut, see `share_supports`; and the rows of the pairs whose
+        relations changed.
+    """
+    cut = share_supports(
+        objects, carried, kept, floor_odds, on_floor, totals, ends, links, first_links
+    )
+    ranked = find_neighbours(
+        objects,
+        states,
+        carried,
+        kept,
+        on_floor,
+        gaps_m,
+        bottom_steps_m,
+        with_,
+        near,
+        eligible,
+        shares,
+        marks,
+        ends,
+        links,
+        first_links,
+    )
+    moved = rank_neighbours(ranked, gaps_m, centre_steps_m, eligible, close, links, first_links)
+    rows = _pairs_around(objects, moved, live, marks, ends, links, first_links)
+    return cut, relate(rows, states, carried, kept, near, close, with_, near_votes, relations)
+
+
+@kernel
+def _pairs_around(
+    objects: Int64,
+    more: Int64,
+    live: Bool,
+    marks: Bool,
+    ends: Int64,
+    links: Int64,
+    first_links: Int64,
+) -> Int64:
+    """Rows of the live pairs of objects, and of some more; the latter may be there twice."""
+    count = len(more)
+    for item in objects:
+        marks[item] = True
+        place = first_links[item]
+        while place:
+            count += 1
+            place = links[(place - 1) >> 1, (place - 1) & 1]
+    rows = np.empty(count, np.int64)
+    count = 0
+    for item in objects:
+        place = first_links[item]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            # A pair of two of the objects is in the lists of both.
+            if live[row] and (end == 0 or not marks[ends[row, 0]]):
+                rows[count] = row
+                count += 1
+            place = links[row, end]
+    for row in more:
+        if live[row] and not marks[ends[row, 0]] and not marks[ends[row, 1]]:
+            rows[count] = row
+            count += 1
+    for item in objects:
+        marks[item] = False
+    return rows[:count]
+
+
+@kernel
 def share_supports(  # noqa: D417
     objects: Int64,
     carried: Float64,
@@ -394,19 +492,19 @@ def relate(  # noqa: D417
     with_: Bool,
     near_votes: Float64,
     relations: Float64,
-) -> Bool:
+) -> Int64:
     """The relations of pairs in both directions.
 
     Args:
-        rows: (k,) rows of pairs.
+        rows: (k,) rows of pairs; it is overwritten.
         states, carried, kept, near, close, with_: see above.
         near_votes: (m,) logits that votes add to "near".
         relations: (m, 2, len(RELATIONS)) probabilities; written.
 
     Returns:
-        (k,) bool, whether the relations of a pair changed.
+        The rows of the pairs whose relations changed.
     """
-    changed = np.zeros(len(rows), np.bool_)
+    count = 0
     now = np.empty((2, NONE + 1))
     for index in range(len(rows)):
         row = rows[index]
@@ -425,10 +523,14 @@ def relate(  # noqa: D417
             beside = 0.0
         beside = min(max(beside, 1.0 - NEAR_CERTAINTY), NEAR_CERTAINTY)
         beside = _expit(math.log(beside / (1.0 - beside)) + near_votes[row])
+        changed = False
         for end in range(2):
             now[end, NEAR] = unrelated * beside
             now[end, NONE] += unrelated * (1.0 - beside)
             for relation in range(NONE + 1):
-                changed[index] |= relations[row, end, relation] != now[end, relation]
+                changed |= relations[row, end, relation] != now[end, relation]
                 relations[row, end, relation] = now[end, relation]
-    return changed
+        if changed:
+            rows[count] = row
+            count += 1
+    return rows[:count]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -73,6 +74,8 @@ class VoteMap(Columns):
     def of(self, nodes: Int64) -> tuple[Int64, Float64]:
         """Frames (m,) and votes (m, 2, R) of pairs of ids (m, 2), smaller first; 0 if unknown."""
         rows = self._rows_of(key(nodes[:, 0], nodes[:, 1]).tolist())
+        if rows.min(initial=0) >= 0:
+            return self.frames[rows], self._votes[self.sums[rows]]
         known = rows >= 0
         frames, sums = np.zeros(len(rows), np.int64), np.zeros((len(rows), 2), np.int32)
         frames[known], sums[known] = self.frames[rows[known]], self.sums[rows[known]]
@@ -119,8 +122,7 @@ class VoteMap(Columns):
         self._changed.update(keys)
 
     def _rows_of(self, keys: list[int]) -> Int64:
-        places = self.places
-        return np.array([places.get(one, -1) for one in keys], np.int64)
+        return np.fromiter(map(self.places.get, keys, repeat(-1)), np.int64, len(keys))
 
     def vote(self, nodes: Int64, votes: Float64) -> None:
         """Add votes (m, R) to m known pairs (m, 2), subject and object."""

@@ -22,12 +22,7 @@ from deworldsg_ros.relations.physical_states import (
     RELATIONS_OF_STATE,
     STATE_COUNT,
 )
-from deworldsg_ros.relations.settling import (
-    find_neighbours,
-    rank_neighbours,
-    relate,
-    share_supports,
-)
+from deworldsg_ros.relations.settling import settle
 
 seeds = st.integers(0, 10_000)
 
@@ -51,7 +46,7 @@ class Scene:
         self.near, self.relations = np.zeros(m), np.zeros((m, 2, NONE + 1))
         self.eligible, self.close = np.zeros(m, np.bool_), np.zeros((m, 2), np.bool_)
         self.on_floor, self.totals, self.shares = (np.zeros(count) for _ in range(3))
-        self.marks = np.zeros(count, np.bool_)
+        self.marks, self.live = np.zeros(count, np.bool_), np.ones(m, np.bool_)
         self.circles: list[set[int]] = []
 
     def change(self, rng: np.random.Generator, rows: np.ndarray) -> None:
@@ -72,26 +67,19 @@ class Scene:
         for circle in self.circles:
             if circle & set(objects.tolist()):
                 objects = np.union1d(objects, np.array(sorted(circle)))
-        args = (self.carried, self.kept, self.floor_odds, self.on_floor, self.totals)
-        for place in share_supports(objects, *args, *lists).tolist():
+        cut, changed = settle(
+            objects, self.states, self.carried, self.kept, self.floor_odds, self.on_floor,
+            self.totals, self.gaps_m, self.bottoms_m, self.centres_m, self.with_, self.near,
+            self.eligible, self.shares, self.marks, self.close, self.near_votes, self.live,
+            self.relations, *lists,
+        )  # fmt: skip
+        for place in cut.tolist():
             # More objects than those of the circle do no harm.
             self.circles.append(set(range(len(self.totals))))
             assert self.kept[place >> 1, place & 1] <= 0.5
-        known = (self.states, self.carried, self.kept)
-        ranked = find_neighbours(
-            objects, *known, self.on_floor, self.gaps_m, self.bottoms_m, self.with_,
-            self.near, self.eligible, self.shares, self.marks, *lists,
-        )  # fmt: skip
         assert not self.marks.any() and not self.shares.any()
-        moved = rank_neighbours(
-            ranked, self.gaps_m, self.centres_m, self.eligible, self.close, *lists[1:]
-        )
-        touched = np.isin(self.pairs, objects).any(axis=1)
-        around = np.union1d(np.flatnonzero(touched), moved).astype(np.int64)
-        changed = relate(
-            around, *known, self.near, self.close, self.with_, self.near_votes, self.relations
-        )
-        return around[changed]
+        assert len(set(changed.tolist())) == len(changed)
+        return changed
 
     def reference(self) -> np.ndarray:
         """The relations of all pairs, by the rules for all pairs at once."""
