@@ -62,9 +62,7 @@ def predicate_probabilities(
     with_index: int,
     scales: Float64,
 ) -> tuple[Float64, Bool]:
-    """Probabilities (k, 2, R) of the predicates of pairs in both directions.
-
-    Also (k, 2) bool: whether frames voted.
+    """Probabilities (k, 2, R) of the predicates of pairs in both directions; (k, 2) bool: any votes.
 
     Each relation's probability is divided among its predicates by their votes. Without votes, a
     relation has the name that comes first in `PREDICATES`; a table is "with" the seats that are
@@ -90,8 +88,7 @@ def predicate_probabilities(
         row = rows[index]
         for end in range(2):
             out = result[index, end]
-            sums[:] = NAMING_VOTES
-            others = 0.0
+            sums[:], others = NAMING_VOTES, 0.0
             for name in range(width):
                 told[name] = votes[index, end, name]
                 voted[index, end] |= told[name] != 0.0

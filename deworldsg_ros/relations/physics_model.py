@@ -104,7 +104,7 @@ class PhysicsModel:
         return self.states_of(np.concatenate([there, back]))
 
     def states_of(self, inputs: Float64) -> Float64:
-        """As `state_logits`, from the inputs (2 m, INPUT_COUNT) of one direction after the other."""
+        """As `state_logits`, from inputs (2 m, INPUT_COUNT): one direction after the other."""
         both = self.relation_logits(inputs)
         return states_of_relations(both.reshape(2, len(inputs) // 2, -1))
 
