@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,11 +27,6 @@ INPUT_SIZE = 416
 STRIDES = (8, 16, 32)
 # The distance to each side of a box is a distribution over 0 to 10 strides.
 BINS = 11
-# Of the training images, BGR, 8-bit scale.
-MEAN_BGR = np.array([103.53, 116.28, 123.675], dtype=np.float32)
-STD_BGR = np.array([57.375, 57.12, 58.395], dtype=np.float32)
-# (3, 256) float32: the input of the network for each channel and each 8-bit value.
-INPUT_OF_VALUE = (np.arange(256, dtype=np.float32) - MEAN_BGR[:, None]) / STD_BGR[:, None]
 # Cells with a lower score are ignored. The limit saves time, and is below all useful thresholds.
 CANDIDATE_SCORE = 0.15
 # Boxes of one class with a larger overlap show one object.
@@ -39,6 +35,20 @@ SAME_CLASS_IOU = 0.5
 ANY_CLASS_IOU = 0.75
 # Fitted by tools/calibration/calibrate_detector.py; see docs/dev/perception.md.
 CALIBRATION = SoftmaxCalibration(temperature=0.35)
+
+
+class Tables(NamedTuple):
+    """Meaning of the network's 8-bit codes: outputs that are the same for all images.
+
+    Attributes:
+        input_codes: (256, 3) uint8, code of each 8-bit value of R, G and B.
+        logits: (3, 256) float32, logit of each code in the side distributions of each stride.
+        scores: (3, 256) float32, ascending: sigmoid score of each code in the classes.
+    """
+
+    input_codes: UInt8
+    logits: Float32
+    scores: Float32
 
 
 class NanoDetDetector:
@@ -68,7 +78,8 @@ class NanoDetDetector:
         self._session = onnxruntime.InferenceSession(
             str(weights), options, providers=["CPUExecutionProvider"]
         )
-        self._input = self._session.get_inputs()[0].name
+        nothing = np.zeros((1, INPUT_SIZE, INPUT_SIZE, 4), np.uint8)
+        self._tables = Tables(*self._session.run(list(Tables._fields), {"pixels": nothing}))
 
     def detect(self, rgb: UInt8, score_threshold: float) -> Detections:
         """Objects of `rgb`, (H, W, 3) uint8, with score >= `score_threshold`, best first."""
@@ -77,50 +88,61 @@ class NanoDetDetector:
 
     def candidates(self, rgb: UInt8) -> tuple[Float64, Float64]:
         """Output of the network before suppression: boxes (k, 4) in pixels, scores (k, 80)."""
-        tensor, scale = letterbox(rgb)
-        heads = self._session.run(None, {self._input: tensor})
-        boxes, class_scores = decode([np.asarray(head)[0] for head in heads])
+        pixels, scale = letterbox(rgb, self._tables.input_codes)
+        codes = self._session.run([f"codes_{stride}" for stride in STRIDES], {"pixels": pixels})
+        boxes, class_scores = decode([np.asarray(c)[0] for c in codes], self._tables)
         height, width = rgb.shape[:2]
         # Pixel centres are at integers here, and at halves in the network.
         return np.clip(boxes / scale - 0.5, -0.5, [width - 0.5, height - 0.5] * 2), class_scores
 
 
-def letterbox(rgb: UInt8) -> tuple[Float32, float]:
-    """Network input (1, 3, 416, 416) float32 BGR with the image at the top left, and its scale."""
+def letterbox(rgb: UInt8, input_codes: UInt8) -> tuple[UInt8, float]:
+    """Network input (1, 416, 416, 4) uint8 with the image at the top left, and its scale.
+
+    Args:
+        rgb: (H, W, 3) uint8.
+        input_codes: (256, 3) uint8, see `Tables`.
+    """
     height, width = rgb.shape[:2]
     scale = INPUT_SIZE / max(height, width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     resized = cv2.resize(rgb, size, interpolation=cv2.INTER_LINEAR)
-    # The part below or beside the image is black.
-    tensor = np.empty((1, 3, INPUT_SIZE, INPUT_SIZE), dtype=np.float32)
-    tensor[0] = INPUT_OF_VALUE[:, 0, None, None]
-    for channel, table in enumerate(INPUT_OF_VALUE):
-        tensor[0, channel, : size[1], : size[0]] = cv2.LUT(resized[..., 2 - channel], table)
-    return tensor, scale
+    # Four channels: convolutions take longer with three. The weights of the fourth are zero. The
+    # part below or beside the image is black.
+    pixels = np.empty((1, INPUT_SIZE, INPUT_SIZE, 4), np.uint8)
+    black = np.append(input_codes[0], np.uint8(0))
+    pixels[0, size[1] :], pixels[0, :, size[0] :] = black, black
+    codes = cv2.LUT(resized, input_codes[None])
+    pixels[0, : size[1], : size[0]] = cv2.cvtColor(codes, cv2.COLOR_RGB2RGBA)
+    return pixels, scale
 
 
-def decode(heads: list[Float32]) -> tuple[Float64, Float64]:
+def decode(codes: Sequence[UInt8], tables: Tables) -> tuple[Float64, Float64]:
     """Candidate boxes (k, 4) in input pixels and their sigmoid class scores (k, 80).
 
     Args:
-        heads: for each stride the scores (cells, 80) and the side distributions (cells, 44), in
-            any order.
+        codes: for each stride (rows, columns, 124) uint8: 80 classes, then 4 side distributions.
+        tables: meaning of the codes.
     """
-    boxes, scores = [], []
-    for stride in STRIDES:
-        side = -(-INPUT_SIZE // stride)
-        cells = [head for head in heads if len(head) == side * side]
-        class_scores = next(head for head in cells if head.shape[1] == len(COCO_CLASSES))
-        side_logits = next(head for head in cells if head.shape[1] == 4 * BINS)
-        rows = np.flatnonzero(class_scores.max(axis=1) > CANDIDATE_SCORE)
-        logits = side_logits[rows].astype(np.float64).reshape(len(rows), 4, BINS)
-        weights = np.exp(logits - logits.max(axis=2, keepdims=True))
-        # The expectation over the bins is the distance to left, top, right and bottom.
-        distances = (weights @ np.arange(BINS)) / weights.sum(axis=2) * stride
-        centres = (np.stack([rows % side, rows // side], axis=1) + 0.5) * stride
-        boxes.append(np.hstack([centres - distances[:, :2], centres + distances[:, 2:]]))
-        scores.append(class_scores[rows].astype(np.float64))
-    return np.concatenate(boxes), np.concatenate(scores)
+    centres, strides, logits, scores = [], [], [], []
+    for level, stride in enumerate(STRIDES):
+        side = codes[level].shape[1]
+        cells = codes[level].reshape(-1, codes[level].shape[2])
+        # Better scores have larger codes.
+        least = np.searchsorted(tables.scores[level], np.float32(CANDIDATE_SCORE), side="right")
+        rows = np.flatnonzero(cells[:, : len(COCO_CLASSES)].max(axis=1) >= least)
+        found = cells[rows]
+        scores.append(tables.scores[level][found[:, : len(COCO_CLASSES)]])
+        logits.append(tables.logits[level][found[:, len(COCO_CLASSES) :]])
+        centres.append((np.stack([rows % side, rows // side], axis=1) + 0.5) * stride)
+        strides.append(np.full((len(rows), 1), stride))
+    sides = np.concatenate(logits).astype(np.float64).reshape(-1, 4, BINS)
+    weights = np.exp(sides - sides.max(axis=2, keepdims=True))
+    # The expectation over the bins is the distance to left, top, right and bottom.
+    distances = (weights @ np.arange(BINS)) / weights.sum(axis=2) * np.concatenate(strides)
+    centre = np.concatenate(centres)
+    boxes = np.hstack([centre - distances[:, :2], centre + distances[:, 2:]])
+    return boxes, np.concatenate(scores).astype(np.float64)
 
 
 def combine(
@@ -141,14 +163,16 @@ def combine(
         calibration: scores (n, 80) to distributions.
     """
     best = class_scores.max(axis=1) if len(class_scores) else np.zeros(0)
+    # A box never suppresses a better one.
+    strong = np.flatnonzero(best >= score_threshold)
     keeper = cluster_boxes(
-        boxes_xyxy,
-        best,
-        class_scores.argmax(axis=1) if len(class_scores) else np.zeros(0, np.int64),
+        boxes_xyxy[strong],
+        best[strong],
+        class_scores[strong].argmax(axis=1) if len(strong) else np.zeros(0, np.int64),
         same_class_iou=SAME_CLASS_IOU,
         any_class_iou=ANY_CLASS_IOU,
     )
-    kept = np.flatnonzero((keeper == np.arange(len(keeper))) & (best >= score_threshold))
+    kept = strong[keeper == np.arange(len(keeper))]
     kept = kept[np.argsort(-best[kept], kind="stable")]
     evidence = class_scores[kept].copy()
     near = pairwise_iou(boxes_xyxy[kept], boxes_xyxy) > ANY_CLASS_IOU

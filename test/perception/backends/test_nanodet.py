@@ -12,9 +12,11 @@ from hypothesis import strategies as st
 
 from deworldsg_ros.perception.backends.nanodet import (
     BINS,
+    CANDIDATE_SCORE,
     INPUT_SIZE,
     STRIDES,
     NanoDetDetector,
+    Tables,
     combine,
     decode,
     letterbox,
@@ -77,14 +79,22 @@ def test_iou_equals_the_plain_loop(rows):
     assert np.allclose(pairwise_iou(boxes, boxes), expected)
 
 
+# Scores and logits of the codes grow evenly: from 0 to 1, and from -64 to 63.5.
+TABLES = Tables(
+    input_codes=np.tile(np.arange(256, dtype=np.uint8)[:, None], 3),
+    logits=np.tile((np.arange(256, dtype=np.float32) - 128) / 2, (3, 1)),
+    scores=np.tile(np.arange(256, dtype=np.float32) / 255, (3, 1)),
+)
+
+
 def empty_heads():
+    """Codes of every cell: scores of 0.012, logits of 0."""
     heads = []
     for stride in STRIDES:
-        cells = (INPUT_SIZE // stride) ** 2
-        heads += [
-            np.full((cells, len(COCO_CLASSES)), 0.01, np.float32),
-            np.zeros((cells, 4 * BINS), np.float32),
-        ]
+        side = INPUT_SIZE // stride
+        head = np.full((side, side, len(COCO_CLASSES) + 4 * BINS), 128, np.uint8)
+        head[..., : len(COCO_CLASSES)] = 3
+        heads.append(head)
     return heads
 
 
@@ -93,21 +103,30 @@ def test_decode_one_cell(level):
     stride = STRIDES[level]
     heads = empty_heads()
     row, column = 5, 7
-    cell = row * (INPUT_SIZE // stride) + column
-    heads[2 * level][cell, CUP] = 0.9
+    cell = heads[level][row, column]
+    cell[CUP] = 230
     # Distances 1, 2, 3 and 4.5 strides: one sharp bin, or two equal ones beside each other.
-    sides = heads[2 * level + 1][cell].reshape(4, BINS)
+    sides = cell[len(COCO_CLASSES) :].reshape(4, BINS)
     for side, bins in enumerate([[1], [2], [3], [4, 5]]):
-        sides[side, bins] = 50.0
-    boxes, scores = decode(heads[::-1])
+        sides[side, bins] = 228
+    boxes, scores = decode(heads, TABLES)
     x, y = (column + 0.5) * stride, (row + 0.5) * stride
     expected = [[x - stride, y - 2 * stride, x + 3 * stride, y + 4.5 * stride]]
     assert np.allclose(boxes, expected, atol=1e-4)
     assert scores.shape == (1, 80) and scores.argmax() == CUP
+    assert scores[0, CUP] == TABLES.scores[level, 230]
+
+
+@pytest.mark.parametrize(("code", "count"), [(38, 0), (39, 1)])
+def test_decode_takes_scores_above_the_limit(code, count):
+    assert TABLES.scores[0, 38] <= CANDIDATE_SCORE < TABLES.scores[0, 39]
+    heads = empty_heads()
+    heads[0][0, 0, CUP] = code
+    assert len(decode(heads, TABLES)[0]) == count
 
 
 def test_decode_without_candidates():
-    boxes, scores = decode(empty_heads())
+    boxes, scores = decode(empty_heads(), TABLES)
     assert boxes.shape == (0, 4) and scores.shape == (0, 80)
     assert len(combine(boxes, scores, 0.4)) == 0
 
@@ -128,6 +147,18 @@ def test_class_scores_of_nearly_identical_boxes_are_combined():
     assert found.class_probabilities[0, COCO_CLASSES.index("bottle")] > 0.2
     assert 0.5 < disputed < plain
     assert np.allclose(found.class_probabilities.sum(axis=1), 1)
+
+
+@given(st.lists(candidate, max_size=10))
+def test_weak_candidates_change_no_object_but_its_classes(rows):
+    table = np.array(rows, dtype=float).reshape(-1, 6)
+    boxes = np.hstack([table[:, :2], table[:, :2] + table[:, 2:4]])
+    scores = np.full((len(rows), 80), 0.01)
+    scores[np.arange(len(rows)), table[:, 5].astype(int)] = table[:, 4]
+    every, strong = combine(boxes, scores, 0.0), combine(boxes, scores, 0.5)
+    best = every.scores >= 0.5
+    assert np.array_equal(every.boxes_xyxy[best], strong.boxes_xyxy)
+    assert np.array_equal(every.class_probabilities[best], strong.class_probabilities)
 
 
 def test_nested_objects_of_different_classes_are_kept():
@@ -162,11 +193,13 @@ def test_calibration_refuses_a_temperature_that_is_not_positive():
 
 @pytest.mark.parametrize("shape", [(480, 640), (640, 480), (416, 416), (60, 80), (1, 500)])
 def test_letterbox_keeps_the_aspect(shape):
-    rgb = np.full((*shape, 3), 255, np.uint8)
-    tensor, scale = letterbox(rgb)
-    assert tensor.shape == (1, 3, 416, 416) and tensor.dtype == np.float32
-    inside = (tensor[0] > 0).all(axis=0)
+    rgb = np.full((*shape, 3), (255, 128, 1), np.uint8)
+    codes = 255 - TABLES.input_codes
+    pixels, scale = letterbox(rgb, codes)
+    assert pixels.shape == (1, 416, 416, 4) and pixels.dtype == np.uint8
+    inside = (pixels[0, ..., :3] == (0, 127, 254)).all(axis=2)
     assert inside[0, 0]
+    assert (pixels[0, ~inside, :3] == codes[0]).all()
     assert np.isclose(scale * max(shape), 416)
     expected = max(1, round(shape[0] * scale)) * max(1, round(shape[1] * scale))
     assert inside.sum() == expected
