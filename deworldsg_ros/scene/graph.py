@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
-from deworldsg_ros.scene.edges import EdgeEvidence, EdgeMap, Pair
+from deworldsg_ros.scene.edge_map import EdgeMap
+from deworldsg_ros.scene.edges import EdgeArrays, EdgeEvidence, Pair
 from deworldsg_ros.scene.edits import Edit, EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import IdState, NodeIds
@@ -31,7 +32,7 @@ class GraphState:
         nodes: arrays of n rows, by their names in `NodeTable`.
         surface_points: (m, 3) float32, metres, those of one node after those of another.
         surface_counts: (n,) int64, number of points of each node.
-        edges: evidence of each directed pair of ids.
+        edges: evidence of the directed pairs of ids.
         votes: votes of frames on each unordered pair of ids.
         ids: the id memory.
         edits: of an operator, oldest first.
@@ -42,7 +43,7 @@ class GraphState:
     nodes: Mapping[str, NDArray[Any]]
     surface_points: Float32
     surface_counts: Int64
-    edges: Mapping[Pair, EdgeEvidence]
+    edges: EdgeArrays
     votes: Mapping[Pair, PairVotes]
     ids: IdState
     revision: int
@@ -103,7 +104,7 @@ class SceneGraph(NodeStore):
             nodes={name: getattr(nodes, name).copy() for name in SAVED_COLUMNS},
             surface_points=nodes.surface_points(),
             surface_counts=nodes.surface_counts.copy(),
-            edges=dict(self.edges),
+            edges=self._edges.arrays(),
             votes=dict(self.votes),
             ids=self._ids.state(),
             revision=self.revision,

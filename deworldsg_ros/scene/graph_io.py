@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.array_checks import checked
 from deworldsg_ros.scene.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.scene.arrays import Int64
-from deworldsg_ros.scene.edges import EdgeEvidence, Pair
+from deworldsg_ros.scene.edges import EdgeArrays, Pair
 from deworldsg_ros.scene.edits import Edit
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
@@ -62,7 +61,9 @@ def to_arrays(state: GraphState) -> Arrays:
         **state.nodes,
         "surface_points": state.surface_points,
         "surface_point_counts": state.surface_counts,
-        **_edge_arrays(state),
+        "edge_pairs": state.edges.pairs,
+        "edge_visual_logits": state.edges.visual_logits,
+        "edge_counts": state.edges.counts,
         **_vote_arrays(state),
         **_id_arrays(state.ids),
         **_edit_arrays(state),
@@ -73,17 +74,6 @@ def _edit_arrays(state: GraphState) -> Arrays:
     """Empty without edits, as in files of older releases."""
     content = msgspec.json.encode(list(state.edits))
     return {"edits": np.frombuffer(content, np.uint8)} if state.edits else {}
-
-
-def _edge_arrays(state: GraphState) -> Arrays:
-    count, width = len(state.edges), len(state.vocabulary.predicates)
-    pairs = np.fromiter(chain.from_iterable(state.edges), np.int64, 2 * count)
-    logits, *counts = zip(*state.edges.values()) if count else [()] * 5
-    return {
-        "edge_pairs": pairs.reshape(-1, 2),
-        "edge_visual_logits": np.concatenate([np.zeros(0), *logits]).reshape(count, width),
-        "edge_counts": np.array(counts, np.int64).T.copy(),
-    }
 
 
 def _vote_arrays(state: GraphState) -> Arrays:
@@ -137,7 +127,7 @@ def _state(arrays: Arrays) -> GraphState:
         nodes={name: _column(arrays, name) for name in SAVED_COLUMNS},
         surface_points=arrays["surface_points"],
         surface_counts=arrays["surface_point_counts"],
-        edges=_edges(arrays),
+        edges=EdgeArrays(arrays["edge_pairs"], arrays["edge_visual_logits"], arrays["edge_counts"]),
         votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
         ids=_ids(arrays, header.next_id),
         revision=header.revision,
@@ -167,15 +157,6 @@ def _column(arrays: Arrays, name: str) -> NDArray[Any]:
     if name == "existence" and name not in arrays:  # files of older releases
         return np.full(len(arrays["ids"]), -1.0)
     return arrays[name]
-
-
-def _edges(arrays: Arrays) -> dict[Pair, EdgeEvidence]:
-    logits, (frames, *others) = arrays["edge_visual_logits"], arrays["edge_counts"].T.tolist()
-    # All pairs without frames share one row.
-    none = np.zeros(logits.shape[1])
-    rows = [row if count else none for row, count in zip(logits, frames)]
-    pairs = zip(*arrays["edge_pairs"].T.tolist())
-    return dict(zip(pairs, map(EdgeEvidence, rows, frames, *others)))
 
 
 def _votes(arrays: Arrays) -> dict[Pair, PairVotes]:

@@ -17,7 +17,7 @@ from support.merging import (
 )
 
 from deworldsg_ros.scene import graph_io, wire
-from deworldsg_ros.scene.edges import EdgeMap
+from deworldsg_ros.scene.edge_map import EdgeMap
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
@@ -187,11 +187,29 @@ def test_restored_edges_are_in_the_order_in_which_they_came(seed: int) -> None:
     one, other = EdgeMap(len(VOCABULARY.predicates)), EdgeMap(len(VOCABULARY.predicates))
     for pair, evidence in graph.edges.items():
         one.add(pair, evidence)
-    other.restore(graph.edges)
+    other.restore(one.arrays())
     assert list(one.evidence) == list(other.evidence)
     assert one.take_changed() == other.take_changed()
     for node_id in graph.nodes.ids.tolist():
         assert list(one.partners(node_id)) == list(other.partners(node_id))
+
+
+@given(seeds)
+@settings(max_examples=20)
+def test_restored_edges_change_as_the_others_do(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    graph = SceneGraph(VOCABULARY, "world")
+    edit_at_random(graph, rng, 40)
+    again = SceneGraph.from_state(graph.state())
+    assert again.take_changed_edges() == graph.edges.keys()
+    for one in (graph, again):
+        edit_at_random(one, np.random.default_rng(seed), 40)
+        for node_id in one.nodes.ids[:1].tolist():
+            one.remove_node(node_id)
+    assert list(again.edges) == list(graph.edges) and len(again.edges) == len(graph.edges)
+    for node_id in range(1, 100):
+        assert list(again.partners(node_id)) == list(graph.partners(node_id))
+    assert equal(again, graph)
 
 
 def test_rows_that_were_removed_are_added_as_zeros() -> None:
