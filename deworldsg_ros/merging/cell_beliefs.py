@@ -40,7 +40,7 @@ def judge(
 
     Args:
         table: marked cells are hit, whatever the images say; the marks are removed.
-        firsts: first slot of each owner.
+        firsts: first row of each owner.
         owners: (n,) owners that the frame shows.
         values: (n,) value of each in the instance image.
         frame: the frame.
@@ -50,35 +50,35 @@ def judge(
         Arrays of the `CellSets` of each owner's cells that this frame has rejected, and of its
         rejected cells that were marked.
     """
-    keys, masks, _, marks, rejected, scores, nexts = table
+    _, row_blocks, masks, _, marks, rejected, scores, nexts = table
     offsets = _offsets(frame[0], cell_m)
     blocks, cells = np.empty(64, np.int64), np.empty(64, np.uint64)
     starts = np.zeros(len(owners) + 1, np.int64)
     count = 0
     for index in range(len(owners)):
-        slot = firsts[owners[index]]
-        while slot >= 0:
-            marked = masks[slot] & marks[slot]
-            marks[slot] = 0
+        row = firsts[owners[index]]
+        while row >= 0:
+            marked = masks[row] & marks[row]
+            marks[row] = 0
             changed, lost = _judge_block(
-                keys[slot],
-                masks[slot],
+                row_blocks[row],
+                masks[row],
                 marked,
-                scores[slot],
+                scores[row],
                 values[index],
                 frame,
                 offsets,
                 cell_m,
             )
-            dropped = (lost & ~rejected[slot]) | (lost & marked)
-            rejected[slot] = (rejected[slot] & ~changed) | lost
+            dropped = (lost & ~rejected[row]) | (lost & marked)
+            rejected[row] = (rejected[row] & ~changed) | lost
             if dropped != 0:
                 if count == len(blocks):
                     blocks = np.concatenate((blocks, blocks))
                     cells = np.concatenate((cells, cells))
-                blocks[count], cells[count] = keys[slot], dropped
+                blocks[count], cells[count] = row_blocks[row], dropped
                 count += 1
-            slot = nexts[slot]
+            row = nexts[row]
         starts[index + 1] = count
     return blocks[:count].copy(), cells[:count].copy(), starts
 

@@ -13,7 +13,6 @@ import numpy as np
 from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt64
 
-EMPTY = np.int64(-1)
 # Cell indices lie in ±2^20: with cells of 3 cm, 31 km around the origin.
 INDEX_BIAS = 1 << 20
 INDEX_MASK = (1 << 21) - 1
@@ -54,22 +53,26 @@ class CellSets(NamedTuple):
 
 
 class CellTable(NamedTuple):
-    """Hash table of cells. A slot holds the cells of one owner in one block.
+    """Hash table of cells. A row holds the cells of one owner in one block.
 
-    The slots of a block lie between its home slot and the next empty slot.
+    Rows are in the order in which they came, so those of one owner mostly lie together. The slots
+    of a block lie between its home slot and the next empty slot.
 
     Attributes:
-        keys: (capacity,) int64, block of each slot; -1 = empty.
-        masks: (capacity,) uint64, cells of each slot.
-        owners: (capacity,) int32, owner of each slot; -1 = removed.
-        marks: (capacity,) uint64, cells that a query has met; zero between queries.
-        rejected: (capacity,) uint64, cells with a negative score.
-        scores: (capacity, 64) int8, evidence that each cell is the owner's surface
-            (`cell_beliefs`). It stays when the owner loses the cell.
-        nexts: (capacity,) int32, next slot of the same owner; -1 = none.
+        slots: (capacity,) int32, row of each slot; -1 = empty. All others have a value of each row,
+            and room for half as many rows as slots: what is not used takes no memory.
+        blocks: (n,) int64.
+        masks: (n,) uint64, cells in the block.
+        owners: (n,) int32; -1 = removed.
+        marks: (n,) uint64, cells that a query has met; zero between queries.
+        rejected: (n,) uint64, cells with a negative score.
+        scores: (n, 64) int8, evidence that each cell is the owner's surface (`cell_beliefs`). It
+            stays when the owner loses the cell.
+        nexts: (n,) int32, next row of the same owner; -1 = none.
     """
 
-    keys: Int64
+    slots: Int32
+    blocks: Int64
     masks: UInt64
     owners: Int32
     marks: UInt64
@@ -79,7 +82,7 @@ class CellTable(NamedTuple):
 
 
 # The kernels take the same arrays as plain tuples: numba is slower to call with named ones.
-TableArrays = tuple[Int64, UInt64, Int32, UInt64, UInt64, Int8, Int32]
+TableArrays = tuple[Int32, Int64, UInt64, Int32, UInt64, UInt64, Int8, Int32]
 SetArrays = tuple[Int64, UInt64, Int64]
 # Sums of a query by owner, zero between queries: cells of a block of the set that lie on the owner;
 # number of cells of the set on the owner, and of the owner on the set.
@@ -88,22 +91,24 @@ SumArrays = tuple[UInt64, Int64, Int64]
 
 def new_table(capacity: int) -> CellTable:
     """An empty table; the capacity is a power of two."""
+    room = capacity // 2
     return CellTable(
-        np.full(capacity, EMPTY, np.int64),
-        np.zeros(capacity, np.uint64),
         np.full(capacity, -1, np.int32),
-        np.zeros(capacity, np.uint64),
-        np.zeros(capacity, np.uint64),
-        np.zeros((capacity, 64), np.int8),
-        np.full(capacity, -1, np.int32),
+        np.zeros(room, np.int64),
+        np.zeros(room, np.uint64),
+        np.zeros(room, np.int32),
+        np.zeros(room, np.uint64),
+        np.zeros(room, np.uint64),
+        np.zeros((room, 64), np.int8),
+        np.zeros(room, np.int32),
     )
 
 
 @kernel
-def _home_slot(keys: Int64, block: np.int64) -> int:
+def _home_slot(slots: Int32, block: np.int64) -> int:
     """First slot in which a block may lie."""
     mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
-    return int(np.int64(mixed >> np.uint64(32)) & (len(keys) - 1))
+    return int(np.int64(mixed >> np.uint64(32)) & (len(slots) - 1))
 
 
 @kernel
@@ -165,7 +170,7 @@ def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt
         while capacity < 2 * (starts[index + 1] - starts[index]):
             capacity *= 2
         # Position of each block in `blocks`, by hash.
-        known = np.empty(capacity, np.int64)
+        known = np.empty(capacity, np.int32)
         for slot in range(capacity):
             known[slot] = -1
         for point in range(starts[index], starts[index + 1]):
@@ -186,25 +191,26 @@ def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt
 
 @kernel
 def _find_slots(table: TableArrays, block: np.int64, owner: int) -> tuple[int, int, int, np.uint64]:
-    """The owner's slot of a block, a removed slot (-1 = none), the next empty slot, and the cells
-    of the block that have four owners.
+    """The owner's row of a block, a removed row (-1 = none), the next empty slot, and the cells of
+    the block that have four owners.
     """
-    keys, masks, slot_owners, marks, _, _, _ = table
+    slots, blocks, masks, owners, _, _, _, _ = table
     own = removed = -1
     # The three bits of the number of owners of each cell.
     ones = twos = fours = np.uint64(0)
-    slot = _home_slot(keys, block)
-    while keys[slot] != -1:
-        if slot_owners[slot] < 0:
-            removed = slot
-        elif keys[slot] == block:
-            if slot_owners[slot] == owner:
-                own = slot
-            carried = ones & masks[slot]
-            ones ^= masks[slot]
+    slot = _home_slot(slots, block)
+    while slots[slot] != -1:
+        row = slots[slot]
+        if owners[row] < 0:
+            removed = row
+        elif blocks[row] == block:
+            if owners[row] == owner:
+                own = row
+            carried = ones & masks[row]
+            ones ^= masks[row]
             fours |= twos & carried
             twos ^= carried
-        slot = (slot + 1) & (len(keys) - 1)
+        slot = (slot + 1) & (len(slots) - 1)
     return own, removed, slot, fours
 
 
@@ -223,63 +229,66 @@ def add(
     Args:
         table: with room for all blocks of the sets.
         counts: number of cells of each owner; updated.
-        firsts: first slot of each owner, -1 = none; updated.
+        firsts: first row of each owner, -1 = none; updated.
         max_cells: of an owner.
-        used: number of slots that are not empty.
+        used: number of rows.
         owners: (n,) owner of each set.
         sets: n sets.
 
     Returns:
         The new `used`.
     """
-    keys, masks, slot_owners, _, _, _, nexts = table
-    blocks, set_masks, starts = sets
+    slots, blocks, masks, row_owners, _, _, _, nexts = table
+    set_blocks, set_masks, starts = sets
     for index in range(len(owners)):
         owner = owners[index]
         for at in range(starts[index], starts[index + 1]):
-            slot, removed, empty, full = _find_slots(table, blocks[at], owner)
+            row, removed, empty, full = _find_slots(table, set_blocks[at], owner)
             # A cell keeps four owners; a fifth is not recorded.
             cells = set_masks[at] & ~full
-            if slot >= 0:
-                cells &= ~masks[slot]
+            if row >= 0:
+                cells &= ~masks[row]
             while _bit_count(cells) > max_cells - counts[owner]:
                 cells &= cells - np.uint64(1)
             if cells == 0:
                 continue
-            if slot < 0:
-                slot = empty if removed < 0 else removed
-                used += int(removed < 0)
-                keys[slot] = blocks[at]
-                slot_owners[slot] = owner
-                nexts[slot] = firsts[owner]
-                firsts[owner] = slot
-            masks[slot] |= cells
+            if row < 0:
+                row = removed
+                if removed < 0:
+                    row = slots[empty] = used
+                    used += 1
+                blocks[row] = set_blocks[at]
+                row_owners[row] = owner
+                nexts[row] = firsts[owner]
+                firsts[owner] = row
+            masks[row] |= cells
             counts[owner] += _bit_count(cells)
     return used
 
 
 @kernel
-def _slot_of(table: TableArrays, block: np.int64, owner: int) -> int:
-    """The slot of an owner's cells in a block; -1 = none."""
-    keys, _, slot_owners, _, _, _, _ = table
-    slot = _home_slot(keys, block)
-    while keys[slot] != -1:
-        if keys[slot] == block and slot_owners[slot] == owner:
-            return slot
-        slot = (slot + 1) & (len(keys) - 1)
+def _row_of(table: TableArrays, block: np.int64, owner: int) -> int:
+    """The row of an owner's cells in a block; -1 = none."""
+    slots, blocks, _, owners, _, _, _, _ = table
+    slot = _home_slot(slots, block)
+    while slots[slot] != -1:
+        row = slots[slot]
+        if blocks[row] == block and owners[row] == owner:
+            return int(row)
+        slot = (slot + 1) & (len(slots) - 1)
     return -1
 
 
 @kernel
 def mark(table: TableArrays, owners: Int64, sets: SetArrays) -> None:
-    """Mark the cells of each set in the slots of its owner."""
-    marks = table[3]
+    """Mark the cells of each set in the rows of its owner."""
+    marks = table[4]
     blocks, set_masks, starts = sets
     for index in range(len(owners)):
         for at in range(starts[index], starts[index + 1]):
-            slot = _slot_of(table, blocks[at], owners[index])
-            if slot >= 0:
-                marks[slot] = set_masks[at]
+            row = _row_of(table, blocks[at], owners[index])
+            if row >= 0:
+                marks[row] = set_masks[at]
 
 
 @kernel
@@ -288,18 +297,18 @@ def add_scores(
 ) -> None:
     """Add to the scores of owners' cells, up to ± `limit`; see `VoxelMap.add_scores`."""
     blocks, _, starts = sets
-    rejected, known = table[4], table[5]
+    rejected, known = table[5], table[6]
     for index in range(len(owners)):
         for at in range(starts[index], starts[index + 1]):
-            slot = _slot_of(table, blocks[at], owners[index])
-            if slot < 0:
+            row = _row_of(table, blocks[at], owners[index])
+            if row < 0:
                 continue
             negative = np.uint64(0)
             for cell in range(64):
-                score = int(known[slot, cell]) + int(scores[at, cell])
-                known[slot, cell] = min(max(score, -limit), limit)
+                score = int(known[row, cell]) + int(scores[at, cell])
+                known[row, cell] = min(max(score, -limit), limit)
                 negative |= np.uint64(score < 0) << np.uint64(cell)
-            rejected[slot] = negative
+            rejected[row] = negative
 
 
 @kernel
@@ -335,12 +344,12 @@ def points_in(points: Float32, counts: Int64, rows: Int64, sets: SetArrays, cell
 
 
 @kernel
-def _mark(slot: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_count: int) -> int:
-    """Mark cells of a slot; lists the slot if it is new, and returns the number of slots listed."""
-    if cells != 0 and marks[slot] == 0:
-        marked[marked_count] = slot
+def _mark(row: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_count: int) -> int:
+    """Mark cells of a row; lists the row if it is new, and returns the number of rows listed."""
+    if cells != 0 and marks[row] == 0:
+        marked[marked_count] = row
         marked_count += 1
-    marks[slot] |= cells
+    marks[row] |= cells
     return marked_count
 
 
@@ -349,7 +358,7 @@ def overlaps(
     table: TableArrays, counts: Int64, sums: SumArrays, used: int, sets: SetArrays
 ) -> tuple[Int64, Float64, Float64]:
     """Owners that any set meets, and the overlap fractions; see `VoxelMap.overlaps`."""
-    slot_owners, marks = table[2], table[3]
+    owners, marks = table[3], table[4]
     blocks, set_masks, starts = sets
     on_block, on_owner, of_owner = sums
     set_count = len(starts) - 1
@@ -377,9 +386,9 @@ def overlaps(
                 on_owner[owner] += _bit_count(on_block[owner])
                 on_block[owner] = 0
         for position in range(marked_count):
-            slot = marked[position]
-            of_owner[slot_owners[slot]] += _bit_count(marks[slot])
-            marks[slot] = 0
+            row = marked[position]
+            of_owner[owners[row]] += _bit_count(marks[row])
+            marks[row] = 0
         for row in range(first, total):
             owner = found[row, 1]
             found[row, 2], found[row, 3] = on_owner[owner], of_owner[owner]
@@ -451,9 +460,9 @@ def _meet(
     """Record the owners that the cells of one block of a set meet, in it or through a face.
 
     Returns:
-        The number of owners, and the new number of marked slots.
+        The number of owners, and the new number of marked rows.
     """
-    keys, masks, slot_owners, marks, _, _, _ = table
+    slots, blocks, masks, owners, marks, _, _, _ = table
     owner_count = 0
     # The block itself (-1), then the adjacent blocks that the cells touch through a face.
     for face in range(-1, 6):
@@ -464,64 +473,66 @@ def _meet(
             touching = _rotated(set_mask & _FACES[face], _ROTATIONS[face])
             if touching == 0:
                 continue
-        slot = _home_slot(keys, block)
-        while keys[slot] != -1:
-            cells = touching & masks[slot]
-            if keys[slot] == block and cells != 0:
-                owner = slot_owners[slot]
-                marked_count = _mark(slot, cells, marks, marked, marked_count)
+        slot = _home_slot(slots, block)
+        while slots[slot] != -1:
+            row = slots[slot]
+            cells = touching & masks[row]
+            if blocks[row] == block and cells != 0:
+                owner = owners[row]
+                marked_count = _mark(row, cells, marks, marked, marked_count)
                 if on_block[owner] == 0:
                     block_owners[owner_count] = owner
                     owner_count += 1
                 if face >= 0:
                     on_block[owner] |= _rotated(cells, np.uint64(64) - _ROTATIONS[face])
                 else:
-                    on_block[owner] |= _dilated(masks[slot]) & set_mask
-            slot = (slot + 1) & (len(keys) - 1)
+                    on_block[owner] |= _dilated(masks[row]) & set_mask
+            slot = (slot + 1) & (len(slots) - 1)
     return owner_count, marked_count
 
 
 @kernel
-def slots_of(table: TableArrays, first: int) -> Int64:
-    """Slots of an owner from its first one on."""
-    nexts = table[6]
-    slots = np.empty(16, np.int64)
+def rows_of(table: TableArrays, first: int) -> Int64:
+    """Rows of an owner from its first one on."""
+    nexts = table[7]
+    rows = np.empty(16, np.int64)
     count = 0
-    slot = first
-    while slot >= 0:
-        if count == len(slots):
-            slots = np.concatenate((slots, slots))
-        slots[count] = slot
+    row = first
+    while row >= 0:
+        if count == len(rows):
+            rows = np.concatenate((rows, rows))
+        rows[count] = row
         count += 1
-        slot = nexts[slot]
-    return slots[:count].copy()
+        row = nexts[row]
+    return rows[:count].copy()
 
 
 @kernel
-def rehash(table: TableArrays, larger: TableArrays, firsts: Int64) -> int:
-    """Copy all slots with an owner to an empty table; returns their number.
+def rehash(table: TableArrays, used: int, larger: TableArrays, firsts: Int64) -> int:
+    """Copy all rows with an owner to an empty table; returns their number.
 
-    `firsts`, the first slot of each owner, is updated.
+    `firsts`, the first row of each owner, is updated.
     """
-    keys, masks, slot_owners, _, rejected, scores, _ = table
-    new_keys, new_masks, new_owners, _, new_rejected, new_scores, new_nexts = larger
-    used = 0
+    _, blocks, masks, owners, _, rejected, scores, _ = table
+    slots, new_blocks, new_masks, new_owners, _, new_rejected, new_scores, new_nexts = larger
+    count = 0
     for owner in range(len(firsts)):
         firsts[owner] = -1
-    for slot in range(len(keys)):
-        owner = slot_owners[slot]
+    for row in range(used):
+        owner = owners[row]
         if owner < 0:
             continue
-        target = _home_slot(new_keys, keys[slot])
-        while new_keys[target] != -1:
-            target = (target + 1) & (len(new_keys) - 1)
-        new_keys[target] = keys[slot]
-        new_masks[target] = masks[slot]
-        new_owners[target] = owner
-        new_rejected[target] = rejected[slot]
+        slot = _home_slot(slots, blocks[row])
+        while slots[slot] != -1:
+            slot = (slot + 1) & (len(slots) - 1)
+        slots[slot] = count
+        new_blocks[count] = blocks[row]
+        new_masks[count] = masks[row]
+        new_owners[count] = owner
+        new_rejected[count] = rejected[row]
         for cell in range(64):
-            new_scores[target, cell] = scores[slot, cell]
-        new_nexts[target] = firsts[owner]
-        firsts[owner] = target
-        used += 1
-    return used
+            new_scores[count, cell] = scores[row, cell]
+        new_nexts[count] = firsts[owner]
+        firsts[owner] = count
+        count += 1
+    return count

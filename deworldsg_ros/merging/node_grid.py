@@ -66,7 +66,13 @@ class NodeGrid:
         if count:
             moved = moved[:count]
             keys = np.floor(means_world[rows[moved]] / CUBE_M).astype(np.int64)
-            cubes = np.array([self._cube(key) for key in map(tuple, keys.tolist())])
+            cube_of = self._cube_of
+            cubes = np.array(
+                [
+                    cube_of[key] if key in cube_of else self._cube(key)
+                    for key in map(tuple, keys.tolist())
+                ]
+            )
             _put(self._cubes, self._firsts, self._balls, self._links, at[moved], cubes)
 
     def remove(self, owner: int) -> None:

@@ -199,12 +199,13 @@ class NodeRecords:
         kept = np.isin(records["node_id"], node_ids)
         owners = [owner_of[node_id] for node_id in records["node_id"][kept].tolist()]
         _name(self, graph, sorted(set(owner_of.values()) - set(owners)))
-        self.rows[owners] = records[kept]
+        # A slice takes no memory.
+        everything, every = slice(None), bool(kept.all())
+        self.rows[owners] = records[everything if every else kept]
         self.looks[:] = memory["looks"]
         self.fates[:] = memory["fates"]
         self.last_ns = int(memory["last_ns"])
-        # A slice takes no memory.
-        own = slice(None) if kept.all() else np.repeat(kept, counts)
+        own = everything if every else np.repeat(kept, counts)
         starts = np.append(0, np.cumsum(counts[kept]))
         cells = CellSets(memory["blocks"][own], memory["masks"][own], starts)
         self.map.add(owners, cells)

@@ -38,9 +38,9 @@ class VoxelMap:
         self.cell_m = cell_m
         self._cells_per_owner = cells_per_owner
         self._table = cell_kernels.new_table(1 << 12)
-        # Slots of the table that are not empty.
+        # Rows of the table, also removed ones.
         self._used = 0
-        # Number of cells of each owner, and its first slot.
+        # Number of cells of each owner, and its first row.
         self._counts = np.zeros(64, np.int64)
         self._firsts = np.full(64, -1, np.int64)
         self._sums = _new_sums(64)
@@ -48,7 +48,7 @@ class VoxelMap:
     @property
     def capacity(self) -> int:
         """Number of slots, used or not."""
-        return len(self._table.keys)
+        return len(self._table.slots)
 
     def cells_of(self, point_sets: Sequence[Float32]) -> CellSets:
         """Cells of each set of points (k, 3), metres."""
@@ -58,13 +58,13 @@ class VoxelMap:
 
     def cells(self, owner: int) -> CellSets:
         """An owner's cells, as one set."""
-        slots = self._slots_of(owner)
-        blocks, masks = self._table.keys[slots], self._table.masks[slots]
-        return CellSets(blocks, masks, np.array([0, len(slots)]))
+        rows = self._rows_of(owner)
+        blocks, masks = self._table.blocks[rows], self._table.masks[rows]
+        return CellSets(blocks, masks, np.array([0, len(rows)]))
 
     def scores(self, owner: int) -> Int8:
         """Score of each cell in each block of `cells` (m, 64)."""
-        return self._table.scores[self._slots_of(owner)]
+        return self._table.scores[self._rows_of(owner)]
 
     def memory(self, owners: Sequence[int]) -> Memory:
         """The cells and scores of all owners as arrays by name; the blocks of each ascend.
@@ -74,15 +74,15 @@ class VoxelMap:
         """
         table, places = self._table, np.zeros(max(owners, default=0) + 1, np.int64)
         places[owners] = np.arange(len(owners))
-        slots = np.flatnonzero(table.owners >= 0)
-        of = places[table.owners[slots]]
-        slots = slots[np.lexsort((table.keys[slots], of))]
+        rows = np.flatnonzero(table.owners[: self._used] >= 0)
+        of = places[table.owners[rows]]
+        rows = rows[np.lexsort((table.blocks[rows], of))]
         return {
             "cell_m": np.array(self.cell_m),
-            "blocks": table.keys[slots],
-            "masks": table.masks[slots],
+            "blocks": table.blocks[rows],
+            "masks": table.masks[rows],
             "block_counts": np.bincount(of, minlength=len(owners)),
-            "scores": table.scores[slots],
+            "scores": table.scores[rows],
         }
 
     def centres(self, owner: int) -> Float32:
@@ -171,11 +171,11 @@ class VoxelMap:
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""
         cells = self.cells(owner)
-        slots = self._slots_of(owner)
-        self._table.masks[slots] = self._table.rejected[slots] = 0
-        self._table.scores[slots] = 0
-        self._table.owners[slots] = -1
-        if len(slots):
+        rows = self._rows_of(owner)
+        self._table.masks[rows] = self._table.rejected[rows] = 0
+        self._table.scores[rows] = 0
+        self._table.owners[rows] = -1
+        if len(rows):
             self._counts[owner], self._firsts[owner] = 0, -1
         return cells
 
@@ -184,10 +184,10 @@ class VoxelMap:
         self._grow(0)
         self.add_scores([0], self.cells(0), self.scores(0))
 
-    def _slots_of(self, owner: int) -> Int64:
-        """Slots of an owner."""
+    def _rows_of(self, owner: int) -> Int64:
+        """Rows of an owner."""
         first = int(self._firsts[owner]) if owner < len(self._firsts) else -1
-        return cell_kernels.slots_of(self._table[:], first)
+        return cell_kernels.rows_of(self._table[:], first)
 
     def _make_room(self, owner_count: int) -> None:
         if owner_count > len(self._counts):
@@ -196,14 +196,14 @@ class VoxelMap:
             self._firsts = np.pad(self._firsts, more, constant_values=-1)
             self._sums = _new_sums(len(self._counts))
 
-    def _grow(self, more_slots: int) -> None:
-        # Slots of removed owners are not copied.
-        slots = np.count_nonzero(self._table.owners >= 0) + more_slots
+    def _grow(self, more_rows: int) -> None:
+        # Rows of removed owners are not copied.
+        rows = np.count_nonzero(self._table.owners[: self._used] >= 0) + more_rows
         capacity = self.capacity
-        while capacity < 3 * slots:
+        while capacity < 3 * rows:
             capacity *= 2
         larger = cell_kernels.new_table(capacity)
-        self._used = cell_kernels.rehash(self._table[:], larger[:], self._firsts)
+        self._used = cell_kernels.rehash(self._table[:], self._used, larger[:], self._firsts)
         self._table = larger
 
 
