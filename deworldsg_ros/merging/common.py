@@ -54,4 +54,5 @@ def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> 
     for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
         pair = (node_ids[subject], node_ids[object_])
         sums[pair] = sums[pair] + logits if pair in sums else logits
-    graph.add_frame_visual(sums, local.stamp_ns)
+    live = {pair: logits for pair, logits in sums.items() if 0 not in pair and pair[0] != pair[1]}
+    graph.add_frame_visual(live, local.stamp_ns)

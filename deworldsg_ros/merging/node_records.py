@@ -73,8 +73,7 @@ class NodeRecords:
 
     def owners_of(self, node_ids: Sequence[int]) -> list[int]:
         """Owners of nodes that have a record."""
-        owner_of = self.owner_of
-        return [owner_of[node_id] for node_id in node_ids]
+        return [self.owner_of[node_id] for node_id in node_ids]
 
     def graph_rows(self, graph: SceneGraph, owners: Sequence[int] | Int64) -> Int64:
         """Row in the graph of each owner."""
@@ -95,8 +94,7 @@ class NodeRecords:
 
     def place(self, graph: SceneGraph, owners: list[int]) -> None:
         """Note where the nodes of owners are, after a change of their Gaussians."""
-        nodes = graph.nodes
-        rows = self.graph_rows(graph, owners)
+        nodes, rows = graph.nodes, self.graph_rows(graph, owners)
         self.grid.put(owners, rows, nodes.means, nodes.eigenvalue_bounds)
 
     def look(
@@ -218,25 +216,26 @@ class NodeRecords:
             }
         )
 
-    def apply_correction(
-        self, graph: SceneGraph, node_ids: list[int], T_correction: Float64
-    ) -> None:
-        """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph.
 
-        Their scores start again at 0: rotated cells do not lie on cells.
-        """
-        for node_id in node_ids:
-            owner = self.owner_of.get(node_id)
-            if owner is None:  # a lost node has no cells
-                continue
-            centres = self.map.centres(owner).astype(np.float64)
-            centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
-            row = graph.nodes.row(node_id)
-            points = graph.nodes.surface(row)
-            cells = self.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
-            self.map.remove(owner)
-            self.map.add([owner], cells)
-            self.place(graph, [owner])
+def apply_correction(
+    records: NodeRecords, graph: SceneGraph, node_ids: list[int], T_correction: Float64
+) -> None:
+    """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph.
+
+    Their scores start again at 0: rotated cells do not lie on cells.
+    """
+    for node_id in node_ids:
+        owner = records.owner_of.get(node_id)
+        if owner is None:  # a lost node has no cells
+            continue
+        centres = records.map.centres(owner).astype(np.float64)
+        centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
+        row = graph.nodes.row(node_id)
+        points = graph.nodes.surface(row)
+        cells = records.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
+        records.map.remove(owner)
+        records.map.add([owner], cells)
+        records.place(graph, [owner])
 
 
 def _rebuild(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:

@@ -16,7 +16,7 @@ from deworldsg_ros.merging.edited_frames import as_edited, may_merge, reject_del
 from deworldsg_ros.merging.editing import EditReply, SurfaceEditor
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
-from deworldsg_ros.merging.node_records import NodeRecords
+from deworldsg_ros.merging.node_records import NodeRecords, apply_correction
 from deworldsg_ros.merging.views import (
     FrameArrays,
     View,
@@ -125,7 +125,7 @@ class SurfaceMerging:
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
         for records in (self._records, self._editor.aside):
-            records.apply_correction(graph, node_ids, T_correction)
+            apply_correction(records, graph, node_ids, T_correction)
 
     def _see(self, graph: SceneGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
         """What the frame shows of the nodes that may be in view."""

@@ -62,7 +62,7 @@ def predicate_probabilities(
     with_index: int,
     scales: Float64,
 ) -> tuple[Float64, Bool]:
-    """Probabilities (k, 2, R) of the predicates of pairs in both directions; (k, 2) bool: any votes.
+    """Probabilities (k, 2, R) of the predicates in both directions, and (k, 2) bool: any votes.
 
     Each relation's probability is divided among its predicates by their votes. Without votes, a
     relation has the name that comes first in `PREDICATES`; a table is "with" the seats that are
@@ -101,9 +101,8 @@ def predicate_probabilities(
                 if relation >= 0 and canonical[relation] >= 0:
                     out[name] = relations[row, end, relation] * told[name] / sums[relation]
             for relation in range(NONE):
-                name = canonical[relation]
-                if relation == NEAR and with_index >= 0 and with_[row, end]:
-                    name = with_index
+                is_with = relation == NEAR and with_index >= 0 and with_[row, end]
+                name = with_index if is_with else canonical[relation]
                 if canonical[relation] >= 0:
                     out[name] += relations[row, end, relation] * NAMING_VOTES / sums[relation]
             if others >= MIN_OTHER_VOTES:

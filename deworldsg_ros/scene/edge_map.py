@@ -55,26 +55,33 @@ class EdgeMap:
             self._restored = False
         return changed
 
-    def add_visual(self, pair: Pair, logits: Float64, stamp_ns: int, revision: int) -> None:
-        """Sum a frame's relation logits (R,) into a pair (Eq. 9).
+    def add_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int, revision: int) -> None:
+        """Sum a frame's relation logits (R,) into pairs (Eq. 9).
+
+        Args:
+            logits: of each subject and object.
+            stamp_ns: of the frame.
+            revision: of the graph before the first pair; each pair adds one.
 
         Raises:
             ValueError: if the logits have another shape.
         """
-        if logits.shape != self._no_logits.shape:
-            raise ValueError(
-                f"relation logits have shape {logits.shape}: expected {self._no_logits.shape}"
+        evidence = self._evidence
+        for pair, summand in logits.items():
+            if summand.shape != self._no_logits.shape:
+                raise ValueError(
+                    f"relation logits have shape {summand.shape}: expected {self._no_logits.shape}"
+                )
+            revision += 1
+            known = evidence.get(pair) or self._saved.take(pair)
+            if known is None:
+                self.add(pair, EdgeEvidence(summand, 1, stamp_ns, 0, revision))
+                continue
+            self._changed.add(pair)
+            summed, frames, last_ns, neighbour_frames, _ = known
+            evidence[pair] = EdgeEvidence(
+                summed + summand, frames + 1, max(last_ns, stamp_ns), neighbour_frames, revision
             )
-        known = self._evidence.get(pair) or self._saved.take(pair)
-        if known is None:
-            self.add(pair, EdgeEvidence(logits, 1, stamp_ns, 0, revision))
-            return
-        self._changed.add(pair)
-        summed, frames, last_ns, neighbour_frames, _ = known
-        last_ns = max(last_ns, stamp_ns)
-        self._evidence[pair] = EdgeEvidence(
-            summed + logits, frames + 1, last_ns, neighbour_frames, revision
-        )
 
     def add_neighbours(self, pairs: Sequence[Pair], stamp_ns: int, revision: int) -> None:
         """Count a frame in which pairs were geometric neighbours (Eq. 8).

@@ -197,26 +197,17 @@ class SceneGraph(NodeStore):
         self.revision += len(seen)
 
     def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
-        """Sum a frame's visual relation logits (R,) into an edge (Eq. 9).
-
-        Returns False if, by now, one of the nodes was removed or both have become one node.
-        """
+        """Sum a frame's visual logits (R,) into an edge (Eq. 9); False if it has no two nodes."""
         pair = (self.resolve(subject_id), self.resolve(object_id))
         if 0 in pair or pair[0] == pair[1]:
             return False
-        self._edges.add_visual(pair, logits, stamp_ns, self.revision + 1)
-        self.revision += 1
+        self.add_frame_visual({pair: logits}, stamp_ns)
         return True
 
     def add_frame_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int) -> None:
-        """Sum a frame's visual relation logits (R,) into edges, by live nodes (0 = removed).
-
-        Pairs without two different nodes are left out.
-        """
-        for pair, summand in logits.items():
-            if pair[0] and pair[1] and pair[0] != pair[1]:
-                self._edges.add_visual(pair, summand, stamp_ns, self.revision + 1)
-                self.revision += 1
+        """As `add_visual`, by pairs of different live nodes."""
+        self._edges.add_visual(logits, stamp_ns, self.revision)
+        self.revision += len(logits)
 
     def add_neighbours(self, pairs: Iterable[Pair], stamp_ns: int) -> None:
         """Count a frame in which pairs of nodes (0 = removed) were geometric neighbours (Eq. 8).

@@ -131,20 +131,9 @@ class NodeStore:
         """
         rows = self.nodes.rows_at(node_ids)
         classes = class_probabilities / class_probabilities.sum(axis=1, keepdims=True)
-        counts = np.ones(len(rows), np.int64)
-        self.nodes.fuse(
-            rows,
-            Observations(
-                means_world,
-                covariances_world,
-                classes,
-                weights,
-                counts,
-                surfaces,
-                stamp_ns,
-                stamp_ns,
-            ),
-        )
+        gaussians, counts = (means_world, covariances_world), np.ones(len(rows), np.int64)
+        seen = Observations(*gaussians, classes, weights, counts, surfaces, stamp_ns, stamp_ns)
+        self.nodes.fuse(rows, seen)
         if classes_after is not None:
             self.nodes.class_probabilities[rows] = classes_after
             self.revision += len(rows)  # each counts as two changes
