@@ -18,7 +18,14 @@ from support.perception import (
 )
 
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.superpixels.mask_upsampling import upsample_labels
+from deworldsg_ros.perception.superpixels.mask_upsampling import (
+    COLOUR_STEP,
+    DEPTH_STEP,
+    DISTANCE_WEIGHT,
+    MAX_DEPTH_COST,
+    upsample_labels,
+)
+from deworldsg_ros.perception.superpixels.regions import adjacency
 
 SEGMENTER = RgbdSegmenter()
 
@@ -156,3 +163,64 @@ def test_read_only_and_sliced_images_use_the_same_compiled_kernel():
     (found,) = segment(from_message, from_slice, box)
     assert np.array_equal(found.pixels, expected.pixels)
     assert len(upsample_labels.signatures) == compiled == 1
+
+
+def plain_label(labels, cell_rgb, cell_depth, rgb, z, y, x, stride):
+    """The label of a pixel: of its own cell and those beside it, the first with the least cost."""
+    rows, columns = labels.shape
+    v, u = min(y // stride, rows - 1), min(x // stride, columns - 1)
+    costs, found = [], []
+    f = np.float32
+    for dv, du in ((-1, 0), (0, -1), (0, 0), (0, 1), (1, 0)):
+        b, a = v + dv, u + du
+        if not (0 <= b < rows and 0 <= a < columns):
+            continue
+        r, g, w = rgb.astype(f) - cell_rgb[b, a].astype(f)
+        cost = (r * r + g * g + w * w) / f(COLOUR_STEP * COLOUR_STEP)
+        if 0 < z < np.inf and cell_depth[b, a] > 0:
+            d = (z - cell_depth[b, a]) / (f(DEPTH_STEP) * z)
+            cost += min(d * d, f(MAX_DEPTH_COST))
+        d = f(y - b * stride - stride // 2) / f(stride)
+        e = f(x - a * stride - stride // 2) / f(stride)
+        costs.append(cost + f(DISTANCE_WEIGHT) * (d * d + e * e))
+        found.append(labels[b, a])
+    return found[int(np.argmin(costs))]
+
+
+@pytest.mark.parametrize("shape", [(20, 31), (8, 8), (12, 15)])
+@pytest.mark.parametrize("stride", [1, 2, 3, 5])
+@pytest.mark.parametrize("levels", [2, 200])  # few levels give equal costs
+def test_pixels_take_the_label_of_the_most_similar_cell(shape, stride, levels):
+    rng = np.random.default_rng(len(shape) + stride + levels)
+    cells = (shape[0] // stride, shape[1] // stride)
+    step = 200 // levels
+    cell_rgb = (rng.integers(0, levels, (*cells, 3)) * step).astype(np.uint8)
+    rgb = (rng.integers(0, levels, (*shape, 3)) * step).astype(np.uint8)
+    depths = np.array([0.0, 1.0, 1.01, 1.02, 2.0, np.nan, np.inf], np.float32)
+    depth_m = rng.choice(depths, shape)
+    cell_depth = rng.choice(depths[:5], cells)
+    labels = rng.integers(-1, 3, cells).astype(np.int32)
+    found = upsample_labels(labels, cell_rgb, cell_depth, rgb, depth_m, stride)
+    expected = [
+        [
+            plain_label(labels, cell_rgb, cell_depth, rgb[y, x], depth_m[y, x], y, x, stride)
+            for x in range(shape[1])
+        ]
+        for y in range(shape[0])
+    ]
+    assert np.array_equal(found, expected)
+
+
+def test_adjacency_equals_the_plain_loop():
+    rng = np.random.default_rng(1)
+    labels = rng.integers(0, 7, (9, 13)).astype(np.int32)
+    weights = rng.uniform(0, 3, (2, 9, 13)).astype(np.float32)
+    borders: dict[tuple[int, int], list[float]] = {}
+    for y, x in np.ndindex(9, 13):
+        for direction, (v, u) in enumerate([(y, x + 1), (y + 1, x)]):
+            if v < 9 and u < 13 and labels[y, x] != labels[v, u]:
+                pair = tuple(sorted((int(labels[y, x]), int(labels[v, u]))))
+                borders.setdefault(pair, []).append(float(weights[direction, y, x]))
+    pairs, strength = adjacency(labels, 7, weights)
+    assert [tuple(pair) for pair in pairs.tolist()] == sorted(borders)
+    assert strength.tolist() == [sum(borders[p]) / len(borders[p]) for p in sorted(borders)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Int32, UInt8
+from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt8
 
 # The cost of a cell sums squared differences between it and the pixel. Each of these counts 1:
 # RGB colour, 8 bit; depth, relative to the depth.
@@ -15,8 +15,11 @@ DEPTH_STEP = 0.015
 DISTANCE_WEIGHT = 0.5
 # Maximum cost of the depth. A flying pixel is far from the surfaces on both sides.
 MAX_DEPTH_COST = 9.0
-# Row and column offsets of the candidate cells; the first of several with one cost is chosen.
-CANDIDATES = ((-1, 0), (0, -1), (0, 0), (0, 1), (1, 0))
+# Row and column offsets of the candidate cells. Of several with one cost, the first in scan order
+# is chosen: those above and on the left come before the pixel's own cell.
+CANDIDATES = ((0, 0), (-1, 0), (0, -1), (0, 1), (1, 0))
+
+_Candidates = tuple[Float32, Int64, Int32, int, int]
 
 
 @kernel
@@ -39,19 +42,45 @@ def upsample_labels(
     height, width = depth_m.shape
     rows, columns = labels.shape
     result = np.empty((height, width), np.int32)
+    near = np.empty((len(CANDIDATES), 4), np.float32)
+    centres = np.empty((len(CANDIDATES), 2), np.int64)
+    near_labels = np.empty(len(CANDIDATES), np.int32)
+    # The cost of each distance along an axis, from `reach` pixels before a centre on.
+    reach = 2 * stride
+    along = np.empty(6 * stride, np.float32)
+    for i in range(len(along)):
+        d = np.float32(i - reach) / np.float32(stride)
+        along[i] = d * d
     for v in range(rows):
         # The last cells also cover the pixels that the stride leaves over.
-        bottom = height if v == rows - 1 else (v + 1) * stride
+        top, bottom = v * stride, height if v == rows - 1 else (v + 1) * stride
         for u in range(columns):
             right = width if u == columns - 1 else (u + 1) * stride
+            for x in range(u * stride, right):
+                result[top, x] = labels[v, u]
+        for y in range(top + 1, bottom):
+            for x in range(width):
+                result[y, x] = result[top, x]
+        for u in range(columns):
             if _is_uniform(labels, v, u):
-                result[v * stride : bottom, u * stride : right] = labels[v, u]
                 continue
-            for y in range(v * stride, bottom):
-                for x in range(u * stride, right):
-                    result[y, x] = _label_of_pixel(
-                        labels, cell_rgb, cell_depth, rgb[y, x], depth_m[y, x], y, x, v, u, stride
-                    )
+            count = 0
+            for dv, du in CANDIDATES:
+                b, a = v + dv, u + du
+                if b < 0 or a < 0 or b >= rows or a >= columns:
+                    continue
+                for k in range(3):
+                    near[count, k] = cell_rgb[b, a, k]
+                near[count, 3] = cell_depth[b, a]
+                centres[count, 0] = b * stride + stride // 2 - reach
+                centres[count, 1] = a * stride + stride // 2 - reach
+                near_labels[count] = labels[b, a]
+                count += 1
+            before = (v > 0) + (u > 0)
+            right = width if u == columns - 1 else (u + 1) * stride
+            pixels = (top, bottom, u * stride, right)
+            candidates = (near, centres, near_labels, count, before)
+            _choose(candidates, along, rgb, depth_m, pixels, result)
     return result
 
 
@@ -67,42 +96,54 @@ def _is_uniform(labels: Int32, v: int, u: int) -> bool:
 
 
 @kernel
-def _label_of_pixel(
-    labels: Int32,
-    cell_rgb: UInt8,
-    cell_depth: Float32,
-    colour: UInt8,
-    z: float,
-    y: int,
-    x: int,
-    v: int,
-    u: int,
-    stride: int,
-) -> int:
-    """The label of pixel (y, x), of colour (3,) and depth z, in cell (v, u)."""
-    rows, columns = labels.shape
-    depth_step = np.float32(DEPTH_STEP) * z
-    has_depth = z > 0 and z < np.inf
-    best = np.float32(np.inf)
-    chosen = labels[v, u]
-    for dv, du in CANDIDATES:
-        b, a = v + dv, u + du
-        if b < 0 or a < 0 or b >= rows or a >= columns:
-            continue
-        cost = np.float32(0.0)
-        for k in range(3):
-            d = np.float32(colour[k]) - np.float32(cell_rgb[b, a, k])
-            cost += d * d
-        cost /= np.float32(COLOUR_STEP * COLOUR_STEP)
-        if cost >= best:  # the other terms only add to it
-            continue
-        if has_depth and cell_depth[b, a] > 0:
-            d = (z - cell_depth[b, a]) / depth_step
-            cost += min(d * d, np.float32(MAX_DEPTH_COST))
-        d = np.float32(y - (b * stride + stride // 2)) / np.float32(stride)
-        e = np.float32(x - (a * stride + stride // 2)) / np.float32(stride)
-        cost += np.float32(DISTANCE_WEIGHT) * (d * d + e * e)
-        if cost < best:
-            best = cost
-            chosen = labels[b, a]
-    return chosen
+def _choose(
+    candidates: _Candidates,
+    along: Float32,
+    rgb: UInt8,
+    depth_m: Float32,
+    pixels: tuple[int, int, int, int],
+    result: Int32,
+) -> None:
+    """Write the label of the candidate with the least cost to each pixel of a cell.
+
+    Args:
+        candidates: their colour and depth (k, 4), the own cell first; row and column (k, 2) from
+            which `along` counts; labels; their number; those from 1 to this one win against the
+            own cell at the same cost.
+        along: cost of the distance along an axis.
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32 metres.
+        pixels: first and last row, first and last column, without the last.
+        result: (H, W) int32, written.
+    """
+    near, centres, labels, count, before = candidates
+    colour_weight = np.float32(COLOUR_STEP * COLOUR_STEP)
+    for y in range(pixels[0], pixels[1]):
+        for x in range(pixels[2], pixels[3]):
+            red, green, blue = (
+                np.float32(rgb[y, x, 0]),
+                np.float32(rgb[y, x, 1]),
+                np.float32(rgb[y, x, 2]),
+            )
+            z = depth_m[y, x]
+            depth_step = np.float32(DEPTH_STEP) * z
+            has_depth = z > 0 and z < np.inf
+            # Above this, colour and distance alone cost more than the best; divisions take long.
+            most = best = np.float32(np.inf)
+            chosen = 0
+            for i in range(count):
+                d, e, f = red - near[i, 0], green - near[i, 1], blue - near[i, 2]
+                cost = d * d + e * e + f * f
+                distance = along[y - centres[i, 0]] + along[x - centres[i, 1]]
+                distance = np.float32(DISTANCE_WEIGHT) * distance
+                if cost + colour_weight * distance > most:
+                    continue
+                cost /= colour_weight
+                if has_depth and near[i, 3] > 0:
+                    d = (z - near[i, 3]) / depth_step
+                    cost += min(d * d, np.float32(MAX_DEPTH_COST))
+                cost += distance
+                if cost < best or (cost == best and chosen == 0 and i <= before):
+                    best, chosen = cost, i
+                    most = best * np.float32(COLOUR_STEP * COLOUR_STEP * (1.0 + 1e-5))
+            result[y, x] = labels[chosen]

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int32, Int64, UInt8
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 
 # An edge weight is the root of summed squares. Each of these differences between neighbouring cells
@@ -116,7 +116,7 @@ def find_regions(cells: Cells) -> Regions:
     # Contiguous also for one region: kernels are compiled for one layout.
     area, valid = np.ascontiguousarray(sums[:, 0]), np.ascontiguousarray(sums[:, 4])
     normal_length = np.linalg.norm(sums[:, 8:11], axis=1)
-    pairs, strength = _adjacency(labels, count, weights)
+    pairs, strength = adjacency(labels, count, weights)
     return Regions(
         labels=labels,
         area=area,
@@ -239,6 +239,8 @@ def _merge(weights: Float32) -> tuple[Int32, int]:
             edge = order[i]
             a = edge if edge < cells else edge - cells
             b = a + (1 if edge < cells else width)
+            if parent[a] == parent[b]:  # most edges are inside a region, whose cells have one root
+                continue
             a, b = _root(parent, a), _root(parent, b)
             if a == b:
                 continue
@@ -321,32 +323,53 @@ def _region_sums(
     return sums
 
 
-def _adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
-    """Adjacent regions (m, 2), and the mean edge weight (m,) along each border."""
-    keys, values = _border_edges(labels, count, weights)
-    order = np.argsort(keys, kind="stable")
-    found, starts = np.unique(keys[order], return_index=True)
-    pairs = np.stack((found // count, found % count), axis=1).astype(np.int32)
-    return pairs, _means(values[order], np.append(starts, len(keys)))
+@kernel
+def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
+    """Adjacent regions (m, 2) int32, in order, and the mean edge weight (m,) along each border."""
+    first, second, values = _border_edges(labels, weights)
+    found = len(values)
+    # Counting sorts: edges in order of both regions, and in scan order along one border.
+    order = np.empty(found, np.int32)
+    for edge in range(found):
+        order[edge] = edge
+    order = _sorted(first, _sorted(second, order, count), count)
+    pairs, means = np.empty((found, 2), np.int32), np.empty(found, np.float64)
+    last, total, edges = -1, 0.0, 0
+    for i in range(found):
+        edge = order[i]
+        a, b = first[edge], second[edge]
+        if last < 0 or pairs[last, 0] != a or pairs[last, 1] != b:
+            last += 1
+            pairs[last, 0], pairs[last, 1] = a, b
+            total, edges = 0.0, 0
+        total += values[edge]
+        edges += 1
+        means[last] = total / edges
+    return pairs[: last + 1], means[: last + 1]
 
 
 @kernel
-def _means(values: Float32, starts: Int64) -> Float64:
-    """Means of groups of values; group k is values[starts[k] : starts[k + 1]]."""
-    means = np.empty(len(starts) - 1, np.float64)
-    for group in range(len(means)):
-        total = 0.0
-        for index in range(starts[group], starts[group + 1]):
-            total += values[index]
-        means[group] = total / (starts[group + 1] - starts[group])
-    return means
+def _sorted(keys: Int32, order: Int32, count: int) -> Int32:
+    """The indices in `order`, in ascending order of their keys in [0, count); stable."""
+    start = np.zeros(count + 1, np.int32)
+    for i in range(len(order)):
+        start[keys[order[i]] + 1] += 1
+    for key in range(count):
+        start[key + 1] += start[key]
+    result = np.empty(len(order), np.int32)
+    for i in range(len(order)):
+        key = keys[order[i]]
+        result[start[key]] = order[i]
+        start[key] += 1
+    return result
 
 
 @kernel
-def _border_edges(labels: Int32, count: int, weights: Float32) -> tuple[Int64, Float32]:
-    """Edges between regions: a number (k,) of the pair of regions, and the weight (k,)."""
+def _border_edges(labels: Int32, weights: Float32) -> tuple[Int32, Int32, Float32]:
+    """Edges between regions, (k,) each: the two regions, the lower one first, and the weight."""
     height, width = labels.shape
-    keys = np.empty(2 * height * width, np.int64)
+    first = np.empty(2 * height * width, np.int32)
+    second = np.empty(2 * height * width, np.int32)
     values = np.empty(2 * height * width, np.float32)
     found = 0
     for y in range(height):
@@ -357,7 +380,7 @@ def _border_edges(labels: Int32, count: int, weights: Float32) -> tuple[Int64, F
                 u = x + 1 - direction
                 if v < height and u < width and labels[v, u] != a:
                     b = labels[v, u]
-                    keys[found] = np.int64(min(a, b)) * count + max(a, b)
+                    first[found], second[found] = min(a, b), max(a, b)
                     values[found] = weights[direction, y, x]
                     found += 1
-    return keys[:found], values[:found]
+    return first[:found], second[:found], values[:found]
