@@ -11,9 +11,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -57,7 +56,9 @@ _HEAD = {"key": "INT64", "version": "INT64", "position": "INT64", "stamp_ns": "I
 
 # Values of the columns of a table, in their order.
 _Row = tuple[Any, ...]
-_edge_row: Callable[[wire.EdgeState], _Row] = attrgetter(*_ENDS, *_RELATION)
+# What stands for a string in a row.
+_Name = Callable[[str], Any]
+_Item = TypeVar("_Item", wire.NodeState, wire.EdgeState, Stay)
 
 
 @dataclass
@@ -153,9 +154,9 @@ class Database:
         for table in ("Relation", "Object"):
             self.run(f"DROP TABLE {table}")
         self._make_graph_tables()
-        self._copy("Object", _OBJECT, map(_object_row, nodes.values()))
-        rows = (_edge_row(edge) for edge in edges if edge.subject in nodes and edge.object in nodes)
-        self._copy("Relation", {**_ENDS, **_RELATION}, rows)
+        self._copy("Object", _OBJECT, nodes.values(), _object_row)
+        related = (edge for edge in edges if edge.subject in nodes and edge.object in nodes)
+        self._copy("Relation", {**_ENDS, **_RELATION}, related, _edge_row)
 
     def remove(self, nodes: Iterable[int], edges: Iterable[tuple[int, int]]) -> None:
         """Remove relations, and objects with theirs; those that are not there are no error."""
@@ -171,27 +172,26 @@ class Database:
         edges: Sequence[wire.EdgeState],
     ) -> None:
         """Add or change objects and relations."""
-        self._each(_creation("Object", _OBJECT), _dicts(_OBJECT, map(_object_row, new)))
+        self._each(_creation("Object", _OBJECT), _dicts(_OBJECT, new, _object_row))
         changes = ", ".join(f"o.{name} = row.{name}" for name in _OBJECT if name != "id")
         cypher = f"MATCH (o:Object {{id: row.id}}) SET {changes}"
-        self._each(cypher, _dicts(_OBJECT, map(_object_row, changed)))
+        self._each(cypher, _dicts(_OBJECT, changed, _object_row))
         changes = ", ".join(f"r.{name} = row.{name}" for name in _RELATION)
         # In this form, both ends are found by their key; `MATCH (a), (b)` would scan all objects.
         cypher = (
             "MATCH (a:Object {id: row.subject}) WITH a, row MATCH (b:Object {id: row.object}) "
             f"WITH a, b, row MERGE (a)-[r:Relation]->(b) SET {changes}"
         )
-        self._each(cypher, _dicts((*_ENDS, *_RELATION), map(_edge_row, edges)))
+        self._each(cypher, _dicts((*_ENDS, *_RELATION), edges, _edge_row))
 
     def put_stays(self, begun: Sequence[Stay], ended: Mapping[int, int]) -> None:
         """Add stays, and end older ones by key."""
-        rows = map(_stay_row, begun)
         if len(begun) > MANY_ROWS:
-            self._copy("Stay", _STAY, rows)
+            self._copy("Stay", _STAY, begun, _stay_row)
         else:
-            self._each(_creation("Stay", _STAY), _dicts(_STAY, rows))
+            self._each(_creation("Stay", _STAY), _dicts(_STAY, begun, _stay_row))
         cypher = "MATCH (s:Stay {key: row.key}) SET s.until_ns = row.until_ns"
-        self._each(cypher, _dicts(("key", "until_ns"), ended.items()))
+        self._each(cypher, [{"key": key, "until_ns": end} for key, end in ended.items()])
 
     def _make_graph_tables(self) -> None:
         self.run(f"CREATE NODE TABLE Object({_typed(_OBJECT)}, PRIMARY KEY (id))")
@@ -201,19 +201,21 @@ class Database:
         if rows:
             self.run(f"UNWIND $rows AS row {cypher}", {"rows": rows})
 
-    def _copy(self, table: str, columns: Mapping[str, str], rows: Iterable[_Row]) -> None:
+    def _copy(
+        self,
+        table: str,
+        columns: Mapping[str, str],
+        items: Iterable[_Item],
+        row: Callable[[_Item, _Name], _Row],
+    ) -> None:
         """Load rows at once. Strings go as one list of parameters, and their numbers as a file."""
         names = _Numbers()
-        rows = list(rows)
+        number = names.__getitem__
+        rows = [row(item, number) for item in items]
         if not rows:
             return
-        # Not `zip(*rows)`, which is slow with many arguments.
-        values = [list(map(itemgetter(number), rows)) for number in range(len(columns))]
-        for number, kind in enumerate(columns.values()):
-            if kind == "STRING":
-                values[number] = [names[text] for text in values[number]]
         # JSON of numbers without its brackets is CSV.
-        content = msgspec.json.encode(list(zip(*values)))[2:-2].replace(b"],[", b"\n")
+        content = msgspec.json.encode(rows)[2:-2].replace(b"],[", b"\n")
         typed = _typed({i: "INT64" if kind == "STRING" else kind for i, kind in columns.items()})
         found = ", ".join(
             f"list_extract($names, {name})" if kind == "STRING" else name
@@ -279,19 +281,30 @@ def stay_of(row: Sequence[Any]) -> Stay:
     return Stay(key, node, label, (x, y, z), (a, b, c), since_ns, until_ns)
 
 
-def _object_row(node: wire.NodeState) -> _Row:
+def _object_row(node: wire.NodeState, name: _Name) -> _Row:
     center, size = box_of(node)
     share = next((item.probability for item in node.classes if item.label == node.label), 0.0)
     existence = node.existence if isinstance(node.existence, float) else 1.0
     first, last = wire.ns_from_stamp(node.first_seen), wire.ns_from_stamp(node.last_seen)
     return (
-        node.id, node.label, share * existence, *center, *size, node.observations, first, last
+        node.id, name(node.label), share * existence, *center, *size, node.observations, first, last
     )  # fmt: skip
 
 
-def _stay_row(stay: Stay) -> _Row:
+def _edge_row(edge: wire.EdgeState, name: _Name) -> _Row:
+    return (
+        edge.subject,
+        edge.object,
+        name(edge.predicate),
+        edge.probability,
+        name(edge.provenance),
+        edge.observations,
+    )
+
+
+def _stay_row(stay: Stay, name: _Name) -> _Row:
     where = (*stay.position_m, *stay.size_m)
-    return stay.key, stay.node, stay.label, *where, stay.since_ns, stay.until_ns
+    return stay.key, stay.node, name(stay.label), *where, stay.since_ns, stay.until_ns
 
 
 def _typed(columns: Mapping[str, str]) -> str:
@@ -302,9 +315,11 @@ def _creation(table: str, columns: Iterable[str]) -> str:
     return f"CREATE (:{table} {{{', '.join(f'{name}: row.{name}' for name in columns)}}})"
 
 
-def _dicts(names: Iterable[str], rows: Iterable[_Row]) -> list[dict[str, Any]]:
+def _dicts(
+    names: Iterable[str], items: Iterable[_Item], row: Callable[[_Item, _Name], _Row]
+) -> list[dict[str, Any]]:
     names = list(names)
-    return [dict(zip(names, row)) for row in rows]
+    return [dict(zip(names, row(item, str))) for item in items]
 
 
 @contextmanager
