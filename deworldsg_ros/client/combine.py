@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -12,7 +12,7 @@ from deworldsg_ros.client.align import align
 from deworldsg_ros.client.changes import Pairing, matched_by_place
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.objects import SceneObject, scene_object
+from deworldsg_ros.client.objects import Point, SceneObject, scene_object
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import check_pose, pose_from_quaternion, quaternion_from_rotation
@@ -47,7 +47,44 @@ class Combined:
     ids: dict[int, int]
 
 
-def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combined:
+class Known:
+    """What was computed of the objects of one graph, for those that are the same the next time."""
+
+    def __init__(self) -> None:
+        self._where: tuple[object, ...] = ()
+        # By id: the object, and the moved one.
+        self._moved: dict[int, tuple[SceneObject, SceneObject]] = {}
+        # By the id of the object of B: both objects, and the message of both as one.
+        self._fused: dict[int, tuple[SceneObject, SceneObject, wire.NodeState]] = {}
+
+    def moved(
+        self, items: Iterable[SceneObject], T: Float64, frame_id: str, up: Point
+    ) -> dict[int, SceneObject]:
+        """Objects by id, as `moved_object` moves them."""
+        where = T.tobytes(), frame_id, up
+        known, self._moved = self._moved if where == self._where else {}, {}
+        self._where = where
+        for item in items:
+            before, moved = known.get(item.id, (None, item))
+            if before is None or not _equal(before, item):
+                moved = moved_object(item, T, frame_id, up)
+            self._moved[item.id] = item, moved
+        return {node_id: moved for node_id, (_, moved) in self._moved.items()}
+
+    def fused(self, pairs: Iterable[Pairing]) -> dict[int, wire.NodeState]:
+        """The messages of pairs of objects as one, by the id of the first."""
+        known, self._fused = self._fused, {}
+        for a, b in ((pair.before, pair.after) for pair in pairs):
+            first, second, state = known.get(b.id, (None, None, a.state))
+            if first is None or second is None or not (_equal(first, a) and _equal(second, b)):
+                state = _fused(a, b)
+            self._fused[b.id] = a, b, msgspec.structs.replace(state, id=a.id)
+        return {state.id: state for _, _, state in self._fused.values()}
+
+
+def combine(
+    a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None, known: Known | None = None
+) -> Combined:
     """Merge a graph into another one.
 
     Objects keep the ids of A. Other objects of B get new ids. Of two edges between the same
@@ -57,6 +94,7 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
         a: gives the world frame, and the ids.
         b: to be merged into it.
         T_a_b: (4, 4) rigid transform, B to A; None = find it from the objects.
+        known: of the last combination with an earlier B; it is brought up to date.
 
     Raises:
         ClientError: if no transform is found with enough confidence, or the given one tilts.
@@ -74,15 +112,14 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
     check_pose(T_a_b)
     if np.dot(T_a_b[:3, :3] @ b.up, a.up) < np.cos(MAX_TILT_RAD):
         raise ClientError(f"the transform turns up {b.up} away from {a.up}: expected the same up")
-    moved = {item.id: moved_object(item, T_a_b, a.frame_id, a.up) for item in b}
+    known = known or Known()
+    moved = known.moved(b, T_a_b, a.frame_id, a.up)
     pairs = matched_by_place(list(a), list(moved.values()))
     merged = {pair.after.id: pair.before.id for pair in pairs}
     first_free = max([*(item.id for item in a), 0]) + 1
     others = [node_id for node_id in moved if node_id not in merged]
     ids = {**merged, **{node_id: first_free + i for i, node_id in enumerate(others)}}
-    nodes = {item.id: item.state for item in a}
-    for pair in pairs:
-        nodes[pair.before.id] = _fused(pair.before, pair.after)
+    nodes = {item.id: item.state for item in a} | known.fused(pairs)
     for node_id in others:
         state = moved[node_id].state
         nodes[ids[node_id]] = msgspec.structs.replace(state, id=ids[node_id])
@@ -97,9 +134,7 @@ def combine(a: SceneGraph, b: SceneGraph, T_a_b: Float64 | None = None) -> Combi
     return Combined(message, T_a_b, confidence, tuple(pairs), ids)
 
 
-def moved_object(
-    item: SceneObject, T: Float64, frame_id: str, up: tuple[float, float, float]
-) -> SceneObject:
+def moved_object(item: SceneObject, T: Float64, frame_id: str, up: Point) -> SceneObject:
     """An object in another world frame.
 
     Args:
@@ -121,6 +156,12 @@ def moved_object(
         box=wire.GravityBox(place, list(item.size_m), turned),
     )
     return scene_object(new, frame_id, up)
+
+
+def _equal(one: SceneObject, other: SceneObject) -> bool:
+    """Whether two objects differ in their ids at most."""
+    same_id = msgspec.structs.replace(other.state, id=one.id)
+    return one.state == same_id and (one.frame_id, one.up) == (other.frame_id, other.up)
 
 
 def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:

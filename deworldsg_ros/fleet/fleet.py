@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from deworldsg_ros.client.align import Alignment, align
-from deworldsg_ros.client.combine import MIN_CONFIDENCE, combine, moved_object
+from deworldsg_ros.client.combine import MIN_CONFIDENCE, Known, combine
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
@@ -47,6 +47,9 @@ class Member:
     reason: str = "no objects"
     tried: int = 0
     ids: dict[int, int] = field(default_factory=dict)
+    # Of its objects in the fleet, and of those of the fleet near it.
+    known: Known = field(default_factory=Known)
+    near: Known = field(default_factory=Known)
 
 
 class Fleet:
@@ -122,11 +125,9 @@ class Fleet:
         others = [item for item in self._objects.values() if name not in self._owners[item.id]]
         places = np.array([item.position_m for item in others], np.float64).reshape(-1, 3)
         gaps_m = _gaps_m(places @ T_world_fleet[:3, :3].T + T_world_fleet[:3, 3], own)
-        nodes = {
-            item.id: moved_object(item, T_world_fleet, graph.frame_id, graph.up).state
-            for item, gap_m in zip(others, gaps_m.tolist())
-            if gap_m <= NEARBY_M
-        }
+        near = [item for item, gap_m in zip(others, gaps_m.tolist()) if gap_m <= NEARBY_M]
+        moved = member.near.moved(near, T_world_fleet, graph.frame_id, graph.up)
+        nodes = {node_id: item.state for node_id, item in moved.items()}
         return msgspec.structs.replace(
             empty_scene_graph(FRAME_ID),
             stamp=self._stamp,
@@ -193,7 +194,7 @@ def _joined(whole: SceneGraph, member: Member) -> tuple[SceneGraph, dict[int, in
 
 def _added(whole: SceneGraph, member: Member) -> tuple[SceneGraph, dict[int, int]]:
     try:
-        combined = combine(whole, member.graph, member.T_fleet_world)
+        combined = combine(whole, member.graph, member.T_fleet_world, member.known)
     except ClientError as error:
         member.T_fleet_world, member.reason = None, str(error)
         return whole, {}

@@ -15,7 +15,7 @@ from support.view import make_graph, make_node
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.align import align
-from deworldsg_ros.client.combine import combine
+from deworldsg_ros.client.combine import Known, combine
 from deworldsg_ros.client.export import FORMATS, SPARK_SYMBOL, export
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import invert_pose
@@ -149,6 +149,31 @@ def test_parts_of_a_room_that_overlap_are_merged(room: SceneGraph) -> None:
     seen = {item.id: item.observations for item in first}
     both = {pair.before.id for pair in combined.pairs}
     assert all(whole[i].observations == seen[i] * (2 if i in both else 1) for i in seen)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_the_last_merge_knows_changes_nothing(room: SceneGraph, seed: int) -> None:
+    rng, known = np.random.default_rng(seed), Known()
+
+    def changed(graph: SceneGraph) -> SceneGraph:
+        nodes = list(graph.message.nodes)
+        for at in rng.permutation(len(nodes))[:3].tolist():
+            mean = [value + 0.01 for value in nodes[at].mean_m]
+            more = nodes[at].observations + 1
+            nodes[at] = msgspec.structs.replace(nodes[at], mean_m=mean, observations=more)
+        del nodes[rng.integers(len(nodes))]
+        ids = {node.id for node in nodes}
+        edges = [e for e in graph.message.edges if {e.subject, e.object} <= ids]
+        return SceneGraph(msgspec.structs.replace(graph.message, nodes=nodes, edges=edges))
+
+    first, second, T = room, room, np.eye(4)
+    for step in range(8):
+        first, second = changed(first), changed(second)
+        if step == 5:
+            T = rigid_motion(np.array([0.02, 0.0, 0.0]), np.array([0.0, 0.0, 0.01]))
+        fresh, again = combine(first, second, T), combine(first, second, T, known)
+        assert wire.encode(again.message) == wire.encode(fresh.message)
+        assert again.ids == fresh.ids
 
 
 def test_graphs_of_different_rooms_are_not_merged(room: SceneGraph) -> None:
