@@ -25,8 +25,8 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from endurance.rig import NODES, Rig
 
-# Models, kernels, buffers and the graph of the room are there after two minutes. Python then fills up
-# its own lists of free tuples (2000 of each length) and names of attributes (4096) for some more.
+# Models, kernels, buffers and the graph of the room are there after two minutes. Then Python still
+# fills up its own lists of free tuples (2000 of each length) and of names of attributes (4096).
 SETTLE_S = 600.0
 SAMPLE_PERIOD_S = 1.0
 # A node that waits for a busy machine holds more messages at once, and keeps that memory for the
