@@ -162,7 +162,7 @@ class EdgeBeliefs:
         table, prior = self._table, self.prior
         if table is None:
             return prior
-        limits = (None, None) if whole else _limits(table, self._begun)
+        limits = (None, None) if whole else _limits(table, self._begun and table.begun)
         table.refresh(self.up.up_world(exact=whole or not self._begun), *limits)
         if self._predicted is not None:
             self._predicted.follow(table, table.changed_pairs)

@@ -20,6 +20,7 @@ from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.class_kinds import SEATS, TABLES
 from deworldsg_ros.scene.edges import key
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.publication import NEW_A_CALL
 from deworldsg_ros.scene.waiting import take_first
 
 # The floor is where the lowest objects stand; single nodes may reach below it.
@@ -41,8 +42,8 @@ class PairTable(PairRows):
 
     Attributes:
         floor_m: height of the floor in the upright frame.
-        begun: whether all nodes that there were at first are measured: pairs are judged from then
-            on, because it needs the floor.
+        begun: whether all nodes are measured, since the beginning or since up turned in a large
+            graph: only then pairs are judged, because it needs the floor.
     """
 
     def __init__(self, graph: SceneGraph, model: PhysicsModel, *, geometry: bool) -> None:
@@ -112,9 +113,12 @@ class PairTable(PairRows):
                     self._forget(node_id)
         self._touched.clear()
         if self._turn(up_world) and len(self.shapes):
-            # All shapes are in one frame.
-            at_most = None
+            # Pairs are judged when all shapes are in one frame: now, or after some calls.
             self._stale.update(dict.fromkeys(self.shapes.ids.tolist()))
+            if at_most is None or len(self._stale) <= NEW_A_CALL:
+                at_most = None
+            else:
+                self.begun = False
         changed = take_first(self._stale, at_most)
         self._measure(changed)
         return changed

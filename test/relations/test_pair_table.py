@@ -25,6 +25,7 @@ from support.room_nodes import (
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.relations import pair_table
 from deworldsg_ros.relations.pair_geometry import NodeShapes
 from deworldsg_ros.relations.pair_table import (
     FLOOR_QUANTILE,
@@ -341,6 +342,24 @@ def test_another_up_direction_turns_all_pairs() -> None:
 
 
 # --- the prior of class pairs --------------------------------------------------------------------
+
+
+def test_a_large_graph_turns_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pair_table, "NEW_A_CALL", 4)
+    graph = room({str(index): item for index, item in enumerate(THINGS)})[0].graph
+    followed = table_of(graph)
+    followed.refresh(Z)
+    tilted = np.array([0.6, 0.0, 0.8])
+    calls = 0
+    while not calls or followed.nodes_waiting:
+        followed.refresh(tilted, 10, 4)
+        assert followed.begun == (not followed.nodes_waiting)
+        calls += 1
+    assert calls == len(THINGS) / 4 and followed.begun
+    followed.refresh(tilted)
+    anew = table_of(graph)
+    anew.refresh(tilted)
+    assert_equal(pairs_of(followed), pairs_of(anew))
 
 
 def test_the_prior_is_the_mean_of_the_predictions_that_say_something() -> None:
