@@ -240,7 +240,8 @@ def _surface_points(objects: list[Estimate], T_world_camera: Float64) -> tuple[F
     points_camera = np.concatenate([item.points for item in objects])
     points = (points_camera @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32)
     ends = [*accumulate(len(item.points) for item in objects)]
-    return tuple(points[start:end] for start, end in zip([0, *ends], ends))
+    # From a list: Python cuts a tuple of a generator to its length, and keeps 2000 of each length.
+    return tuple([points[start:end] for start, end in zip([0, *ends], ends)])
 
 
 def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> DepthGrid:

@@ -225,7 +225,7 @@ def _with_objects(local: LocalGraph, objects: list[_Object], grid: DepthGrid | N
         means_world=np.array([item.mean for item in objects]),
         covariances_world=np.array([item.covariance for item in objects]),
         pixel_counts=np.array([item.pixels for item in objects]),
-        surface_points_world=tuple(item.points for item in objects),
+        surface_points_world=tuple([item.points for item in objects]),
         relations=Relations.none(len(local.vocabulary.predicates)),
         depth_grid=grid,
     )

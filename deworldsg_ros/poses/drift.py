@@ -133,5 +133,5 @@ def moved(local: LocalGraph, T: Float64) -> LocalGraph:
         T_world_camera=T @ local.T_world_camera,
         means_world=means_world,
         covariances_world=covariances_world,
-        surface_points_world=tuple(points[a:b] for a, b in zip([0, *ends], ends)),
+        surface_points_world=tuple([points[a:b] for a, b in zip([0, *ends], ends)]),
     )

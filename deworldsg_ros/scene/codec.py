@@ -174,7 +174,7 @@ def local_graph_from_message(message: wire.LocalGraphMessage) -> LocalGraph:
             ).reshape(-1, 3, 3),
             depths_m=np.array([item.depth_m for item in objects], np.float64),
             pixel_counts=np.array([item.pixel_count for item in objects], np.int64),
-            surface_points_world=tuple(_surface(item, message.schema) for item in objects),
+            surface_points_world=tuple([_surface(item, message.schema) for item in objects]),
             relations=_relations_from_wire(message.relations, len(message.predicates)),
             drops=message.drops,
             depth_grid=_depth_grid_from_wire(message),

@@ -109,9 +109,10 @@ class DepthGrid:
         if self.stride_px < 1:
             raise ValueError(f"stride of the depth grid is {self.stride_px}: expected >= 1")
         first = self.stride_px // 2
-        shape = tuple(
-            len(range(first, size, self.stride_px))
-            for size in (self.intrinsics.height, self.intrinsics.width)
+        height, width = self.intrinsics.height, self.intrinsics.width
+        shape = (
+            len(range(first, height, self.stride_px)),
+            len(range(first, width, self.stride_px)),
         )
         checks.check_shape("depth grid", self.depth_mm, shape)
         if self.instances is not None:
