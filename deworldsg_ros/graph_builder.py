@@ -29,6 +29,7 @@ from deworldsg_ros.scene.node_states import hidden_node
 from deworldsg_ros.scene.publication import Publication
 from deworldsg_ros.scene.seen_frames import FrameMemory
 from deworldsg_ros.scene.seen_space import SeenSpace
+from deworldsg_ros.scene.softmax import softmax_weights
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.votes import frame_votes
 
@@ -122,8 +123,10 @@ class GraphBuilder:
         if self._drift is not None:
             check_fits(self.graph, local)
             local = self._drift.align(local)
-        node_ids = self.merging.merge(self.graph, self._edges.weigh(local))
-        votes = frame_votes(local.relations.logits)
+        logits = local.relations.logits
+        weights = softmax_weights(logits) if logits.size else None
+        node_ids = self.merging.merge(self.graph, self._edges.weigh(local, weights))
+        votes = frame_votes(logits, weights)
         self._edges.observe(local, node_ids, votes)
         self.frames.note(self.graph, local, node_ids, votes)
         self.space.note(local)

@@ -114,7 +114,7 @@ class Drift:
 
 
 def _squared(step: Float64) -> float:
-    return float(step**2 @ JOINT)
+    return float((step * step).dot(JOINT))
 
 
 def _shrunk(squared: float, noise_squared: float) -> float:

@@ -31,6 +31,7 @@ from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabu
 from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.predicates import SYMMETRIC, plain
 from deworldsg_ros.scene.publication import MEASURED_A_CALL, NEW_A_CALL
+from deworldsg_ros.scene.softmax import SoftmaxWeights
 from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.waiting import some_of
 
@@ -87,11 +88,14 @@ class EdgeBeliefs:
         # Of both directions of the pairs with a message, by key.
         self._basis: dict[int, tuple[_Basis, _Basis]] = {}
 
-    def weigh(self, local: LocalGraph) -> LocalGraph:
-        """A frame's local graph with the relation logits as they enter the sum of Eq. 9."""
+    def weigh(self, local: LocalGraph, weights: SoftmaxWeights | None = None) -> LocalGraph:
+        """A frame's local graph with the relation logits as they enter the sum of Eq. 9.
+
+        The weights are those of its logits, if they are known.
+        """
         if self._robust is None:
             return local
-        logits = bounded_logits(local.relations.logits, OUTLIER_RATE)
+        logits = bounded_logits(local.relations.logits, OUTLIER_RATE, weights)
         return derived(local, relations=derived(local.relations, logits=logits))
 
     def observe(self, local: LocalGraph, node_ids: Sequence[int], votes: Float64) -> None:

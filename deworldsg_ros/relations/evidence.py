@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.scene.arrays import Bool, Float64, Int8
-from deworldsg_ros.scene.softmax import softmax
+from deworldsg_ros.scene.softmax import SoftmaxWeights, softmax, softmax_weights
 from deworldsg_ros.scene.wire import Provenance
 
 PROVENANCES: tuple[Provenance, ...] = ("visual", "prior", "fused")
@@ -20,7 +20,9 @@ _VISUAL, _PRIOR, _FUSED = range(3)
 OUTLIER_RATE = 0.1
 
 
-def bounded_logits(logits: Float64, outlier_rate: float) -> Float64:
+def bounded_logits(
+    logits: Float64, outlier_rate: float, weights: SoftmaxWeights | None = None
+) -> Float64:
     """A frame's relation logits if a fraction of all frames are outliers (beyond the paper).
 
     log((1 - ε) softmax(ℓ)_r + ε / R). They are summed like the logits in Eq. 9, but the evidence of
@@ -29,14 +31,15 @@ def bounded_logits(logits: Float64, outlier_rate: float) -> Float64:
     Args:
         logits: (m, R) float64, pre-sigmoid logits of one frame.
         outlier_rate: ε, between 0 and 1.
+        weights: those of the logits, if they are known.
 
     Returns:
         (m, R) float64.
     """
     if not logits.size:
         return logits
-    weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-    inliers = (1.0 - outlier_rate) * weights / weights.sum(axis=1, keepdims=True)
+    _, exponentials, totals = weights or softmax_weights(logits)
+    inliers = (1.0 - outlier_rate) * exponentials / totals
     bounded: Float64 = np.log(inliers + outlier_rate / logits.shape[1])
     return bounded
 

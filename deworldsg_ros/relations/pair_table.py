@@ -14,7 +14,7 @@ from deworldsg_ros.relations.pair_rows import PairRows
 from deworldsg_ros.relations.physical_states import relation_of_predicates
 from deworldsg_ros.relations.physics_model import PhysicsModel
 from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach, known_reach
-from deworldsg_ros.relations.vote_model import most_other_votes, relation_counts
+from deworldsg_ros.relations.vote_model import count_votes
 from deworldsg_ros.relations.waiting_pairs import WaitingPairs
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 from deworldsg_ros.scene.class_kinds import SEATS, TABLES
@@ -150,7 +150,7 @@ class PairTable(PairRows):
         classes = edits.believed_classes(nodes, names, rows)
         shapes.seating[at] = classes @ self._seating > 0.5
         best = classes.argmax(axis=1)
-        differs = np.flatnonzero(shapes.best_classes[at] != best).tolist()
+        differs = (shapes.best_classes[at] != best).nonzero()[0].tolist()
         shapes.best_classes[at] = best
         for shape in at.tolist():
             if shapes.counts[shape] >= MIN_SHAPE_POINTS:
@@ -227,8 +227,7 @@ class PairTable(PairRows):
     def _count(self, rows: Int64) -> None:
         """Take in the votes on pairs."""
         self.frames[rows], votes = self._graph.votes.of(self.nodes[rows])
-        self.counts[rows] = relation_counts(votes, self._relation_of)
-        self.other_votes[rows] = most_other_votes(votes, self._relation_of)
+        count_votes(rows, votes, self._relation_of, self.counts, self.other_votes)
 
 
 def floor_height(bottoms_m: Sequence[float]) -> float:

@@ -58,31 +58,36 @@ def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
     Returns:
         (..., NONE) float64.
     """
-    flat = np.ascontiguousarray(votes, np.float64).reshape(-1, len(relation_of))
-    counts: Float64 = _relation_counts(flat, relation_of).reshape(*votes.shape[:-1], NONE)
-    return counts
+    flat = np.ascontiguousarray(votes, np.float64).reshape(-1, 1, len(relation_of))
+    counts, others = np.empty((len(flat), 1, NONE)), np.empty(len(flat))
+    count_votes(np.arange(len(flat)), flat, relation_of, counts, others)
+    return counts.reshape(*votes.shape[:-1], NONE)
 
 
 @kernel
-def _relation_counts(votes: Float64, relation_of: Int64) -> Float64:
-    counts = np.zeros((len(votes), NONE), np.float64)
-    for row in range(len(votes)):
-        for name in range(len(relation_of)):
-            if relation_of[name] >= 0:
-                counts[row, relation_of[name]] += votes[row, name]
-    return counts
+def count_votes(
+    rows: Int64, votes: Float64, relation_of: Int64, counts: Float64, others: Float64
+) -> None:
+    """Write what votes are on.
 
-
-@kernel
-def most_other_votes(votes: Float64, relation_of: Int64) -> Float64:
-    """Most of the votes (m, 2, R) on a predicate that names no physical relation, (m,)."""
-    most = np.zeros(len(votes), np.float64)
-    for row in range(len(votes)):
-        for end in range(2):
+    Args:
+        rows: (k,) where to write.
+        votes: (k, ends, R) sums of the votes, in some directions.
+        relation_of: (R,) relation of each predicate, -1 = it names none.
+        counts: (m, ends, NONE) votes by relation; written.
+        others: (m,) most votes on a predicate that names no physical relation; written.
+    """
+    for index in range(len(rows)):
+        row, most = rows[index], 0.0
+        for end in range(votes.shape[1]):
+            for relation in range(NONE):
+                counts[row, end, relation] = 0.0
             for name in range(len(relation_of)):
-                if relation_of[name] < 0:
-                    most[row] = max(most[row], votes[row, end, name])
-    return most
+                if relation_of[name] >= 0:
+                    counts[row, end, relation_of[name]] += votes[index, end, name]
+                else:
+                    most = max(most, votes[index, end, name])
+        others[row] = most
 
 
 def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:

@@ -55,9 +55,8 @@ class Columns:
 
     def rows_at(self, ids: Sequence[int]) -> Int64:
         """The present row of each id (n,); KeyError if there is none."""
-        rows = self._rows
         try:
-            return np.array([rows[node_id] for node_id in ids], np.int64)
+            return np.fromiter(map(self._rows.__getitem__, ids), np.int64, len(ids))
         except KeyError as missing:
             raise KeyError(f"node {missing} is not in the graph") from None
 

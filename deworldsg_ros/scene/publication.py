@@ -171,8 +171,13 @@ def _take(
         if now is None:
             if known.pop(key, None) is not None:
                 gone.append(key)
-        # Identity first: an unchanged message is usually the same object.
-        elif known.get(key) is not now and known.get(key) != now:
+            continue
+        before = known.get(key)
+        # Identity first: an unchanged message is usually the same object. Then a number: a frame
+        # that shows something adds one, and to compare all takes longer.
+        if before is now:
+            continue
+        if before is None or before.observations != now.observations or before != now:
             known[key] = now
             changed.append(now)
     touched.clear()

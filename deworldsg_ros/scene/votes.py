@@ -13,6 +13,7 @@ from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene.arrays import Float64, Int32, Int64
 from deworldsg_ros.scene.columns import Columns
 from deworldsg_ros.scene.edges import Pair, ends_of, key
+from deworldsg_ros.scene.softmax import SoftmaxWeights, softmax_weights
 
 
 @dataclass(frozen=True)
@@ -241,21 +242,21 @@ def _vote(
     return used, left
 
 
-def frame_votes(logits: Float64) -> Float64:
+def frame_votes(logits: Float64, weights: SoftmaxWeights | None = None) -> Float64:
     """The votes of one frame: the probability of each predicate, or of none.
 
     The best sigmoid is the probability that the pair is related; it is divided by the softmax.
 
     Args:
         logits: (m, R) float64, before the sigmoid.
+        weights: those of the logits, if they are known.
 
     Returns:
         (m, R) float64, row sums from 0 to 1.
     """
     if not logits.size:
         return np.zeros(logits.shape)
-    best = logits.max(axis=1, keepdims=True)
-    weights = np.exp(logits - best)
+    best, exponentials, totals = weights or softmax_weights(logits)
     related = np.exp(-np.logaddexp(0.0, -best))
-    votes: Float64 = related * weights / weights.sum(axis=1, keepdims=True)
+    votes: Float64 = related * exponentials / totals
     return votes

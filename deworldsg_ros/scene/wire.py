@@ -5,7 +5,7 @@ because JSON numbers cannot hold 64-bit nanoseconds. Floats keep full precision 
 decimal that reads back as the same float64), so that a graph over DDS equals one in process.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union
 
 import msgspec
@@ -95,6 +95,7 @@ class Stamp(msgspec.Struct, frozen=True, gc=False):
     nanosec: Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
 
 
+@lru_cache(maxsize=4096)
 def stamp_from_ns(stamp_ns: int) -> Stamp:
     """Stamp of a time in nanoseconds."""
     return Stamp(*divmod(stamp_ns, 10**9))

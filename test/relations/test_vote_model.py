@@ -23,7 +23,7 @@ from deworldsg_ros.relations.physical_states import (
 from deworldsg_ros.relations.physics_model import load_physics_model
 from deworldsg_ros.relations.vote_model import (
     VoteScales,
-    most_other_votes,
+    count_votes,
     near_logits,
     relation_counts,
     vote_logits,
@@ -151,6 +151,9 @@ def test_votes_are_summed_by_relation(count: int) -> None:
 def test_votes_beyond_the_relations(count: int) -> None:
     votes = np.random.default_rng(count).uniform(0, 5, (count, 2, 6))
     relation_of = np.array([ON, -1, NEAR, -1, -1, ABOVE])
-    most = most_other_votes(votes, relation_of)
+    counts, most = np.full((count, 2, NONE), np.nan), np.full(count, np.nan)
+    count_votes(np.arange(count), votes, relation_of, counts, most)
     np.testing.assert_array_equal(most, votes[:, :, relation_of < 0].max(axis=(1, 2), initial=0))
-    assert (most_other_votes(votes, np.full(6, ON)) == 0).all()
+    np.testing.assert_array_equal(counts, relation_counts(votes, relation_of))
+    count_votes(np.arange(count), votes, np.full(6, ON), counts, most)
+    assert (most == 0).all()
