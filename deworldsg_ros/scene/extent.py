@@ -249,17 +249,29 @@ def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
         near = _count_near(x[first:last], y[first:last], z[first:last], x[a], y[a], z[a])
         weights[a] = _EVEN_WEIGHTS[min(near, len(_EVEN_WEIGHTS) - 1)]
         total += weights[a]
-    for axis in range(3):
-        mean[axis] = 0.0
-        for a in range(count):
-            weights[a] = weights[a] / total if axis == 0 else weights[a]
-            mean[axis] += weights[a] * ordered[axis, a]
-    for i in range(3):
-        for j in range(i, 3):
-            total = EVEN_RADIUS_M**2 / 5 if i == j else 0.0
-            for a in range(count):
-                total += weights[a] * (ordered[i, a] - mean[i]) * (ordered[j, a] - mean[j])
-            covariance[i, j] = covariance[j, i] = total
+    # One pass for all sums: the processor adds to them at the same time.
+    mean_x = mean_y = mean_z = 0.0
+    for a in range(count):
+        weights[a] = weights[a] / total
+        mean_x += weights[a] * x[a]
+        mean_y += weights[a] * y[a]
+        mean_z += weights[a] * z[a]
+    mean[0], mean[1], mean[2] = mean_x, mean_y, mean_z
+    xx = yy = zz = EVEN_RADIUS_M**2 / 5
+    xy = xz = yz = 0.0
+    for a in range(count):
+        step_x, step_y, step_z = x[a] - mean_x, y[a] - mean_y, z[a] - mean_z
+        by_x, by_y = weights[a] * step_x, weights[a] * step_y
+        xx += by_x * step_x
+        xy += by_x * step_y
+        xz += by_x * step_z
+        yy += by_y * step_y
+        yz += by_y * step_z
+        zz += weights[a] * step_z * step_z
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx, yy, zz
+    covariance[0, 1] = covariance[1, 0] = xy
+    covariance[0, 2] = covariance[2, 0] = xz
+    covariance[1, 2] = covariance[2, 1] = yz
 
 
 @kernel

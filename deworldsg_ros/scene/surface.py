@@ -93,7 +93,7 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
     changed = np.zeros(len(rows), np.bool_)
     # The points that enter a sample, their hashes, and the known points that they come before.
     entering, places = np.empty(len(new_bits), np.int64), np.empty(len(new_bits), np.int64)
-    hashes, known_hashes = np.empty(len(new_bits), np.uint64), np.empty(capacity, np.uint64)
+    hashes = np.empty(len(new_bits), np.uint64)
     for index in range(len(rows)):
         row = rows[index]
         known = counts[row]
@@ -106,14 +106,11 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
         if count == 0:
             continue
         _sort(hashes, entering, count)
-        for place in range(known):
-            known_hashes[place] = _hash(bits[row, place])
         place = fresh = 0
         for new in range(count):
-            while place < known and known_hashes[place] < hashes[new]:
-                place += 1
+            place = _place(bits[row], place, known, hashes[new])
             # Equal hashes mean equal points: with 64 bits, collisions within a node are negligible.
-            if place < known and known_hashes[place] == hashes[new]:
+            if place < known and _hash(bits[row, place]) == hashes[new]:
                 continue
             if new and hashes[new - 1] == hashes[new]:
                 continue
@@ -123,6 +120,22 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
         _insert(bits[row], known, new_bits, entering[:fresh], places)
         counts[row] = min(capacity, known + fresh)
     return changed
+
+
+@kernel
+def _place(bits: UInt32, first: int, known: int, wanted: np.uint64) -> int:
+    """First of the known points, from a place on, whose hash is not less; few are hashed."""
+    low, high, step = first, first, 1
+    while high < known and _hash(bits[high]) < wanted:
+        low, high, step = high + 1, high + step, 2 * step
+    high = min(high, known)
+    while low < high:
+        middle = (low + high) // 2
+        if _hash(bits[middle]) < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
 @kernel
