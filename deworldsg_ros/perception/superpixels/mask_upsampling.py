@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Int32, Int64, UInt8
+from deworldsg_ros.scene.arrays import Float32, Int16, Int32, Int64, UInt8
 
 # The cost of a cell sums squared differences between it and the pixel. Each of these counts 1:
 # RGB colour, 8 bit; depth, relative to the depth.
@@ -19,17 +19,17 @@ MAX_DEPTH_COST = 9.0
 # is chosen: those above and on the left come before the pixel's own cell.
 CANDIDATES = ((0, 0), (-1, 0), (0, -1), (0, 1), (1, 0))
 
-_Candidates = tuple[Float32, Int64, Int32, int, int]
+_Candidates = tuple[Float32, Int64, Int16, int, int]
 
 
 @kernel
 def upsample_labels(
     labels: Int32, cell_rgb: UInt8, cell_depth: Float32, rgb: UInt8, depth_m: Float32, stride: int
-) -> Int32:
+) -> Int16:
     """Each pixel takes the label of the most similar of its own cell and the four beside it.
 
     Args:
-        labels: (h, w) int32 of cells.
+        labels: (h, w) int32 of cells, below 2^15.
         cell_rgb: (h, w, 3) uint8 mean colour of cells.
         cell_depth: (h, w) float32 metres; 0 = invalid.
         rgb: (H, W, 3) uint8.
@@ -37,14 +37,14 @@ def upsample_labels(
         stride: pixels per cell.
 
     Returns:
-        (H, W) int32.
+        (H, W) int16.
     """
     height, width = depth_m.shape
     rows, columns = labels.shape
-    result = np.empty((height, width), np.int32)
+    result = np.empty((height, width), np.int16)
     near = np.empty((len(CANDIDATES), 4), np.float32)
     centres = np.empty((len(CANDIDATES), 2), np.int64)
-    near_labels = np.empty(len(CANDIDATES), np.int32)
+    near_labels = np.empty(len(CANDIDATES), np.int16)
     # The cost of each distance along an axis, from `reach` pixels before a centre on.
     reach = 2 * stride
     along = np.empty(6 * stride, np.float32)
@@ -64,19 +64,20 @@ def upsample_labels(
         for u in range(columns):
             if _is_uniform(labels, v, u):
                 continue
-            count = 0
+            before = (v > 0) + (u > 0)
+            count = 1 + before + (u < columns - 1) + (v < rows - 1)
+            i = 0
             for dv, du in CANDIDATES:
                 b, a = v + dv, u + du
                 if b < 0 or a < 0 or b >= rows or a >= columns:
                     continue
                 for k in range(3):
-                    near[count, k] = cell_rgb[b, a, k]
-                near[count, 3] = cell_depth[b, a]
-                centres[count, 0] = b * stride + stride // 2 - reach
-                centres[count, 1] = a * stride + stride // 2 - reach
-                near_labels[count] = labels[b, a]
-                count += 1
-            before = (v > 0) + (u > 0)
+                    near[i, k] = cell_rgb[b, a, k]
+                near[i, 3] = cell_depth[b, a]
+                centres[i, 0] = b * stride + stride // 2 - reach
+                centres[i, 1] = a * stride + stride // 2 - reach
+                near_labels[i] = labels[b, a]
+                i += 1
             right = width if u == columns - 1 else (u + 1) * stride
             pixels = (top, bottom, u * stride, right)
             candidates = (near, centres, near_labels, count, before)
@@ -102,7 +103,7 @@ def _choose(
     rgb: UInt8,
     depth_m: Float32,
     pixels: tuple[int, int, int, int],
-    result: Int32,
+    result: Int16,
 ) -> None:
     """Write the label of the candidate with the least cost to each pixel of a cell.
 
@@ -114,7 +115,7 @@ def _choose(
         rgb: (H, W, 3) uint8.
         depth_m: (H, W) float32 metres.
         pixels: first and last row, first and last column, without the last.
-        result: (H, W) int32, written.
+        result: (H, W) int16, written.
     """
     near, centres, labels, count, before = candidates
     colour_weight = np.float32(COLOUR_STEP * COLOUR_STEP)
