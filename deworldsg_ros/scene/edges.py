@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -62,7 +63,7 @@ class EdgeArrays:
         """The arrays of some pairs, in their order."""
         logits, *counts = zip(*evidence.values()) if evidence else [()] * 5
         return cls(
-            np.array(list(evidence), np.int64).reshape(-1, 2),
+            np.fromiter(chain.from_iterable(evidence), np.int64, 2 * len(evidence)).reshape(-1, 2),
             np.concatenate([np.zeros(0), *logits]).reshape(-1, predicate_count),
             np.array(counts, np.int64).T.copy(),
         )

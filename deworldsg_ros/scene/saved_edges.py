@@ -70,14 +70,16 @@ class SavedEdges:
         known, rows = self._arrays, np.flatnonzero(self._live)
         if not values and len(rows) == len(known):
             return known
-        width = known.visual_logits.shape[1]
-        changed = EdgeArrays.of({pair: values[pair] for pair in self.changed}, width)
-        new = {pair: value for pair, value in values.items() if pair not in self.changed}
+        width, changed = known.visual_logits.shape[1], self.changed
+        new = {pair: value for pair, value in values.items() if pair not in changed}
         more = EdgeArrays.of(new, width)
-        at = rows.searchsorted(np.array(list(self.changed.values()), np.int64))
+        if not len(rows):
+            return more
+        newer = EdgeArrays.of({pair: values[pair] for pair in changed}, width)
+        at = rows.searchsorted(np.array(list(changed.values()), np.int64))
         logits = np.concatenate((known.visual_logits[rows], more.visual_logits))
         counts = np.concatenate((known.counts[rows], more.counts))
-        logits[at], counts[at] = changed.visual_logits, changed.counts
+        logits[at], counts[at] = newer.visual_logits, newer.counts
         return EdgeArrays(np.concatenate((known.pairs[rows], more.pairs)), logits, counts)
 
     def _places_of(self, node_id: int) -> Int64:
