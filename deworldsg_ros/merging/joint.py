@@ -82,13 +82,10 @@ class JointEvidence:
         sure = dict(zip(object_owners, (detection_scores >= SURE_SCORE).tolist()))
         evidence: dict[Pair, int] = {}
         taken = set(matches.columns)
-        rows, columns = np.nonzero(matches.touching | (matches.scores > 0))
-        nested = matches.touching & (matches.on_nodes >= NESTED_FRACTION)
+        met = (matches.touching | (matches.scores > 0)).nonzero()
+        nested = matches.touching[met] & (matches.on_nodes[met] >= NESTED_FRACTION)
         for row, column, score, is_nested in zip(
-            rows.tolist(),
-            columns.tolist(),
-            matches.scores[rows, columns].tolist(),
-            nested[rows, columns].tolist(),
+            *(places.tolist() for places in met), matches.scores[met].tolist(), nested.tolist()
         ):
             a, b = object_owners[row], matches.owners[column]
             pair = (a, b) if a < b else (b, a)

@@ -168,7 +168,7 @@ class PairTable(PairRows):
         """Count the votes on nodes that are published from now on."""
         for node_id in node_ids:
             partners = self._graph.seen_together(node_id)
-            self._waiting.add(key(min(node_id, other), max(node_id, other)) for other in partners)
+            self._waiting.add([key(min(node_id, other), max(node_id, other)) for other in partners])
 
     def _forget(self, node_id: int) -> None:
         """Forget a node that is not published any more, and its pairs."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
+from itertools import filterfalse
 
 import numpy as np
 
@@ -30,14 +31,13 @@ class WaitingPairs:
     def __len__(self) -> int:
         return len(self._new) + len(self._again)
 
-    def add(self, keys: Iterable[int]) -> None:
+    def add(self, keys: Collection[int]) -> None:
         """Let pairs wait. Those with a node that is not published count when it is."""
-        known, new, again = self._known, self._new, self._again
-        for pair_key in keys:
-            if pair_key in known:
-                again[pair_key] = None
-            elif self._are_published(pair_key):
-                new[pair_key] = None
+        # Most are known: a loop of Python is for the others only.
+        self._again.update(dict.fromkeys(filter(self._known.__contains__, keys)))
+        for pair_key in filterfalse(self._known.__contains__, keys):
+            if self._are_published(pair_key):
+                self._new[pair_key] = None
 
     def move(self, keys: Int64) -> None:
         """Let pairs wait that have another geometry."""

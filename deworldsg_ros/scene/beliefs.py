@@ -38,8 +38,8 @@ def listed(probabilities: Float64, names: Sequence[str], top_k: int) -> list[Lis
     found = _best(probabilities, probabilities.sum(axis=1), min(top_k, len(names)))
     order, shares, rests, entropies = (array.tolist() for array in found)
     return [
-        Listed([wire.Belief(names[label], share) for label, share in zip(*pairs)], rest, entropy)
-        for *pairs, rest, entropy in zip(order, shares, rests, entropies)
+        Listed(list(map(wire.Belief, map(names.__getitem__, best), values)), rest, entropy)
+        for best, values, rest, entropy in zip(order, shares, rests, entropies)
     ]
 
 

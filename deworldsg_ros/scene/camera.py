@@ -206,8 +206,8 @@ def invert_pose(T: Float64) -> Float64:
     """Inverse of a rigid transform (4, 4)."""
     inverse = np.zeros((4, 4))
     inverse[3, 3] = 1.0
-    inverse[:3, :3] = T[:3, :3].T
-    inverse[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    inverse[:3, :3] = turn = T[:3, :3].T
+    inverse[:3, 3] = -turn @ T[:3, 3]
     return inverse
 
 
