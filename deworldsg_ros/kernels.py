@@ -54,10 +54,13 @@ class _Kernel:
         """Numba's."""
         if self._dispatcher is None:
             with self._lock:
+                # None if another thread has made them meanwhile.
                 items = self._waiting.pop(self._module, [])
-                for item in items:
-                    item._dispatcher = _jit(item._function)
-                _replace(items)
+                dispatchers = [_jit(item._function) for item in items]
+                # Kernels are compiled when all of their module are in place: they call one another.
+                _replace(self._module, items, dispatchers)
+                for item, dispatcher in zip(items, dispatchers):
+                    item._dispatcher = dispatcher
         return self._dispatcher
 
     @property
@@ -66,16 +69,16 @@ class _Kernel:
         return self.dispatcher.signatures
 
 
-def _replace(items: list[_Kernel]) -> None:
-    """Put numba's dispatchers in place of kernels, in all modules of the package."""
+def _replace(own: ModuleType, items: list[_Kernel], dispatchers: list[Any]) -> None:
+    """Put numba's dispatchers in place of a module's kernels, in all modules of the package."""
     package = __name__.partition(".")[0]
     for module_name, module in list(sys.modules.items()):
-        if module_name.partition(".")[0] == package or module is items[0]._module:
+        if module_name.partition(".")[0] == package or module is own:
             content = vars(module)
-            for item in items:
+            for item, dispatcher in zip(items, dispatchers):
                 name = item._function.__name__
                 if content.get(name) is item:
-                    content[name] = item.dispatcher
+                    content[name] = dispatcher
 
 
 # Functions to call when the first kernel is compiled.

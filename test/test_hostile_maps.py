@@ -126,6 +126,7 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "the same edge twice": changed("edge_pairs", lambda a: a * 0 + a[0]),
     "edge logits of infinity": changed("edge_visual_logits", put((0, 0), np.inf)),
     "negative frames of an edge": changed("edge_counts", put((0, 0), -1)),
+    "logits of an edge without frames": changed("edge_counts", put((0, 0), 0)),
     "votes of NaN": changed("vote_counts", lambda a: a * np.nan if len(a) else np.ones((1, 2, 3))),
     "more votes than frames": changed("vote_known", lambda a: a + [[0, 0, 1]]),
     "a live node that was removed": lambda arrays: {**arrays, "successors": np.array([[1, 0]])},

@@ -112,7 +112,9 @@ class PairTable(PairRows):
                 if node_id in self.shapes:
                     self._forget(node_id)
         self._touched.clear()
-        if self._turn(up_world) and len(self.shapes):
+        # A turn waits until the one before is done: up that always turns would stop all updates.
+        may_turn = self.begun or at_most is None or not len(self.shapes)
+        if may_turn and self._turn(up_world) and len(self.shapes):
             # Pairs are judged when all shapes are in one frame: now, or after some calls.
             self._stale.update(dict.fromkeys(self.shapes.ids.tolist()))
             if at_most is None or len(self._stale) <= NEW_A_CALL:

@@ -64,7 +64,7 @@ class EdgeArrays:
         logits, *counts = zip(*evidence.values()) if evidence else [()] * 5
         return cls(
             np.fromiter(chain.from_iterable(evidence), np.int64, 2 * len(evidence)).reshape(-1, 2),
-            np.concatenate([np.zeros(0), *logits]).reshape(-1, predicate_count),
+            np.concatenate([np.zeros(0), *logits]).reshape(len(evidence), predicate_count),
             np.array(counts, np.int64).T.copy(),
         )
 

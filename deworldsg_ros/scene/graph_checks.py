@@ -137,6 +137,8 @@ def _check_edges(arrays: Arrays, header: Header, ids: Int64) -> None:
     within("edge_visual_logits", logits, *_sym(MAX_LOGIT))
     counts = checked(arrays, "edge_counts", np.int64, len(pairs), 4)
     within("edge_counts (frames)", counts[:, 0], 0, MAX_COUNT)
+    unseen = logits[counts[:, 0] == 0]
+    holds("edge_visual_logits", not unseen.any(), "zeros for an edge without frames")
     _check_stamps("edge_counts (last_seen_ns)", counts[:, 1])
     within("edge_counts (neighbour_frames)", counts[:, 2], 0, MAX_COUNT)
     within("edge_counts (revision)", counts[:, 3], 0, header.revision)

@@ -164,7 +164,8 @@ class NodeStore:
         existence = existence.round(2)
         confirmed = existence >= minimum
         if self.edits:
-            confirmed &= [not self.edits.hides(node_id) for node_id in node_ids]
+            shown = (not self.edits.hides(node_id) for node_id in node_ids)
+            confirmed &= np.fromiter(shown, np.bool_, len(node_ids))
         known = nodes.confirmed[rows]
         differs = (nodes.existence[rows] != existence) | (known != confirmed)
         nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
-from support.surfaces import CHAIR, CUP, HERE, TABLE, slab, view
+from support.surfaces import CHAIR, CUP, HERE, TABLE, frame, slab, view
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -114,6 +114,16 @@ def test_a_deleted_object_stays_deleted_when_it_was_away():
     room.see(20, (WHOLE, TABLE))
     room.see(20)
     assert room.labels() == {2: "table"}
+
+
+@RULES
+def test_after_an_edit_a_frame_may_show_and_miss_nothing(association):
+    room = Room((HERE, CUP), association=association)
+    room.builder.edit(SetLabel(1, "chair"))
+    away = np.eye(4)
+    away[:3, 3] = [50.0, 0.0, 0.0]
+    assert room.builder.integrate(frame(room.stamp + 1, T_world_camera=away)) == []
+    assert room.labels() == {1: "chair"}
 
 
 def test_merged_objects_stay_one_though_the_detector_sees_two():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -42,6 +43,30 @@ def test_no_frame_waits_for_the_compiler(root_dir: Path) -> None:
     recording.close()
     late = {name: found - before.get(name, set()) for name, found in signatures().items()}
     assert {name: found for name, found in late.items() if found} == {}
+
+
+FIRST_CALLS = """
+import threading
+import numpy as np
+from deworldsg_ros.scene import surface
+begin, done = threading.Barrier(4), []
+def call():
+    begin.wait()
+    points, counts = np.zeros((1, 8, 3), np.float32), np.zeros(1, np.int64)
+    surface.add_points(points, counts, np.array([0]), [np.ones((3, 3), np.float32)])
+    done.append(counts.tolist())
+threads = [threading.Thread(target=call) for _ in range(4)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+print(done)
+"""
+
+
+def test_threads_may_call_a_kernel_for_the_first_time_together() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True, check=True
+    )
+    assert (done.stderr, json.loads(done.stdout)) == ("", [[1]] * 4)
 
 
 @pytest.mark.parametrize(

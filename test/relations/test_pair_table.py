@@ -356,6 +356,13 @@ def test_a_large_graph_turns_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
         assert followed.begun == (not followed.nodes_waiting)
         calls += 1
     assert calls == len(THINGS) / 4 and followed.begun
+    # A turn that comes before the other one is done waits for it.
+    other = np.array([0.0, 0.6, 0.8])
+    followed.refresh(other, 10, 4)
+    for _ in range(len(THINGS) // 4 - 1):
+        assert not followed.begun
+        followed.refresh(tilted, 10, 4)
+    assert followed.begun
     followed.refresh(tilted)
     anew = table_of(graph)
     anew.refresh(tilted)

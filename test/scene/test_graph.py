@@ -20,6 +20,7 @@ from deworldsg_ros.scene import graph_io, wire
 from deworldsg_ros.scene.edge_map import EdgeMap
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
 from deworldsg_ros.scene.graph import SceneGraph
 
@@ -54,6 +55,13 @@ def test_an_empty_graph() -> None:
     assert graph.node_states(3) == {}
     assert graph.take_removals() == {}
     assert graph.resolve(1) == 0
+
+
+def test_a_graph_without_predicates_is_saved_and_loaded() -> None:
+    graph = SceneGraph(Vocabulary(("cup",), ()), "world")
+    graph.add_node(np.zeros(3), np.eye(3), np.ones(1), 1)
+    again = graph_io.graph_from_arrays(arrays_of(graph), "saved")
+    assert len(again) == 1 and equal(graph, again)
 
 
 def test_ids_start_at_1_and_are_never_reused() -> None:
