@@ -83,7 +83,7 @@ def _vote_arrays(state: GraphState) -> Arrays:
     return {
         "vote_pairs": np.array(list(state.votes), np.int64).reshape(-1, 2),
         "vote_known": np.array(known, np.int64).reshape(-1, 3),
-        "vote_counts": np.array(voted, np.float64).reshape(-1, 2, width),
+        "vote_counts": np.array(voted, np.float64).reshape(len(voted), 2, width),
     }
 
 

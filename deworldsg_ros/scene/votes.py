@@ -145,7 +145,7 @@ class VoteMap(Columns):
         voted = [index for index, one in enumerate(votes) if one.counts is not None]
         counts = np.array([votes[index].counts for index in voted], np.float64)
         directed = np.stack([nodes[voted], nodes[voted, ::-1]], axis=1)
-        self.vote(directed.reshape(-1, 2), counts.reshape(-1, self.predicate_count))
+        self.vote(directed.reshape(-1, 2), counts.reshape(2 * len(voted), self.predicate_count))
 
     def repoint(self, old_id: int, new_id: int, revision: int) -> None:
         """Move the votes of one node to another; votes between the two are dropped."""
