@@ -66,6 +66,7 @@ class Drift:
             spare.register(np.eye(4), grid)
             spare.add(np.eye(4))
         difference(np.eye(4), about_camera(np.ones(6), np.eye(4)))
+        stepped(np.zeros(6), np.eye(4))
 
     def align(self, local: LocalGraph) -> LocalGraph:
         """The local graph under the corrected pose; the same one without a depth grid."""

@@ -298,6 +298,7 @@ def warm_up(config: Config) -> None:
     for pair in ((1, 2), (2, 3), (3, 1)):
         graph.add_votes(*pair, np.array([[30.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]))
     beliefs.refresh()
+    _counted(np.array([1, 2]), np.zeros((2, 3)))
     graph.move_node(2, np.array([[1.0, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
     beliefs.refresh()
     graph.remove_node(1)

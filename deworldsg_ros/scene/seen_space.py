@@ -99,6 +99,10 @@ class SeenSpace:
         since = self.stamps_ns >= since_ns
         self.poses[since] = T_correction @ self.poses[since]
 
+    def warm_up(self) -> None:
+        """Compile the kernel before the first frame."""
+        self._has(np.eye(4))
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies by name, for `restore`; empty without views."""
         values = (self.depths_mm, self.poses, self.cameras, self.stamps_ns)

@@ -26,7 +26,8 @@ class RgbdSegmenter:
             np.zeros((side, side, 3), dtype=np.uint8),
             np.ones((side, side), dtype=np.float32),
             Intrinsics(side, side, side / 2, side / 2, side, side),
-            np.array([[4.0, 4.0, 16.0, 16.0]]),
+            # In the small box lies no whole region, in the large one there is one.
+            np.array([[4.0, 4.0, 16.0, 16.0], [0.0, 0.0, side, side]]),
         )
 
     def segment(
