@@ -1,4 +1,4 @@
-"""The edges of a map, of which most never change."""
+"""The edges that a map file brings. Most of them never change."""
 
 from __future__ import annotations
 
