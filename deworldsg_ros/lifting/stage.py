@@ -18,7 +18,7 @@ from deworldsg_ros.lifting.moments import Estimate, estimate_gaussian
 from deworldsg_ros.lifting.pixels import valid_depth
 from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
 from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
-from deworldsg_ros.scene.arrays import Float32, Float64, Int32, Int64, UInt16
+from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
@@ -27,6 +27,7 @@ from deworldsg_ros.scene.frame_graph import (
     LocalGraph,
     Relations,
     Vocabulary,
+    lifted,
 )
 from deworldsg_ros.scene.gaussian import transform
 
@@ -111,23 +112,16 @@ class Lifting:
         means_camera = np.array([item.mean for item in found]).reshape(-1, 3)
         covariances = np.array([item.covariance for item in found]).reshape(-1, 3, 3)
         means, covariances = transform(means_camera, covariances, T_world_camera)
-        return LocalGraph(
-            stamp_ns=frame_graph.stamp_ns,
-            frame_id=frame_id,
-            width=frame_graph.width,
-            height=frame_graph.height,
-            T_world_camera=np.array(T_world_camera, np.float64),
-            vocabulary=frame_graph.vocabulary,
-            instance_ids=rows + 1,
-            boxes_xyxy=frame_graph.boxes_xyxy[rows],
-            class_probabilities=frame_graph.class_probabilities[rows],
-            scores=frame_graph.scores[rows],
+        return lifted(
+            frame_graph,
+            rows,
+            frame_id,
+            T_world_camera,
             means_world=means,
             covariances_world=covariances + self._config.covariance_ridge_m2 * np.eye(3),
             depths_m=means_camera[:, 2].copy(),
             pixel_counts=np.array([item.pixel_count for item in found], np.int64),
             surface_points_world=_surface_points(found, T_world_camera),
-            relations=_kept_relations(frame_graph.relations, rows, len(frame_graph)),
             drops=drops,
             depth_grid=_depth_grid(depth_m, instances, intrinsics),
         )
@@ -251,14 +245,3 @@ def _depth_grid(depth_m: Float32, instances: UInt16, intrinsics: Intrinsics) -> 
     samples_mm = np.minimum(samples_mm, np.iinfo(np.uint16).max).astype(np.uint16)
     samples = np.ascontiguousarray(instances[every, every], np.uint16)
     return DepthGrid(samples_mm, DEPTH_GRID_STRIDE_PX, intrinsics, samples)
-
-
-def _kept_relations(relations: Relations, rows: Int64, count: int) -> Relations:
-    """Relations between kept rows, with the rows renumbered."""
-    if len(rows) == count:
-        return relations
-    renumbered = np.full(count, -1, np.int64)
-    renumbered[rows] = np.arange(len(rows))
-    pairs = renumbered[relations.pairs]
-    kept = (pairs >= 0).all(axis=1)
-    return Relations(pairs[kept], relations.logits[kept], relations.scores[kept])

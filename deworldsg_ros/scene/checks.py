@@ -29,7 +29,7 @@ def check_shape(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> None:
 def check_array(name: str, array: NDArray[Any], shape: tuple[int, ...], limit: float) -> None:
     """Check the shape of an array, and that no value exceeds a limit."""
     check_shape(name, array, shape)
-    if array.size and not max(array.max(), -array.min()) <= limit:
+    if array.size and not np.abs(array).max() <= limit:
         worst = np.nanargmax(np.where(np.isfinite(array), np.abs(array), np.inf))
         raise ValueError(
             f"{name} contain {array.flat[worst]:.6g}: expected finite values up to {limit:g}"
@@ -70,7 +70,7 @@ def check_covariances(covariances: Float64, count: int) -> None:
     if not count:
         return
     apart = np.abs(covariances - covariances.swapaxes(1, 2))
-    if (apart > 1e-9 * np.abs(covariances)).any():
+    if apart.any() and (apart > 1e-9 * np.abs(covariances)).any():
         row = int((apart > 1e-9 * np.abs(covariances)).any(axis=(1, 2)).argmax())
         raise ValueError(f"covariance {covariances[row].tolist()} of row {row} is not symmetric")
     variances = np.linalg.eigvalsh(covariances)

@@ -168,18 +168,69 @@ class LocalGraph:
             check_pose(self.T_world_camera)
         except RefusedInput as refusal:
             raise ValueError(str(refusal)) from refusal
-        checks.check_array("means", self.means_world, (count, 3), limits.MAX_COORDINATE_M)
-        checks.check_covariances(self.covariances_world, count)
         checks.check_boxes(self.boxes_xyxy, count)
-        checks.check_depths(self.depths_m, count)
         checks.check_instance_ids(self.instance_ids, count)
         checks.check_counts("pixel counts", self.pixel_counts, count)
-        checks.check_surfaces(self.surface_points_world, count)
         _check_objects(count, self.vocabulary, self.class_probabilities, self.scores)
         _check_relations(count, self.vocabulary, self.relations)
+        self.check_geometry()
+
+    def check_geometry(self) -> None:
+        """Check what lifting computes; raises ValueError."""
+        count = len(self.means_world)
+        checks.check_array("means", self.means_world, (count, 3), limits.MAX_COORDINATE_M)
+        checks.check_covariances(self.covariances_world, count)
+        checks.check_depths(self.depths_m, count)
+        checks.check_surfaces(self.surface_points_world, count)
 
     def __len__(self) -> int:
         return len(self.means_world)
+
+
+def lifted(
+    frame: FrameGraph, rows: Int64, frame_id: str, T_world_camera: Float64, **geometry: Any
+) -> LocalGraph:
+    """The local graph of some objects of a frame graph; only its geometry is checked.
+
+    Args:
+        frame: checked when it came in.
+        rows: (n,) of the objects in the frame graph, ascending.
+        frame_id: world frame.
+        T_world_camera: (4, 4) pose, checked.
+        geometry: the other attributes of `LocalGraph`.
+
+    Raises:
+        ValueError: as `LocalGraph`.
+    """
+    local = object.__new__(LocalGraph)
+    local.__dict__.update(
+        stamp_ns=frame.stamp_ns,
+        frame_id=frame_id,
+        width=frame.width,
+        height=frame.height,
+        T_world_camera=np.array(T_world_camera, np.float64),
+        vocabulary=frame.vocabulary,
+        instance_ids=rows + 1,
+        boxes_xyxy=frame.boxes_xyxy[rows],
+        class_probabilities=frame.class_probabilities[rows],
+        scores=frame.scores[rows],
+        relations=_between(frame.relations, rows, len(frame)),
+        **geometry,
+    )
+    local.check_geometry()
+    return local
+
+
+def _between(relations: Relations, rows: Int64, count: int) -> Relations:
+    """Relations between some of the rows, with the rows renumbered."""
+    if len(rows) == count:
+        return relations
+    renumbered = np.full(count, -1, np.int64)
+    renumbered[rows] = np.arange(len(rows))
+    pairs = renumbered[relations.pairs]
+    kept = (pairs >= 0).all(axis=1)
+    logits, scores = relations.logits[kept], relations.scores[kept]
+    return derived(relations, pairs=pairs[kept], logits=logits, scores=scores)
 
 
 Checked = TypeVar("Checked", Relations, LocalGraph)
