@@ -32,6 +32,8 @@ MAX_GAPS = 32
 # Neighbouring pixels often fall into one bucket. So that their counts do not wait for one another,
 # they are counted in turn in this number of tables.
 COUNT_TABLES = 4
+# More than the rounding of a mean, relative to the highest depth.
+MEAN_ROUNDING = 1e-9
 # Above the bits of all depths.
 MOST_BITS = np.int32(np.iinfo(np.int32).max)
 
@@ -136,7 +138,7 @@ def _least_above(depths: Float32, buckets: UInt16, bucket: int) -> float:
     least = MOST_BITS
     for index in range(depths.size):
         bits = np.float32(depths[index]).view(np.int32)
-        least = min(least, bits if buckets[index] > bucket else least)
+        least = min(least, bits if buckets[index] > bucket else MOST_BITS)
     return np.float64(np.int32(least).view(np.float32))
 
 
@@ -199,8 +201,8 @@ def _blocks(
         below, above = np.int32(0), MOST_BITS
         for index in range(depths.size):
             bits, is_above = np.float32(depths[index]).view(np.int32), buckets[index] >= start
-            above = min(above, bits if is_above else above)
-            below = max(below, below if is_above else bits)
+            above = min(above, bits if is_above else MOST_BITS)
+            below = max(below, np.int32(0) if is_above else bits)
         lows[gap + 1] = np.float64(np.int32(above).view(np.float32))
         highs[gap] = np.float64(np.int32(below).view(np.float32))
     return lows, highs
@@ -241,12 +243,24 @@ def _nearest_cluster(
     The reference lies in a cluster or between two, and the means are ordered. So only this cluster
     and its neighbours are candidates.
     """
-    unit = _unit(depths.size, lows[0], highs[-1])
     at = 0
     while at < lows.size - 1 and highs[at] < reference:
         at += 1
+    first, last = max(at - 1, 0), min(at + 2, lows.size)
+    # A mean lies between the lowest and the highest depth. That alone often decides.
+    least_m = np.inf
+    for cluster in range(first, last):
+        least_m = min(least_m, max(reference - lows[cluster], highs[cluster] - reference))
+    least_m += MEAN_ROUNDING * highs[-1]
+    while max(lows[first] - reference, reference - highs[first]) > least_m:
+        first += 1
+    while max(lows[last - 1] - reference, reference - highs[last - 1]) > least_m:
+        last -= 1
+    if last - first == 1:
+        return lows[first], highs[first]
+    unit = _unit(depths.size, lows[0], highs[-1])
     best, best_distance = -1, np.inf
-    for cluster in range(max(at - 1, 0), min(at + 2, lows.size)):
+    for cluster in range(first, last):
         mean = _mean_between(depths, lows[cluster], highs[cluster], unit)
         distance = abs(mean - reference)
         if distance < best_distance:
