@@ -6,9 +6,9 @@ import itertools
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 
-# With more removed ids than this, those that no remembered frame has are forgotten. So many ids are
-# a few kilobytes, and far more than are removed while a frame is remembered.
-PRUNE_ABOVE = 4096
+# With more removed ids than this, those that no remembered frame has are forgotten. An id takes 0.1
+# kB; far fewer are removed while a frame is remembered.
+PRUNE_ABOVE = 512
 
 
 @dataclass(frozen=True)
