@@ -95,7 +95,7 @@ class Stamp(msgspec.Struct, frozen=True, gc=False):
     nanosec: Annotated[int, msgspec.Meta(ge=0, lt=10**9)]
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1024)
 def stamp_from_ns(stamp_ns: int) -> Stamp:
     """Stamp of a time in nanoseconds."""
     return Stamp(*divmod(stamp_ns, 10**9))
