@@ -7,8 +7,11 @@ from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, field
 
 # With more removed ids than this, those that no remembered frame has are forgotten. An id takes 0.1
-# kB; far fewer are removed while a frame is remembered.
+# kB.
 PRUNE_ABOVE = 512
+# The newest removed ids stay in any case: `FrameMemory` follows merges once in 256 frames, in which
+# far fewer ids are removed, and names nodes that no remembered frame shows.
+NEWEST_KEPT = 128
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,8 @@ class NodeIds:
     def _prune(self) -> None:
         """Forget the removed ids that nobody can ask for."""
         kept: set[int] = set()
-        for node_id in itertools.chain(self._removals, *self._frames.values()):
+        newest = list(self._successors)[-NEWEST_KEPT:]
+        for node_id in itertools.chain(newest, self._removals, *self._frames.values()):
             while node_id in self._successors and node_id not in kept:
                 kept.add(node_id)
                 node_id = self._successors[node_id]

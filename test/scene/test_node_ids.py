@@ -30,3 +30,16 @@ def test_removed_ids_are_forgotten_and_those_of_remembered_frames_are_not():
         sizes.append(len(ids.state().successors))
     assert len(everything.state().successors) == 29_995
     assert max(sizes) <= PRUNE_ABOVE + 10
+
+
+def test_a_new_merge_of_a_node_that_no_remembered_frame_shows_is_not_forgotten():
+    live = {1, 2}
+    ids = NodeIds(live, FRAMES)
+    for node_id in range(3, PRUNE_ABOVE + 3):
+        ids.retire(node_id, 0)
+    ids.retire(1, 2)
+    live.discard(1)
+    ids.take_removals()
+    ids.remember_frame(0, [2])
+    assert len(ids.state().successors) < PRUNE_ABOVE
+    assert ids.resolve(1) == 2
