@@ -187,6 +187,15 @@ class LocalGraph:
         return len(self.means_world)
 
 
+Checked = TypeVar("Checked", Relations, LocalGraph)
+
+
+def _unchecked(kind: type[Checked], **attributes: Any) -> Checked:
+    item = object.__new__(kind)
+    item.__dict__.update(attributes)
+    return item
+
+
 def lifted(
     frame: FrameGraph, rows: Int64, frame_id: str, T_world_camera: Float64, **geometry: Any
 ) -> LocalGraph:
@@ -202,8 +211,8 @@ def lifted(
     Raises:
         ValueError: as `LocalGraph`.
     """
-    local = object.__new__(LocalGraph)
-    local.__dict__.update(
+    local = _unchecked(
+        LocalGraph,
         stamp_ns=frame.stamp_ns,
         frame_id=frame_id,
         width=frame.width,
@@ -233,17 +242,12 @@ def _between(relations: Relations, rows: Int64, count: int) -> Relations:
     return derived(relations, pairs=pairs[kept], logits=logits, scores=scores)
 
 
-Checked = TypeVar("Checked", Relations, LocalGraph)
-
-
 def derived(item: Checked, **changes: Any) -> Checked:
     """A local graph or relations with some attributes replaced, without the checks of new ones.
 
     For changes that cannot make it invalid: it came in checked, and no value comes from outside.
     """
-    copy = object.__new__(type(item))
-    copy.__dict__.update(item.__dict__, **changes)
-    return copy
+    return _unchecked(type(item), **{**item.__dict__, **changes})
 
 
 def _check_objects(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from deworldsg_ros.lifting import Lifting, depth_layer, moments, pixels, spatial
 from deworldsg_ros.lifting.constants import LiftingConstants
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
 
 VOCABULARY = Vocabulary(("chair", "table"), ("on", "near", "under"))
 
@@ -184,6 +185,9 @@ def test_relations_of_dropped_objects_are_removed_and_rows_renumbered():
     np.testing.assert_array_equal(local.relations.scores, graph.relations.scores[[1, 3]])
     np.testing.assert_array_equal(local.class_probabilities, graph.class_probabilities[[0, 2]])
     assert (local.stamp_ns, local.frame_id) == (5, "world")
+    # It has all attributes, and passes the checks of a graph that comes from outside.
+    LocalGraph(**vars(local))
+    assert vars(local).keys() == {item.name for item in fields(LocalGraph)}
 
 
 def test_surface_points_are_an_even_sample_of_the_inliers():
