@@ -15,10 +15,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from deworldsg_ros.client.asking import ask
-from deworldsg_ros.client.content import Which
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.objects import odds_of
+from deworldsg_ros.client.objects import SURE, odds_of
 from deworldsg_ros.client.patterns import Answers
 
 # typer evaluates these annotations at run time.
@@ -61,24 +60,47 @@ def goal(
 
     The words are the id of an object or its class.
     """
-    with _opened(words, live, namespace) as (graph, rest):
-        found = graph.goal_near(_which(rest), distance)
-        if as_json:
-            print_json(found.to_dict())
-            return
-        x, y, z = found.position_m
-        Console(highlight=False, soft_wrap=True).print(
-            f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found.frame_id}', facing "
-            f"{escape(found.target.name)} ({found.target.probability:.0%}"
-            f"{'' if found.target.is_sure else ', not sure'}); quaternion xyzw "
-            + " ".join(f"{value:.4f}" for value in found.orientation_xyzw)
-            + f"\n{found.distance_m:.2f} m from it; next object {found.clearance_m:.2f} m away; "
-            f"it extends {found.along_std_m:.2f} m (1σ) along, {found.across_std_m:.2f} m across "
-            "the view"
-            + ("" if found.seen_free is None else f"\nseen as free: {found.seen_free:.0%}")
-            + ("" if found.in_known_area else "\nnot sure: the pose is outside of all objects")
-            + (f"\nnot sure: {found.blocked_by.name} may hide it" if found.blocked_by else "")
-        )
+    if live:
+        from deworldsg_ros.client import SceneGraphClient
+
+        with SceneGraphClient(namespace) as client:
+            client.wait(timeout_s=10.0)
+            found = client.goal_near(_which(words), distance)
+    else:
+        with _opened(words, live, namespace) as (graph, rest):
+            found = graph.goal_near(_which(rest), distance).to_dict()
+    if as_json:
+        print_json(found)
+    else:
+        Console(highlight=False, soft_wrap=True).print(escape(_goal_text(found)))
+
+
+def _goal_text(found: dict[str, Any]) -> str:
+    """The fields of `Goal.to_dict` in words."""
+    x, y, z = found["pose"]["position"].values()
+    target, clearance_m, seen_free = (found[key] for key in ("target", "clearance_m", "seen_free"))
+    probability = found["target_probability"]
+    return "\n".join(
+        [
+            f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found['header']['frame_id']}', facing "
+            f"{target['label']} #{target['id']} ({probability:.0%}"
+            f"{'' if probability >= SURE else ', not sure'}); quaternion xyzw "
+            + " ".join(f"{value:.4f}" for value in found["pose"]["orientation"].values()),
+            f"{found['distance_m']:.2f} m from it; "
+            + ("" if clearance_m is None else f"next object {clearance_m:.2f} m away; ")
+            + f"it extends {found['along_std_m']:.2f} m (1σ) along, "
+            f"{found['across_std_m']:.2f} m across the view",
+            "not sure: walls are not known here"
+            if seen_free is None
+            else f"seen as free: {seen_free:.0%}",
+            *([] if found["in_known_area"] else ["not sure: the pose is outside of all objects"]),
+            *(
+                []
+                if found["blocked_by"] is None
+                else [f"not sure: object #{found['blocked_by']} may hide it"]
+            ),
+        ]
+    )
 
 
 def explain(
@@ -118,7 +140,7 @@ def _opened(words: list[str], live: bool, namespace: str) -> Iterator[tuple[Scen
     yield SceneGraph.load(Path(words[0])), words[1:]
 
 
-def _which(words: list[str]) -> Which:
+def _which(words: list[str]) -> int | str:
     text = " ".join(words).removeprefix("#")
     return int(text) if text.isdigit() else text
 

@@ -40,4 +40,4 @@ def mcp(
     from deworldsg_ros.client import SceneGraphClient
 
     with SceneGraphClient(namespace) as client:
-        make_server(lambda: client.graph, client if edits else None).run()
+        make_server(lambda: client.graph, client, edits).run()

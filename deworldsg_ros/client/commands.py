@@ -1,4 +1,4 @@
-"""Commands to a running graph: an operator's edits, save, load, clear and explanations."""
+"""Commands to a running graph: an operator's edits, save, load, clear, and any other service."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 import time
 from typing import Any
 
-from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.client.errors import ClientError, NoService
 from deworldsg_ros.client.objects import Point
 from deworldsg_ros.client.ros_messages import TEXT_SERVICE, TRIGGER_SERVICE
 
@@ -98,7 +98,7 @@ class GraphCommands:
             if found:
                 return found[0]
             time.sleep(0.05)
-        raise ClientError(
+        raise NoService(
             f"no service {' or '.join(names)} within {FIND_S:g} s: is graph_node running, and are "
             "ROS_DOMAIN_ID and the namespace the same?"
         )

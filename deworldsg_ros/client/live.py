@@ -16,7 +16,7 @@ from std_msgs.msg import String
 
 from deworldsg_ros.client.changes import Changes
 from deworldsg_ros.client.commands import GraphCommands
-from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.client.errors import ClientError, NoService
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
@@ -173,6 +173,25 @@ class SceneGraphClient(GraphCommands):
             graph = self.newest
         assert graph is not None
         return graph
+
+    def goal_near(self, of: int | str, distance_m: float = 1.0) -> dict[str, Any]:
+        """A pose from which an object is in view, with the fields of `Goal.to_dict`.
+
+        The node with the graph computes it and does not publish it: only this node has the depth
+        images that show walls. The graphs of fleets and regions have no such node; there,
+        ``seen_free`` is None and walls are not known.
+
+        Args:
+            of: id or class of the object.
+            distance_m: horizontal distance from its box.
+
+        Raises:
+            ClientError: if there is no such object, or no free side of it.
+        """
+        try:
+            return self.command("goal_near", object=of, distance_m=distance_m, publish=False)
+        except NoService:
+            return self.graph.goal_near(of, distance_m).to_dict()
 
     def on_change(self, callback: Callback) -> None:
         """Call a function with the new graph and the changes, after every change of the graph.

@@ -19,12 +19,13 @@ INSTRUCTIONS = (
 )
 
 
-def make_server(newest: Callable[[], SceneGraph], edits: Any = None) -> Any:
+def make_server(newest: Callable[[], SceneGraph], client: Any = None, edits: bool = False) -> Any:
     """The server with its tools.
 
     Args:
         newest: returns the newest graph.
-        edits: a live client: the agent may edit its graph. None = the agent only reads.
+        client: a `SceneGraphClient` with this graph; None = the graph is of a file.
+        edits: the agent may edit the graph of the client.
 
     Raises:
         ClientError: without the package mcp.
@@ -47,7 +48,7 @@ def make_server(newest: Callable[[], SceneGraph], edits: Any = None) -> Any:
 
         return call
 
-    tools = GraphTools(newest)
+    tools = GraphTools(newest, client)
     functions: list[Callable[..., dict[str, Any]]] = [
         tools.list_objects,
         tools.list_relations,
@@ -55,7 +56,7 @@ def make_server(newest: Callable[[], SceneGraph], edits: Any = None) -> Any:
         tools.get_object_context,
         tools.what_changed,
         tools.goal_near,
-        *([] if edits is None else EditTools(edits)),
+        *(EditTools(client) if edits else []),
     ]
     server = MCPServer("deworldsg", instructions=INSTRUCTIONS, log_level="WARNING")
     for function in functions:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from deworldsg_ros.client.asking import ask
-from deworldsg_ros.client.content import Which
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
@@ -27,10 +26,12 @@ class GraphTools:
 
     Args:
         newest: returns the newest graph; called before each answer.
+        client: a `SceneGraphClient`, which knows walls; None = the graph is of a file.
     """
 
-    def __init__(self, newest: Callable[[], SceneGraph]) -> None:
+    def __init__(self, newest: Callable[[], SceneGraph], client: Any = None) -> None:
         self._newest = newest
+        self._client = client
         self._known: deque[SceneGraph] = deque(maxlen=MOST_GRAPHS)
 
     def list_objects(
@@ -133,15 +134,19 @@ class GraphTools:
     def goal_near(self, object: str, distance_m: float = 1.0) -> dict[str, Any]:
         """Give a pose on the floor from which an object is in view, for a navigation goal.
 
+        `seen_free` is the share of the robot's volume there that was seen as free; null = walls are
+        not known.
+
         Args:
             object: id, or class.
             distance_m: from the box of the object, metres.
         """
-        graph = self._graph()
         which = _which(object)
         if which is None:
             raise ClientError("object is empty: expected an id or a class")
-        return graph.goal_near(which, distance_m).to_dict()
+        if self._client is not None:
+            return dict(self._client.goal_near(which, distance_m))
+        return self._graph().goal_near(which, distance_m).to_dict()
 
     def _graph(self) -> SceneGraph:
         graph = self._newest()
@@ -240,6 +245,6 @@ def _short(item: SceneObject) -> dict[str, Any]:
     return {name: values[name] for name in names}
 
 
-def _which(text: str) -> Which | None:
+def _which(text: str) -> int | str | None:
     text = text.strip().removeprefix("#")
     return None if not text else int(text) if text.isdigit() else text

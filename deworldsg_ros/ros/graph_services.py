@@ -52,11 +52,15 @@ class Query(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class GoalNear(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An object, by id or class, and where to stand; see `client.goals`."""
+    """An object, by id or class, and where to stand; see `client.goals`.
+
+    `publish` false: the pose is only an answer.
+    """
 
     object: int | Text
     distance_m: float = 1.0
     towards: Point | None = None
+    publish: bool = True
 
 
 class Explain(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -149,7 +153,8 @@ class GraphServices:
         goal: Goal = self._asked().goal_near(
             request.object, request.distance_m, towards=towards, space=self._builder.space
         )
-        self._publish_goal(goal.pose_stamped())
+        if request.publish:
+            self._publish_goal(goal.pose_stamped())
         return _json(goal.to_dict())
 
     def _explain(self, request: Explain) -> str:

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import rclpy
 import typer.testing
@@ -23,13 +24,14 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraphClient
-from deworldsg_ros.client.tools import EditTools
+from deworldsg_ros.client.tools import EditTools, GraphTools
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.scene.codec import local_graph_to_message
 from deworldsg_ros.scene.graph_file import read_graph
+from deworldsg_ros.scene.seen_space import SeenSpace
 
 LOCAL = "deworldsg/local_graph"
 SERVICES = {
@@ -166,6 +168,37 @@ def test_questions_are_answered_and_the_goal_is_published(robot: Robot) -> None:
         assert goals[0].pose.position.x == pytest.approx(goal["pose"]["position"]["x"], abs=1e-3)
         reason = robot.ask(lambda: client.command("explain", object="cup"))
         assert reason["lines"][0] == "detected in 5 frames over 0.4 s"
+
+
+class WallAlongX(SeenSpace):
+    """All is free, and a wall is where y > 0."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def look(self, points_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return points_world[:, 1] <= 0, points_world[:, 1] > 0
+
+
+def test_a_live_goal_is_before_the_walls_and_drives_no_robot(robot: Robot) -> None:
+    goals: list[PoseStamped] = []
+    robot.bench.peer.node.create_subscription(PoseStamped, "deworldsg/goal", goals.append, 1)
+    runner = typer.testing.CliRunner()
+    robot.bench.node.graph.builder.space = WallAlongX()
+    with SceneGraphClient() as client:
+        robot.ask(lambda: client.wait(1, LIMIT_S))
+        assert client.graph.goal_near("cup", 0.8).seen_free is None
+        goal = robot.ask(lambda: client.goal_near("cup", 0.8))
+        assert goal["seen_free"] == 1.0 and goal["pose"]["position"]["y"] < 0
+        agent = GraphTools(lambda: client.graph, client)
+        assert robot.ask(lambda: agent.goal_near("cup", 0.8)) == goal
+        call = ["goal", "--live", "cup", "--distance", "0.8"]
+        assert "seen as free: 100%" in robot.ask(lambda: runner.invoke(app, call)).output
+        done = robot.ask(lambda: runner.invoke(app, [*call, "--json"]))
+        assert json.loads(done.output) == goal
+        robot.ask(lambda: client.command("goal_near", object="cup"))
+        robot.bench.expect(lambda: bool(goals), "the pose that was to be published")
+    assert len(goals) == 1
 
 
 @pytest.mark.parametrize(
