@@ -11,13 +11,13 @@ import numpy as np
 
 from deworldsg_ros.client.align import Alignment, align
 from deworldsg_ros.client.combine import MIN_CONFIDENCE, Known, combine
-from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.scene.errors import DeWorldSGError
 
 FRAME_ID = "fleet"
 # Two objects of one graph lie on two of another one in many wrong ways. Four do not.
@@ -195,10 +195,11 @@ def _joined(whole: SceneGraph, member: Member) -> tuple[SceneGraph, dict[int, in
 def _added(whole: SceneGraph, member: Member) -> tuple[SceneGraph, dict[int, int]]:
     try:
         combined = combine(whole, member.graph, member.T_fleet_world, member.known)
-    except ClientError as error:
+        joined = SceneGraph(combined.message)
+    except (DeWorldSGError, ValueError) as error:  # of one robot: the others go on
         member.T_fleet_world, member.reason = None, str(error)
         return whole, {}
-    return SceneGraph(combined.message), combined.ids
+    return joined, combined.ids
 
 
 def _locate(whole: SceneGraph, member: Member) -> None:
@@ -209,7 +210,7 @@ def _locate(whole: SceneGraph, member: Member) -> None:
     member.tried = size
     try:
         found = align(list(whole), list(member.graph))
-    except ClientError as error:
+    except (DeWorldSGError, ValueError) as error:
         member.reason = str(error)
         return
     if found.matched < MIN_MATCHED or found.confidence < MIN_CONFIDENCE:

@@ -85,7 +85,8 @@ class FleetNode(StageNode):
             return
         self._topics.publish(self._fleet.combine())
         for name in self._fleet.members:
-            self._serve(name)
+            with self.refusing():  # what one robot sent stops no other robot
+                self._serve(name)
         self._publish_robots(json.dumps(self._fleet.status()))
         self.health.published()
 

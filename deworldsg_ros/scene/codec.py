@@ -19,7 +19,7 @@ from deworldsg_ros.scene.frame_graph import (
     Relations,
     Vocabulary,
 )
-from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
+from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR, MAX_PREDICTIONS
 from deworldsg_ros.scene.names import check_labels
 
 
@@ -44,6 +44,11 @@ def _relations_from_wire(items: list[wire.RelationLogits], predicate_count: int)
 
 def _predictions(pairs: list[wire.PairEvidence], predicate_count: int) -> Float64:
     """Predictions (m, R); rows of NaN for pairs without one."""
+    if len(pairs) * predicate_count > MAX_PREDICTIONS:
+        raise ValueError(
+            f"{len(pairs)} pairs with {predicate_count} predicates: expected at most "
+            f"{MAX_PREDICTIONS} predictions"
+        )
     nothing = [float("nan")] * predicate_count
     predictions = _rows(
         [item.prediction or nothing for item in pairs], predicate_count, "prediction"

@@ -13,6 +13,8 @@ from deworldsg_ros.kernels import kernel
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.scene.checks import check_array
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
 
 # Radius in which the density of points is counted: half a cell of the surface map.
 EVEN_RADIUS_M = 0.015
@@ -29,6 +31,8 @@ DIRECTIONS = 45
 MOST_POINTS = 256
 # The up of the world frame if nothing tells it (REP 103).
 DEFAULT_UP = (0.0, 0.0, 1.0)
+# Points that spread less are at one place: the number of buckets for each metre stays finite.
+LEAST_SPREAD_M = 1e-12
 # Decimals of numbers in messages: positions to 0.1 mm, variances to (0.3 mm)², so that a thin
 # object keeps its thickness.
 POSITION_DECIMALS, VARIANCE_DECIMALS = 4, 7
@@ -82,7 +86,11 @@ def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
     point is the inverse square root of the number of points within `EVEN_RADIUS_M`. The inverse
     itself would give a stray point the weight of a whole patch. The covariance of a ball of that
     radius is added.
+
+    Raises:
+        ValueError: without points, or for one that is not finite or out of reach.
     """
+    _check_points(points_world)
     means, covariances = np.empty(3), np.empty((3, 3))
     _even_moments(np.ascontiguousarray(points_world.T, np.float64), means, covariances)
     return means, covariances
@@ -94,7 +102,11 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
     Args:
         points_world: metres.
         up: unit vector against gravity.
+
+    Raises:
+        ValueError: without points, or for one that is not finite or out of reach.
     """
+    _check_points(points_world)
     box = np.empty(3), np.empty(3), np.empty(4)
     columns = np.ascontiguousarray(points_world[:MOST_POINTS].T, np.float64)
     _box(columns, *_frame_of(tuple(up)), *box)
@@ -104,6 +116,14 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         rounded(size, BOX_DECIMALS),
         rounded(quat_xyzw, QUATERNION_DECIMALS),
     )
+
+
+def _check_points(points_world: Float32 | Float64) -> None:
+    """The kernels take their indices from the points."""
+    if not len(points_world):
+        raise ValueError("a surface without points: expected at least one")
+    # Corners of a box around a Gaussian may lie outside of the limit of its mean.
+    check_array("points", points_world, (len(points_world), 3), 4 * MAX_GRAPH_COORDINATE_M)
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -209,7 +229,7 @@ def _along_widest(columns: Float64) -> tuple[Float64, int]:
         if most - least > spread:
             widest, low, spread = axis, least, most - least
     # As many buckets as points; then each point is near its place.
-    per_m = (count - 1) / spread if spread > 0.0 else 0.0
+    per_m = (count - 1) / spread if spread > LEAST_SPREAD_M else 0.0
     starts = np.zeros(count + 1, np.int64)
     for place in range(count):
         starts[int((columns[widest, place] - low) * per_m) + 1] += 1

@@ -36,8 +36,12 @@ MIN_FOCAL_PX = 1e-3
 # Distance of objects and cameras from the world's origin. A float32 point keeps a millimetre up
 # to 16 km, and the map of cells ends at 31 km.
 MAX_COORDINATE_M = 1e4
+# Coordinates of a scene graph: corrections of poses move its objects, each by MAX_COORDINATE_M.
+MAX_GRAPH_COORDINATE_M = 1e8
 # Length of a transform in TF: the distance to the centre of the earth (REP 105) is 6.4e6 m.
 MAX_TRANSFORM_M = 1e8
+# Variances of an object of a scene graph, which may be made of many.
+MAX_GRAPH_VARIANCE_M2 = MAX_GRAPH_COORDINATE_M**2
 # Variances of an object: its extent is below MAX_COORDINATE_M, and no sensor measures micrometres.
 MAX_VARIANCE_M2 = MAX_COORDINATE_M**2
 MIN_VARIANCE_M2 = 1e-12
@@ -55,5 +59,10 @@ MAX_NAME_CHARACTERS = 256
 MAX_FRAME_BYTES = 16 * 2**20
 # Size of a message of the global graph: 5000 nodes with 512 points each need 150 MB.
 MAX_GRAPH_BYTES = 256 * 2**20
+# Reasons why an object is hidden, characters.
+MAX_REASON_CHARACTERS = 1000
+# Predictions of a frame, pairs times predicates: all pairs of 256 objects with 64 predicates. They
+# are a table of 8 bytes each, also where a pair has no prediction.
+MAX_PREDICTIONS = 2**22
 # Error of the sum of a predicted distribution: that of float32 networks.
 MAX_PREDICTION_SUM_ERROR = 1e-3

@@ -5,6 +5,7 @@ because JSON numbers cannot hold 64-bit nanoseconds. Floats keep full precision 
 decimal that reads back as the same float64), so that a graph over DDS equals one in process.
 """
 
+from collections import Counter
 from functools import cache, lru_cache
 from typing import Annotated, Any, Literal, Optional, TypeVar, Union
 
@@ -17,6 +18,8 @@ from deworldsg_ros.scene.limits import (
     MAX_FOCAL_PX,
     MAX_FRAME_BYTES,
     MAX_GRAPH_BYTES,
+    MAX_GRAPH_COORDINATE_M,
+    MAX_GRAPH_VARIANCE_M2,
     MAX_INSTANCE,
     MAX_INT,
     MAX_LOGIT,
@@ -25,12 +28,13 @@ from deworldsg_ros.scene.limits import (
     MAX_OBJECTS,
     MAX_PAIRS,
     MAX_POINTS,
+    MAX_REASON_CHARACTERS,
     MAX_RELATIONS,
     MAX_SECONDS,
     MAX_SIDE_PX,
     MAX_VARIANCE_M2,
 )
-from deworldsg_ros.scene.names import checked_frame_id
+from deworldsg_ros.scene.names import check_labels, checked_frame_id
 
 # A reader of version N reads N - 1 too. Version 2 of the graph added up, boxes, remainders, compact
 # surfaces and mutual edges; that of a local graph has compact surfaces.
@@ -44,10 +48,6 @@ NodeId = Annotated[int, msgspec.Meta(ge=1, le=MAX_INT)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0 + 1e-9)]
 Distribution = Annotated[
     list[Probability], msgspec.Meta(max_length=MAX_NAMES, description="sums to one")
-]
-Vector3 = Annotated[list[float], msgspec.Meta(min_length=3, max_length=3)]
-Matrix3 = Annotated[
-    list[float], msgspec.Meta(min_length=9, max_length=9, description="3x3, row by row")
 ]
 Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 Point = Annotated[list[Coordinate], msgspec.Meta(min_length=3, max_length=3)]
@@ -82,6 +82,25 @@ Name = Annotated[
     str,
     msgspec.Meta(max_length=MAX_NAME_CHARACTERS, description="without control characters"),
 ]
+# Of a scene graph, in metres.
+Vector3 = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_COORDINATE_M, le=MAX_GRAPH_COORDINATE_M)]],
+    msgspec.Meta(min_length=3, max_length=3),
+]
+Size3 = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=0.0, le=2 * MAX_GRAPH_COORDINATE_M)]],
+    msgspec.Meta(
+        min_length=3,
+        max_length=3,
+        description="along the axes of the box; the third one is up",
+    ),
+]
+Matrix3 = Annotated[
+    list[Annotated[float, msgspec.Meta(ge=-MAX_GRAPH_VARIANCE_M2, le=MAX_GRAPH_VARIANCE_M2)]],
+    msgspec.Meta(min_length=9, max_length=9, description="3x3, row by row"),
+]
+# Part of a direction or quaternion of unit length, which may be rounded.
+UnitPart = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
 Names = Annotated[list[Name], msgspec.Meta(min_length=1, max_length=MAX_NAMES)]
 # Row of an object in the message of its frame.
 Row = Annotated[int, msgspec.Meta(ge=0, lt=MAX_OBJECTS)]
@@ -231,7 +250,7 @@ class RelationEvidenceMessage(Message, kw_only=True):
 class Belief(msgspec.Struct, frozen=True, gc=False):
     """A label with its probability."""
 
-    label: str
+    label: Name
     probability: Probability
 
 
@@ -239,11 +258,9 @@ class GravityBox(msgspec.Struct, frozen=True, gc=False):
     """A box around an object with one axis along `up`; points far from the others are left out."""
 
     center_m: Vector3
-    size_m: Annotated[
-        Vector3, msgspec.Meta(description="along the axes of the box; the third one is up")
-    ]
+    size_m: Size3
     orientation_xyzw: Annotated[
-        list[float],
+        list[UnitPart],
         msgspec.Meta(min_length=4, max_length=4, description="axes of the box to world, unit"),
     ]
 
@@ -252,8 +269,11 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
     """One object of the global graph."""
 
     id: Annotated[NodeId, msgspec.Meta(description="stable, never reused")]
-    label: str
-    classes: Annotated[list[Belief], msgspec.Meta(description="most probable first, top k")]
+    label: Name
+    classes: Annotated[
+        list[Belief],
+        msgspec.Meta(max_length=MAX_NAMES, description="most probable first, top k"),
+    ]
     mean_m: Vector3
     covariance_m2: Matrix3
     observations: Positive
@@ -268,7 +288,8 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
         msgspec.Meta(description="probability that this is an object; absent = not estimated"),
     ] = msgspec.UNSET
     surface_points_m: Annotated[
-        Union[list[Vector3], msgspec.UnsetType], msgspec.Meta(description="of version 1")
+        Union[Annotated[list[Vector3], msgspec.Meta(max_length=MAX_POINTS)], msgspec.UnsetType],
+        msgspec.Meta(description="of version 1"),
     ] = msgspec.UNSET
     entropy_nats: Annotated[
         Union[float, None],
@@ -286,7 +307,7 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
         msgspec.Meta(description="absent = without surface points"),
     ] = msgspec.UNSET
     surface_mm: Annotated[
-        Union[bytes, msgspec.UnsetType],
+        Union[Annotated[bytes, msgspec.Meta(max_length=6 * MAX_POINTS)], msgspec.UnsetType],
         msgspec.Meta(
             description="points of the surface relative to mean_m: x y z of each, int16 "
             "little-endian, millimetres, base64; replaces surface_points_m"
@@ -301,11 +322,11 @@ class NodeState(msgspec.Struct, frozen=True, gc=False):
 class HiddenNode(msgspec.Struct, frozen=True):
     """An object that was detected and is not in the graph, with the reason."""
 
-    label: str
+    label: Name
     mean_m: Vector3
     existence: Probability
-    observations: Annotated[int, msgspec.Meta(ge=1)]
-    reason: str
+    observations: Positive
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON_CHARACTERS)]
 
 
 Provenance = Literal["visual", "prior", "fused"]
@@ -316,7 +337,7 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
 
     subject: NodeId
     object: NodeId
-    predicate: Annotated[str, msgspec.Meta(description="the most probable one")]
+    predicate: Annotated[Name, msgspec.Meta(description="the most probable one")]
     probability: Annotated[
         Probability,
         msgspec.Meta(
@@ -327,8 +348,9 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
     predicates: Annotated[
         list[Belief],
         msgspec.Meta(
+            max_length=MAX_NAMES,
             description="most probable first, top k; the probabilities of all predicates sum to "
-            "at most 1, and the rest is the probability of no relation"
+            "at most 1, and the rest is the probability of no relation",
         ),
     ]
     provenance: Annotated[
@@ -354,7 +376,7 @@ class EdgeState(msgspec.Struct, frozen=True, gc=False):
 
 
 Up = Annotated[
-    Union[Vector3, msgspec.UnsetType],
+    Union[Annotated[list[UnitPart], msgspec.Meta(min_length=3, max_length=3)], msgspec.UnsetType],
     msgspec.Meta(description="unit vector against gravity in the world frame"),
 ]
 
@@ -398,7 +420,7 @@ class Association(msgspec.Struct, frozen=True):
     """Which node each object of a frame's local graph became, row by row."""
 
     stamp: Stamp
-    nodes: list[NonNegative]
+    nodes: Annotated[list[NonNegative], msgspec.Meta(max_length=MAX_OBJECTS)]
 
 
 class SceneGraphUpdateMessage(Message, kw_only=True):
@@ -485,7 +507,47 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
             f"expected {known.name} version {known.version} or older",
         )
     checked_frame_id(message.frame_id)
+    if isinstance(message, (SceneGraphMessage, SceneGraphUpdateMessage)):
+        try:
+            _check_graph(message)
+        except ValueError as error:
+            raise RefusedInput("invalid_message", f"{kind.__name__}: {error}") from error
     return message
+
+
+def _check_graph(message: Union[SceneGraphMessage, SceneGraphUpdateMessage]) -> None:
+    """What the schema cannot say of a graph: text, unit lengths, ids. Raises ValueError."""
+    nodes, edges = message.nodes, message.edges
+    labels = {node.label for node in nodes} | {edge.predicate for edge in edges}
+    labels.update(belief.label for node in nodes for belief in node.classes)
+    labels.update(belief.label for edge in edges for belief in edge.predicates)
+    if isinstance(message, SceneGraphMessage) and isinstance(message.hidden, list):
+        labels.update(text for node in message.hidden for text in (node.label, node.reason))
+    check_labels(sorted(labels))
+    if isinstance(message.up, list):
+        _check_unit("up", message.up)
+    for node in nodes:
+        if isinstance(node.box, GravityBox):
+            _check_unit(f"box orientation of node {node.id}", node.box.orientation_xyzw)
+    ids = [node.id for node in nodes]
+    if len(set(ids)) < len(ids):
+        raise ValueError(f"node {_repeated(ids)} is there twice")
+    ends = [(edge.subject, edge.object) for edge in edges]
+    if len(set(ends)) < len(ends):
+        raise ValueError(f"edge {_repeated(ends)} is there twice")
+    for subject, object_ in ends:
+        if subject == object_:
+            raise ValueError(f"an edge connects node {subject} with itself")
+
+
+def _check_unit(name: str, values: list[float]) -> None:
+    squared = sum([value * value for value in values])
+    if not 0.98 <= squared <= 1.02:
+        raise ValueError(f"{name} is {values}: expected length 1, its square is {squared:.4g}")
+
+
+def _repeated(items: list[Any]) -> Any:
+    return Counter(items).most_common(1)[0][0]
 
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:

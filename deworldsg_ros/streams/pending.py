@@ -13,10 +13,11 @@ class PendingEvidence:
 
     Args:
         capacity: maximum number of messages.
+        most_bytes: of the predictions of all messages, when there are two or more.
     """
 
-    def __init__(self, capacity: int = 256) -> None:
-        self._capacity = capacity
+    def __init__(self, capacity: int = 256, most_bytes: int = 1 << 26) -> None:
+        self._capacity, self._most_bytes = capacity, most_bytes
         self._waiting: deque[RelationEvidence] = deque()
 
     def __len__(self) -> int:
@@ -29,12 +30,14 @@ class PendingEvidence:
             RefusedInput: ``unmatched_evidence`` for the oldest message, if the buffer is full.
         """
         self._waiting.append(evidence)
-        if len(self._waiting) > self._capacity:
+        size = sum(item.predictions.nbytes for item in self._waiting)
+        many = len(self._waiting) > self._capacity
+        if many or (size > self._most_bytes and len(self._waiting) > 1):
             oldest = self._waiting.popleft()
             raise RefusedInput(
                 "unmatched_evidence",
                 f"relation evidence at {oldest.stamp_ns / 1e9:.3f} s: no local graph of this "
-                f"stamp arrived during {self._capacity} later messages. Check lifting_node",
+                f"stamp arrived during {len(self._waiting)} later messages. Check lifting_node",
             )
 
     def clear(self) -> int:

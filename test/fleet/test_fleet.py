@@ -46,6 +46,20 @@ def seen_by(name: str, keep=lambda y: True, *, sequence: int = 1, session: str =
     )
 
 
+def test_one_robot_with_an_impossible_graph_stops_no_other() -> None:
+    fleet = Fleet()
+    fleet.update("ada", seen_by("ada"))
+    bad = seen_by("bob")
+    box = wire.GravityBox([0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0])
+    bad.nodes[0] = msgspec.structs.replace(bad.nodes[0], box=box)
+    fleet.update("bob", bad)
+    fleet.update("eve", seen_by("eve"))
+    whole = fleet.combine()
+    assert len(whole.nodes) == len(ROOM)
+    assert fleet.members["eve"].T_fleet_world is not None
+    assert "orientation" in fleet.members["bob"].reason
+
+
 def test_three_robots_in_unknown_worlds_have_one_node_an_object() -> None:
     fleet = Fleet()
     fleet.update("ada", seen_by("ada", lambda y: y < 0.5))

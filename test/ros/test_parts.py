@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -171,6 +172,22 @@ def test_pending_evidence_is_bounded() -> None:
     with pytest.raises(RefusedInput) as caught:
         waiting.add(evidence(3))
     assert caught.value.reason == "unmatched_evidence"
+    assert [item.stamp_ns for item in waiting.take(3)] == [3]
+
+
+def test_the_bytes_of_pending_evidence_are_bounded() -> None:
+    pairs = np.tile(np.array([[0, 1]]), (4, 1))
+    large = replace(
+        evidence(2),
+        pairs=pairs,
+        pair_classes=np.zeros((4, 2), np.int64),
+        geo_costs=np.zeros(4),
+        predictions=np.ones((4, 1)),
+    )
+    waiting = PendingEvidence(most_bytes=40)
+    waiting.add(large)
+    with pytest.raises(RefusedInput):
+        waiting.add(replace(large, stamp_ns=3))
     assert [item.stamp_ns for item in waiting.take(3)] == [3]
 
 

@@ -11,6 +11,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.scene.extent import (
     box_of,
+    even_moments,
     horizontal_axes,
     rounded,
     surface_bytes,
@@ -83,6 +84,23 @@ def test_points_of_version_1_and_broken_bytes() -> None:
     assert surface_points(node([0.0] * 3, surface_mm=b"12345")).shape == (0, 3)
     far = np.array([[40.0, 0.0, 0.0], [1.0, 0.0, 0.0]], np.float32)
     assert len(surface_points(node([0.0] * 3, surface_mm=surface_bytes(far, [0.0] * 3)))) == 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
+def test_points_that_no_kernel_may_see_are_refused(bad: float) -> None:
+    points = np.array([[0.0, 0.0, 0.0], [bad, 0.0, 0.0]])
+    with pytest.raises(ValueError, match="points contain"):
+        box_of(points, (0.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="points contain"):
+        even_moments(points)
+    with pytest.raises(ValueError, match="without points"):
+        box_of(np.zeros((0, 3)), (0.0, 0.0, 1.0))
+
+
+def test_points_at_nearly_one_place_have_a_box() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [5e-324, 0.0, 0.0], [0.0, 5e-324, 0.0]])
+    assert box_of(points, (0.0, 0.0, 1.0)).size_m == [0.0, 0.0, 0.0]
+    assert even_moments(points)[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_rounding_has_no_negative_zero() -> None:

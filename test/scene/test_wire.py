@@ -6,6 +6,7 @@ import base64
 import json
 from collections.abc import Callable
 from dataclasses import fields
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -368,6 +369,59 @@ def test_evidence_that_the_schema_excludes_is_refused(
     with pytest.raises(RefusedInput) as refused:
         evidence_from_message(wire.decode(json.dumps(content), wire.RelationEvidenceMessage))
     assert refused.value.reason == reason
+
+
+def test_the_table_of_predictions_has_a_limit() -> None:
+    names = [f"p{index}" for index in range(8000)]
+    pair = {"subject": 0, "object": 1, "subject_class": 0, "object_class": 0, "geo_cost": 0.0}
+    message = {
+        "schema": {"name": "relation_evidence"},
+        "stamp": {"sec": 1, "nanosec": 0},
+        "frame_id": "map",
+        "classes": ["cup"],
+        "predicates": names,
+        "source": "fake",
+        "pairs": [pair] * 65_280,
+    }
+    text = json.dumps(message)
+    assert len(text) < wire.max_bytes(wire.RelationEvidenceMessage)
+    with pytest.raises(RefusedInput, match="expected at most 4194304 predictions"):
+        evidence_from_message(wire.decode(text, wire.RelationEvidenceMessage))
+
+
+@pytest.mark.parametrize("name", ["scene_graph", "scene_graph_updates"])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (_set("nodes.0.mean_m", [1e9, 0, 0]), "nodes[0].mean_m"),
+        (_set("nodes.0.covariance_m2", [1e308] * 9), "nodes[0].covariance_m2"),
+        (_set("nodes.0.box.center_m", [0, 0, -1e9]), "nodes[0].box.center_m"),
+        (_set("nodes.0.box.size_m", [1, 1, -1]), "nodes[0].box.size_m"),
+        (_set("nodes.0.box.orientation_xyzw", [0, 0, 0, 0]), "orientation of node 1"),
+        (_set("nodes.0.box.orientation_xyzw", [0, 0, 0, 1e308]), "orientation_xyzw"),
+        (_set("nodes.0.surface_points_m", [[1e9, 0, 0]]), "surface_points_m"),
+        (_set("nodes.0.label", "x" * 257), "nodes[0].label"),
+        (_set("nodes.0.label", "cup\x1b[2J"), "control character"),
+        (_set("nodes.0.classes.0.label", "cup\n"), "control character"),
+        (_set("edges.0.predicate", "on\x07"), "control character"),
+        (_set("edges.0.object", 1), "node 1 with itself"),
+        (_set("up", [0, 0, 0]), "up is [0.0, 0.0, 0.0]"),
+        (_set("up", [0, 0, 1e300]), ".up"),
+        (lambda content: content["nodes"].append(content["nodes"][0]), "node 1 is there twice"),
+        (lambda content: content["edges"].append(content["edges"][0]), "is there twice"),
+    ],
+)
+def test_graphs_with_impossible_content_are_refused(
+    root_dir: Path, name: str, change: Callable[[dict], None], says: str
+) -> None:
+    content = json.loads((root_dir / "msg_schemas" / f"{name}.example.json").read_text())
+    kind = wire.MESSAGES[name]
+    wire.decode(json.dumps(content), kind)
+    change(content)
+    with pytest.raises(RefusedInput) as refused:
+        wire.decode(json.dumps(content), kind)
+    assert refused.value.reason == "invalid_message"
+    assert says in str(refused.value)
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", "null", '{"schema": 3}', "\x00"])
