@@ -258,9 +258,9 @@ class OdometryConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class OutputConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The published graph."""
 
-    rate_hz: Annotated[float, option("maximum rate of /scene_graph/updates, Hz", gt=0, le=1000)] = (
-        30.0
-    )
+    rate_hz: Annotated[
+        float, option("maximum rate of /scene_graph/updates, Hz", ge=1e-3, le=1000)
+    ] = 30.0
     top_k: Annotated[
         int,
         option(

@@ -176,7 +176,9 @@ class GraphServices:
     def _load(self, request: Load) -> str:
         builder = read_map(self._node.parameters, Path(request.path))
         present = self._graph.builder
-        if present is not None and present.graph.vocabulary != builder.graph.vocabulary:
+        # An empty graph, as after `clear`, has no names to keep.
+        names = present.graph.vocabulary if present is not None and len(present.graph) else None
+        if names is not None and names != builder.graph.vocabulary:
             raise RefusedInput(
                 "invalid_request",
                 f"map {request.path} has other classes or predicates than the present graph: "

@@ -36,6 +36,7 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "seconds between two checkpoints of the map while the graph changes: a node that is "
             "killed loses no more; 0 = none",
             ge=0,
+            le=1e9,
         ),
     ] = 10.0
 

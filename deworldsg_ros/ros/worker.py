@@ -11,6 +11,9 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
+# A condition cannot wait for more than 2^63 ns; after this time `after` is asked again.
+MAX_WAIT_S = 3600.0
+
 
 class Worker(Generic[T]):
     """Calls `work` with each item, in order, in its own thread.
@@ -102,6 +105,8 @@ class Worker(Generic[T]):
             for item in items:
                 self._work(item)
             wait_s = self._after()
+            if wait_s is not None:
+                wait_s = min(wait_s, MAX_WAIT_S)
 
     def _take(self) -> tuple[list[T], list[T]]:
         """The waiting items that are dropped, and the next one."""

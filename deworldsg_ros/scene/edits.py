@@ -74,7 +74,7 @@ class Edit(msgspec.Struct, frozen=True):
         id: from 1, in the order of the edits; 0 = not in a log yet.
         kind: what was said.
         stamp_ns: of the newest frame at that time.
-        nodes: for which it holds; one, or the two parts of a split.
+        nodes: for which it holds; one, or the parts of a split that are left.
         replaced: hidden nodes that undo brings back; empty if it cannot any more.
         label: of the nodes; empty = that of the frames.
     """
@@ -163,16 +163,18 @@ class EditLog:
         for index, edit in enumerate(self.edits):
             if node_id in edit.nodes:
                 nodes = [successor if known == node_id else known for known in edit.nodes]
-                self.edits[index] = msgspec.structs.replace(edit, nodes=nodes)
+                # Of a split, one part may go: what was said of the other one still holds.
+                left = [known for known in nodes if known]
+                self.edits[index] = msgspec.structs.replace(edit, nodes=left)
                 self._finish(index, lost)
-        self.edits = [edit for edit in self.edits if 0 not in edit.nodes]
+        self.edits = [edit for edit in self.edits if edit.nodes]
         self._read()
         return lost
 
     def _finish(self, index: int, lost: dict[int, int]) -> None:
         """From now on, an edit cannot be undone."""
         edit = self.edits[index]
-        lost.update(dict.fromkeys(edit.replaced, edit.nodes[0]))
+        lost.update(dict.fromkeys(edit.replaced, edit.nodes[0] if edit.nodes else 0))
         self.edits[index] = msgspec.structs.replace(edit, replaced=[])
 
     def _read(self) -> None:
@@ -199,6 +201,6 @@ class EditLog:
         for edit in reversed(self.edits):
             nodes = [present.get(node_id, {node_id}) for node_id in edit.nodes]
             present.update(dict.fromkeys(edit.replaced, set().union(*nodes)))
-            if edit.kind == "split":
+            if edit.kind == "split" and len(nodes) == 2:
                 pairs.update((min(a, b), max(a, b)) for a in nodes[0] for b in nodes[1] if a != b)
         return pairs

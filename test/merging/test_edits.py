@@ -324,3 +324,31 @@ def test_an_object_that_goes_takes_its_edits_with_it():
     room.builder.edit(SetLabel(1, "chair"))
     room.builder.graph.remove_node(1)
     assert not room.builder.graph.edits
+
+
+def test_what_was_said_of_a_part_holds_when_the_other_part_goes():
+    room = Room((LONG, TABLE))
+    (whole,) = room.labels()
+    room.builder.edit(SetLabel(whole, "bench"))
+    left, right = room.builder.edit(SplitNode(whole)).nodes
+    room.builder.graph.remove_node(left)
+    assert room.labels() == {right: "bench"}
+    assert [edit.nodes for edit in room.builder.graph.edits.edits] == [[right], [right]]
+    assert len(room.builder.graph) == 1, "the whole table cannot come back"
+    room.builder.graph.remove_node(right)
+    assert not room.builder.graph.edits
+
+
+def test_a_map_keeps_what_was_said_of_the_part_that_is_left(tmp_path):
+    builder = GraphBuilder(Config(), VOCABULARY, "world")
+    for stamp in range(1, 9):
+        builder.integrate(view(stamp, (LONG, TABLE)))
+    (whole,) = [node.id for node in builder.full().nodes]
+    builder.edit(SetLabel(whole, "bench"))
+    builder.edit(SplitNode(whole))
+    for stamp in range(9, 40):
+        builder.integrate(view(stamp, (RIGHT, TABLE)))
+    assert [node.label for node in builder.full().nodes] == ["bench"]
+    write_map(builder, tmp_path / "room.map")
+    again = read_map(Config(), tmp_path / "room.map")
+    assert [node.label for node in again.full().nodes] == ["bench"]

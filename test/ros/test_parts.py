@@ -143,6 +143,19 @@ def test_a_worker_stops_with_items_in_its_queue() -> None:
     assert len(done) <= 1
 
 
+@pytest.mark.parametrize("wait_s", [1e10, 1e308, float("inf")])
+def test_a_worker_that_waits_for_ages_takes_the_next_item(wait_s: float) -> None:
+    done: list[int] = []
+    worker: Worker[int] = Worker(
+        "test", done.append, size=2, on_overrun=print, after=lambda: wait_s
+    )
+    for item in range(2):
+        worker.submit(item)
+        assert worker.wait_idle(10)
+    assert done == [0, 1]
+    assert worker.stop(10)
+
+
 def evidence(stamp_ns: int) -> RelationEvidence:
     return RelationEvidence(
         stamp_ns=stamp_ns,
