@@ -22,7 +22,8 @@ def keep_freed_memory() -> None:
     By default each thread also has a heap of its own, whose free memory no other thread uses: the
     heap of one thread grew in steps of 0.3 to 0.5 MB while others had room. All threads use one.
 
-    It changes nothing without glibc. Call it before threads start.
+    It changes nothing without glibc. Call it before the first thread starts, so before numpy is
+    imported: a heap that exists is used.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:

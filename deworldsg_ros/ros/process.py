@@ -11,7 +11,6 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
-from deworldsg_ros.memory import keep_freed_memory
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
 
 EXIT_USAGE = 2
@@ -35,7 +34,6 @@ def run_process(body: Callable[[threading.Event], int], args: list[str] | None =
     Returns:
         The exit code of `body`; 2 for unusable input; 0 after an interrupt.
     """
-    keep_freed_memory()
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -1,0 +1,38 @@
+"""The heap of a node's process."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+# A heap of a thread begins at a multiple of 64 MB.
+PROGRAM = """
+import threading
+{first}
+import numpy
+def fill():
+    kept = [bytearray(5000) for _ in range(200)]
+    both.wait()
+both = threading.Barrier(5)
+threads = [threading.Thread(target=fill) for _ in range(4)]
+for thread in threads:
+    thread.start()
+both.wait()
+starts = [int(line.split("-")[0], 16) for line in open("/proc/self/maps") if len(line.split()) < 6]
+print(sum(start % (64 << 20) == 0 for start in starts))
+"""
+
+
+def heaps(first: str) -> int:
+    """Heaps of threads after a first statement."""
+    command = [sys.executable, "-c", PROGRAM.format(first=first)]
+    return int(subprocess.run(command, capture_output=True, check=True, timeout=60).stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other heaps")
+def test_all_threads_of_a_node_use_one_heap() -> None:
+    assert heaps("") >= 4
+    assert heaps("import deworldsg_ros.nodes") == 0
