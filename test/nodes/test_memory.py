@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-# A heap of a thread begins at a multiple of 64 MB.
+# A heap of a thread has 64 MB of addresses; most of them are not in use, up to a multiple of 64 MB.
 PROGRAM = """
 import threading
 {first}
@@ -21,8 +21,9 @@ threads = [threading.Thread(target=fill) for _ in range(4)]
 for thread in threads:
     thread.start()
 both.wait()
-starts = [int(line.split("-")[0], 16) for line in open("/proc/self/maps") if len(line.split()) < 6]
-print(sum(start % (64 << 20) == 0 for start in starts))
+unused = [line.split()[0] for line in open("/proc/self/maps") if line.split()[1] == "---p"]
+bounds = [[int(end, 16) for end in addresses.split("-")] for addresses in unused]
+print(sum(end % (64 << 20) == 0 and end - start > 32 << 20 for start, end in bounds))
 """
 
 
