@@ -19,7 +19,8 @@ HEADER = """\
 # value. The sections follow the data: inputs, odometry, the four stages, output.
 # This is a ROS 2 parameter file: pass it to the nodes (--params-file) or to deworldsg (--config).
 # A file may contain a part of the options; the others keep their defaults.
-# No option can be changed while a node runs: nodes read their parameters once, at start-up.
+# Some thresholds and rates can be changed while a node runs (docs/dev/nodes.md). Nodes read all
+# others once, at start-up.
 """
 NO_BREAK = "\N{NO-BREAK SPACE}"
 
