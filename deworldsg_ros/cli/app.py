@@ -163,7 +163,8 @@ def demo(
         str,
         typer.Option(
             "--models",
-            help="paper: config/paper.yaml with the folder models/ (`deworldsg models get paper`); "
+            help="paper: config/paper.yaml with the folder models/ (two networks come from "
+            "`deworldsg models get paper`, the others are imported: docs/dev/models.md); "
             "embedded: the default",
         ),
     ] = "embedded",
