@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import typer
 
-from deworldsg_ros.cli.ask import AsJson, Live, Namespace, Words, print_json
+from deworldsg_ros.cli.ask import AsJson, Namespace, print_json
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.scene.edits import (
     DeleteNode,
@@ -19,6 +19,10 @@ from deworldsg_ros.scene.edits import (
     SplitNode,
     Undo,
 )
+
+# typer evaluates these annotations at run time.
+Words = Annotated[list[str], typer.Argument(metavar="[FILE] WORDS", help="map file, then the edit")]
+Live = Annotated[bool, typer.Option("--live", help="edit the running graph_node instead of a file")]
 
 USAGE = (
     "set_label ID LABEL, merge ID ID, split ID [X,Y,Z X,Y,Z], delete ID, or undo, after the map "
