@@ -24,6 +24,7 @@ CLASSES = ["cup", "table", "chair"]
 PREDICATES = ["on", "near", "under"]
 STAMP = wire.Stamp(sec=12, nanosec=300_000_000)
 EARLIER = wire.Stamp(sec=2, nanosec=100_000_000)
+SESSION = "5f3c0a91b7d2e846"
 
 
 def message_schema(name: str) -> dict[str, Any]:
@@ -107,6 +108,7 @@ def _graph_examples() -> dict[str, wire.Message]:
     return {
         "scene_graph": wire.SceneGraphMessage(
             **_head("scene_graph"),
+            session=SESSION,
             sequence=41,
             nodes=[_cup(), _node(2, "table", [0.45, 0.1, 0.71], 0.09, 29)],
             edges=[_cup_on_table()],
@@ -115,6 +117,7 @@ def _graph_examples() -> dict[str, wire.Message]:
         ),
         "scene_graph_updates": wire.SceneGraphUpdateMessage(
             **_head("scene_graph_updates"),
+            session=SESSION,
             sequence=42,
             removed_nodes=[wire.RemovedNode(id=7, merged_into=2), wire.RemovedNode(id=9)],
             removed_edges=[wire.RemovedEdge(subject=1, object=7)],
