@@ -2,7 +2,9 @@
 
 Each run of `RUNS` is one `deworldsg evaluate table`; DIR keeps its figures. A run that DIR has is
 not repeated, and an interrupted one goes on where it stopped. Without folders, the tables are made
-from the figures that DIR has. No figure in them is typed by hand; the text around them is.
+from the figures that DIR has; a table stays if one of its runs has none. The rendered rooms (A) are
+not in the repository; tools/physics_rooms/make_rooms.py makes the simulated ones (B). No figure in
+the tables is typed by hand; the text around them is.
 """
 
 from __future__ import annotations
@@ -203,8 +205,8 @@ def page(text: str, reports: Mapping[str, Mapping[str, Any]], commit: str) -> st
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.results", description=__doc__)
     parser.add_argument("out", type=Path, metavar="DIR", help="figures, and results of the scans")
-    parser.add_argument("--rooms", type=Path, metavar="FOLDER", help="the rendered rooms")
-    parser.add_argument("--simulated", type=Path, metavar="FOLDER", help="of tools/physics_rooms")
+    parser.add_argument("--rooms", type=Path, metavar="FOLDER", help="the rendered rooms; not in the repository")
+    parser.add_argument("--simulated", type=Path, metavar="FOLDER", help="of tools/physics_rooms/make_rooms.py")
     parser.add_argument("--workers", type=int, default=0, help="processes; default: one per core")
     options = parser.parse_args()
     out = options.out.resolve()
