@@ -205,8 +205,12 @@ def page(text: str, reports: Mapping[str, Mapping[str, Any]], commit: str) -> st
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m bench.results", description=__doc__)
     parser.add_argument("out", type=Path, metavar="DIR", help="figures, and results of the scans")
-    parser.add_argument("--rooms", type=Path, metavar="FOLDER", help="the rendered rooms; not in the repository")
-    parser.add_argument("--simulated", type=Path, metavar="FOLDER", help="of tools/physics_rooms/make_rooms.py")
+    parser.add_argument(
+        "--rooms", type=Path, metavar="FOLDER", help="the rendered rooms; not in the repository"
+    )
+    parser.add_argument(
+        "--simulated", type=Path, metavar="FOLDER", help="of tools/physics_rooms/make_rooms.py"
+    )
     parser.add_argument("--workers", type=int, default=0, help="processes; default: one per core")
     options = parser.parse_args()
     out = options.out.resolve()
