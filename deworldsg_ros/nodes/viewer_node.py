@@ -22,6 +22,7 @@ from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.following import GraphFollower
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.view.live.errors import OnError
 from deworldsg_ros.view.live.joining import FrameJoiner
 from deworldsg_ros.view.live.sources import Sink, open_sink
 
@@ -50,6 +51,7 @@ class ViewerNode(StageNode):
         self._viewer = make_viewer(
             self.parameters.node,
             f"waiting for {topic}: is graph_node running, and is ROS_DOMAIN_ID the same?",
+            self._failed,
         )
         self._follower = GraphFollower(self._viewer)
         self._frames = FrameJoiner(VIEW_PERIOD_S)
@@ -88,6 +90,11 @@ class ViewerNode(StageNode):
         self._viewer.close()
         super().close()
 
+    def _failed(self, error: Exception) -> None:
+        """Count an exception of the page's thread, and log it."""
+        with self.refusing():
+            raise error
+
     def _snapshot(self, message: Any) -> None:
         self._follower.snapshot(wire.decode(message.data, wire.SceneGraphMessage))
         if not self._viewer.sequence:
@@ -117,10 +124,16 @@ class ViewerNode(StageNode):
             self.health.published()
 
 
-def make_viewer(options: ViewerOptions, why_empty: str) -> Sink:
+def make_viewer(options: ViewerOptions, why_empty: str, on_error: OnError) -> Sink:
     """The page, with its address in the log; raises ConfigurationError without its package."""
     try:
-        viewer = open_sink(options.host, options.port, why_empty, foxglove=options.foxglove)
+        viewer = open_sink(
+            options.host,
+            options.port,
+            why_empty,
+            foxglove=options.foxglove,
+            on_error=on_error,
+        )
     except ImportError as error:
         extra = "foxglove" if options.foxglove else "view"
         raise ConfigurationError(

@@ -61,7 +61,12 @@ def update(sequence, *nodes, stamp_ns=0, node_ids=()):
 @pytest.fixture()
 def at(monkeypatch):
     made = Recorder()
-    monkeypatch.setattr(module, "make_viewer", lambda *_: made)
+
+    def make(options, why_empty, on_error):
+        made.on_error = on_error
+        return made
+
+    monkeypatch.setattr(module, "make_viewer", make)
     bench = Bench(ViewerNode, TOPICS, reliable(50, latched=True))
     bench.viewer = made
     yield bench
@@ -125,3 +130,8 @@ def test_without_a_graph_it_says_what_is_missing(at):
 def test_what_is_no_message_is_refused(at, topic, text):
     at.refuses("invalid_message", lambda: at.send(**{topic: text}))
     works(at, lambda: send_frame(at, at.viewer.sequence + 1))
+
+
+def test_an_error_of_the_page_is_counted(at):
+    at.refuses("internal_error", lambda: at.viewer.on_error(ZeroDivisionError("odd")))
+    assert at.node.health.report(0.0).values["example internal_error"] == "odd"

@@ -63,6 +63,11 @@ class ClientLabels:
         handle.visible = True
 
 
+def has_area(client: Any) -> bool:
+    """Whether the page of a client of viser has room for a picture: a panel may cover all of it."""
+    return bool(client.camera.image_width > 0 and client.camera.image_height > 0)
+
+
 def camera_of(client: Any) -> Camera:
     """The camera of a client of viser."""
     camera = client.camera

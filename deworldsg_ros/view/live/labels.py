@@ -64,7 +64,7 @@ def place(labels: Sequence[Label], camera: Camera, most: int) -> list[Placed]:
 
     A label stands above its point, or beside, or below. Without room it is not shown.
     """
-    if not labels:
+    if not labels or most < 1:
         return []
     points_px, depths = camera.project(np.array([label.position for label in labels]))
     sizes = np.array([(FRAME_PX + LETTER_PX * len(label.text), HEIGHT_PX) for label in labels])

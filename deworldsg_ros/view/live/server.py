@@ -8,7 +8,7 @@ import ipaddress
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,11 +17,13 @@ import viser
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.extent import horizontal_axes
 from deworldsg_ros.view.live.camera import CameraView
-from deworldsg_ros.view.live.client_labels import ClientLabels, overview
+from deworldsg_ros.view.live.client_labels import ClientLabels, has_area, overview
 from deworldsg_ros.view.live.details import object_html
+from deworldsg_ros.view.live.errors import LogOnce, OnError
 from deworldsg_ros.view.live.panel import Panel, set_theme
 from deworldsg_ros.view.live.scene import ViserScene
 from deworldsg_ros.view.live.state import LiveState, up_of
+from deworldsg_ros.view.live.tables import Label
 
 # Updates come at up to 30 Hz; a browser shows them at this rate, and surface points more seldom.
 PERIOD_S = 0.1
@@ -43,12 +45,17 @@ class Viewer:
         host: address to listen on; 127.0.0.1 = only this machine.
         port: the next free port from this one on is taken.
         why_empty: shown while there are no objects.
+        on_error: called with each exception of the page's own thread, which goes on; None = the
+            log gets the first one of each type.
 
     Attributes:
         url: of the page.
     """
 
-    def __init__(self, host: str, port: int, why_empty: str) -> None:
+    def __init__(
+        self, host: str, port: int, why_empty: str, on_error: OnError | None = None
+    ) -> None:
+        self._on_error = LogOnce() if on_error is None else on_error
         with contextlib.redirect_stdout(io.StringIO()):  # viser prints a table
             self._server = viser.ViserServer(host, port, label="DeWorldSG", verbose=False)
         self.url = f"http://{_reachable(host)}:{self._server.get_port()}"
@@ -126,9 +133,16 @@ class Viewer:
             # Without a change, only the labels follow the cameras of the browsers.
             if self._changed.wait(timeout=PERIOD_S):
                 self._changed.clear()
-                self._redraw()
-            self._place_labels()
+                self._guarded(self._redraw)
+            self._guarded(self._place_labels)
             time.sleep(max(began_s + PERIOD_S - time.monotonic(), 0.0))
+
+    def _guarded(self, step: Callable[..., None], *arguments: Any) -> None:
+        """Take a step of the thread. One that fails must not freeze the page of all browsers."""
+        try:
+            step(*arguments)
+        except Exception as error:
+            self._on_error(error)
 
     def _redraw(self) -> None:
         with self._lock, self._server.atomic():
@@ -173,12 +187,17 @@ class Viewer:
         self._labels = {key: item for key, item in self._labels.items() if key in clients}
         labels = self._drawing.labels if self._panel.labels.value else ()
         for key, client in clients.items():
+            self._guarded(self._place_labels_of, key, client, labels)
+
+    def _place_labels_of(self, key: int, client: Any, labels: Sequence[Label]) -> None:
+        if has_area(client):
             self._follow_growth(key, client)
             self._labels.setdefault(key, ClientLabels(client)).show(labels)
 
     def _follow_growth(self, key: int, client: Any) -> None:
         """Keep everything in view until the user moves the camera."""
-        bounds = self._state.bounds()
+        with self._lock:
+            bounds = self._state.bounds()
         if bounds is None:
             return
         fitted = self._fitted.get(key)
@@ -194,7 +213,7 @@ class Viewer:
     def _fit(self, client: Any) -> None:
         with self._lock:
             bounds, up = self._state.bounds(), up_of(self._state.shown)
-        if bounds is None:
+        if bounds is None or not has_area(client):
             return
         camera = client.camera
         aspect = camera.aspect

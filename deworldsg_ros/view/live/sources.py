@@ -15,6 +15,7 @@ from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.following import Copy
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.view.live.camera import CameraView, view_of
+from deworldsg_ros.view.live.errors import OnError
 
 
 class Sink(Copy, Protocol):
@@ -44,7 +45,9 @@ PAGE_PORT, FOXGLOVE_PORT = 8080, 8765
 MOST_PORTS = 100
 
 
-def open_sink(host: str, port: int, why_empty: str, *, foxglove: bool) -> Sink:
+def open_sink(
+    host: str, port: int, why_empty: str, *, foxglove: bool, on_error: OnError | None = None
+) -> Sink:
     """A page of viser, or a server for Foxglove.
 
     Args:
@@ -52,6 +55,7 @@ def open_sink(host: str, port: int, why_empty: str, *, foxglove: bool) -> Sink:
         port: the next free port from this one on is taken; 0 = the usual one.
         why_empty: shown while there are no objects.
         foxglove: whether Foxglove is served.
+        on_error: as `Viewer`; the server for Foxglove has no thread of its own.
 
     Raises:
         ImportError: without the package.
@@ -64,7 +68,7 @@ def open_sink(host: str, port: int, why_empty: str, *, foxglove: bool) -> Sink:
         return FoxgloveServer(host, port)
     from deworldsg_ros.view.live.server import Viewer
 
-    return Viewer(host, port, why_empty)
+    return Viewer(host, port, why_empty, on_error)
 
 
 def _free_port(host: str, first: int) -> int:
