@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -24,17 +25,24 @@ from deworldsg_ros.scene.following import MOST_WAITING, GraphFollower
 from deworldsg_ros.scene.replica import GraphReplica
 
 SPIN_PERIOD_S = 0.1
+# Minimum time between two log lines of a kind: a function that fails may do so at each update.
+LOG_PERIOD_S = 10.0
 
 Callback = Callable[[SceneGraph, Changes], object]
 GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
 
 
 class _ToldReplica:
-    """A copy of the graph that tells listeners each message that changed it."""
+    """A copy of the graph that tells listeners each message that changed it.
 
-    def __init__(self) -> None:
+    Args:
+        call: calls a listener with a message, and does not raise.
+    """
+
+    def __init__(self, call: Callable[..., object]) -> None:
         self.graph = GraphReplica()
         self.listeners: list[Callable[[GraphMessage], object]] = []
+        self._call = call
 
     @property
     def session(self) -> str | None:
@@ -56,7 +64,7 @@ class _ToldReplica:
 
     def _tell(self, message: GraphMessage) -> None:
         for listener in self.listeners:
-            listener(message)
+            self._call(listener, message)
 
 
 class SceneGraphClient(GraphCommands):
@@ -79,7 +87,7 @@ class SceneGraphClient(GraphCommands):
         self._own_context = context is None
         self._context = context if context is not None else Context()
         self._namespace = namespace.rstrip("/")
-        self._replica = _ToldReplica()
+        self._replica = _ToldReplica(self._survives)
         self._follower = GraphFollower(self._replica)
         # Made from the copy when somebody asks: a large graph changes more often than that.
         self._graph: SceneGraph | None = None
@@ -196,20 +204,36 @@ class SceneGraphClient(GraphCommands):
     def on_change(self, callback: Callback) -> None:
         """Call a function with the new graph and the changes, after every change of the graph.
 
-        It runs in the thread of the client, so it should be short.
+        It runs in the thread of the client, so it should be short. If it raises an exception, this
+        is logged with its traceback, and the client goes on.
         """
         self._callbacks.append(callback)
 
     def on_message(self, callback: Callable[[GraphMessage], object]) -> None:
         """Call a function with each message that changes the copy, in order: whole graphs, updates.
 
-        It runs in the thread of the client, so it should be short.
+        It runs in the thread of the client, so it should be short. An exception is logged, as in
+        `on_change`.
         """
         self._replica.listeners.append(callback)
 
     def _spin(self) -> None:
         while not self._stop.is_set() and self._context.ok():
-            self._executor.spin_once(timeout_sec=SPIN_PERIOD_S)
+            if not self._survives(self._executor.spin_once, SPIN_PERIOD_S):
+                self._stop.wait(SPIN_PERIOD_S)  # an error that stays must not take a whole core
+
+    def _survives(self, function: Callable[..., object], *arguments: object) -> bool:
+        """Call a function, and log an exception: without its thread, a client has an old graph."""
+        try:
+            function(*arguments)
+        except Exception as error:
+            if not self._stop.is_set() and self._context.ok():  # else it is the end of the client
+                self._node.get_logger().error(
+                    f"the client goes on after {error!r}\n{traceback.format_exc()}",
+                    throttle_duration_sec=LOG_PERIOD_S,
+                )
+            return False
+        return True
 
     def _guarded(self, receive: Callable[[Any], bool]) -> Callable[[Any], None]:
         def call(message: Any) -> None:
@@ -221,7 +245,7 @@ class SceneGraphClient(GraphCommands):
                         self._changed.notify_all()
             except RefusedInput as refusal:
                 self.refused += 1
-                self._node.get_logger().warning(str(refusal), throttle_duration_sec=10.0)
+                self._node.get_logger().warning(str(refusal), throttle_duration_sec=LOG_PERIOD_S)
                 return
             if changed and self._callbacks:
                 self._tell_changes()
@@ -240,7 +264,7 @@ class SceneGraphClient(GraphCommands):
         self._told = graph
         changes = graph.changes_since(before or SceneGraph(GraphReplica().message()))
         for callback in self._callbacks:
-            callback(graph, changes)
+            self._survives(callback, graph, changes)
 
 
 def _qos(depth: int) -> QoSProfile:

@@ -15,7 +15,7 @@ from support.nodes import Peer, peer, wait_until
 from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.client import ClientError, SceneGraphClient
+from deworldsg_ros.client import ClientError, SceneGraph, SceneGraphClient
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 
@@ -111,3 +111,37 @@ def test_a_client_ends_at_once_and_twice() -> None:
     client.close()
     client.close()
     assert time.monotonic() - started_s < 5.0
+
+
+def test_functions_of_the_user_that_raise_do_not_end_the_client(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = [graph(i, *["table", "cup", "book", "vase"][:i]) for i in range(5)]
+
+    def fail(*arguments: object) -> None:
+        raise KeyError("a mistake of the user")
+
+    with peer("robot") as me, SceneGraphClient() as client:
+        robot = Robot(me)
+        seen: list[object] = []
+        client.on_message(fail)
+        client.on_message(lambda message: seen.append(message.sequence))
+        client.on_change(fail)
+        client.on_change(lambda now, changes: seen.append(changes.lines))
+        robot.latch(steps[1])
+        assert len(client.graph) == 1
+        robot.wait()
+        robot.update(steps[1], steps[2])
+        wait_until(lambda: len(seen) == 4, LIMIT_S, "the second change")
+        assert len(client.newest) == 2
+        monkeypatch.setattr(SceneGraph, "changes_since", fail)
+        robot.update(steps[2], steps[3])
+        assert len(client.wait(3, LIMIT_S)) == 3
+        monkeypatch.undo()
+        robot.update(steps[3], steps[4])
+        assert len(client.wait(4, LIMIT_S)) == 4
+        wait_until(lambda: len(seen) == 7, LIMIT_S, "the last change")
+    assert (client.gaps, client.refused) == (0, 0)
+    log = capfd.readouterr().err
+    assert "the client goes on after KeyError('a mistake of the user')" in log
+    assert "Traceback" in log

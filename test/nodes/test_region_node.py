@@ -108,6 +108,21 @@ def test_the_region_changes_while_the_node_runs() -> None:
         rclpy.try_shutdown(context=context)
 
 
+def test_a_message_that_fails_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = RegionNode(context=context)
+    try:
+        monkeypatch.setattr(node._part, "add", lambda message: 1 / 0)
+        for listener in node._client._replica.listeners:
+            listener(SceneGraph.load(SAVED).message)
+        assert node.health.drops == {"internal_error": 1}
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+
+
 @pytest.mark.parametrize("center", ["1,2", "a,b,c", "1,2,inf", "1,2,3,4", ","])
 def test_no_centre(center: str) -> None:
     with pytest.raises(ConfigurationError, match=r"parameter center is .*: expected X,Y,Z"):
