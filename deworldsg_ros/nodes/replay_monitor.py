@@ -24,6 +24,7 @@ from deworldsg_ros.ros.health import (
     LISTENERS,
     LOST_PREFIX,
     UNMATCHED_PREFIX,
+    count_in,
     counts_in,
     received_in,
 )
@@ -180,8 +181,8 @@ class Connections:
             full_name = self._node.resolve_topic_name(topic)
             expected = len(self._node.get_subscriptions_info_by_topic(full_name))
             for name in sorted(publishers):
-                told = self._diagnostics.get(name, {}).get(f"{LISTENERS}{full_name}", "0")
-                if int(told) < expected:
+                told = count_in(self._diagnostics.get(name, {}), f"{LISTENERS}{full_name}")
+                if told < expected:
                     missing.append(f"{name} to connect to the listeners of {full_name}")
         return missing
 
@@ -227,7 +228,7 @@ class PipelineMonitor:
     @property
     def nodes(self) -> int:
         """Number of nodes in the graph, by the newest diagnostics of graph_node."""
-        return int(self.diagnostics.get(GRAPH, {}).get("nodes", 0))
+        return count_in(self.diagnostics.get(GRAPH, {}), "nodes")
 
     def has_to_wait(self, stall_s: float, now_s: float) -> bool:
         """Whether the next frame waits for results of the frames in flight.
@@ -284,7 +285,7 @@ class PipelineMonitor:
         all_evidence = self._evidence >= self._local_graphs - self._drops(RELATION)
         if not (all_evidence or silent_s > EVIDENCE_QUIET_S):
             return False
-        if int(self.diagnostics.get(RELATION, {}).get("clips pending", 0)):
+        if count_in(self.diagnostics.get(RELATION, {}), "clips pending"):
             return False
         return (
             self._received(LOCAL_GRAPH) >= self._local_graphs

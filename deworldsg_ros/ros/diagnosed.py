@@ -7,9 +7,10 @@ from collections import Counter
 from collections.abc import Mapping
 
 from deworldsg_ros.doctor import Observations
-from deworldsg_ros.ros.health import DROPPED, HIDDEN, counts_in, received_in
+from deworldsg_ros.ros.health import COUNT, DROPPED, HIDDEN, count_in, counts_in, received_in
 
-EXAMPLE, WAITING, TURNED = "example ", "waiting for ", "frames turned by "
+EXAMPLE, WAITING = "example ", "waiting for "
+TURNED = re.compile(r"frames turned by ([0-9]{1,3})\b.*")
 
 
 def observations_of(
@@ -34,9 +35,9 @@ def observations_of(
                 examples[key[len(EXAMPLE) :]] = value
             elif key.startswith(WAITING):
                 missing.append(value)
-            elif key.startswith(TURNED):
-                turns[int(key[len(TURNED) :].split()[0]) // 90] += int(value)
-    nodes = [int(values["nodes"]) for values in statuses.values() if "nodes" in values]
+            elif turned := TURNED.fullmatch(key):
+                turns[int(turned[1]) // 90] += count_in(values, key)
+    nodes = [int(of["nodes"]) for of in statuses.values() if COUNT.fullmatch(of.get("nodes", ""))]
     images = [received_in(values, "rgb") for values in statuses.values()]
     return Observations(
         images=max(images, default=0) or None,

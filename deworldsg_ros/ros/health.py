@@ -24,7 +24,9 @@ DROPPED, LEFT_OUT, RECEIVED = "dropped ", "objects left out ", "received "
 LISTENERS = "listeners of "
 # Nodes of the graph that are not published.
 HIDDEN = "hidden, "
-TOTAL = re.compile(r"(\d+) in total")
+# /diagnostics is shared with other programs. A count of a node has no more digits than 64 bits.
+COUNT = re.compile(r"[0-9]{1,18}")
+TOTAL = re.compile(r"(?<![0-9-])([0-9]{1,18}) in total")
 
 
 @dataclass(frozen=True)
@@ -163,10 +165,21 @@ class Health:
 
 
 def counts_in(values: Mapping[str, str], prefix: str) -> dict[str, int]:
-    """Counts by reason in a report's values; `prefix` is DROPPED, LEFT_OUT or HIDDEN."""
+    """Counts by reason in a report's values; `prefix` is DROPPED, LEFT_OUT or HIDDEN.
+
+    A value that is no count is left out.
+    """
     return {
-        key[len(prefix) :]: int(value) for key, value in values.items() if key.startswith(prefix)
+        key[len(prefix) :]: int(value)
+        for key, value in values.items()
+        if key.startswith(prefix) and COUNT.fullmatch(value)
     }
+
+
+def count_in(values: Mapping[str, str], key: str) -> int:
+    """A count in a report's values; 0 if it is not there, or no count."""
+    value = values.get(key, "")
+    return int(value) if COUNT.fullmatch(value) else 0
 
 
 def received_in(values: Mapping[str, str], topic: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from sensor_msgs.msg import CameraInfo
 from deworldsg_ros.doctor import Observations
 from deworldsg_ros.ros.diagnosed import listened, observations_of
 from deworldsg_ros.ros.qos import best_effort, source
+from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 # Types that may stand for each other on a topic.
@@ -93,7 +95,8 @@ class _Listener:
 
     def _noting(self, topic: str) -> Callable[[Any], None]:
         def note(message: Any) -> None:
-            self._behind_s[topic] = time.time() - stamp_ns_of(message) / 1e9
+            with contextlib.suppress(RefusedInput):  # a stamp below 0: the nodes count it
+                self._behind_s[topic] = time.time() - stamp_ns_of(message) / 1e9
 
         return note
 

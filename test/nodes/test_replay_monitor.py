@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import String
 from support.nodes_bench import local_graph
@@ -174,3 +175,26 @@ def test_what_a_restarted_graph_node_missed_is_not_waited_for():
     assert monitor.drained(10 * EVIDENCE_QUIET_S)
     result(monitor, 7)
     assert not monitor.drained(20 * EVIDENCE_QUIET_S)
+
+
+NO_COUNTS = ["many", "", "-3", "1e9", "9" * 5000, "3 "]
+
+
+@pytest.mark.parametrize("value", NO_COUNTS)
+def test_values_of_others_that_are_no_counts_are_left_out(value):
+    """/diagnostics is shared with other programs."""
+    node, monitor = monitor_with_full_window()
+    node.get_namespace.return_value = "/"
+    received = "received__deworldsg/local_graph"
+    keys = ("nodes", "clips__pending", "dropped__x", "listeners__of__deworldsg/frame_graph")
+    for name in ("segmentation_node", "lifting_node", "relation_node", "graph_node"):
+        diagnostics(monitor, name, **dict.fromkeys(keys, value))
+    diagnostics(
+        monitor, "graph_node", nodes=value, **{received: f"1.0 per second, {value} in total"}
+    )
+    assert monitor.nodes == 0 and monitor.window.in_flight == WINDOW_FRAMES
+    assert monitor.connections.missing({}, 100.0) != []
+    monitor.window.give_up()
+    assert monitor.drained(100.0)
+    diagnostics(monitor, "graph_node", nodes="7")
+    assert monitor.nodes == 7

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from deworldsg_ros.ros.diagnosed import observations_of
 from deworldsg_ros.ros.health import (
     DROPPED,
     ERROR,
@@ -12,6 +13,7 @@ from deworldsg_ros.ros.health import (
     OK,
     WARN,
     Health,
+    count_in,
     counts_in,
     received_in,
 )
@@ -100,3 +102,20 @@ def test_counts_are_read_back_from_a_report() -> None:
     assert counts_in(values, DROPPED) == {"no_pose": 2}
     assert counts_in(values, LEFT_OUT) == {"few_mask_pixels": 4}
     assert (received_in(values, "rgb"), received_in(values, "depth")) == (3, 0)
+
+
+@pytest.mark.parametrize("value", ["many", "", "-3", "9" * 5000])
+def test_what_is_no_count_is_left_out(value: str) -> None:
+    values = {
+        "dropped x": value,
+        "dropped y": "2",
+        "nodes": value,
+        "received rgb": f"1.0 per second, {value} in total",
+        f"frames turned by {value} degrees": "3",
+        "frames turned by 90 degrees": value,
+    }
+    assert counts_in(values, DROPPED) == {"y": 2}
+    assert (count_in(values, "nodes"), count_in(values, "edges")) == (0, 0)
+    assert received_in(values, "rgb") == 0
+    seen = observations_of({"a": values, "b": {"nodes": "4", "frames turned by 270 degrees": "5"}})
+    assert (seen.nodes, seen.drops, +seen.turns) == (4, {"y": 2}, {3: 5})
