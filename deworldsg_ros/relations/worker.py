@@ -91,10 +91,17 @@ class EvidenceWorker:
                 self._changed.wait_for(lambda: self._stopping or self._news)
                 self._news = False
                 self._busy = True
-            while not self._stopping and (evidence := self.reasoner.work()) is not None:
+            while not self._stopping and (evidence := self._work_safely()) is not None:
                 self._deliver_safely(evidence)
             if self._stopping:
                 return
+
+    def _work_safely(self) -> RelationEvidence | None:
+        try:
+            return self.reasoner.work()
+        except Exception as error:  # the next frame begins again; without a thread, none would
+            self._report(f"a clip was not judged: {type(error).__name__}: {error}")
+            return None
 
     def _deliver_safely(self, evidence: RelationEvidence) -> None:
         if self._stopping:

@@ -96,7 +96,8 @@ class MapKeeper:
         self._lock.release()
 
     def _write(self, state: Arrays) -> None:
-        try:
-            write_state(state, self.path)
-        except ConfigurationError as error:
-            self._node.drop("map_not_written", str(error))
+        with self._node.refusing():  # the thread also writes the next one
+            try:
+                write_state(state, self.path)
+            except ConfigurationError as error:
+                self._node.drop("map_not_written", str(error))

@@ -150,3 +150,26 @@ def test_many_threads_may_observe(observers):
     counters = worker.reasoner.counters()
     assert counters.queued == counters.encoded + sum(counters.dropped.values())
     assert len(receiver.evidence) == counters.encoded
+
+
+def test_an_unexpected_error_of_the_reasoner_does_not_end_the_thread(monkeypatch):
+    reports, receiver = [], Receiver()
+    worker = worker_of(RecordingModel(), receiver, reports.append)
+    work, calls = worker.reasoner.work, []
+
+    def fail_once():
+        calls.append(0)
+        if len(calls) == 1:
+            raise IndexError("a mistake")
+        return work()
+
+    monkeypatch.setattr(worker.reasoner, "work", fail_once)
+    worker.start()
+    try:
+        for stamp in range(2):
+            worker.observe(pair_graph(stamp), picture(stamp))
+            assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+    assert len(receiver.evidence) == 2
+    assert reports == ["a clip was not judged: IndexError: a mistake"]
