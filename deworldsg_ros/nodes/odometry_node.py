@@ -52,7 +52,7 @@ class OdometryNode(JoiningNode[UnposedFrame]):
         listen_rgb(self, self.taking(frames.add_rgb), self.wants_images, WANTED_DEPTH)
 
     def _track(self, frame: UnposedFrame) -> None:
-        if frame.stamp_ns < self._newest_ns:  # a recording was restarted
+        if frame.stamp_ns < self._newest_ns:  # the clock was set back, or a recording restarted
             self._odometry = RgbdOdometry()
         self._newest_ns = frame.stamp_ns
         T_world_camera = self._odometry.track(frame.rgb, frame.depth_m, frame.intrinsics)

@@ -65,9 +65,10 @@ REASONS: dict[str, str] = {
     "no_rgb": "A local graph arrived without its RGB image. Use `config/fastdds.xml` in every "
     "process.",
     "stale": "A message is not newer than the last one on its topic. Look for a second publisher.",
-    "time_jump": "Stamps jumped back by more than a second, or forward by more than a minute. A "
-    "jump of one message costs this message. If the next message confirms it, the node continues "
-    "at the new time: a recording was restarted, or a clock was set.",
+    "time_jump": "Stamps jumped back by more than a second, or forward by more than a minute "
+    "(odometry_node: a second). A jump of one message costs this message. If the next message "
+    "confirms it, the node continues at the new time: a recording was restarted, or a clock was "
+    "set.",
     "overrun": "Frames arrive faster than a node processes them. It dropped the oldest in its "
     "queue. Lower the camera's frame rate, or choose a faster model.",
     "evidence_overrun": "As `overrun`, for relation evidence. The graph has its frame without it.",

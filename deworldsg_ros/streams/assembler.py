@@ -177,7 +177,7 @@ class Assembler(ABC, Generic[T, Out]):
         stream.heard()
         admitted, lost_ns = stream.gate.admit(stamp_ns, value)
         if lost_ns is not None:
-            self._drop("time_jump", jump_text(stream.name, lost_ns))
+            self._drop("time_jump", jump_text(stream.name, lost_ns, stream.gate.max_step_ns))
         for at_ns, item in admitted:
             self._take(stream, at_ns, item)
 

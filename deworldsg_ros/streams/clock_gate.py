@@ -15,15 +15,19 @@ MAX_STEP_NS = 60 * 10**9
 class ClockGate(Generic[T]):
     """Holds back a message whose stamp jumps, until the next one confirms the jump.
 
-    A stamp jumps if it is more than `MAX_STEP_NS` after the newest one, or more than `RESTART_NS`
+    A stamp jumps if it is more than `max_step_ns` after the newest one, or more than `RESTART_NS`
     before it. The next message confirms the jump if its stamp is later and jumps in the same
     direction. Otherwise the first one had a wrong stamp, and is lost.
+
+    Args:
+        max_step_ns: as above.
 
     Attributes:
         newest_ns: stamp of the newest message that passed; None before the first.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_step_ns: int = MAX_STEP_NS) -> None:
+        self.max_step_ns = max_step_ns
         self.newest_ns: int | None = None
         self._held: tuple[int, T] | None = None
 
@@ -57,12 +61,12 @@ class ClockGate(Generic[T]):
             return 0
         if stamp_ns < self.newest_ns - RESTART_NS:
             return -1
-        return int(stamp_ns > self.newest_ns + MAX_STEP_NS)
+        return int(stamp_ns > self.newest_ns + self.max_step_ns)
 
 
-def jump_text(name: str, stamp_ns: int) -> str:
+def jump_text(name: str, stamp_ns: int, max_step_ns: int = MAX_STEP_NS) -> str:
     """The message of a drop."""
     return (
-        f"{name} at {stamp_ns / 1e9:.3f} s is more than a minute after, or a second before, its "
-        "neighbours: expected increasing stamps. Check the clock"
+        f"{name} at {stamp_ns / 1e9:.3f} s is more than {max_step_ns / 1e9:g} s after, or a second "
+        "before, its neighbours: expected increasing stamps. Check the clock"
     )

@@ -12,8 +12,13 @@ from deworldsg_ros.scene.arrays import Float32, UInt8
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.assembler import OnDrop
+from deworldsg_ros.streams.clock_gate import ClockGate
 from deworldsg_ros.streams.images import rgb_from_message
 from deworldsg_ros.streams.posed import PosedAssembler
+
+# After a stamp of the future, the next ones are earlier. Odometry would begin anew at the origin,
+# for good: so a stamp is held back if a camera that odometry can follow does not reach it.
+MAX_GAP_NS = 10**9
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,8 @@ class UnposedAssembler(PosedAssembler[Any, UnposedFrame]):
     ) -> None:
         super().__init__("rgb", (), inputs, topics, capacity, max_wait_s, on_drop)
         self._streams.remove(self._pose)
+        for stream in self._streams:
+            stream.gate = ClockGate(MAX_GAP_NS)
 
     def add_rgb(self, message: Any, stamp_ns: int) -> None:
         """Keep an RGB image, Image or CompressedImage."""

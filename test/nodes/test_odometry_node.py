@@ -38,8 +38,10 @@ def info(stamp_ns: int) -> CameraInfo:
     return message
 
 
-def send(at: Bench, T: np.ndarray, *, blind: bool = False, half: bool = False) -> None:
-    stamp_ns = at.next_stamp()
+def send(
+    at: Bench, T: np.ndarray, *, blind: bool = False, half: bool = False, wrong_ns: int = 0
+) -> None:
+    stamp_ns = at.next_stamp() + wrong_ns
     frame = corner_frame(T)
     depth_m = np.zeros_like(frame.depth_m) if blind else frame.depth_m
     at.send(
@@ -99,6 +101,23 @@ def test_a_restarted_recording_restarts_the_odometry(odometry: Bench) -> None:
     odometry.refuses("time_jump", lambda: [send(odometry, T) for T in path[1:]])
     odometry.expect(lambda: len(poses) == 2, "two poses")
     np.testing.assert_allclose(pose_from_message(poses[0])[0], LEVEL, atol=1e-12)
+
+
+@pytest.mark.parametrize("wrong_s", [5, -5, 50, 3600])
+def test_one_wrong_stamp_costs_one_frame_of_odometry(odometry: Bench, wrong_s: int) -> None:
+    poses = collect(odometry, PoseStamped, "camera/pose")
+    path = walk(6)
+    for place, T in enumerate(path):
+        if place == 3:
+            send(odometry, T, wrong_ns=wrong_s * 10**9)
+        else:
+            works(odometry, lambda T=T: send(odometry, T))
+    odometry.expect(lambda: len(poses) == 5, "five poses")
+    estimate, _ = pose_from_message(poses[-1])
+    expected = LEVEL @ invert_pose(path[0]) @ path[-1]
+    assert np.linalg.norm(estimate[:3, 3] - expected[:3, 3]) < 0.02
+    assert odometry.node.health.drops["time_jump"] == 2  # RGB and depth
+    assert odometry.node.more_values()["odometry tracked"] == "5"
 
 
 def at(x: float = 0.0, y: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
