@@ -11,6 +11,7 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.names import OBJECT_FRAME
 
 
 def object_transforms(
@@ -27,7 +28,7 @@ def object_transforms(
     for node in graph.nodes:
         if not isinstance(node.box, wire.GravityBox):
             continue
-        found = TransformStamped(child_frame_id=f"{prefix}object_{node.id}")
+        found = TransformStamped(child_frame_id=f"{prefix}{OBJECT_FRAME}{node.id}")
         found.header.frame_id, found.header.stamp = graph.frame_id, stamp
         at, turned = found.transform.translation, found.transform.rotation
         at.x, at.y, at.z = map(float, node.box.center_m)

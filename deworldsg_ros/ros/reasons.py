@@ -37,6 +37,8 @@ REASONS: dict[str, str] = {
     "no_transform": "The odometry describes another frame than the camera's, and TF does not "
     "connect the two. Publish that transform; if the poses are the camera's, set "
     "`inputs.pose_source` to odometry.",
+    "too_many_frames": "TF has more than 1000 frames, and the new ones are ignored. Look for a "
+    "node that gives its frames ever new names.",
     "odometry_lost": "The odometry could not align a frame. The frame gets no pose. Move the "
     "camera more slowly, and keep it unobstructed.",
     # Models

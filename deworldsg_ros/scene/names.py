@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.limits import MAX_NAME_CHARACTERS
 
+# Of the frames of objects on /tf: this, and the id.
+OBJECT_FRAME = "object_"
 # Control characters forge lines of logs and terminals; half of a surrogate pair has no UTF-8.
 _UNWANTED = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
 

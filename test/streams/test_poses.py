@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 
 import numpy as np
@@ -20,7 +21,7 @@ from deworldsg_ros.streams.poses import (
     set_stamp,
     stamp_ns_of,
 )
-from deworldsg_ros.streams.transforms import TransformTree
+from deworldsg_ros.streams.transforms import MAX_FRAMES, TransformTree
 
 SLOP = 100 * MS
 
@@ -249,3 +250,67 @@ def test_a_loop_in_tf_ends() -> None:
     tree.add(tf(transform("a", "b", at(1.0)), transform("b", "a", at(1.0))), static=True)
     with pytest.raises(RefusedInput):
         tree.at(T0, "a")
+
+
+SECOND = 10**9
+
+
+def moving(tree: TransformTree, stamp_ns: int, *pairs: str) -> None:
+    """Add transforms, named "parent child"."""
+    tree.add(tf(*(transform(*pair.split(), at(1.0), stamp_ns) for pair in pairs)), static=False)
+
+
+def test_silent_frames_are_dropped() -> None:
+    """Static ones stay, and those between the camera and the world."""
+    tree = TransformTree(SLOP, "map")
+    tree.add(
+        tf(transform("base", "camera", at(0.1)), transform("base", "lidar", at(0.2))), static=True
+    )
+    moving(tree, T0, "map odom", "odom base", *(f"map person_{i}" for i in range(300)))
+    assert tree.settled(T0, "camera")
+    for seconds in (0, 50, 100, 101, 150):
+        moving(tree, T0 + seconds * SECOND, "odom base")
+        tree.forget_before(T0 + seconds * SECOND)
+        assert len(tree) == (304 if seconds <= 100 else 4)
+    now_ns = T0 + 150 * SECOND
+    with pytest.raises(RefusedInput, match="the nearest pose is 150.000 s away"):
+        tree.at(now_ns, "camera")
+    for stamp_ns in (now_ns, now_ns + MS):  # the gate waits for the second one
+        moving(tree, stamp_ns, "map odom", "map person_7")
+    assert tree.at(now_ns, "camera")[1] == "map"
+    np.testing.assert_allclose(tree.between(now_ns, "map", "person_7"), at(1.0))
+
+
+def test_frames_that_end_before_a_restart_are_forgotten() -> None:
+    tree = TransformTree(SLOP, "map")
+    for run in range(5):
+        moving(
+            tree, T0 + run * SECOND, "map camera", *(f"map person_{run}_{i}" for i in range(900))
+        )
+        assert tree.settled(T0, "camera")
+        tree.restart()
+        assert len(tree) == 0
+
+
+def test_the_number_of_frames_is_bounded() -> None:
+    tree = TransformTree(SLOP, "map")
+    moving(tree, T0, "map base")
+    for place in range(2 * MAX_FRAMES):
+        with contextlib.suppress(RefusedInput):
+            tree.add(tf(transform("map", f"person_{place}", at(1.0))), static=place % 2 == 0)
+    assert len(tree) == MAX_FRAMES
+    with pytest.raises(RefusedInput, match="TF has 1000 frames") as refused:
+        moving(tree, T0 + 10 * MS, "base camera", "map base")
+    assert refused.value.reason == "too_many_frames"
+    assert tree.settled(T0 + 10 * MS, "base")  # those that are known go on
+    assert not tree.settled(T0, "camera")
+
+
+def test_objects_of_the_graph_are_no_frames_of_the_camera() -> None:
+    tree = TransformTree(SLOP, "map")
+    moving(tree, T0, "map object_1", "map robot1/object_22", "map object_x", "map my_object_3")
+    assert len(tree) == 2
+    tree.add(tf(transform("object_1", "camera", at(0.1))), static=True)
+    moving(tree, T0, "map object_1", "map object_2")  # a tracker that names bodies so
+    assert len(tree) == 4
+    assert tree.at(T0, "camera")[0][0, 3] == pytest.approx(1.1)
