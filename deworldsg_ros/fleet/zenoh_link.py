@@ -7,7 +7,9 @@ that joins late need no special case: the next answer contains everything that i
 from __future__ import annotations
 
 import json
+import re
 import threading
+import time
 import zlib
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +24,13 @@ from deworldsg_ros.scene.replica import GraphReplica
 PREFIX = "deworldsg"
 # Level 1 takes a quarter of the time of level 6, and a tenth more bytes.
 COMPRESSION = 1
+MAX_NAME = 64
+ROBOT_NAME = re.compile(rf"[A-Za-z0-9_-]{{1,{MAX_NAME}}}")
+# Each one takes a thread while it is asked, and the fleet keeps its last graph.
+MAX_ROBOTS = 256
+# A robot without a token and without an answer for so long is asked no more. If it comes back, its
+# whole graph is sent again: that should not happen after each gap of a radio link.
+GONE_S = 60.0
 
 
 def open_session(connect: str = "", listen: str = "") -> Any:
@@ -177,17 +186,28 @@ def _unpacked(packed: bytes) -> wire.SceneGraphUpdateMessage:
 class Robots:
     """Follows the graphs of all robots that are on the network.
 
+    Names that are none are refused (``invalid_robot``), and so are new robots when `MAX_ROBOTS`
+    have answered since the start (``too_many_robots``).
+
     Args:
         session: of Zenoh.
 
     Attributes:
-        followers: by name of the robot; those that are gone stay.
+        followers: by name of the robot; those that have been gone for `GONE_S` are forgotten.
     """
 
     def __init__(self, session: Any) -> None:
         self._session = session
         self.followers: dict[str, Follower] = {}
-        self._refused: list[RefusedInput] = []
+        self._errors: list[Exception] = []
+        self._answered: set[str] = set()
+        self._there_s: dict[str, float] = {}
+        self._forgotten_bytes = 0
+
+    @property
+    def received_bytes(self) -> int:
+        """Size of all answers."""
+        return self._forgotten_bytes + sum(of.received_bytes for of in self.followers.values())
 
     def ask(self, timeout_s: float) -> dict[str, bool | None]:
         """Ask every robot once, all at the same time.
@@ -198,8 +218,8 @@ class Robots:
         prefix = robot_key("")
         for reply in self._session.liveliness().get(prefix + "*", timeout=timeout_s):
             if reply.ok is not None:
-                name = str(reply.ok.key_expr)[len(prefix) :]
-                self.followers.setdefault(name, Follower(self._session, prefix + name))
+                self._meet(str(reply.ok.key_expr)[len(prefix) :])
+        self._forget_gone()
         answers: dict[str, bool | None] = dict.fromkeys(self.followers)
         threads = [
             threading.Thread(target=self._ask, args=(name, timeout_s, answers), daemon=True)
@@ -209,15 +229,49 @@ class Robots:
             thread.start()
         for thread in threads:
             thread.join()
+        for name, changed in answers.items():
+            if changed is not None:
+                self._answered.add(name)
+                self._there_s[name] = time.monotonic()
         return answers
 
-    def take_refused(self) -> list[RefusedInput]:
-        """Answers that were refused since the last call."""
-        refused, self._refused = self._refused, []
-        return refused
+    def take_errors(self) -> list[Exception]:
+        """What was refused or went wrong since the last call."""
+        errors, self._errors = self._errors, []
+        return errors
+
+    def _meet(self, name: str) -> None:
+        """Follow a robot that is on the network."""
+        if name in self.followers:
+            self._there_s[name] = time.monotonic()
+        elif not ROBOT_NAME.fullmatch(name):
+            self._errors.append(
+                RefusedInput(
+                    "invalid_robot",
+                    f"a robot is named {name[:MAX_NAME]!r}: expected at most {MAX_NAME} letters, "
+                    "digits, _ and -",
+                )
+            )
+        elif len({name, *self._answered, *self.followers}) > MAX_ROBOTS:
+            self._errors.append(
+                RefusedInput(
+                    "too_many_robots",
+                    f"robot '{name}' is ignored: expected at most {MAX_ROBOTS} since the start",
+                )
+            )
+        else:
+            self.followers[name] = Follower(self._session, robot_key(name))
+            self._there_s[name] = time.monotonic()
+
+    def _forget_gone(self) -> None:
+        """Each robot that is asked takes a thread, also one that never answers."""
+        now_s = time.monotonic()
+        for name in [name for name, at_s in self._there_s.items() if now_s - at_s > GONE_S]:
+            del self._there_s[name]
+            self._forgotten_bytes += self.followers.pop(name).received_bytes
 
     def _ask(self, name: str, timeout_s: float, answers: dict[str, bool | None]) -> None:
         try:
             answers[name] = self.followers[name].ask(timeout_s)
-        except RefusedInput as refusal:
-            self._refused.append(refusal)
+        except Exception as error:  # one robot must not stop the others
+            self._errors.append(error)

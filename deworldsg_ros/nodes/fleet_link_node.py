@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from typing import Any
 
 from deworldsg_ros.client.live import SceneGraphClient
-from deworldsg_ros.fleet.zenoh_link import Feed, Follower, open_session, part_key, robot_key
+from deworldsg_ros.fleet.zenoh_link import (
+    ROBOT_NAME,
+    Feed,
+    Follower,
+    open_session,
+    part_key,
+    robot_key,
+)
 from deworldsg_ros.ros.graph_topics import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import FleetLinkParameters
 from deworldsg_ros.ros.repeating import Repeating
 from deworldsg_ros.scene.change_log import ChangeLog
 from deworldsg_ros.scene.errors import ConfigurationError
-
-ROBOT_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 class FleetLinkNode(StageNode):
@@ -39,7 +43,7 @@ class FleetLinkNode(StageNode):
         self._client = SceneGraphClient(self.get_namespace(), self.context).__enter__()
         self._log = ChangeLog()
         key = robot_key(settings.robot)
-        self._feed = Feed(self._session, key, self._log, self._refresh)
+        self._feed = Feed(self._session, key, self._log, self.guarded(self._refresh))
         self._token = self._session.liveliness().declare_token(key)
         self._follower = Follower(self._session, part_key(settings.robot))
         self._others = GraphTopics(self, "others")

@@ -65,17 +65,17 @@ class FleetNode(StageNode):
 
     def more_values(self) -> dict[str, str]:
         """Robots and bytes on the wire."""
-        received = sum(item.received_bytes for item in self._robots.followers.values())
         return {
             "robots": str(len(self._answered_s)),
-            "bytes received": str(received),
+            "bytes received": str(self._robots.received_bytes),
             "bytes sent": str(sum(feed.sent_bytes for feed in self._feeds.values())),
         }
 
     def _step(self) -> None:
         answers = self._robots.ask(self.parameters.node.period_s + 1.0)
-        for refusal in self._robots.take_refused():
-            self.drop(refusal.reason, str(refusal))
+        for error in self._robots.take_errors():
+            with self.refusing():
+                raise error
         for name, changed in answers.items():
             if changed is not None:
                 self._answered_s[name] = time.monotonic()
