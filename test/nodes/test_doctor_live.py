@@ -20,6 +20,7 @@ from deworldsg_ros.streams.poses import set_stamp
 VALUES = {
     "received rgb": "9.8 per second, 100 in total",
     "dropped no_pose": "60",
+    "dropped by another program": "many",
     "example no_pose": "frame at 7 s has no pose",
     "frames turned by 90 degrees": "12",
     "waiting for 1": "no rgb on /rgb/image_raw for 5 s",
@@ -55,6 +56,7 @@ def test_a_running_system_is_examined(context):
         )
         other = DiagnosticStatus(name="motor", hardware_id="motor")
         diagnostics.publish(DiagnosticArray(status=[status, other]))
+        info.publish(CameraInfo(header=stamped(-(10**9))))  # no time: it is left out
         info.publish(CameraInfo(header=stamped(node.get_clock().now().nanoseconds)))
         poses.publish(PoseStamped(header=stamped(7 * 10**9)))
 
