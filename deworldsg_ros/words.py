@@ -1,14 +1,45 @@
-"""Text for people: counts with their noun, and the known name that a misspelt one may mean."""
+"""Text for people and from people: counts, misspelt names, text of others, numbers."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
+
+# Control characters act on a terminal, line separators and overrides of the direction forge what is
+# printed, half of a surrogate pair cannot be written, and XML has no place for the last two.
+_ACTING = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
+)
+# Of a whole number as text: ids have 63 bits.
+_MAX_DIGITS = 19
 
 
 def counted(count: int, noun: str) -> str:
     """A count with its noun: ``1 frame``, ``2 frames``."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def visible(text: str) -> str:
+    """Text of a file or message for one line: what is no character to see becomes an escape.
+
+    The escapes are those of JSON, so that a line of JSON stays one.
+    """
+    return _ACTING.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def visible_lines(text: str) -> str:
+    """As `visible`, for text that may have several lines."""
+    return "\n".join(map(visible, text.split("\n")))
+
+
+def whole_number(text: str) -> int | None:
+    """The number that ASCII digits write; None for other text, and for more than 19 digits.
+
+    ``isdigit`` and ``int`` alone disagree on text such as "²".
+    """
+    is_number = text.isascii() and text.isdecimal() and len(text) <= _MAX_DIGITS
+    return int(text) if is_number else None
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -1,10 +1,12 @@
-"""Counts, and the names that misspelt ones may mean."""
+"""Counts, the names that misspelt ones may mean, text of others, and numbers."""
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
-from deworldsg_ros.words import counted, suggestion
+from deworldsg_ros.words import counted, suggestion, visible, visible_lines, whole_number
 
 KNOWN = ["perception.score_threshold", "perception.threads", "lifting.tau", "save_path"]
 
@@ -29,3 +31,26 @@ def test_one_is_singular() -> None:
 def test_the_nearest_name_is_suggested(name: str, meant: str | None) -> None:
     assert suggestion(name, KNOWN) == (f" (did you mean {meant}?)" if meant else "")
     assert suggestion(name, []) == ""
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["cup\x1b[2J", "a\nb", "\x00", "\x7f", "\x9b31m", "\u2028", "\u202e", "\ud800", "\uffff"],
+)
+def test_what_is_no_character_to_see_is_an_escape(text: str) -> None:
+    shown = visible(text)
+    assert shown.isprintable() and "\\u" in shown
+    assert json.loads(f'"{shown}"') == text
+
+
+def test_other_text_is_shown_as_it_is() -> None:
+    for text in ("", "dining table", "Stühle 椅子 🪑", "[bold]", "100 %"):
+        assert visible(text) == text
+    assert visible_lines("a\tb\nc") == "a\\u0009b\nc"
+
+
+def test_only_ascii_digits_write_a_number() -> None:
+    assert [whole_number(text) for text in ("0", "13", "007")] == [0, 13, 7]
+    assert whole_number(str(2**63 - 1)) == 2**63 - 1
+    for text in ("", "²", "٣", "-1", "1_0", " 1", "1.0", "9" * 5000):
+        assert whole_number(text) is None

@@ -41,6 +41,7 @@ from deworldsg_ros.cli.options import (
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+from deworldsg_ros.words import visible_lines
 
 app = typer.Typer(
     name="deworldsg",
@@ -58,18 +59,22 @@ def _reporting_errors() -> Iterator[None]:
     try:
         yield
     except DeWorldSGError as error:
-        console = Console(stderr=True, highlight=False, soft_wrap=True)
-        console.print(Text.assemble(("error:", "bold red"), f" {error}"))
+        _print_error(str(error))
         raise typer.Exit(EXIT_USAGE) from error
     except OSError as error:
         # Of a file that could not be written: a full disk, a read-only place.
         where = f"{error.filename}: " if error.filename else ""
-        text = Text.assemble(("error:", "bold red"), f" {where}{error.strerror or error}")
-        Console(stderr=True, highlight=False, soft_wrap=True).print(text)
+        _print_error(f"{where}{error.strerror or error}")
         raise typer.Exit(EXIT_USAGE) from error
     except KeyboardInterrupt as interrupt:
         Console(stderr=True).print("interrupted")
         raise typer.Exit(EXIT_INTERRUPTED) from interrupt
+
+
+def _print_error(message: str) -> None:
+    """Print the lines of an error, which may contain names of a file or message."""
+    text = Text.assemble(("error:", "bold red"), f" {visible_lines(message)}")
+    Console(stderr=True, highlight=False, soft_wrap=True).print(text)
 
 
 def _version(requested: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +19,7 @@ from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SURE, odds_of
 from deworldsg_ros.client.patterns import Answers
+from deworldsg_ros.words import visible, whole_number
 
 # typer evaluates these annotations at run time.
 Words = Annotated[
@@ -72,35 +73,33 @@ def goal(
     if as_json:
         print_json(found)
     else:
-        Console(highlight=False, soft_wrap=True).print(escape(_goal_text(found)))
+        print_lines(_goal_lines(found))
 
 
-def _goal_text(found: dict[str, Any]) -> str:
+def _goal_lines(found: dict[str, Any]) -> list[str]:
     """The fields of `Goal.to_dict` in words."""
     x, y, z = found["pose"]["position"].values()
     target, clearance_m, seen_free = (found[key] for key in ("target", "clearance_m", "seen_free"))
     probability = found["target_probability"]
-    return "\n".join(
-        [
-            f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found['header']['frame_id']}', facing "
-            f"{target['label']} #{target['id']} ({probability:.0%}"
-            f"{'' if probability >= SURE else ', not sure'}); quaternion xyzw "
-            + " ".join(f"{value:.4f}" for value in found["pose"]["orientation"].values()),
-            f"{found['distance_m']:.2f} m from it; "
-            + ("" if clearance_m is None else f"next object {clearance_m:.2f} m away; ")
-            + f"it extends {found['along_std_m']:.2f} m (1σ) along, "
-            f"{found['across_std_m']:.2f} m across the view",
-            "not sure: walls are not known here"
-            if seen_free is None
-            else f"seen as free: {seen_free:.0%}",
-            *([] if found["in_known_area"] else ["not sure: the pose is outside of all objects"]),
-            *(
-                []
-                if found["blocked_by"] is None
-                else [f"not sure: object #{found['blocked_by']} may hide it"]
-            ),
-        ]
-    )
+    return [
+        f"stand at {x:.2f} {y:.2f} {z:.2f} in frame '{found['header']['frame_id']}', facing "
+        f"{target['label']} #{target['id']} ({probability:.0%}"
+        f"{'' if probability >= SURE else ', not sure'}); quaternion xyzw "
+        + " ".join(f"{value:.4f}" for value in found["pose"]["orientation"].values()),
+        f"{found['distance_m']:.2f} m from it; "
+        + ("" if clearance_m is None else f"next object {clearance_m:.2f} m away; ")
+        + f"it extends {found['along_std_m']:.2f} m (1σ) along, "
+        f"{found['across_std_m']:.2f} m across the view",
+        "not sure: walls are not known here"
+        if seen_free is None
+        else f"seen as free: {seen_free:.0%}",
+        *([] if found["in_known_area"] else ["not sure: the pose is outside of all objects"]),
+        *(
+            []
+            if found["blocked_by"] is None
+            else [f"not sure: object #{found['blocked_by']} may hide it"]
+        ),
+    ]
 
 
 def explain(
@@ -111,19 +110,31 @@ def explain(
     The words are an id, two ids, or a class.
     """
     with _opened(words, live, namespace) as (graph, rest):
-        if len(rest) == 2 and all(word.isdigit() for word in rest):
-            found = graph.explain((int(rest[0]), int(rest[1])))
+        first, *others = [whole_number(word) for word in rest]
+        if len(others) == 1 and first is not None and others[0] is not None:
+            found = graph.explain((first, others[0]))
         else:
             found = graph.explain(_which(rest))
         if as_json:
             print_json({"subject": found.subject, "lines": list(found.lines), **found.values})
         else:
-            typer.echo(str(found))
+            print_lines([found.subject, *(f"  {line}" for line in found.lines)])
 
 
 def print_json(content: Any) -> None:
-    """Print a JSON document."""
-    typer.echo(json.dumps(content, indent=2, ensure_ascii=False))
+    """Print a JSON document; control characters in it are escapes of JSON."""
+    print_lines(json.dumps(content, indent=2, ensure_ascii=False).split("\n"))
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines that contain names of a file or message: whatever these are, as text."""
+    for line in lines:
+        typer.echo(visible(line))
+
+
+def plain(text: str) -> str:
+    """Text of a file or message for a table of rich, which would read markup in it."""
+    return escape(visible(text))
 
 
 @contextmanager
@@ -142,11 +153,12 @@ def _opened(words: list[str], live: bool, namespace: str) -> Iterator[tuple[Scen
 
 def _which(words: list[str]) -> int | str:
     text = " ".join(words).removeprefix("#")
-    return int(text) if text.isdigit() else text
+    number = whole_number(text)
+    return text if number is None else number
 
 
 def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
-    table = Table(box=box.SIMPLE, caption=f"positions in frame {frame_id!r}")
+    table = Table(box=box.SIMPLE, caption=plain(f"positions in frame {frame_id!r}"))
     table.add_column("object", no_wrap=True)
     table.add_column("x, y, z (m)", no_wrap=True)
     table.add_column("size (cm)", no_wrap=True)
@@ -156,14 +168,14 @@ def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
     for answer in answers.found:
         item = answer.item
         table.add_row(
-            escape(item.name),
+            plain(item.name),
             " ".join(f"{value:.2f}" for value in item.position_m),
             " × ".join(f"{100 * value:.0f}" for value in item.size_m),
             f"{answer.probability:.0%}",
             odds_of(answer.probability),
-            ("" if answer.is_sure else "[yellow]not sure:[/] ") + escape(answer.evidence),
+            ("" if answer.is_sure else "[yellow]not sure:[/] ") + plain(answer.evidence),
         )
     if answers.found:
         console.print(table)
     for note in answers.notes:
-        console.print(escape(note), highlight=False, soft_wrap=True)
+        console.print(plain(note), highlight=False, soft_wrap=True)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from deworldsg_ros.cli.ask import AsJson, Namespace, print_json
+from deworldsg_ros.cli.ask import AsJson, Namespace, print_json, print_lines
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.scene.edits import (
     DeleteNode,
@@ -19,6 +19,7 @@ from deworldsg_ros.scene.edits import (
     SplitNode,
     Undo,
 )
+from deworldsg_ros.words import whole_number
 
 # typer evaluates these annotations at run time.
 Words = Annotated[list[str], typer.Argument(metavar="[FILE] WORDS", help="map file, then the edit")]
@@ -49,7 +50,7 @@ def edit(
     if as_json:
         print_json(reply)
     else:
-        typer.echo(reply["text"])
+        print_lines([reply["text"]])
 
 
 def parse_edit(words: list[str]) -> EditRequest:
@@ -74,7 +75,10 @@ def parse_edit(words: list[str]) -> EditRequest:
 
 
 def _number(word: str) -> int:
-    return int(word.removeprefix("#"))
+    number = whole_number(word.removeprefix("#"))
+    if number is None:
+        raise ValueError(f"{word} is no id")
+    return number
 
 
 def _edit_live(namespace: str, verb: str, request: EditRequest) -> dict[str, Any]:

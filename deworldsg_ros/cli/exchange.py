@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from deworldsg_ros.cli.ask import AsJson, print_json
+from deworldsg_ros.cli.ask import AsJson, print_json, print_lines
 from deworldsg_ros.client.combine import combine
 from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.export import FORMATS
@@ -48,8 +48,7 @@ def diff(before: First, after: Second, as_json: AsJson = False) -> None:
     if as_json:
         print_json(changes.to_dict())
         return
-    for line in changes.lines:
-        typer.echo(line)
+    print_lines(changes.lines)
     typer.echo(f"unchanged: {counted(changes.same, 'object')}")
 
 

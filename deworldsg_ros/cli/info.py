@@ -16,7 +16,7 @@ from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import detect_kind, open_source
-from deworldsg_ros.words import counted
+from deworldsg_ros.words import counted, visible
 
 
 def show_recording(
@@ -60,8 +60,8 @@ def show_recording(
     table.add_column("messages", justify="right")
     table.add_column("used as")
     for name, msgtype, count in rows:
-        kind_of = Text(msgtype.split("/")[-1])
-        table.add_row(Text(name), kind_of, str(count), used.get(name, ""))
+        kind_of = Text(visible(msgtype.split("/")[-1]))
+        table.add_row(Text(visible(name)), kind_of, str(count), used.get(name, ""))
     console.print(table)
     if used and Role.POSE.value not in used.values():
         print_noted(

@@ -23,6 +23,7 @@ from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.scene.seen_frames import path_beside
 from deworldsg_ros.scene.seen_space import space_path
 from deworldsg_ros.scene.up import UpEstimator
+from deworldsg_ros.words import visible
 
 PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
@@ -160,5 +161,5 @@ def print_drops(
 
 def print_noted(console: Console, note: str, text: str) -> None:
     """Print a line that begins with a yellow note. Its text comes from files: no markup in it."""
-    line = Text.assemble((note, "yellow"), f" {text}")
+    line = Text.assemble((note, "yellow"), f" {visible(text)}")
     console.print(line, highlight=False, soft_wrap=True)

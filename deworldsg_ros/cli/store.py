@@ -13,10 +13,9 @@ from typing import Annotated, Any, Optional
 import typer
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
-from deworldsg_ros.cli.ask import AsJson, Live, Namespace, print_json
+from deworldsg_ros.cli.ask import AsJson, Live, Namespace, plain, print_json
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.delta import join
 from deworldsg_ros.store import Store, StoreError
@@ -67,9 +66,9 @@ def ask(
     if as_json:
         print_json([dict(zip(found.columns, row)) for row in found.rows])
         return
-    table = Table(*map(escape, found.columns), box=box.SIMPLE)
+    table = Table(*map(plain, found.columns), box=box.SIMPLE)
     for row in found.rows:
-        table.add_row(*(escape(str(value)) for value in row))
+        table.add_row(*(plain(str(value)) for value in row))
     Console().print(table)
 
 
@@ -88,13 +87,12 @@ def at(
     if as_json:
         print_json([stay.to_dict() for stay in stays])
         return
-    table = Table(
-        "object", "x, y, z (m)", "since", "until", box=box.SIMPLE, caption=f"in {head.frame_id!r}"
-    )
+    where = plain(f"in {head.frame_id!r}")
+    table = Table("object", "x, y, z (m)", "since", "until", box=box.SIMPLE, caption=where)
     for stay in stays:
         name, place = f"{stay.label} #{stay.node}", " ".join(f"{v:.2f}" for v in stay.position_m)
         until = "" if stay.is_current else _clock(stay.until_ns)
-        table.add_row(escape(name), place, _clock(stay.since_ns), until)
+        table.add_row(plain(name), place, _clock(stay.since_ns), until)
     Console().print(table)
 
 

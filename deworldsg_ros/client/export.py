@@ -18,6 +18,7 @@ from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.words import visible
 
 # A node of spark_dsg has the symbol of its layer in the upper byte: O for objects, layer 2.
 SPARK_SYMBOL = ord("O") << 56
@@ -27,6 +28,8 @@ SPARK_VERSION = {"major": 1, "minor": 1, "patch": 3}
 SH_C0 = 0.28209479177387814
 # Splats of flat objects are this thick at least.
 MIN_SIGMA_M = 1e-3
+# Primes: the colours of labels depend on a number modulo their product.
+_RED, _GREEN, _BLUE = 97, 89, 83
 
 _OBJECT_COLUMNS = (
     "id", "label", "probability", "existence", "x", "y", "z", "length", "width", "height",
@@ -108,7 +111,7 @@ def gaussians(graph: SceneGraph) -> dict[str, bytes]:
         "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
         "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
     ]  # fmt: skip
-    labels = [f"comment object {item.id} {item.label}" for item in graph]
+    labels = [f"comment object {item.id} {visible(item.label)}" for item in graph]
     header = ["ply", "format binary_little_endian 1.0", *labels, f"element vertex {len(graph)}"]
     header += [*(f"property float {name}" for name in names), "end_header\n"]
     rows = np.array([_splat(item) for item in graph], "<f4").reshape(-1, len(names))
@@ -166,9 +169,10 @@ FORMATS: dict[str, Callable[[SceneGraph], dict[str, bytes]]] = {
 def _object_rows(graph: SceneGraph) -> list[dict[str, object]]:
     rows = []
     for item in graph:
-        values: list[object] = [item.id, item.label, round(item.probability, 4), item.existence]
+        label, frame_id = visible(item.label), visible(item.frame_id)
+        values: list[object] = [item.id, label, round(item.probability, 4), item.existence]
         values += [*item.position_m, *item.size_m, *item.orientation_xyzw, item.observations]
-        values += [item.first_seen_ns / 1e9, item.last_seen_ns / 1e9, item.frame_id]
+        values += [item.first_seen_ns / 1e9, item.last_seen_ns / 1e9, frame_id]
         rows.append(dict(zip(_OBJECT_COLUMNS, values)))
     return rows
 
@@ -177,7 +181,7 @@ def _relation_rows(graph: SceneGraph) -> list[dict[str, object]]:
     return [
         {
             "subject": item.subject.id,
-            "predicate": item.predicate,
+            "predicate": visible(item.predicate),
             "object": item.object.id,
             "probability": round(item.probability, 4),
             "provenance": item.provenance,
@@ -210,8 +214,11 @@ def _splat(item: SceneObject) -> list[float]:
 
 def _colour(label: str) -> Float64:
     """A colour (3,) from 0.2 to 1 that depends on the class alone."""
-    number = sum(ord(letter) * 31**place for place, letter in enumerate(label))
-    return 0.2 + 0.8 * np.array([number % 97, number // 97 % 89, number // 8633 % 83]) / 97.0
+    number = 0
+    for letter in reversed(label):
+        number = (number * 31 + ord(letter)) % (_RED * _GREEN * _BLUE)
+    parts = number % _RED, number // _RED % _GREEN, number // (_RED * _GREEN) % _BLUE
+    return 0.2 + 0.8 * np.array(parts) / _RED
 
 
 def _spark_node(item: SceneObject, label: int) -> dict[str, object]:

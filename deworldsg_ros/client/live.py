@@ -23,6 +23,7 @@ from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.following import MOST_WAITING, GraphFollower
 from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.words import visible
 
 SPIN_PERIOD_S = 0.1
 # Minimum time between two log lines of a kind: a function that fails may do so at each update.
@@ -245,7 +246,8 @@ class SceneGraphClient(GraphCommands):
                         self._changed.notify_all()
             except RefusedInput as refusal:
                 self.refused += 1
-                self._node.get_logger().warning(str(refusal), throttle_duration_sec=LOG_PERIOD_S)
+                logger = self._node.get_logger()
+                logger.warning(visible(str(refusal)), throttle_duration_sec=LOG_PERIOD_S)
                 return
             if changed and self._callbacks:
                 self._tell_changes()

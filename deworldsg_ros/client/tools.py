@@ -14,6 +14,8 @@ from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.graph_file import GRAPH_FILE
+from deworldsg_ros.scene.limits import MAX_SECONDS
+from deworldsg_ros.words import whole_number
 
 # Graphs that are remembered for `what_changed`.
 MOST_GRAPHS = 256
@@ -113,6 +115,8 @@ class GraphTools:
         Args:
             seconds_ago: before the newest frame of the graph.
         """
+        if not abs(seconds_ago) <= MAX_SECONDS:
+            raise ClientError(f"seconds_ago {seconds_ago:g}: expected at most {MAX_SECONDS}")
         graph = self._graph()
         start_ns = graph.stamp_ns - round(seconds_ago * 1e9)
         earlier = [known for known in self._known if known.stamp_ns <= start_ns]
@@ -247,4 +251,5 @@ def _short(item: SceneObject) -> dict[str, Any]:
 
 def _which(text: str) -> int | str | None:
     text = text.strip().removeprefix("#")
-    return None if not text else int(text) if text.isdigit() else text
+    number = whole_number(text)
+    return (text or None) if number is None else number

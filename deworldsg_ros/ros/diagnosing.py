@@ -9,6 +9,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from deworldsg_ros.ros.health import INTERNAL_ERROR, UNMATCHED_PREFIX, Report
+from deworldsg_ros.words import visible, visible_lines
 
 # Minimum time between two log lines with the same reason.
 LOG_PERIOD_S = 10.0
@@ -33,12 +34,12 @@ class DropLog:
             if now_s - self._logged_s.get(reason, -LOG_PERIOD_S) < LOG_PERIOD_S:
                 return
             self._logged_s[reason] = now_s
-        if reason == INTERNAL_ERROR:
-            self._logger.error(f"{reason}: {message}")
+        if reason == INTERNAL_ERROR:  # with a traceback
+            self._logger.error(f"{reason}: {visible_lines(message)}")
         elif reason.startswith(UNMATCHED_PREFIX):
-            self._logger.debug(f"{reason}: {message}")
+            self._logger.debug(f"{reason}: {visible(message)}")
         else:
-            self._logger.warning(f"{reason}: {message}")
+            self._logger.warning(f"{reason}: {visible(message)}")
 
 
 def diagnostic_array(report: Report, name: str, full_name: str) -> DiagnosticArray:

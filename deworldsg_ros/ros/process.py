@@ -12,6 +12,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+from deworldsg_ros.words import visible_lines
 
 EXIT_USAGE = 2
 # A model never returns: EX_SOFTWARE of sysexits.h.
@@ -58,5 +59,5 @@ def run_process(body: Callable[[threading.Event], int], args: list[str] | None =
 
 def refuse(error: Exception, code: int = EXIT_USAGE) -> int:
     """Print an error on the standard error; return the exit code."""
-    print(f"error: {error}", file=sys.stderr)
+    print(f"error: {visible_lines(str(error))}", file=sys.stderr)
     return code

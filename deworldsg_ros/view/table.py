@@ -11,6 +11,7 @@ from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import scene_object
 from deworldsg_ros.scene import wire
 from deworldsg_ros.view.colours import class_colours
+from deworldsg_ros.words import visible
 
 MOST_ROWS = 60
 PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}
@@ -41,7 +42,7 @@ def object_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Table:
     for node in sorted(graph.nodes, key=lambda node: (-node.observations, node.id))[:most]:
         item = scene_object(node, graph.frame_id, up)
         table.add_row(
-            Text.assemble((node.label, Style(color=colours[node.label])), (f" #{node.id}", "dim")),
+            _name(node.label, node.id, Style(color=colours[node.label])),
             _percent(node.classes[0].probability) if node.classes else "",
             " ".join(f"{value:6.2f}" for value in item.position_m),
             " × ".join(f"{100 * value:.0f}" for value in item.size_m),
@@ -66,7 +67,7 @@ def relation_table(graph: wire.SceneGraphMessage, most: int = MOST_ROWS) -> Tabl
     for edge in edges[:most]:
         table.add_row(
             names.get(edge.subject, _name("?", edge.subject)),
-            Text(edge.predicate, "bold"),
+            Text(visible(edge.predicate), "bold"),
             names.get(edge.object, _name("?", edge.object)),
             _percent(edge.probability),
             Text(edge.provenance, PROVENANCE_STYLES[edge.provenance]),
@@ -80,8 +81,8 @@ def _title(noun: str, number: int, most: int) -> str:
     return f"{number} {plural}" + (f" (the first {most})" if number > most else "")
 
 
-def _name(label: str, node_id: int) -> Text:
-    return Text.assemble(label, (f" #{node_id}", "dim"))
+def _name(label: str, node_id: int, style: str | Style = "") -> Text:
+    return Text.assemble((visible(label), style), (f" #{node_id}", "dim"))
 
 
 def _percent(probability: float) -> str:

@@ -52,7 +52,9 @@ def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path: Path) -> None:
         (["delete", "7"], "object 7 is not in the graph"),
         (["undo"], "nothing to undo"),
         (["paint", "1", "red"], "'paint 1 red': expected set_label ID LABEL"),
-        (["merge", "1", "one"], "invalid literal for int"),
+        (["merge", "1", "one"], "one is no id"),
+        (["merge", "1", "²"], "² is no id"),
+        (["delete", "9" * 5000], "is no id"),
         (["split", "1", "0,0", "1,1,1"], "length >= 3"),
         (["delete", "-3"], "No such option"),
     ):

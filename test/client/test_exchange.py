@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import msgspec
 import numpy as np
 import pytest
 import typer.testing
-from support.view import make_graph, make_node
+from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.align import align
 from deworldsg_ros.client.combine import Known, combine
-from deworldsg_ros.client.export import FORMATS, SPARK_SYMBOL, export
+from deworldsg_ros.client.export import FORMATS, SPARK_SYMBOL, _colour, export
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -225,3 +227,60 @@ def test_the_commands(demo_out: Path, tmp_path: Path, room: SceneGraph) -> None:
     changes = json.loads(run("diff", demo_out, other, "--json").stdout)
     assert changes["moved"] or changes["gone"]
     assert "graph.csv" in run("export", "csv", demo_out, tmp_path / "graph.csv").stdout
+
+
+HOSTILE = "cup\nelement vertex 9\x1b[2J\x00\ufffe"
+
+
+@pytest.fixture
+def hostile() -> SceneGraph:
+    """A graph whose names contain control characters."""
+    nodes = [make_node(1, HOSTILE), make_node(2, "table", (0.4, 0, 0))]
+    return SceneGraph(make_graph(nodes, [make_edge(1, 2, HOSTILE)], HOSTILE))
+
+
+def test_names_are_text_in_every_format(hostile: SceneGraph, tmp_path: Path) -> None:
+    written = {kind: export(hostile, kind, tmp_path / f"graph.{kind}") for kind in FORMATS}
+    (ply,), (graphml,), (spark,) = (written[kind] for kind in ("ply", "graphml", "spark_dsg"))
+    header = ply.read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert [line for line in header if "vertex" in line and "comment" not in line] == [
+        "element vertex 2"
+    ]
+    for path in (graphml, *written["csv"]):
+        assert not re.search(r"[\x00-\x09\x0b-\x1f]", path.read_text(encoding="utf-8"))
+    values = [data.text for data in ElementTree.parse(graphml).iter() if data.text]
+    assert any(value.startswith("cup\\u000aelement") for value in values)
+    objects, relations = (list(csv.reader(path.open())) for path in written["csv"])
+    assert (len(objects), len(relations)) == (3, 2)
+    assert json.loads(spark.read_text())["nodes"][0]["attributes"]["name"] == HOSTILE
+
+
+def test_the_terminal_shows_names_as_text(
+    hostile: SceneGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SceneGraph, "load", lambda path: hostile if path.name == "a" else EMPTY)
+    commands = (
+        ["explain", "a", "1"], ["explain", "a", "1", "2"], ["explain", "a", "1", "--json"],
+        ["query", "a", "table"], ["query", "a", "sofa"], ["goal", "a", "1"],
+        ["goal", "a", "2"], ["diff", "a", "b"], ["diff", "b", "a"], ["diff", "b", "a", "--json"],
+        ["explain", "a", "\x1b[2J"],
+    )  # fmt: skip
+    for command in commands:
+        shown = typer.testing.CliRunner().invoke(app, command)
+        text = shown.stdout + shown.stderr
+        assert "1b[2J" in text.replace("\n", ""), command
+        assert not re.search(r"[\x00-\x09\x0b-\x1f]", text), command
+        assert "\nelement" not in text, command
+
+
+def old_colour(label: str) -> list[float]:
+    number = sum(ord(letter) * 31**place for place, letter in enumerate(label))
+    rest = np.array([number % 97, number // 97 % 89, number // 8633 % 83])
+    return (0.2 + 0.8 * rest / 97.0).tolist()
+
+
+@pytest.mark.timeout(60)  # with powers of 31, the last one takes hours
+def test_the_colours_of_classes_stay_and_long_names_take_no_time() -> None:
+    for label in ("", "cup", "dining table", "椅子", "x" * 500):
+        assert _colour(label).tolist() == old_colour(label)
+    assert _colour("x" * 400_000).min() >= 0.2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import sys
 from pathlib import Path
@@ -90,6 +91,13 @@ def test_empty_and_unknown_arguments(room: SceneGraph) -> None:
     with pytest.raises(ClientError, match="expected an id or a class"):
         tools.goal_near(" ")
     assert tools.list_relations(limit=0)["relations"] == []
+    for text in ("²", "#٣", "9" * 5000):
+        with pytest.raises(ClientError, match="no object of class"):
+            tools.goal_near(text)
+        assert tools.list_relations(text)["relations"] == []
+    for seconds in (math.inf, math.nan, 1e300, -1e300):
+        with pytest.raises(ClientError, match="seconds_ago .*: expected at most 2147483647"):
+            tools.what_changed(seconds)
 
 
 def test_a_file_is_read_again_when_it_changes(demo_out: Path, room: SceneGraph) -> None:

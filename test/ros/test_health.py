@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import pytest
 
 from deworldsg_ros.ros.diagnosed import observations_of
+from deworldsg_ros.ros.diagnosing import DropLog
 from deworldsg_ros.ros.health import (
     DROPPED,
     ERROR,
@@ -119,3 +122,14 @@ def test_what_is_no_count_is_left_out(value: str) -> None:
     assert received_in(values, "rgb") == 0
     seen = observations_of({"a": values, "b": {"nodes": "4", "frames turned by 270 degrees": "5"}})
     assert (seen.nodes, seen.drops, +seen.turns) == (4, {"y": 2}, {3: 5})
+
+
+def test_the_log_of_drops_shows_text_of_others_as_text() -> None:
+    logger = Mock()
+    log = DropLog(logger)
+    log.write("invalid_request", "query: 'a\x1b[2J\n[INFO] all is well'")
+    log.write(INTERNAL_ERROR, "bad \x1b[2J\nTraceback")
+    logger.warning.assert_called_once_with(
+        "invalid_request: query: 'a\\u001b[2J\\u000a[INFO] all is well'"
+    )
+    logger.error.assert_called_once_with(f"{INTERNAL_ERROR}: bad \\u001b[2J\nTraceback")
