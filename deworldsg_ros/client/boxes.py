@@ -85,7 +85,7 @@ def gap_m(a: Footprint, b: Footprint) -> float:
 
 def polygon_gap_m(a: Float64, b: Float64) -> float:
     """Distance of two convex polygons, (n, 2) and (m, 2); 0 if they overlap."""
-    if not _separated(a, b) and not _separated(b, a):
+    if not _separated(a, b) and not _separated(b, a) and not _apart(a, b):
         return 0.0
     return min(_corner_gap_m(a, b), _corner_gap_m(b, a))
 
@@ -94,7 +94,9 @@ def point_gaps_m(point: Float64, polygons: Float64) -> Float64:
     """Distances (k,) of a point (2,) from convex polygons (k, n, 2), corners anticlockwise."""
     sides = np.roll(polygons, -1, axis=1) - polygons
     offsets = point - polygons
-    inside = (sides[..., 0] * offsets[..., 1] - sides[..., 1] * offsets[..., 0] >= 0).all(axis=1)
+    # For each side, twice the area of the triangle with the point. Nothing is inside of a line.
+    areas = sides[..., 0] * offsets[..., 1] - sides[..., 1] * offsets[..., 0]
+    inside = (areas >= 0).all(axis=1) & (areas > 0).any(axis=1)
     lengths = np.maximum((sides**2).sum(axis=2), 1e-18)
     along = np.clip((offsets * sides).sum(axis=2) / lengths, 0.0, 1.0)
     rest = offsets - along[..., None] * sides
@@ -108,6 +110,21 @@ def _separated(a: Float64, b: Float64) -> bool:
     normals = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
     own, other = a @ normals.T, b @ normals.T
     return bool(((own.max(0) < other.min(0)) | (other.max(0) < own.min(0))).any())
+
+
+def _apart(a: Float64, b: Float64) -> bool:
+    """Whether boxes without width that no side separates are apart, one behind the other."""
+    if not (_is_flat(a) and _is_flat(b)):
+        return False
+    along = b.mean(axis=0) - a.mean(axis=0)
+    return bool((a @ along).max() < (b @ along).min())
+
+
+def _is_flat(polygon: Float64) -> bool:
+    """Whether all corners are on one line."""
+    spokes = polygon[1:] - polygon[0]
+    areas = spokes[:-1, 0] * spokes[1:, 1] - spokes[:-1, 1] * spokes[1:, 0]
+    return not areas.any()
 
 
 def _corner_gap_m(a: Float64, b: Float64) -> float:

@@ -144,7 +144,7 @@ def goal_near(
         if seen_free is not None and seen_free < 0.0:
             continue
         blocker = _blocker(target, obstacles, spot)
-        known = bool(point_gaps_m(spot, area[None])[0] == 0.0)
+        known = area is not None and bool(point_gaps_m(spot, area[None])[0] == 0.0)
         goal = _goal(target, ray, spot, floor, stamp_ns, clearance, blocker, known)
         goal = replace(goal, seen_free=seen_free)
         score = _score(goal, towards)
@@ -281,11 +281,14 @@ def _spot(box: Footprint, ray: Float64, distance: float) -> Float64:
     return np.asarray(box.center + high * ray)
 
 
-def _hull(points: Float64) -> Float64:
-    """The corners (k, 2) of the convex hull of points (n, 2), n >= 3 not on one line."""
-    from scipy.spatial import ConvexHull  # slow to import, and only for goals
+def _hull(points: Float64) -> Float64 | None:
+    """The corners (k, 2) of the convex hull of points (n, 2); None if they are on one line."""
+    from scipy.spatial import ConvexHull, QhullError  # slow to import, and only for goals
 
-    return np.asarray(points[ConvexHull(points).vertices])
+    try:
+        return np.asarray(points[ConvexHull(points).vertices])
+    except QhullError:
+        return None
 
 
 def _blocker(

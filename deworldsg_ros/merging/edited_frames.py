@@ -23,6 +23,8 @@ from deworldsg_ros.scene.limits import MAX_INSTANCE
 JOINED_FRACTION = 0.5
 # An object is cut if the smaller part has this fraction of its points.
 CUT_FRACTION = 0.2
+# A single point has no covariance.
+LEAST_POINTS = 2
 # Added to the covariance of a part of an object, m²: its points may lie on a plane.
 RIDGE_M2 = 1e-6
 
@@ -139,7 +141,8 @@ def _parts(graph: SceneGraph, points: Float32, on_nodes: dict[int, float]) -> li
 
     nearest = side_of[cKDTree(np.concatenate(surfaces)).query(points)[1]]
     parts = [np.flatnonzero(nearest == side) for side in range(len(sides))]
-    parts = [part for part in parts if len(part) >= CUT_FRACTION * len(points)]
+    least = max(CUT_FRACTION * len(points), LEAST_POINTS)
+    parts = [part for part in parts if len(part) >= least]
     return sorted(parts, key=len, reverse=True) if len(parts) > 1 else whole
 
 

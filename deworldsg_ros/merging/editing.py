@@ -264,7 +264,7 @@ def _parts(points: Float32, near_m: list[Any] | None) -> list[Float32]:
 
     The larger part is the first one. Parts of fewer than MIN_PART_POINTS are left out.
     """
-    if not len(points):
+    if len(points) < 2 * MIN_PART_POINTS:
         return []
     places = np.array(near_m, np.float64) if near_m else _ends(points)
     from scipy.spatial import cKDTree  # slow to import, and only for edits

@@ -97,6 +97,39 @@ def test_a_goal_with_y_down() -> None:
     assert np.hypot(goal.position_m[0], goal.position_m[2] - 0.5) > 1.0
 
 
+@pytest.mark.parametrize("size", [(0, 0, 0), (0.4, 0, 0.3), (0, 0, 0.3), (0.4, 0.1, 0)])
+@pytest.mark.parametrize("others", [0, 1, 3])
+def test_a_goal_near_objects_without_width(size, others: int) -> None:
+    behind = [boxed(2 + i, "cup", (1.5 + i, 0, 0.5), size) for i in range(others)]
+    goal = graph_of(boxed(1, "post", (0, 0, 0.5), size), *behind).goal_near(1, 0.8)
+    assert goal.distance_m == pytest.approx(0.8, abs=1e-3)
+    assert goal.clearance_m == math.inf if not others else goal.clearance_m > 0.0
+    assert goal.blocked_by is None
+    assert not goal.in_known_area
+
+
+def test_gaps_of_boxes_without_width() -> None:
+    def box(x: float, width: float, heading_rad: float = 0.0):
+        turn = (0.0, 0.0, math.sin(heading_rad / 2), math.cos(heading_rad / 2))
+        return footprint((x, 0, 0), (width, 0, 1), turn, (0, 0, 1))
+
+    for first, second, gap in (
+        (box(0, 0), box(2, 0), 2.0),
+        (box(0, 1), box(2, 0), 1.5),
+        (box(0, 1), box(2, 1), 1.0),
+        (box(0, 1), box(0.8, 1), 0.0),
+        (box(0, 1), box(0, 0), 0.0),
+        (box(0, 1), box(0.2, 1, math.pi / 2), 0.0),
+        (box(0, 1), box(2, 1, math.pi / 2), 1.5),
+    ):
+        assert gap_m(first, second) == pytest.approx(gap)
+        assert gap_m(second, first) == pytest.approx(gap)
+    beyond, on = np.array([3.0, 0.0]), np.array([0.2, 0.0])
+    assert point_gaps_m(beyond, box(0, 1).corners[None])[0] == pytest.approx(2.5)
+    assert point_gaps_m(beyond, box(0, 0).corners[None])[0] == pytest.approx(3.0)
+    assert point_gaps_m(on, box(0, 1).corners[None])[0] == 0.0
+
+
 def test_free_directions(corner: SceneGraph) -> None:
     x, y, z = corner.free_direction("table", room=0.5)
     assert z == 0.0

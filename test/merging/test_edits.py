@@ -189,6 +189,26 @@ def test_a_split_takes_the_places_that_are_named():
         room.builder.edit(SplitNode(reply.nodes[0], [[5, 5, 5], [9, 9, 9]]))
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 15, 40])
+def test_an_object_of_few_places_is_not_split(count):
+    room = Room((BESIDE, CUP))
+    row = room.builder.graph.nodes.row(1)
+    room.builder.graph.nodes.set_surface(row, np.tile(BESIDE[:1], (count, 1)))
+    for places in (None, [[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [0, 0, 0]]):
+        with pytest.raises(RefusedInput, match="has no two parts of at least 8 there"):
+            room.builder.edit(SplitNode(1, places))
+    assert room.see() == [1]
+
+
+def test_a_single_point_is_no_part_of_a_cut_object():
+    room = Room((LONG, TABLE))
+    first, second = room.builder.edit(SplitNode(1)).nodes
+    for count in (2, 3, 4):
+        few = np.concatenate([LEFT[:1], RIGHT[: count - 1]])
+        assert room.see(1, (few, TABLE))[0] in (first, second)
+    assert all(np.isfinite(node.mean_m).all() for node in room.builder.full().nodes)
+
+
 def test_edits_of_edited_objects_are_undone_newest_first():
     room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
     steps = []
