@@ -18,6 +18,8 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import check_pose, pose_from_quaternion, quaternion_from_rotation
 from deworldsg_ros.scene.extent import rounded, surface_bytes, surface_points
 from deworldsg_ros.scene.gaussian import fuse, transform
+from deworldsg_ros.scene.limits import MAX_INT
+from deworldsg_ros.words import counted
 
 # A transform with less confidence is not used unless it is given. Of graphs of one room it was
 # 0.28 and more, of graphs of two rooms 0.006 and less.
@@ -97,7 +99,8 @@ def combine(
         known: of the last combination with an earlier B; it is brought up to date.
 
     Raises:
-        ClientError: if no transform is found with enough confidence, or the given one tilts.
+        ClientError: if no transform is found with enough confidence, the given one tilts, or the
+            ids of A leave none for the objects of B.
         RefusedInput: if it is no rigid transform.
     """
     confidence = 1.0
@@ -118,6 +121,11 @@ def combine(
     merged = {pair.after.id: pair.before.id for pair in pairs}
     first_free = max([*(item.id for item in a), 0]) + 1
     others = [node_id for node_id in moved if node_id not in merged]
+    if others and first_free + len(others) - 1 > MAX_INT:
+        raise ClientError(
+            f"the largest id of the first graph is {first_free - 1}: expected at most "
+            f"{MAX_INT - len(others)}, because {counted(len(others), 'object')} need new ids"
+        )
     ids = {**merged, **{node_id: first_free + i for i, node_id in enumerate(others)}}
     nodes = {item.id: item.state for item in a} | known.fused(pairs)
     for node_id in others:
@@ -190,7 +198,7 @@ def _fused(a: SceneObject, b: SceneObject) -> wire.NodeState:
         remainder=round(max(0.0, 1.0 - sum(value for _, value in best)), 4),
         **_geometry(mean, covariance, points),
         box=_box(seen_more),
-        observations=count + more,
+        observations=min(count + more, MAX_INT),
         first_seen=wire.stamp_from_ns(first),
         last_seen=wire.stamp_from_ns(last),
         existence=max(known) if known else msgspec.UNSET,

@@ -284,3 +284,16 @@ def test_the_colours_of_classes_stay_and_long_names_take_no_time() -> None:
     for label in ("", "cup", "dining table", "椅子", "x" * 500):
         assert _colour(label).tolist() == old_colour(label)
     assert _colour("x" * 400_000).min() >= 0.2
+
+
+def test_sums_of_a_merge_are_those_that_a_message_may_have() -> None:
+    most = 2**63 - 1
+    many = make_graph([make_node(1, "cup", observations=most)])
+    whole = combine(SceneGraph(many), SceneGraph(many), np.eye(4)).message
+    assert wire.decode(wire.encode(whole), wire.SceneGraphMessage).nodes[0].observations == most
+    last = SceneGraph(make_graph([make_node(most, "cup")]))
+    other = SceneGraph(make_graph([make_node(1, "dog", (9, 0, 0)), make_node(2, "cat", (0, 9, 0))]))
+    with pytest.raises(ClientError, match="because 2 objects need new ids"):
+        combine(last, other, np.eye(4))
+    assert combine(other, last, np.eye(4)).ids == {most: 3}
+    assert combine(last, last, np.eye(4)).ids == {most: most}
