@@ -21,7 +21,7 @@ from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.parsing import parse_json, paused_collector
 from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
 from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.array_checks import checked
+from deworldsg_ros.scene.array_checks import checked, holds
 from deworldsg_ros.scene.array_file import Arrays
 from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -159,8 +159,7 @@ def _read(config: Config, path: Path) -> GraphBuilder:
         builder.up.restore(arrays["up"])
     builder.space.restore(arrays)
     if "seen_frames" in arrays:  # nor this
-        content = checked(arrays, "seen_frames", np.uint8, None).tobytes()
-        builder.frames = FrameMemory(parse_json(content, list[SeenFrames]))
+        builder.frames = FrameMemory(_seen_frames(arrays, graph.vocabulary))
     return builder
 
 
@@ -205,6 +204,15 @@ def _prior(arrays: Arrays, vocabulary: Vocabulary) -> ClassPairPrior:
             f"{expected[0]} and {expected[1]}"
         )
     return ClassPairPrior.from_state(state)
+
+
+def _seen_frames(arrays: Arrays, vocabulary: Vocabulary) -> list[SeenFrames]:
+    content = checked(arrays, "seen_frames", np.uint8, None).tobytes()
+    seen = parse_json(content, list[SeenFrames])
+    names = {frame.name for item in seen for frame in item.clearest}
+    unknown = names.difference(vocabulary.classes, vocabulary.predicates)
+    holds("seen_frames (name)", not unknown, "classes and predicates of the graph")
+    return seen
 
 
 @contextmanager

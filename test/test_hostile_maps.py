@@ -72,10 +72,16 @@ def field(name: str, place: Any, value: Any) -> Callable[[Arrays], Arrays]:
     return changed("merging.records", change)
 
 
+def as_json(content: Any) -> Any:
+    return np.frombuffer(msgspec.json.encode(content), np.uint8)
+
+
+LABEL = {"id": 1, "kind": "set_label", "stamp_ns": 1, "nodes": [1], "label": "pot"}
+
+
 def header(**values: Any) -> Callable[[Arrays], Arrays]:
     def change(array: Any) -> Any:
-        content = {**msgspec.json.decode(array.tobytes()), **values}
-        return np.frombuffer(msgspec.json.encode(content), np.uint8)
+        return as_json({**msgspec.json.decode(array.tobytes()), **values})
 
     return changed("header", change)
 
@@ -151,7 +157,29 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "a header of a list": changed("header", lambda a: np.frombuffer(b"[]", np.uint8)),
     "10^9 surface points a node": header(surface_point_capacity=10**9),
     "10^12 remembered frames": header(remembered_frames=10**12),
-    "classes twice": header(classes=["a", "a", "b", "c"]),
+    # Clients would refuse the messages of its graph.
+    "a class with a control character": header(classes=["a", "b\x1b[2J", "c", "d"]),
+    "a class of 5000 characters": header(classes=["a", "b" * 5000, "c", "d"]),
+    "a predicate with a line feed": header(predicates=["on", "near", "under\n"]),
+    "a frame_id with a control character": header(frame_id="map\x1b[2J"),
+    "a frame_id of 1000 characters": header(frame_id="m" * 1000),
+    "10^4 classes": header(classes=list(map(str, range(10_000)))),
+    "first seen before 1970": changed("first_seen_ns", put(0, -1)),
+    "an edge seen before 1970": changed("edge_counts", put((0, 1), -1)),
+    "frames before 1970": changed("frame_stamps_ns", put(0, -1)),
+    "more surface points than a message": header(surface_point_capacity=4097),
+    "ids beyond the keys of pairs": header(next_id=2**31 + 1),
+    "a label that ends with a line feed": lambda arrays: {
+        **arrays,
+        "edits": as_json([{**LABEL, "label": "pot\n"}]),
+    },
+    "an edit before 1970": lambda arrays: {
+        **arrays,
+        "edits": as_json([{**LABEL, "stamp_ns": -1}]),
+    },
+    "frames of an unknown class": changed(
+        "seen_frames", lambda a: np.frombuffer(a.tobytes().replace(b"table", b"t\\u001b"), np.uint8)
+    ),
     "a version of text": header(version="1"),
     "no means": lambda arrays: {k: v for k, v in arrays.items() if k != "means"},
     "no fates in it": lambda arrays: {k: v for k, v in arrays.items() if k != "merging.fates"},
@@ -164,6 +192,17 @@ def test_a_hostile_map_is_refused(good: Path, tmp_path: Path, attack: str) -> No
     graph_io.write(path, ATTACKS[attack](graph_io.read(good)))
     with pytest.raises(ConfigurationError, match=r"map .*bad\.map cannot be used: \w+"):
         read_map(CONFIG, path)
+
+
+def test_an_edit_and_a_class_twice_are_no_attacks(good: Path, tmp_path: Path) -> None:
+    arrays = {**graph_io.read(good), "edits": as_json([LABEL])}
+    graph_io.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
+    with pytest.raises(ConfigurationError, match="classes and predicates of the graph"):
+        read_map(CONFIG, tmp_path / "room.map")
+    del arrays["seen_frames"]
+    graph_io.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
+    nodes = read_map(CONFIG, tmp_path / "room.map").full().nodes
+    assert [node.label for node in nodes] == ["pot", "a", "b"]
 
 
 def test_an_error_names_the_array_the_value_and_the_expectation(good: Path, tmp_path: Path) -> None:

@@ -286,7 +286,7 @@ def _is_counter(name: str) -> bool:
 
 def _packed(name: str) -> str:
     """The name in torch's attention, which stores the rows of q, k and v in one parameter."""
-    return re.sub(r"\.self_attn\.[qkv]_proj\.(weight|bias)$", r".self_attn.in_proj_\1", name)
+    return re.sub(r"\.self_attn\.[qkv]_proj\.(weight|bias)\Z", r".self_attn.in_proj_\1", name)
 
 
 def _unpacked(name: str, value: torch.Tensor) -> dict[str, torch.Tensor]:

@@ -49,6 +49,9 @@ MOMENT_NS = 1_000_000_000
 # were true in 90 % of the cases with every tenth frame of the recording, and in 15 to 30 % in video
 # with false boxes.
 MAX_WEIGHT = 2.0
+# Stamps of earlier runs move no further into the past, however often the clock is set back: only
+# MOMENT_NS of it counts.
+OLDEST_NS = -(2**31) * 10**9
 # The camera stands still if it moves less than this. A look that only time has ended shows the same
 # picture: it counts as this fraction of a look.
 STILL_M = 0.001
@@ -155,9 +158,9 @@ def observe(
                 record.camera_world[axis] = camera_world[axis]
         # The clock may be behind that of an earlier run: stamps of that run move into the past.
         behind_ns = max(0, max(record.last_ns, record.look_ns) - stamp_ns)
-        record.first_ns -= behind_ns
-        record.last_ns -= behind_ns
-        record.look_ns -= behind_ns
+        record.first_ns = max(record.first_ns - behind_ns, OLDEST_NS)
+        record.last_ns = max(record.last_ns - behind_ns, OLDEST_NS)
+        record.look_ns = max(record.look_ns - behind_ns, OLDEST_NS)
         distance_m = step_m = 0.0
         for axis in range(3):
             distance_m += (means_world[index, axis] - camera_world[axis]) ** 2

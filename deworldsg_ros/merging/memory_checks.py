@@ -10,7 +10,15 @@ from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.names import LABELS
 from deworldsg_ros.merging.views import VISIBILITIES
 from deworldsg_ros.merging.voxel_map import CELLS_PER_OWNER
-from deworldsg_ros.scene.array_checks import checked, distinct, holds, lengths, refuse, within
+from deworldsg_ros.scene.array_checks import (
+    MAX_SUM_ERROR,
+    checked,
+    distinct,
+    holds,
+    lengths,
+    refuse,
+    within,
+)
 from deworldsg_ros.scene.arrays import Int64
 
 # Sums that grow with every frame, far from overflow.
@@ -66,7 +74,7 @@ def _records(memory: Memory, record: np.dtype[np.void]) -> NDArray[np.void]:
 
 
 def _check_existence(records: NDArray[np.void]) -> None:
-    within("records (best_score)", records["best_score"], 0.0, 1.0)
+    within("records (best_score)", records["best_score"], 0.0, 1.0 + 1e-9)
     for name in ("looks", "missed", "missed_since", "reach_m", "detected", "shown", "pending"):
         within(f"records ({name})", records[name], 0.0, MAX_SUM)
     within("records (look_weight)", records["look_weight"], 0.0, 1e3)
@@ -88,10 +96,10 @@ def _check_names(records: NDArray[np.void], class_count: int) -> None:
     holds("records (labels)", (known[:, 1:] <= known[:, :-1]).all(), "labels first, then -1")
     ordered = np.sort(np.where(known, labels, -1 - np.arange(LABELS)), axis=1)
     holds("records (labels)", (np.diff(ordered, axis=1) > 0).all(), "each label once")
-    within("records (joint)", joint, 0.0, 1.0 + 1e-6)
+    within("records (joint)", joint, 0.0, 1.0 + MAX_SUM_ERROR)
     both = known[:, :, None] & known[:, None, :]
     sums = (joint * both).sum(axis=(1, 2))
-    within("records (sum of joint)", sums, 1e-12, 1.0 + 1e-6)
+    within("records (sum of joint)", sums, 1e-12, 1.0 + MAX_SUM_ERROR)
 
 
 def _check_cells(memory: Memory, count: int) -> None:

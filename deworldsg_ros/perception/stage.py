@@ -24,8 +24,9 @@ from deworldsg_ros.perception.protocols import (
 from deworldsg_ros.perception.upright import Uprighter, UprightFrame, turned_back
 from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
+from deworldsg_ros.scene.names import check_names
 from deworldsg_ros.scene.up import UpEstimator
 
 logger = logging.getLogger(__name__)
@@ -100,7 +101,7 @@ class Perception:
         self._uprighter = Uprighter(world_up) if config.refine_detections else None
         self._failures: dict[str, str] = {}
         self._logged: set[str] = set()
-        self.vocabulary = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
+        self.vocabulary = _vocabulary(detector, relation_head)
         self.configure(config)
 
     def configure(self, config: PerceptionConfig) -> None:
@@ -276,3 +277,14 @@ def fills_image(boxes_xyxy: Float64, width: int, height: int) -> Bool:
     """
     margins = boxes_xyxy * [1.0, 1.0, -1.0, -1.0] + [0.0, 0.0, width - 1.0, height - 1.0]
     return np.asarray((margins <= BORDER_FRACTION * np.array([width, height] * 2)).all(axis=1))
+
+
+def _vocabulary(detector: Detector, relation_head: RelationHead) -> Vocabulary:
+    """The names of the models, which come from files: messages and maps have to be readable."""
+    names = Vocabulary(tuple(detector.classes), tuple(relation_head.predicates))
+    for kind, of_kind in (("classes", names.classes), ("predicates", names.predicates)):
+        try:
+            check_names(of_kind)
+        except ValueError as error:
+            raise ConfigurationError(f"{kind} of the models: {error}") from error
+    return names

@@ -29,7 +29,7 @@ from deworldsg_ros.scene.stamps import stamp_ns_from_text
 MAX_FILE_BYTES = 1 << 30
 FORMATS = ("tum", "kitti", "3rscan", "slam")
 SUFFIXES = {"3rscan": ".pose.txt", "slam": ".slam.pose.txt"}
-FRAME_NAME = re.compile(r"frame-(\d+)(\.slam)?\.pose\.txt$")
+FRAME_NAME = re.compile(r"frame-(\d+)(\.slam)?\.pose\.txt\Z")
 COLUMNS = {8: "tum", 12: "kitti"}
 
 

@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.scene.checks import SUM_TOLERANCE
+
+# Means and products of the distributions of frames have their errors, and those of rounding.
+MAX_SUM_ERROR = 1.01 * SUM_TOLERANCE
 
 
 def checked(
@@ -69,13 +73,10 @@ def distinct(name: str, rows: NDArray[Any]) -> None:
 
 
 def distributions(name: str, rows: NDArray[Any]) -> None:
-    """ValueError unless each row has numbers from 0 to 1 that sum to one.
-
-    Sums of float64 over at most 10^4 classes are exact to 1e-6.
-    """
-    within(name, rows, 0.0, 1.0 + 1e-9)
+    """ValueError unless each row has numbers from 0 to 1 that sum to one, as those of frames."""
+    within(name, rows, 0.0, 1.0 + MAX_SUM_ERROR)
     sums = rows.sum(axis=1)
-    if rows.size and np.abs(sums - 1.0).max() > 1e-6:
+    if rows.size and np.abs(sums - 1.0).max() > MAX_SUM_ERROR:
         refuse(name, f"a row with the sum {sums[np.abs(sums - 1.0).argmax()]:g}", "1")
 
 

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 
-# Distributions of messages may be written with six decimals. Files keep float64: `array_checks` is
-# stricter.
+# Distributions of messages may be written with six decimals. Maps keep them as they came.
 SUM_TOLERANCE = 1.1e-5
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from deworldsg_ros.scene.arrays import Float64, Int64
 
 Pair = tuple[int, int]
+# A `key` has two ids.
+MAX_ID = 2**31 - 1
 Ids = TypeVar("Ids", int, Int64)
 
 

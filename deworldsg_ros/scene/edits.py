@@ -24,8 +24,8 @@ MAX_UNDO = 100
 # Edits that hold at the same time.
 MAX_EDITS = 10_000
 
-# Control characters forge lines of logs and terminals.
-LABEL_PATTERN = r"^[^\x00-\x1f\x7f-\x9f]*$"
+# Control characters forge lines of logs and terminals. A "$" would let a last line feed pass.
+LABEL_PATTERN = r"\A[^\x00-\x1f\x7f-\x9f]*\Z"
 Label = Annotated[
     str, msgspec.Meta(min_length=1, max_length=MAX_NAME_CHARACTERS, pattern=LABEL_PATTERN)
 ]

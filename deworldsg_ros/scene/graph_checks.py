@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.array_checks import (
     acyclic,
     checked,
@@ -20,23 +21,22 @@ from deworldsg_ros.scene.array_checks import (
     within,
 )
 from deworldsg_ros.scene.arrays import Int64
+from deworldsg_ros.scene.edges import MAX_ID
 from deworldsg_ros.scene.edits import MAX_EDITS, Edit
+from deworldsg_ros.scene.names import check_names
 
-# Map projections (UTM) have coordinates up to 10^7 m.
-MAX_POSITION_M = 1e8
+# What clients read in a message may be in a map: the limits of both are the same.
+MAX_POSITION_M = limits.MAX_GRAPH_COORDINATE_M
 # Numbers that only grow: 100 frames a second for 10^6 years, far from overflow.
 MAX_COUNT = 2**52
-# Stamps have 32-bit seconds.
-MAX_STAMP_NS = 2**31 * 10**9
-# Of summed logits; a frame adds at most some hundred. Sums of such sums stay finite.
-MAX_LOGIT = 1e15
-# A table of priors has a row for each pair of classes: 0.8 GB. Large detectors know 1200 classes.
-MAX_NAMES = 10_000
+MAX_STAMP_NS = limits.MAX_SECONDS * 10**9 + 10**9 - 1
+# Of summed logits: each relation of each frame may add the largest one. Sums of such sums stay
+# finite.
+MAX_LOGIT = limits.MAX_LOGIT * limits.MAX_RELATIONS * MAX_COUNT
 # The default is 512.
-MAX_SURFACE_POINTS = 1 << 14
+MAX_SURFACE_POINTS = limits.MAX_POINTS
 MAX_REMEMBERED_FRAMES = 1 << 20
 
-Names = Annotated[list[str], msgspec.Meta(min_length=0, max_length=MAX_NAMES)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=MAX_COUNT)]
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -45,22 +45,22 @@ class Header(msgspec.Struct):
     """The settings of a saved graph; see `GraphState`."""
 
     version: Annotated[int, msgspec.Meta(ge=1)]
-    classes: Names
-    predicates: Names
+    classes: list[str]
+    predicates: list[str]
     frame_id: str
     surface_point_capacity: Annotated[int, msgspec.Meta(ge=0, le=MAX_SURFACE_POINTS)]
     remembered_frames: Annotated[int, msgspec.Meta(ge=0, le=MAX_REMEMBERED_FRAMES)]
     revision: Count
-    next_id: Annotated[int, msgspec.Meta(ge=1, le=MAX_COUNT)]
+    next_id: Annotated[int, msgspec.Meta(ge=1, le=MAX_ID + 1)]
     # Files of earlier releases do not have it.
     even_gaussians: bool = False
     format: Literal["deworldsg scene graph"] = "deworldsg scene graph"
 
 
 def check_header(header: Header) -> None:
-    """Raise ValueError for a name that exists twice."""
-    for kind, names in (("class", header.classes), ("predicate", header.predicates)):
-        holds(f"names of {kind}", len(set(names)) == len(names), "each name once")
+    """Raise ValueError for a name that no message may contain."""
+    for names in (header.classes, header.predicates, [header.frame_id]):
+        check_names(names)
 
 
 def check_arrays(arrays: Arrays, header: Header) -> None:
@@ -87,7 +87,7 @@ def check_edits(edits: Sequence[Edit], arrays: Arrays) -> None:
     nodes = np.array([node_id for edit in edits for node_id in edit.nodes], np.int64)
     contained("edits (nodes)", nodes, arrays["ids"])
     for edit in edits:
-        within("edits (stamp_ns)", np.array(edit.stamp_ns), *_sym(MAX_STAMP_NS))
+        within("edits (stamp_ns)", np.array(edit.stamp_ns), 0, MAX_STAMP_NS)
         # New nodes have later ids: so no node is replaced by itself, in any number of steps.
         newer = max(edit.replaced, default=0) < min(edit.nodes)
         holds("edits (nodes)", newer, "later ids than the nodes that they replace")
@@ -104,7 +104,7 @@ def _check_nodes(arrays: Arrays, header: Header) -> None:
     distinct("ids", ids)
     within("means", checked(arrays, "means", np.float64, count, 3), *_sym(MAX_POSITION_M))
     covariances = checked(arrays, "covariances", np.float64, count, 3, 3)
-    within("covariances", covariances, *_sym(MAX_POSITION_M**2))
+    within("covariances", covariances, *_sym(limits.MAX_GRAPH_VARIANCE_M2))
     apart = np.abs(covariances - covariances.swapaxes(1, 2)).max(axis=(1, 2), initial=0.0)
     largest = np.abs(covariances).max(axis=(1, 2), initial=0.0)
     holds("covariances", (apart <= 1e-6 * largest).all(), "symmetric matrices")
@@ -185,7 +185,7 @@ def _check_pairs(name: str, pairs: Int64, ids: Int64) -> None:
 
 
 def _check_stamps(name: str, stamps_ns: Int64) -> None:
-    within(name, stamps_ns, -MAX_STAMP_NS, MAX_STAMP_NS - 1)
+    within(name, stamps_ns, 0, MAX_STAMP_NS)
 
 
 def _sym(limit: float) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.limits import MAX_NAME_CHARACTERS
+from deworldsg_ros.scene.limits import MAX_NAME_CHARACTERS, MAX_NAMES
 
 # Of the frames of objects on /tf: this, and the id.
 OBJECT_FRAME = "object_"
@@ -30,3 +30,16 @@ def check_labels(labels: Sequence[str]) -> None:
     if _UNWANTED.search("".join(labels)):
         bad = next(label for label in labels if _UNWANTED.search(label))
         raise ValueError(f"label {bad!r} contains a control character")
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise ValueError for names of classes or predicates that no message may contain."""
+    if len(names) > MAX_NAMES:
+        raise ValueError(f"{len(names)} names: expected at most {MAX_NAMES}")
+    longest = max(names, key=len, default="")
+    if len(longest) > MAX_NAME_CHARACTERS:
+        raise ValueError(
+            f"name {longest[:40]!r} of {len(longest)} characters: expected at most "
+            f"{MAX_NAME_CHARACTERS}"
+        )
+    check_labels(names)

@@ -192,3 +192,18 @@ def test_vocabularies_are_the_published_ones():
         ["above", "against", "attached to", "has", "in", "near", "on", "under", "with"]
     ) <= set(REPLICA_SSG_PREDICATES)
     assert sorted(SCANNET_PREDICATES) == list(SCANNET_PREDICATES)
+
+
+@pytest.mark.parametrize(
+    ("classes", "reason"),
+    [
+        (("table", "cup\x1b[2J", "person"), "contains a control character"),
+        (("table", "c" * 257, "person"), "of 257 characters: expected at most 256"),
+        (tuple(map(str, range(8193))), "8193 names: expected at most 8192"),
+    ],
+)
+def test_names_of_a_model_that_no_message_may_contain_are_refused(classes, reason) -> None:
+    detector = ListedDetector([], [], [])
+    detector.classes = classes
+    with pytest.raises(ConfigurationError, match=f"classes of the models: .*{reason}"):
+        Perception(detector, RgbdSegmenter(), GeometricRelationHead(("on",)), PerceptionConfig())

@@ -17,7 +17,9 @@ from deworldsg_ros.evaluation.protocol.pickles import load_pickle
 from deworldsg_ros.evaluation.protocol.predictions import read_predictions
 from deworldsg_ros.files import read_regular
 from deworldsg_ros.parsing import parse_any_json, parse_yaml
+from deworldsg_ros.poses.trajectory import FRAME_NAME
 from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES, bound_chunks, decompress
+from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.stamps import stamp_ns_from_text
 from deworldsg_ros.streams.encoded import decode, encoded_size
@@ -64,6 +66,15 @@ def png(width: int, height: int) -> bytes:
         packed += struct.pack(">I", len(data)) + kind + data
         packed += struct.pack(">I", zlib.crc32(kind + data))
     return packed
+
+
+def test_a_line_feed_ends_no_file_name() -> None:
+    for pattern, name in (
+        (COLOR_NAME, "frame-000001.color.jpg"),
+        (FRAME_NAME, "frame-000001.pose.txt"),
+    ):
+        assert pattern.match(name)
+        assert not pattern.match(f"{name}\n")
 
 
 def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:

@@ -198,7 +198,7 @@ def storage_files(folder: Path) -> list[Path]:
         # NAME_2 comes before NAME_10.
         key=lambda file: (len(file.name), file.name),
     )
-    bags = {(re.sub(r"_\d+$", "", file.stem), file.suffix) for file in found}
+    bags = {(re.sub(r"_\d+\Z", "", file.stem), file.suffix) for file in found}
     return found if len(bags) == 1 else []
 
 

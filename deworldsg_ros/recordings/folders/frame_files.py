@@ -30,7 +30,7 @@ from deworldsg_ros.scene.stamps import MAX_STAMP_S
 
 # Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9
-COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)$")
+COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png)\Z")
 
 
 class FrameFiles(Dataset):
