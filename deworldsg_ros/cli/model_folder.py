@@ -17,6 +17,7 @@ from deworldsg_ros.checkpoints.headers import ParameterHeader, read_headers
 from deworldsg_ros.checkpoints.hub import SUMS_FILE, Hub
 from deworldsg_ros.checkpoints.required import is_hub_id
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.words import visible
 
 
 def get_models(names: list[str], into: Path, console: Console) -> None:
@@ -79,7 +80,7 @@ def inspect_file(path: Path, console: Console) -> None:
         console.print(f"{file.name}: {len(headers)} parameters, {values / 1e6:.2f} million values")
         for header in headers:
             shape = " x ".join(map(str, header.shape)) or "scalar"
-            console.print(f"  {header.name}  {header.dtype}  {shape}")
+            console.print(f"  {visible(header.name)}  {header.dtype}  {shape}")
 
 
 def _models(name: str) -> list[Published]:

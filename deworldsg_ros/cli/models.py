@@ -17,6 +17,7 @@ from deworldsg_ros.cli.model_folder import get_models, inspect_file, list_models
 from deworldsg_ros.files import read_regular
 from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
+from deworldsg_ros.words import visible_lines
 
 if TYPE_CHECKING:
     from deworldsg_ros.checkpoints.fross import Imported
@@ -40,7 +41,8 @@ def _terminal() -> Iterator[Console]:
     try:
         yield Console(highlight=False, soft_wrap=True, markup=False)
     except DeWorldSGError as error:
-        Console(stderr=True, highlight=False, soft_wrap=True, markup=False).print(f"error: {error}")
+        errors = Console(stderr=True, highlight=False, soft_wrap=True, markup=False)
+        errors.print(f"error: {visible_lines(str(error))}")
         raise typer.Exit(EXIT_USAGE) from error
 
 
@@ -110,7 +112,7 @@ def import_fross(
     try:
         made = _import(checkpoint, out, names, frequency_bias)
     except DeWorldSGError as error:
-        errors.print(f"error: {error}")
+        errors.print(f"error: {visible_lines(str(error))}")
         raise typer.Exit(EXIT_USAGE) from error
     console.print(_summary(made, out), markup=False)
     if made.unknown_bias:

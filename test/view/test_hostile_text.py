@@ -11,8 +11,10 @@ from rich.console import Console
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.cli import outputs
-from deworldsg_ros.evaluation.protocol.scoring import Count
+from deworldsg_ros.cli.model_folder import inspect_file
+from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
 from deworldsg_ros.evaluation.reports.plots import plot_classes
+from deworldsg_ros.evaluation.reports.terminal import print_protocol
 from deworldsg_ros.view import page, picture, table
 
 LABELS = [
@@ -32,6 +34,30 @@ def printed(graph) -> str:
     output = io.StringIO()
     table.print_graph(Console(file=output, width=200, markup=False), graph)
     return output.getvalue()
+
+
+def is_text(printed_text: str) -> bool:
+    return printed_text.replace("\n", "").isprintable()
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_tables_show_any_label_as_text(label):
+    assert is_text(printed(graph_of(label, "table")))
+
+
+def test_names_of_parameters_and_scores_are_text(tmp_path):
+    header = json.dumps({"a\x1b[2J": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}})
+    content = len(header).to_bytes(8, "little") + header.encode() + bytes(4)
+    (tmp_path / "model.safetensors").write_bytes(content)
+    output = io.StringIO()
+    console = Console(file=output, width=200, markup=False)
+    inspect_file(tmp_path, console)
+    count = Count(1, 2)
+    classes = {"b\x1b[2J": count}
+    result = ProtocolResult(count, count, count, classes, classes, [])
+    print_protocol(console, result, "title \x1b[2J")
+    assert output.getvalue().count("u001b[2J") == 4
+    assert is_text(output.getvalue())
 
 
 @pytest.mark.parametrize("label", LABELS)

@@ -31,6 +31,7 @@ from deworldsg_ros.poses.perturbation import parse_noise
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.words import visible
 
 
 def run_scans(
@@ -61,7 +62,7 @@ def run_scans(
     ]
     outcomes, failures = _run(tasks, console)
     for scan, reason in failures.items():
-        line = Text.assemble(("failed:", "red"), f" {scan}: {reason}")
+        line = Text.assemble(("failed:", "red"), " " + visible(f"{scan}: {reason}"))
         console.print(line, highlight=False, soft_wrap=True)
     if not outcomes:
         raise typer.Exit(EXIT_NOTHING_DONE)

@@ -12,6 +12,7 @@ from rich.text import Text
 from deworldsg_ros.evaluation.measures.graph_measures import Measures
 from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
 from deworldsg_ros.evaluation.reports.evaluation import Evaluation
+from deworldsg_ros.words import visible
 
 
 def percent(fraction: float) -> str:
@@ -28,7 +29,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 
 def print_protocol(console: Console, result: ProtocolResult, title: str) -> None:
     """Print the five scores, the scores by class, and the notes."""
-    table = Table(title=Text(title))
+    table = Table(title=Text(visible(title)))
     for heading in ("recall at 1, %", "items", "right", "recall", "mean over classes"):
         table.add_column(heading, justify="left" if heading.startswith("recall at") else "right")
     rows = (
@@ -42,7 +43,7 @@ def print_protocol(console: Console, result: ProtocolResult, title: str) -> None
     _print_classes(console, "objects by class", result.object_classes)
     _print_classes(console, "predicates", result.predicate_classes)
     for note in dict.fromkeys(result.notes):
-        line = Text.assemble(("note:", "yellow"), f" {note}")
+        line = Text.assemble(("note:", "yellow"), f" {visible(note)}")
         console.print(line, highlight=False, soft_wrap=True)
 
 
@@ -83,7 +84,7 @@ def print_measures(console: Console, measures: Mapping[str, Measures]) -> None:
     table = Table(title="precision, geometry, edges")
     table.add_column("")
     for name in shown:
-        table.add_column(Text(name), justify="right", overflow="fold")
+        table.add_column(Text(visible(name)), justify="right", overflow="fold")
     numbers = [item.numbers() for item in shown.values()]
     for heading, key, factor in MEASURE_ROWS:
         table.add_row(heading, *(_cell(item[key], factor) for item in numbers))
@@ -103,7 +104,9 @@ def print_edges(console: Console, measures: Measures) -> None:
         cells = [_cell(numbers[key], factor) for _, key, factor in EDGE_COLUMNS]
         # A line separates the predicates from the sums.
         last = list(scores).index(name) == len(scores) - 3
-        table.add_row(Text(name), *cells, f"{item.sure_wrong}/{item.sure}", end_section=last)
+        table.add_row(
+            Text(visible(name)), *cells, f"{item.sure_wrong}/{item.sure}", end_section=last
+        )
     console.print(table)
 
 
@@ -117,5 +120,5 @@ def _print_classes(console: Console, title: str, counts: Mapping[str, Count]) ->
     for heading in ("items", "right", "recall, %"):
         table.add_column(heading, justify="right")
     for name, count in counts.items():
-        table.add_row(Text(name), str(count.total), str(count.hits), percent(count.recall))
+        table.add_row(Text(visible(name)), str(count.total), str(count.hits), percent(count.recall))
     console.print(table)

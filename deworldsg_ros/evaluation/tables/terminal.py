@@ -11,6 +11,7 @@ from rich.text import Text
 
 from deworldsg_ros.evaluation.tables.row_results import RowResult, total_ms
 from deworldsg_ros.timing import STAGES
+from deworldsg_ros.words import visible
 
 # Heading, number, factor, decimals.
 RECALL_COLUMNS = (
@@ -94,7 +95,7 @@ def print_failures(console: Console, rows: Sequence[RowResult]) -> None:
             reasons.setdefault((row.name, reason), []).append(scan)
     for (name, reason), scans in reasons.items():
         text = f"{name}, {', '.join(scans)}: {reason}"
-        line = Text.assemble(("failed:", "red"), f" {text}")
+        line = Text.assemble(("failed:", "red"), f" {visible(text)}")
         console.print(line, highlight=False, soft_wrap=True)
 
 
