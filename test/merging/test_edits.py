@@ -263,7 +263,7 @@ def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
         (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[99],"label":"x"}]', "id 99"),
         (b'[{"id":1,"kind":"delete","stamp_ns":0,"nodes":[1]}]', "deleted"),
         (b'[{"id":1,"kind":"merge","stamp_ns":0,"nodes":[2],"replaced":[1,7]}]', "replaced"),
-        (b'[{"id":1,"kind":"split","stamp_ns":0,"nodes":[1]}]', "2 for split"),
+        (b'[{"id":1,"kind":"merge","stamp_ns":0,"nodes":[1,2]}]', "1 for merge"),
         (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[1],"label":"a\\nb"}]', "regex"),
     ],
 )
@@ -346,7 +346,7 @@ def test_an_object_that_goes_takes_its_edits_with_it():
     assert not room.builder.graph.edits
 
 
-def test_what_was_said_of_a_part_holds_when_the_other_part_goes():
+def test_what_was_said_of_a_part_holds_when_the_other_part_goes(tmp_path):
     room = Room((LONG, TABLE))
     (whole,) = room.labels()
     room.builder.edit(SetLabel(whole, "bench"))
@@ -355,6 +355,8 @@ def test_what_was_said_of_a_part_holds_when_the_other_part_goes():
     assert room.labels() == {right: "bench"}
     assert [edit.nodes for edit in room.builder.graph.edits.edits] == [[right], [right]]
     assert len(room.builder.graph) == 1, "the whole table cannot come back"
+    write_map(room.builder, tmp_path / "room.map")
+    assert list(read_map(Config(), tmp_path / "room.map").graph.edits.labels) == [right]
     room.builder.graph.remove_node(right)
     assert not room.builder.graph.edits
 
