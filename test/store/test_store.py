@@ -31,8 +31,8 @@ SECOND = 10**9
 HOSTILE = [
     "cup",
     "'}) DETACH DELETE o //",
-    'a "quoted", label\n$names {key: 1} \\',
-    "\x00\x1f\t\r\n",
+    'a "quoted", label $names {key: 1} \\',
+    "\u2028\u202e\u00ad",
     "`; DROP TABLE Object; --",
     "",
     "ünïcödé 杯 \U0001f375",
