@@ -18,7 +18,7 @@ from deworldsg_ros.evaluation.protocol.predictions import read_predictions
 from deworldsg_ros.files import read_regular
 from deworldsg_ros.parsing import parse_any_json, parse_yaml
 from deworldsg_ros.poses.trajectory import FRAME_NAME
-from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES, bound_chunks, decompress
+from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES, bound_decompression, decompress
 from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.stamps import stamp_ns_from_text
@@ -111,7 +111,7 @@ def test_predictions_of_many_classes_are_refused(tmp_path: Path) -> None:
 def test_chunks_unpack_to_what_they_declare() -> None:
     import lz4.frame
 
-    bound_chunks()
+    bound_decompression()
     packed = lz4.frame.compress(bytes(1 << 24))
     assert decompress("lz4", packed, 1 << 24) == bytes(1 << 24)
     for size in (1, (1 << 24) + 1, MAX_CHUNK_BYTES + 1):

@@ -17,6 +17,7 @@ from deworldsg_ros.recordings.bags.chunks import decompress
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 OPCODES = range(0x01, 0x10)
+OPCODES_IN_CHUNKS = (SCHEMA, CHANNEL, MESSAGE)
 # Opcode (1 byte) and length of the content (8 bytes), before each record.
 HEAD_BYTES = 9
 
@@ -120,7 +121,8 @@ def _chunk_messages(content: bytes, tables: _Tables, is_cut: bool) -> list[Messa
     while position + HEAD_BYTES <= len(raw):
         opcode, length = struct.unpack_from("<BQ", raw, position)
         position += HEAD_BYTES
-        if position + length > len(raw):
+        # Megabytes of zeros, packed to nothing, would be as many empty records.
+        if opcode not in OPCODES_IN_CHUNKS or position + length > len(raw):
             break
         message = tables.take(opcode, raw[position : position + length])
         if message is not None:

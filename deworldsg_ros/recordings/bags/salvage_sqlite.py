@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES
+from deworldsg_ros.recordings.errors import RecordingError
 
 Message = tuple[str, str, int, bytes]
 
@@ -20,10 +25,12 @@ def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]
         path: the file.
         note: called with a sentence for each loss.
     """
-    database = sqlite3.connect(f"file:{path.resolve()}?immutable=1", uri=True)
     try:
-        # Without this, SQLite refuses a file that is shorter than its header declares.
-        database.execute("PRAGMA writable_schema = ON")
+        database = open_database(path)
+    except sqlite3.DatabaseError as error:
+        note(f"{path.name} cannot be read as a database ({error}); nothing of it was read")
+        return
+    try:
         topics = {
             key: (name, msgtype)
             for key, name, msgtype in database.execute("SELECT id, name, type FROM topics")
@@ -34,6 +41,44 @@ def salvage_sqlite(path: Path, note: Callable[[str], None]) -> Iterator[Message]
         note(f"{path.name} cannot be read as a database ({error}); nothing of it was read")
     finally:
         database.close()
+
+
+def open_database(path: Path) -> sqlite3.Connection:
+    """Open a file for reading, if it stores all that it contains.
+
+    Raises:
+        RecordingError: it has a view, a trigger, a virtual table or a generated column. These
+            compute rows and values: a query of 8 KB may never end.
+        sqlite3.DatabaseError: it cannot be read.
+    """
+    database = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
+    try:
+        if sys.version_info >= (3, 11):
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
+        # Without this, SQLite refuses a file that is shorter than its header declares.
+        database.execute("PRAGMA writable_schema = ON")
+        for name, sql in database.execute("SELECT name, sql FROM sqlite_master"):
+            if not _is_stored(sql):
+                raise RecordingError(
+                    f"recording {path}: {repr(name)[:80]} is computed, by a view, a trigger, a "
+                    "virtual table or a generated column: expected tables and indexes only"
+                )
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _is_stored(sql: object) -> bool:
+    """Whether the SQL of an item of the schema makes a plain table or an index.
+
+    SQLite goes by the SQL, and not by the type beside it. Views and generated columns have an AS.
+    """
+    if sql is None:  # an index that SQLite made itself
+        return True
+    if not isinstance(sql, str) or re.search(r"\bAS\b", sql, re.IGNORECASE):
+        return False
+    return sql.startswith(("CREATE TABLE ", "CREATE INDEX ", "CREATE UNIQUE INDEX "))
 
 
 def _rows(

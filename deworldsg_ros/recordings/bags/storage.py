@@ -7,7 +7,6 @@ reader reads the intact part, and `losses` states in words that data was lost.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import re
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
@@ -15,11 +14,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import ReaderError
 
 from deworldsg_ros.files import confined, read_regular
 from deworldsg_ros.parsing import check_yaml
-from deworldsg_ros.recordings.bags.chunks import bound_chunks
+from deworldsg_ros.recordings.bags.chunks import ZSTD_MAGIC, decompress_message
+from deworldsg_ros.recordings.bags.readers import BagReader
 from deworldsg_ros.recordings.bags.salvage_mcap import salvage_mcap
 from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
 from deworldsg_ros.recordings.errors import RecordingError
@@ -31,8 +31,6 @@ SALVAGERS: dict[str, Callable[..., Iterator[tuple[str, str, int, bytes]]]] = {
     ".mcap": salvage_mcap,
     ".db3": salvage_sqlite,
 }
-
-bound_chunks()
 
 
 @dataclass(frozen=True, order=True)
@@ -68,11 +66,11 @@ class RawBag:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.losses: list[str] = []
-        self._reader: Reader | None = None
+        self._reader: BagReader | None = None
         _check_links(path)
         try:
             _check_files(path)
-            reader = Reader(path)
+            reader = BagReader(path)
             reader.open()
             topics = [_topic(connection) for connection in reader.connections]
         except FileNotFoundError:
@@ -115,7 +113,11 @@ class RawBag:
         return storage_files(self.path)
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of the topics in the order in which they were recorded."""
+        """Messages of the topics in the order in which they were recorded.
+
+        Raises:
+            RecordingError: for a file that would take too much memory.
+        """
         names = frozenset(topics)
         if self._reader is None:
             yield from (RawMessage(*item) for item in self._salvage([]) if item[0] in names)
@@ -132,7 +134,7 @@ class RawBag:
                 if time_ns != last_time_ns:
                     last_time_ns, topics_at_last_time = time_ns, set()
                 topics_at_last_time.add(connection.topic)
-        except GeneratorExit:
+        except (GeneratorExit, RecordingError):
             raise
         except Exception as error:  # a damaged chunk: its decompressor raises any type
             self._note(f"the bag is damaged ({_one_line(error)}); its intact part was read")
@@ -149,9 +151,16 @@ class RawBag:
             if text not in losses:
                 losses.append(text)
 
-        return itertools.chain.from_iterable(
-            SALVAGERS[file.suffix](file, note) for file in self.files
-        )
+        for file in self.files:
+            for topic, msgtype, time_ns, data in SALVAGERS[file.suffix](file, note):
+                # CDR starts with a zero.
+                if data.startswith(ZSTD_MAGIC):
+                    try:
+                        data = decompress_message(data)
+                    except Exception as error:  # the decompressor raises any type
+                        note(f"{file.name}: compressed messages are damaged and lost ({error})")
+                        continue
+                yield topic, msgtype, time_ns, data
 
     def _note(self, text: str) -> None:
         if text not in self.losses:

@@ -1,0 +1,183 @@
+"""A bag is data: it runs no program, fills no memory, and no file of it leads to another."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from support.recordings import camera_items, write_bag
+
+from deworldsg_ros.recordings.bags import chunks, readers, salvage_mcap
+from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
+from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.messages import typestore
+
+STRING = "std_msgs/msg/String"
+COUNT = 4
+
+
+def read(path: Path) -> list[RawMessage]:
+    """All messages."""
+    bag = RawBag(path)
+    try:
+        return list(bag.messages([topic.name for topic in bag.topics]))
+    finally:
+        bag.close()
+
+
+def losses_of(path: Path) -> str:
+    """What is told about a bag after all its messages were read."""
+    bag = RawBag(path)
+    list(bag.messages([topic.name for topic in bag.topics]))
+    bag.close()
+    return "; ".join(bag.losses)
+
+
+def text_bag(folder: Path, plugin: StoragePlugin, mode: CompressionMode, times: list[int]) -> Path:
+    """A bag of texts of 600 kB, two in a chunk, which pack to almost nothing."""
+    writer = Writer(folder, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    text = typestore().types[STRING](data="x" * 600_000)
+    with writer:
+        connection = writer.add_connection("/s", STRING, typestore=typestore())
+        for time_ns in times:
+            writer.write(connection, time_ns, bytes(typestore().serialize_cdr(text, STRING)))
+    return folder
+
+
+# --- SQLite ----------------------------------------------------------------------------------
+
+ROWS = "WITH c(x) AS (VALUES (1), (2)) SELECT x AS id, 1 AS topic_id, x AS timestamp"
+PROGRAMS = {
+    "view": f"DROP TABLE messages; CREATE VIEW messages AS {ROWS}, zeroblob(16) AS data FROM c",
+    "view called a table": f"""
+        DROP TABLE messages; CREATE VIEW messages AS {ROWS}, zeroblob(16) AS data FROM c;
+        PRAGMA writable_schema = ON; UPDATE sqlite_master SET type = 'table' WHERE type = 'view'""",
+    "generated column": """
+        DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp,
+        data BLOB GENERATED ALWAYS AS (zeroblob(16))); INSERT INTO messages VALUES(1, 1, 1)""",
+    "short form": """
+        DROP TABLE messages; CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp,
+        "data"as/**/(zeroblob(16))); INSERT INTO messages VALUES(1, 1, 1)""",
+    "view of topics": """
+        DROP TABLE topics; CREATE VIEW topics AS SELECT 1 AS id, '/s' AS name, 'x' AS type,
+        'cdr' AS serialization_format, '' AS offered_qos_profiles, '' AS type_description_hash""",
+    "virtual table": "CREATE VIRTUAL TABLE x USING fts3(y)",
+    "trigger": "CREATE TRIGGER x INSERT ON messages BEGIN SELECT 1; END",
+}
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+@pytest.mark.parametrize("place", ["folder", "folder, other name", "salvaged", "file"])
+def test_a_database_that_computes_its_rows_is_refused(
+    tmp_path: Path, program: str, place: str
+) -> None:
+    bag = write_bag(tmp_path / "bag", camera_items(2), "sqlite3")
+    file = bag / "bag.db3"
+    with sqlite3.connect(file) as database:
+        database.executescript(PROGRAMS[program])
+    database.close()
+    if place == "folder, other name":
+        file.rename(bag / "notes.txt")
+        metadata = (bag / "metadata.yaml").read_text()
+        (bag / "metadata.yaml").write_text(metadata.replace("bag.db3", "notes.txt"))
+    if place == "salvaged":
+        (bag / "metadata.yaml").unlink()
+    with pytest.raises(RecordingError, match="is computed, by a view"):
+        read(file if place == "file" else bag)
+
+
+@pytest.mark.parametrize("name", ["a#1.db3", "new?mode=rwc&x=.db3", "..%2Foutside%2Foutside.db3"])
+def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
+    write_bag(tmp_path / "outside", camera_items(1), "sqlite3")
+    bag = write_bag(tmp_path / "bag", camera_items(COUNT), "sqlite3")
+    bag = bag.rename(tmp_path / "50%2Fb #1?mode=rwc&x=")
+    file, metadata = (bag / "bag.db3").rename(bag / name), bag / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("bag.db3", name))
+    before = sorted(tmp_path.rglob("*"))
+    assert len(read(bag)) == len(read(file)) == 4 * COUNT
+    assert not losses_of(bag)
+    assert len(list(salvage_sqlite(file, print))) == 4 * COUNT
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+# --- zstd ------------------------------------------------------------------------------------
+
+
+def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag = text_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE, [1, 2, 3])
+    assert [message.log_time_ns for message in read(bag)] == [1, 2, 3]
+    monkeypatch.setattr(chunks, "MIN_FILE_BYTES", 1_000_000)
+    with pytest.raises(RecordingError, match="unpacks to more than 1000000 bytes; if you trust"):
+        read(bag)
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_compressed_message_unpacks_to_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugin: StoragePlugin
+) -> None:
+    bag = text_bag(tmp_path / "bag", plugin, CompressionMode.MESSAGE, [1, 2])
+    whole = read(bag)
+    assert [len(message.data) for message in whole] == [600_009] * 2
+    metadata = bag / "metadata.yaml"
+    metadata.rename(tmp_path / "metadata.yaml")
+    assert read(bag) == whole
+    (tmp_path / "metadata.yaml").rename(metadata)
+    monkeypatch.setattr(chunks, "MAX_CHUNK_BYTES", 500_000)
+    assert read(bag) == []
+    assert (
+        "compressed messages are damaged and lost (a message is cut, or unpacks to more than "
+        in (losses_of(bag))
+    )
+
+
+def test_chunks_that_overlap_in_time_are_few(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_by_one = text_bag(
+        tmp_path / "a", StoragePlugin.MCAP, CompressionMode.STORAGE, list(range(12))
+    )
+    overlapping = text_bag(
+        tmp_path / "b", StoragePlugin.MCAP, CompressionMode.STORAGE, [0, 9, 1, 8, 2, 7, 3, 6]
+    )
+    assert len(read(overlapping)) == 8
+    monkeypatch.setattr(readers, "MAX_BYTES_AT_ONCE", 4_000_000)
+    assert len(read(one_by_one)) == 12
+    for path in (overlapping, overlapping / "b.mcap"):
+        with pytest.raises(RecordingError, match=r"4800\d+ bytes would be unpacked at once"):
+            read(path)
+
+
+def test_bytes_of_chunks_at_once() -> None:
+    assert readers.bytes_at_once([]) == 0
+    assert readers.bytes_at_once([(0, 1, 5), (2, 3, 7), (4, 5, 6)]) == 7
+    # A chunk ends after the message at its end.
+    assert readers.bytes_at_once([(0, 2, 5), (2, 3, 7), (4, 5, 6)]) == 12
+    assert readers.bytes_at_once([(0, 9, 1)] * 5 + [(7, 6, 2)]) == 7
+
+
+def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[int] = []
+    take = salvage_mcap._Tables.take
+
+    def count(self: Any, opcode: int, content: bytes) -> Any:
+        taken.append(opcode)
+        return take(self, opcode, content)
+
+    monkeypatch.setattr(salvage_mcap._Tables, "take", count)
+    size = 9 * 1000
+    packed = chunks.zstd.compress(bytes(size))
+    chunk = struct.pack("<QQQI", 0, 1, size, 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
+    path = tmp_path / "zeros.mcap"
+    record = struct.pack("<BQ", salvage_mcap.CHUNK, len(chunk + packed)) + chunk + packed
+    path.write_bytes(salvage_mcap.MAGIC + record)
+    with pytest.raises(RecordingError, match="no message could be read"):
+        RawBag(path)
+    assert not taken
