@@ -9,13 +9,15 @@ from typing import Any
 
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from support.recordings import camera_items, write_bag
+from support.recordings import camera_items, stamp_ns, write_bag
 
 from deworldsg_ros.recordings.bags import chunks, readers, salvage_mcap
 from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
 from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
 from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import typestore
+from deworldsg_ros.recordings.messages import CAMERA_INFO, POSE_STAMPED, typestore
+from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.recordings.writer import write_mcap
 
 STRING = "std_msgs/msg/String"
 COUNT = 4
@@ -25,7 +27,7 @@ def read(path: Path) -> list[RawMessage]:
     """All messages."""
     bag = RawBag(path)
     try:
-        return list(bag.messages([topic.name for topic in bag.topics]))
+        return list(bag.messages([topic.key for topic in bag.topics]))
     finally:
         bag.close()
 
@@ -33,7 +35,7 @@ def read(path: Path) -> list[RawMessage]:
 def losses_of(path: Path) -> str:
     """What is told about a bag after all its messages were read."""
     bag = RawBag(path)
-    list(bag.messages([topic.name for topic in bag.topics]))
+    list(bag.messages([topic.key for topic in bag.topics]))
     bag.close()
     return "; ".join(bag.losses)
 
@@ -181,3 +183,43 @@ def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(RecordingError, match="no message could be read"):
         RawBag(path)
     assert not taken
+
+
+# --- topics of two types -----------------------------------------------------------------------
+
+DEPTH = "/camera/depth/image_raw/compressedDepth"
+RGB = "/camera/color/image_raw/compressed"
+INFO = "/camera/color/camera_info"
+
+
+@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("has_metadata", [True, False])
+@pytest.mark.parametrize(
+    ("topic", "other"),
+    [(DEPTH, CAMERA_INFO), ("/camera/pose", CAMERA_INFO), (INFO, POSE_STAMPED),
+     (RGB, POSE_STAMPED), (RGB, STRING)],
+)  # fmt: skip
+def test_a_topic_of_two_types_is_read_by_one(
+    tmp_path: Path, storage: StoragePlugin, has_metadata: bool, topic: str, other: str
+) -> None:
+    items = camera_items(COUNT)
+    messages = {msgtype: message for _, msgtype, _, message in items}
+    messages[STRING] = typestore().types[STRING](data="x" * 50)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
+        connections = {
+            key: writer.add_connection(*key, typestore=typestore())
+            for key in [(topic, other), *sorted({(name, kind) for name, kind, _, _ in items})]
+        }
+        for time_ns in map(stamp_ns, range(COUNT)):
+            data = bytes(typestore().serialize_cdr(messages[other], other))
+            writer.write(connections[topic, other], time_ns, data)
+        for name, kind, time_ns, message in items:
+            data = bytes(typestore().serialize_cdr(message, kind))
+            writer.write(connections[name, kind], time_ns, data)
+    if not has_metadata:
+        (tmp_path / "bag" / "metadata.yaml").unlink()
+    recording = open_recording(tmp_path / "bag")
+    assert len(list(recording.frames())) == COUNT
+    assert not recording.drops
+    source = open_source(tmp_path / "bag")
+    assert write_mcap(source.raw_messages(), tmp_path / "out.mcap") == len(items)

@@ -20,9 +20,12 @@ COUNT = 40
 
 
 def read(path, topics=(RGB,)):
+    """Messages of the topics, of any type."""
     bag = RawBag(path)
     try:
-        return [m for m in bag.messages(topics)], bag.losses
+        return [
+            m for m in bag.messages([t.key for t in bag.topics if t.name in topics])
+        ], bag.losses
     finally:
         bag.close()
 

@@ -86,6 +86,7 @@ class BagSource:
         except RecordingError:
             self._bag.close()
             raise
+        self._found = found
         self.topics = {
             role: UsedTopic(topic.name, topic.msgtype, topic.count) for role, topic in found.items()
         }
@@ -98,13 +99,14 @@ class BagSource:
 
     def raw_messages(self) -> Iterator[RawRoleMessage]:
         """Serialized messages in the order in which they were recorded."""
-        roles = {topic.name: role for role, topic in self.topics.items()}
+        # A topic may have messages of several types.
+        roles = {topic.key: role for role, topic in self._found.items()}
         poses = None
-        if Role.POSE in self.topics and self.topics[Role.POSE].msgtype == TF_MESSAGE:
-            del roles[self.topics[Role.POSE].name]
+        if Role.POSE in self._found and self._found[Role.POSE].msgtype == TF_MESSAGE:
+            del roles[self._found[Role.POSE].key]
             poses = _TfPoses(self._bag, self._inputs)
         for raw in self._bag.messages(roles):
-            role = roles[raw.topic]
+            role = roles[raw.topic, raw.msgtype]
             try:
                 stamp_ns = stamp_ns_of_cdr(raw.data)
                 needs_frame = role is Role.RGB and (poses is not None or self._intrinsics)
@@ -206,7 +208,7 @@ class BagSource:
 
     def _first(self, topic: Topic) -> Any:
         """The first message that can be decoded; None if there is none."""
-        for raw in self._bag.messages([topic.name]):
+        for raw in self._bag.messages([topic.key]):
             with contextlib.suppress(Exception):  # rosbags raises errors of many types
                 return decode(raw.data, raw.msgtype)
         return None
@@ -217,12 +219,12 @@ class _TfPoses:
 
     def __init__(self, bag: RawBag, inputs: InputsConfig) -> None:
         self._tree = TransformTree(round(inputs.pose_slop_s * 1e9), inputs.world_frame)
-        names = [t.name for t in bag.topics if t.msgtype == TF_MESSAGE]
-        static = [name for name in names if name.endswith(STATIC_SUFFIX)]
+        keys = [t.key for t in bag.topics if t.msgtype == TF_MESSAGE]
+        static = [key for key in keys if key[0].endswith(STATIC_SUFFIX)]
         self.refusal = ""
         for raw in bag.messages(static):
             self._add(raw, is_static=True)
-        self._moving = bag.messages([name for name in names if name not in static])
+        self._moving = bag.messages([key for key in keys if key not in static])
 
     def mounting(self, parent_frame: str, camera_frame: str) -> Float64:
         """T_parent_camera (4, 4) from static transforms; raises RefusedInput without them."""

@@ -41,6 +41,11 @@ class Topic:
     msgtype: str
     count: int
 
+    @property
+    def key(self) -> tuple[str, str]:
+        """Name and type."""
+        return self.name, self.msgtype
+
 
 class RawMessage(NamedTuple):
     """A serialized message of a bag; `log_time_ns` is its time of recording."""
@@ -112,20 +117,20 @@ class RawBag:
             return [self.path] if self.path.suffix in SALVAGERS else []
         return storage_files(self.path)
 
-    def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """Messages of the topics in the order in which they were recorded.
+    def messages(self, topics: Collection[tuple[str, str]]) -> Iterator[RawMessage]:
+        """Messages of the topics, (name, type), in the order in which they were recorded.
 
         Raises:
             RecordingError: for a file that would take too much memory.
         """
-        names = frozenset(topics)
+        keys = frozenset(topics)
         if self._reader is None:
-            yield from (RawMessage(*item) for item in self._salvage([]) if item[0] in names)
+            yield from (RawMessage(*item) for item in self._salvage([]) if item[:2] in keys)
             return
-        connections = [c for c in self._reader.connections if c.topic in names]
+        connections = [c for c in self._reader.connections if (c.topic, c.msgtype) in keys]
         if not connections:
             return
-        last_time_ns, topics_at_last_time = -1, set[str]()
+        last_time_ns, topics_at_last_time = -1, set[tuple[str, str]]()
         try:
             for connection, time_ns, data in self._reader.messages(connections):
                 if not (isinstance(time_ns, int) and isinstance(data, bytes)):
@@ -133,17 +138,17 @@ class RawBag:
                 yield RawMessage(connection.topic, connection.msgtype, time_ns, data)
                 if time_ns != last_time_ns:
                     last_time_ns, topics_at_last_time = time_ns, set()
-                topics_at_last_time.add(connection.topic)
+                topics_at_last_time.add((connection.topic, connection.msgtype))
         except (GeneratorExit, RecordingError):
             raise
         except Exception as error:  # a damaged chunk: its decompressor raises any type
             self._note(f"the bag is damaged ({_one_line(error)}); its intact part was read")
             for item in self._salvage(self.losses):
-                topic, time_ns = item[0], item[2]
+                topic, time_ns = item[:2], item[2]
                 known = time_ns < last_time_ns or (
                     time_ns == last_time_ns and topic in topics_at_last_time
                 )
-                if topic in names and not known:
+                if topic in keys and not known:
                     yield RawMessage(*item)
 
     def _salvage(self, losses: list[str]) -> Iterator[tuple[str, str, int, bytes]]:
