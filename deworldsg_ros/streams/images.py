@@ -124,8 +124,10 @@ def depth_from_message(message: Any, *, depth_scale_m: float, max_depth_m: float
     depth_m: Float32 = raw.astype(np.float32)
     if raw.dtype.kind == "u":
         depth_m *= np.float32(depth_scale_m)
+    # Also if the limit is infinite, or too large for float32.
+    limit_m = np.float32(min(max_depth_m, float(np.finfo(np.float32).max)))
     # The negated comparison also catches NaN.
-    depth_m[~((depth_m > 0) & (depth_m <= np.float32(max_depth_m)))] = 0.0
+    depth_m[~((depth_m > 0) & (depth_m <= limit_m))] = 0.0
     return depth_m
 
 

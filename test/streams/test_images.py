@@ -109,6 +109,9 @@ def test_invalid_depth_becomes_zero() -> None:
     result = depth_from_message(image(values, "32FC1"), **DEPTH)
     np.testing.assert_array_equal(result, [[0, 0, 0, 0, 0, 10, 0]])
     assert result.dtype == np.float32
+    for limit_m in (np.inf, 1e39):
+        far = depth_from_message(image(values, "32FC1"), depth_scale_m=1e-3, max_depth_m=limit_m)
+        np.testing.assert_array_equal(far, np.float32([[0, 0, 0, 0, 0, 10, 10.001]]))
 
 
 def test_depth_does_not_change_the_message() -> None:
