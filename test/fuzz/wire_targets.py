@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,26 @@ from support.hostile import (
     check_published,
     hostile_evidence,
     hostile_local_graph,
+    hostile_scene_graph,
     state_of,
 )
 
+from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client.asking import ask
+from deworldsg_ros.client.export import FORMATS
 from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
+from deworldsg_ros.fleet.fleet import Fleet
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations.graph_view import PublishedGraph
 from deworldsg_ros.scene import codec, wire
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, RelationEvidence
 from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.view import picture
+from deworldsg_ros.view.geometry import view_axes
+from deworldsg_ros.view.live.state import LiveState
+from deworldsg_ros.view.markers import markers
+from deworldsg_ros.view.page import content_of
 from fuzz.target import Target
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,6 +50,7 @@ CONFIGS = {
     "default": Config(),
 }
 FRAMES = 6
+EXPORTS = ("graphml", "csv", "ply")
 
 
 @lru_cache
@@ -124,6 +136,44 @@ def _use_snapshot(message: wire.SceneGraphMessage) -> None:
     for node in message.nodes:
         published.node(node.id)
     wire.encode(replica.message())
+    for item in SceneGraph(message):
+        item.to_dict()
+
+
+def _ask_as_a_client(graph: SceneGraph) -> None:
+    """Questions are answered, or refused in words."""
+    for item in list(graph)[:2]:
+        for question in (
+            lambda item=item: ask(graph, f"anything near {item.label}"),
+            lambda item=item: graph.goal_near(item),
+            lambda item=item: graph.explain(item),
+            lambda item=item: graph.neighbours(item),
+        ):
+            with suppress(ClientError):
+                question()
+    graph.changes_since(_snapshot())
+
+
+def _combine(message: wire.SceneGraphMessage) -> None:
+    """A fleet goes on whatever one of its robots sends."""
+    fleet = Fleet()
+    fleet.update("good", _snapshot().message)
+    fleet.combine()
+    fleet.update("other", message)
+    whole = fleet.combine()
+    assert {node.label for node in _snapshot().message.nodes} <= {
+        item.label for item in whole.nodes
+    }
+    wire.decode(wire.encode(whole), wire.SceneGraphMessage)
+    for name in fleet.members:
+        part = fleet.part_for(name)
+        if part is not None:
+            wire.decode(wire.encode(part), wire.SceneGraphMessage)
+
+
+@lru_cache
+def _snapshot() -> SceneGraph:
+    return SceneGraph(wire.decode(_example("scene_graph"), wire.SceneGraphMessage))
 
 
 def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
@@ -136,15 +186,20 @@ def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
     wire.encode(replica.message())
 
 
+def _write_seed(folder: Path) -> None:
+    (folder / "seed").write_bytes(b"hostile")
+
+
+def _rng_of(folder: Path) -> np.random.Generator:
+    digest = hashlib.sha256((folder / "seed").read_bytes()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+
+
 def _graph(name: str) -> Target:
     """A graph that gets local graphs of the worst allowed values; the content is their seed."""
 
-    def make(folder: Path) -> None:
-        (folder / "seed").write_bytes(b"hostile")
-
     def read(folder: Path) -> None:
-        digest = hashlib.sha256((folder / "seed").read_bytes()).digest()
-        rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
+        rng = _rng_of(folder)
         builder, replica = GraphBuilder(CONFIGS[name], VOCABULARY, "map"), GraphReplica()
         stamp_ns = 0
         for _ in range(FRAMES):
@@ -160,7 +215,26 @@ def _graph(name: str) -> Target:
             builder.add_evidence(hostile_evidence_in(rng, local))
             check_published(builder, replica)
 
-    return Target(f"graph_{name}", make, read)
+    return Target(f"graph_{name}", _write_seed, read)
+
+
+def _use_hostile_graph(folder: Path) -> None:
+    """A graph of the worst allowed values, in everything that shows or writes graphs."""
+    rng = _rng_of(folder)
+    message = hostile_scene_graph(rng)
+    _use_snapshot(message)
+    _ask_as_a_client(SceneGraph(message))
+    _combine(message)
+    state = LiveState()
+    state.reset(message)
+    state.draw()
+    json.dumps(content_of(message, view_axes((0.0, 0.0, 1.0)), None), allow_nan=False)
+    markers(message)
+    graph = SceneGraph(message)
+    for kind in EXPORTS:
+        FORMATS[kind](graph)
+    if rng.random() < 0.02:  # a picture takes a second
+        picture.draw(message, folder / "graph.png")
 
 
 def hostile_evidence_in(rng: np.random.Generator, local: LocalGraph) -> RelationEvidence:
@@ -178,4 +252,5 @@ TARGETS: list[Target] = [
     _message("scene_graph", _use_snapshot),
     _message("scene_graph_updates", _use_update),
     *map(_graph, CONFIGS),
+    Target("clients", _write_seed, _use_hostile_graph),
 ]

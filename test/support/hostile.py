@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import pickle
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -24,6 +26,8 @@ PLACES_M = [0.0, 1e-9, 0.01, 0.5, 1.0, 31.0, 1e3, limits.MAX_COORDINATE_M]
 LOGITS = [0.0, 1e-300, 5.0, -5.0, 745.0, 1e4, limits.MAX_LOGIT, -limits.MAX_LOGIT]
 PROBABILITIES = [0.0, 1e-300, 1e-9, 0.2, 0.45, 0.5, 1.0 - 1e-9, 1.0]
 STEPS_NS = [1, 10**3, 10**8, 10**8, 10**9, 3600 * 10**9, 10**17]
+LABELS = ["cup", "table", "", "[bold]", "<b>&amp;", "$x_1$", "\U0001f600", "x" * 256, "a/b\\c", '"']
+COUNTS = [1, 2, 2**31, 2**63 - 1]
 PIXELS = [1, 2, 50, 1000, limits.MAX_SIDE_PX**2]
 
 
@@ -126,6 +130,119 @@ def hostile_evidence(rng: np.random.Generator, local: LocalGraph) -> RelationEvi
         predictions=predictions,
         source="fake",
     )
+
+
+def hostile_scene_graph(rng: np.random.Generator) -> wire.SceneGraphMessage:
+    """A scene graph of 0 to 8 nodes, as its schema allows it."""
+    count = int(rng.integers(0, 9))
+    ids = rng.choice([1, 2, 3, 4, 5, 7, 2**31, 2**53 + 1, 2**63 - 1], count, replace=False)
+    pairs = [(a, b) for a in [*ids, 6] for b in [*ids, 8] if a != b and rng.random() < 0.2]
+    message = {
+        "schema": {"name": "scene_graph", "version": 2},
+        "stamp": _hostile_stamp(rng),
+        "frame_id": str(rng.choice(["map", "", "x" * 256])),
+        "sequence": int(rng.choice([0, 1, 2**63 - 1])),
+        "nodes": [_hostile_node(rng, int(node_id)) for node_id in ids],
+        "edges": [_hostile_edge(rng, int(a), int(b)) for a, b in pairs],
+        "up": _unit(rng, 3),
+        "hidden": [
+            {
+                "label": str(rng.choice(LABELS)),
+                "mean_m": _place(rng),
+                "existence": float(rng.choice(PROBABILITIES)),
+                "observations": int(rng.choice(COUNTS)),
+                "reason": str(rng.choice(["", "seen once", "[bold]"])),
+            }
+        ],
+    }
+    for name in ("up", "hidden"):
+        if rng.random() < 0.5:
+            del message[name]
+    return wire.decode(msgspec.json.encode(message), wire.SceneGraphMessage)
+
+
+def _hostile_node(rng: np.random.Generator, node_id: int) -> dict[str, Any]:
+    kinds = ["zero", "ball", "needle", "largest", "negative", "any"]
+    variance = {
+        "zero": np.zeros((3, 3)),
+        "ball": np.eye(3) * rng.choice([1e-300, 1e-12, 0.01, 1e16]),
+        "needle": np.diag([1e16, 1e-300, 0.0]),
+        "largest": np.full((3, 3), 1e16),
+        "negative": -np.eye(3),
+        "any": rng.normal(size=(3, 3)) * rng.choice([1e-9, 1.0, 1e15]),
+    }[str(rng.choice(kinds))]
+    node: dict[str, Any] = {
+        "id": node_id,
+        "label": str(rng.choice(LABELS)),
+        "classes": [_belief(rng) for _ in range(int(rng.integers(0, 3)))],
+        "mean_m": _place(rng),
+        "covariance_m2": np.clip(variance, -1e16, 1e16).ravel().tolist(),
+        "observations": int(rng.choice(COUNTS)),
+        "first_seen": _hostile_stamp(rng),
+        "last_seen": _hostile_stamp(rng),
+        "confirmed": bool(rng.random() < 0.9),
+        "existence": float(rng.choice(PROBABILITIES)),
+        "remainder": float(rng.choice(PROBABILITIES)),
+        "entropy_nats": float(rng.choice([-1e308, 0.0, 0.3, 1e308])),
+        "box": {
+            "center_m": _place(rng),
+            "size_m": rng.choice([0.0, 1e-300, 0.2, 2e8], 3).tolist(),
+            "orientation_xyzw": _unit(rng, 4),
+        },
+        "surface_points_m": [_place(rng) for _ in range(int(rng.integers(0, 9)))],
+        "surface_mm": base64.b64encode(rng.bytes(int(rng.integers(0, 60)))).decode(),
+        "label_provenance": "operator",
+    }
+    optional = ("existence", "remainder", "entropy_nats", "box", "surface_points_m", "surface_mm")
+    for name in (*optional, "label_provenance"):
+        if rng.random() < 0.5:
+            del node[name]
+    return node
+
+
+def _hostile_edge(rng: np.random.Generator, subject: int, object_: int) -> dict[str, Any]:
+    edge = {
+        "subject": subject,
+        "object": object_,
+        "predicate": str(rng.choice(LABELS)),
+        "probability": float(rng.choice(PROBABILITIES)),
+        "predicates": [_belief(rng) for _ in range(int(rng.integers(0, 3)))],
+        "provenance": str(rng.choice(["visual", "prior", "fused"])),
+        "entropy_nats": float(rng.choice([0.0, 0.3, 1e308])),
+        "observations": int(rng.choice([0, 1, 2**63 - 1])),
+        "remainder": float(rng.choice(PROBABILITIES)),
+        "mutual": bool(rng.random() < 0.5),
+        "shown": int(rng.choice([0, 1, 2**63 - 1])),
+    }
+    for name in ("remainder", "mutual", "shown"):
+        if rng.random() < 0.5:
+            del edge[name]
+    return edge
+
+
+def _belief(rng: np.random.Generator) -> dict[str, Any]:
+    return {
+        "label": str(rng.choice(LABELS)),
+        "probability": float(rng.choice(PROBABILITIES)),
+    }
+
+
+def _place(rng: np.random.Generator) -> list[float]:
+    sign = rng.choice([-1, 1], 3)
+    return (rng.choice([0.0, 5e-324, 1e-9, 0.3, 1.0, 1e4, 1e8], 3) * sign).tolist()
+
+
+def _unit(rng: np.random.Generator, size: int) -> list[float]:
+    values = rng.normal(size=size) if rng.random() < 0.5 else np.eye(size)[rng.integers(size)]
+    scale = rng.choice([0.995, 1.0, 1.005]) * rng.choice([-1, 1])
+    return (values / np.linalg.norm(values) * scale).tolist()
+
+
+def _hostile_stamp(rng: np.random.Generator) -> dict[str, int]:
+    return {
+        "sec": int(rng.choice([0, 1, 2**31 - 1])),
+        "nanosec": int(rng.choice([0, 10**9 - 1])),
+    }
 
 
 def state_of(builder: GraphBuilder) -> bytes:
