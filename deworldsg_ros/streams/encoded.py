@@ -11,11 +11,15 @@ from numpy.typing import NDArray
 
 # An image of 8K video has 33 million pixels. A PNG of 388 kB can claim a thousand times that.
 MAX_PIXELS = 1 << 26
+# A progressive JPEG has about ten scans. Each goes over all pixels and may have a few bytes only.
+MAX_SCANS = 100
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _PGM = re.compile(rb"P[56](?:\s+|#[^\n]*\n)+(\d{1,9})(?:\s+|#[^\n]*\n)+(\d{1,9})\s")
 # Start-of-frame markers of JPEG; C4, C8 and CC are others.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+# The marker before a scan. It is not within one: there, a zero follows each FF.
+_JPEG_SCAN = b"\xff\xda"
 
 
 def encoded_size(content: bytes | memoryview) -> tuple[int, int]:
@@ -39,11 +43,14 @@ def decode(content: bytes | memoryview, flags: int) -> NDArray[Any]:
         flags: of cv2.imdecode.
 
     Raises:
-        ValueError: it is no JPEG, PNG or PGM, is larger than `MAX_PIXELS`, or is damaged.
+        ValueError: it is no JPEG, PNG or PGM, is larger than `MAX_PIXELS`, has more than
+            `MAX_SCANS`, or is damaged.
     """
     width, height = encoded_size(content)
     if width * height > MAX_PIXELS:
         raise ValueError(f"it has {width}x{height} pixels: expected at most {MAX_PIXELS}")
+    if content[:2] == b"\xff\xd8" and (scans := bytes(content).count(_JPEG_SCAN)) > MAX_SCANS:
+        raise ValueError(f"it has {scans} scans: expected at most {MAX_SCANS}")
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error as error:

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 
 from deworldsg_ros.checkpoints.probe_card import Window, relative_box_pair
+from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.recordings.folders.dataset import decode_image, read_file
 from deworldsg_ros.relations.clips import CropBox, Rgb, crop_clip, interval_start, union_box
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
@@ -122,9 +124,10 @@ def _reader(
     def read() -> Rgb:
         images = []
         for path in paths:
-            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if image is None:
-                raise RefusedInput("unreadable_clip", f"{path} cannot be decoded")
+            try:
+                image = decode_image(read_file(path), cv2.IMREAD_COLOR, path)
+            except RecordingError as error:
+                raise RefusedInput("unreadable_clip", str(error)) from error
             if rotated:
                 image = cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE)
             images.append(np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8))

@@ -9,7 +9,9 @@ import zlib
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
+from support.images import SCAN, many_scans
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.evaluation.errors import EvaluationError
@@ -85,6 +87,15 @@ def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
     for other in (b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
         with pytest.raises(ValueError):
             decode(other, cv2.IMREAD_UNCHANGED)
+
+
+def test_a_jpeg_has_a_bounded_number_of_scans() -> None:
+    pixels = np.full((64, 64, 3), 128, np.uint8)
+    content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    assert content.count(SCAN) == 10 and decode(content, cv2.IMREAD_COLOR).shape == (64, 64, 3)
+    with pytest.raises(ValueError, match="it has 101 scans: expected at most 100"):
+        decode(many_scans(content, 101), cv2.IMREAD_COLOR)
+    decode(memoryview(many_scans(content, 100)), cv2.IMREAD_COLOR)
 
 
 def test_pickles_of_shared_lists_and_large_memos_are_refused() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from support.images import many_scans
 from support.sequences import (
     BLOCKS,
     HEIGHT,
@@ -17,7 +18,7 @@ from support.sequences import (
     write_surface,
 )
 
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.training.dataset_clips import ClipChoice, read_clips
 
 CHOICE = ClipChoice(clip_length=4, clips_per_pair=2)
@@ -63,6 +64,16 @@ def test_clips_of_3rscan_are_upright_and_show_visible_objects(rio):
         x1, y1, x2, y2 = sample * (width, height, width, height)
         middle = clip[-1, int((y1 + y2) / 2), int((x1 + x2) / 2)]
         assert np.abs(middle[::-1].astype(int) - COLOURS[object_id]).max() < 60
+
+
+@pytest.mark.parametrize("harm", [lambda jpeg: many_scans(jpeg, 101), lambda jpeg: jpeg[:100]])
+def test_a_frame_that_cannot_be_decoded_refuses_its_clip(rio, harm):
+    clip = read_clips(rio, CHOICE)[0]
+    for path in (rio / "data" / "a" / "sequence").glob("*.color.jpg"):
+        path.write_bytes(harm(path.read_bytes()))
+    with pytest.raises(RefusedInput, match="cannot be decoded") as refused:
+        clip.read()
+    assert refused.value.reason == "unreadable_clip"
 
 
 def test_hidden_objects_have_no_boxes(rio):
