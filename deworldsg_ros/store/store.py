@@ -17,6 +17,7 @@ from deworldsg_ros.store.database import Database, Head, Rows, opened, stay_of
 from deworldsg_ros.store.errors import StoreError
 from deworldsg_ros.store.history import History, Stay
 from deworldsg_ros.store.journal import GraphMessage, Journal, read_messages
+from deworldsg_ros.store.question import checked_question
 
 MESSAGES_FILE, DATABASE_FILE = "messages.jsonl", "graph.lbug"
 # Messages that go to the database at a time when it is made anew.
@@ -66,7 +67,7 @@ class Store:
                 pass
 
     def ask(self, cypher: str, parameters: Mapping[str, Any] | None = None) -> Rows:
-        """Answer a question in Cypher; it cannot change the database.
+        """Answer a question in Cypher; it cannot change the database, nor use other files.
 
         Args:
             cypher: with the tables Object, Relation and Stay (docs/dev/store.md).
@@ -75,9 +76,10 @@ class Store:
         Raises:
             StoreError: if it cannot be answered.
         """
+        question = checked_question(cypher)
         with self.opened() as database:
             try:
-                return database.run(cypher, parameters)
+                return database.run(question, parameters)
             except RuntimeError as error:
                 problem = str(error).splitlines()[0]
                 raise StoreError(f"the question cannot be answered: {problem}") from error

@@ -263,10 +263,16 @@ def test_strings_are_values_wherever_they_come_from(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("cypher", "problem"),
     [
-        ("FOO", "mismatched input"),
+        ("FOO", "begins with 'FOO': expected MATCH"),
+        ("MATCH (o:Object) RETRUN o", "input"),
         ("MATCH (o:Nothing) RETURN o", "Nothing"),
         ("MATCH (o:Object) DETACH DELETE o", "read-only"),
-        ("DROP TABLE Relation", "read-only"),
+        ("MATCH (o:Object) SET o.x = 1", "read-only"),
+        ("DROP TABLE Relation", "begins with 'DROP'"),
+        ("", "begins with ''"),
+        ("MATCH (o:Object) RETURN o.id; MATCH (o:Object) RETURN o.x", "more than one statement"),
+        ("CALL show_functions() RETURN *", "begins with 'CALL'"),
+        ("WITH 1 AS x CALL show_functions() RETURN x", "CALL is no part of a question"),
     ],
 )
 def test_a_question_that_cannot_be_answered(tmp_path: Path, cypher: str, problem: str) -> None:
@@ -276,6 +282,49 @@ def test_a_question_that_cannot_be_answered(tmp_path: Path, cypher: str, problem
     with pytest.raises(StoreError, match=f"the question cannot be answered: .*{problem}"):
         store.ask(cypher)
     assert len(content(store)[0]) == 1
+
+
+LOADED = "LOAD FROM 'FILE' (file_format='csv', header=false) RETURN *"
+
+
+@pytest.mark.parametrize(
+    "cypher",
+    [
+        LOADED,
+        f"UNWIND [1] AS x {LOADED}",
+        # A number ends where a word begins.
+        f"UNWIND [1] AS x WITH x LIMIT 1{LOADED}",
+        # For ladybug, the first of these comments ends later; for others, a string begins in it.
+        f"UNWIND [1] AS x /***/ ' */ {LOADED} // '",
+        f"UNWIND [1] AS x /* ' */ {LOADED} /* ' */",
+        f"UNWIND ['\\''] AS x {LOADED} //'",
+        f"RETURN 1; {LOADED}",
+        "COPY (MATCH (o:Object) RETURN o.id) TO 'FILE'",
+        "PROFILE COPY (MATCH (o:Object) RETURN o.id) TO 'FILE'",
+        "EXPORT DATABASE 'FILE.folder'",
+        "ATTACH 'FILE' AS other (dbtype lbug)",
+        "INSTALL httpfs",
+    ],
+)
+def test_a_question_neither_reads_nor_writes_other_files(tmp_path: Path, cypher: str) -> None:
+    with StoreWriter(tmp_path / "store") as writer:
+        writer.add(graph(1, 1.0, [node(1)]))
+    file = tmp_path / "mine.csv"
+    file.write_text("a secret\n")
+    with pytest.raises(StoreError, match="the question cannot be answered: "):
+        print(Store(tmp_path / "store").ask(cypher.replace("FILE", str(file))).rows)
+    assert file.read_text() == "a secret\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.csv", "store"]
+
+
+def test_strings_names_and_comments_of_a_question_are_free(tmp_path: Path) -> None:
+    with StoreWriter(tmp_path) as writer:
+        writer.add(graph(1, 1.0, [node(1, "load; // it")]))
+    ask = Store(tmp_path).ask
+    found = ask("match (o:Object) where o.label = 'load; // it' return o.id AS `copy`;")
+    assert (found.columns, found.rows) == (["copy"], [[1]])
+    cypher = '/* LOAD it; */ OPTIONAL MATCH (o:Object) // CALL\nRETURN "it\'s /* ", o.id //'
+    assert ask(cypher).rows == [["it's /* ", 1]]
 
 
 def test_a_damaged_database_is_made_anew(tmp_path: Path) -> None:
