@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +14,9 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 # A longer header is not one: that of a network of 40 thousand parameters has 6 MB.
 MAX_HEADER_BYTES = 100_000_000
+# A small file can have a dictionary that contains itself, or one that it contains very often.
+MAX_DEPTH = 32
+MAX_ENTRIES = 1_000_000
 DTYPES = {"F64": "float64", "F32": "float32", "F16": "float16", "BF16": "bfloat16", "I64": "int64"}
 
 
@@ -78,15 +82,31 @@ def _torch(path: Path) -> list[ParameterHeader]:
             f"{path} cannot be read without executing code in it ({reason}): expected a file of "
             "safetensors, or tensors that torch saved"
         ) from error
-    found: list[ParameterHeader] = []
-    pending = [("", content)]
-    while pending:
-        name, value = pending.pop()
-        if torch.is_tensor(value):
-            dtype = str(value.dtype).removeprefix("torch.")
-            found.append(ParameterHeader(name, dtype, tuple(value.shape)))
-        elif isinstance(value, dict):
-            pending += [
-                (f"{name}.{key}" if name else str(key), part) for key, part in value.items()
-            ]
+    try:
+        found = [
+            ParameterHeader(name, str(value.dtype).removeprefix("torch."), tuple(value.shape))
+            for name, value in _entries(content)
+            if torch.is_tensor(value)
+        ]
+    except ValueError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
     return sorted(found, key=lambda header: header.name)
+
+
+def _entries(content: Any) -> Iterator[tuple[str, Any]]:
+    """Values of nested dictionaries, by name; ValueError if they are too many or too deep."""
+    pending = [("", content, 0)]
+    for _ in range(MAX_ENTRIES):
+        if not pending:
+            return
+        name, value, depth = pending.pop()
+        if not isinstance(value, dict):
+            yield name, value
+        elif depth == MAX_DEPTH:
+            raise ValueError(f"its dictionaries are nested more than {MAX_DEPTH} deep")
+        else:
+            pending += [
+                (f"{name}.{key}" if name else str(key), part, depth + 1)
+                for key, part in value.items()
+            ]
+    raise ValueError(f"its dictionaries have more than {MAX_ENTRIES} entries")

@@ -152,6 +152,25 @@ def test_inspect_prints_names_and_shapes(tmp_path: Path) -> None:
     assert "state_dict.a  float32  2 x 3" in models("inspect", tmp_path / "model.ckpt").output
 
 
+def test_inspect_ends_on_dictionaries_without_end(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    path = tmp_path / "model.pt"
+    itself: dict[str, object] = {"weight": torch.zeros(1)}
+    itself["a"] = itself
+    torch.save(itself, path)
+    with pytest.raises(ConfigurationError, match="nested more than 32 deep"):
+        read_headers(path)
+    often: dict[str, object] = {"weight": torch.zeros(1)}
+    for _ in range(30):
+        often = {"a": often, "b": often}
+    torch.save(often, path)
+    with pytest.raises(ConfigurationError, match="more than 1000000 entries"):
+        read_headers(path)
+    once = {"weight": torch.zeros(1)}
+    torch.save({"a": once, "b": once}, path)
+    assert [header.name for header in read_headers(path)] == ["a.weight", "b.weight"]
+
+
 def test_inspect_refuses_other_files(tmp_path: Path) -> None:
     cut = tmp_path / "cut.safetensors"
     cut.write_bytes(WEIGHTS[:50])
