@@ -16,6 +16,8 @@ NODES = ("graph_node", "deworldsg_node")
 # The graph's thread may compile kernels, or write a large map.
 TIMEOUT_S = 60.0
 FIND_S = 10.0
+# Between two looks whether the client was closed meanwhile.
+STEP_S = 0.1
 
 
 class GraphCommands:
@@ -27,6 +29,10 @@ class GraphCommands:
 
     _node: Any
     _namespace: str
+
+    def _check_can_wait(self) -> None:
+        """Raise ClientError if nothing can arrive any more while this thread waits."""
+        raise NotImplementedError
 
     def set_label(self, node: int, label: str) -> dict[str, Any]:
         """Set the class of an object."""
@@ -67,6 +73,15 @@ class GraphCommands:
         return answer
 
     def _call(self, service: str, request: dict[str, Any] | None) -> str:
+        try:
+            return self._answer(service, request)
+        except ClientError:
+            raise
+        except Exception:
+            self._check_can_wait()  # without its node, a closed client has errors of ROS
+            raise
+
+    def _answer(self, service: str, request: dict[str, Any] | None) -> str:
         kind = TRIGGER_SERVICE if request is None else TEXT_SERVICE
         client = self._node.create_client(kind, self._find(service))
         try:
@@ -76,11 +91,14 @@ class GraphCommands:
             end_s = time.monotonic() + TIMEOUT_S
             arrived = threading.Event()
             while not client.service_is_ready() and time.monotonic() < end_s:
+                self._check_can_wait()
                 time.sleep(0.02)
             future = client.call_async(message)
             future.add_done_callback(lambda _: arrived.set())
-            if not arrived.wait(end_s - time.monotonic()):
-                raise ClientError(f"no answer of {client.srv_name} within {TIMEOUT_S:g} s")
+            while not arrived.wait(STEP_S):
+                self._check_can_wait()
+                if time.monotonic() > end_s:
+                    raise ClientError(f"no answer of {client.srv_name} within {TIMEOUT_S:g} s")
             response = future.result()
         finally:
             self._node.destroy_client(client)
@@ -93,6 +111,7 @@ class GraphCommands:
         end_s = time.monotonic() + FIND_S
         names = [f"{self._namespace}/{node}/{service}" for node in NODES]
         while time.monotonic() < end_s:
+            self._check_can_wait()
             known = dict(self._node.get_service_names_and_types())
             found = [name for name in names if name in known]
             if found:

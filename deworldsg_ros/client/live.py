@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import String
 
 from deworldsg_ros.client.changes import Changes
-from deworldsg_ros.client.commands import GraphCommands
+from deworldsg_ros.client.commands import STEP_S, GraphCommands
 from deworldsg_ros.client.errors import ClientError, NoService
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.scene import wire
@@ -166,11 +166,13 @@ class SceneGraphClient(GraphCommands):
         """The graph, as soon as it contains the update with this number.
 
         Raises:
-            ClientError: if it does not arrive in time.
+            ClientError: if it does not arrive in time, or cannot: in a function of `on_change`, and
+                after `close`.
         """
         end_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
             while not self.has_graph or self._replica.sequence < sequence:
+                self._check_can_wait()
                 left_s = end_s - time.monotonic()
                 if left_s <= 0:
                     topic = f"{self._namespace}/scene_graph"
@@ -178,7 +180,7 @@ class SceneGraphClient(GraphCommands):
                         f"no graph on {topic} within {timeout_s:g} s: is graph_node running, and "
                         "are ROS_DOMAIN_ID and the namespace the same?"
                     )
-                self._changed.wait(min(left_s, 1.0))
+                self._changed.wait(min(left_s, STEP_S))
             graph = self.newest
         assert graph is not None
         return graph
@@ -205,18 +207,27 @@ class SceneGraphClient(GraphCommands):
     def on_change(self, callback: Callback) -> None:
         """Call a function with the new graph and the changes, after every change of the graph.
 
-        It runs in the thread of the client, so it should be short. If it raises an exception, this
-        is logged with its traceback, and the client goes on.
+        It runs in the thread of the client, so it should be short. It must not wait for the client:
+        there, commands and `wait` raise ClientError. If it raises an exception, this is logged with
+        its traceback, and the client goes on.
         """
         self._callbacks.append(callback)
 
     def on_message(self, callback: Callable[[GraphMessage], object]) -> None:
         """Call a function with each message that changes the copy, in order: whole graphs, updates.
 
-        It runs in the thread of the client, so it should be short. An exception is logged, as in
-        `on_change`.
+        It runs in the thread of the client, as in `on_change`; an exception is logged, too.
         """
         self._replica.listeners.append(callback)
+
+    def _check_can_wait(self) -> None:
+        if threading.current_thread() is self._thread:
+            raise ClientError(
+                "the client's own thread cannot wait for what it has to receive itself: call this "
+                "from another thread"
+            )
+        if self._stop.is_set():
+            raise ClientError("the client is closed")
 
     def _spin(self) -> None:
         while not self._stop.is_set() and self._context.ok():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 
 import pytest
 
@@ -11,6 +12,7 @@ pytest.importorskip("rclpy")
 
 import msgspec
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 from support.nodes import Peer, peer, wait_until
 from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
@@ -145,3 +147,57 @@ def test_functions_of_the_user_that_raise_do_not_end_the_client(
     log = capfd.readouterr().err
     assert "the client goes on after KeyError('a mistake of the user')" in log
     assert "Traceback" in log
+
+
+def test_a_function_of_the_client_cannot_wait_for_it() -> None:
+    refusals: list[str] = []
+
+    def note(call: Callable[[], object]) -> None:
+        try:
+            call()
+        except ClientError as error:
+            refusals.append(str(error))
+
+    with peer("graph_node") as me, SceneGraphClient() as client:
+        called = threading.Event()
+        me.node.create_service(Trigger, "~/save", lambda request, response: response)
+        client.on_message(lambda message: note(lambda: client.wait(2)))
+        client.on_change(lambda now, changes: note(client.save))
+        client.on_change(lambda now, changes: note(lambda: client.goal_near("cup")))
+        client.on_change(lambda now, changes: refusals.append(f"{len(client.graph)} object"))
+        client.on_change(lambda now, changes: called.set())
+        Robot(me).latch(graph(1, "cup"))
+        assert called.wait(LIMIT_S)
+    assert refusals.pop() == "1 object"  # what has arrived needs no waiting
+    assert len(refusals) == 3
+    assert all("call this from another thread" in refusal for refusal in refusals)
+
+
+def test_closing_a_client_ends_those_who_wait_for_it() -> None:
+    errors: list[BaseException] = []
+    closed = threading.Event()
+
+    def wait(call: Callable[[], object]) -> None:
+        try:
+            call()
+        except BaseException as error:
+            errors.append(error)
+
+    def answer(request: object, response: Trigger.Response) -> Trigger.Response:
+        client.close()
+        closed.set()
+        return response
+
+    with peer("graph_node") as me, SceneGraphClient() as client:
+        me.node.create_service(Trigger, "~/save", answer)
+        # Waiting for an answer, for a service, and for a graph.
+        calls: list[Callable[[], object]] = [client.save, client.clear, client.wait]
+        threads = [threading.Thread(target=wait, args=(call,), daemon=True) for call in calls]
+        for thread in threads:
+            thread.start()
+        me.spin_until(closed.is_set, LIMIT_S, "the request")
+        for thread in threads:
+            thread.join(LIMIT_S)
+        wait(client.save)
+    assert [str(error) for error in errors] == ["the client is closed"] * 4
+    assert {type(error) for error in errors} == {ClientError}
