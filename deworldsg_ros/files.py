@@ -148,6 +148,23 @@ def confined(folder: Path, name: str | Path) -> Path:
     return path
 
 
+def check_different(files: Iterable[tuple[str, Path]]) -> None:
+    """Test that no two files to write are one.
+
+    Args:
+        files: what each is, in words, and its path.
+
+    Raises:
+        ValueError: two are; the message begins with both.
+    """
+    seen: dict[str, str] = {}
+    for name, path in files:
+        real = os.path.realpath(path)
+        if real in seen:
+            raise ValueError(f"{seen[real]} and {name} are one file, {path}: give another path")
+        seen[real] = name
+
+
 def check_writable(path: Path) -> None:
     """Make the folder of a file and test that `write_atomically` can write there.
 

@@ -6,7 +6,7 @@ frames everything comes, and the space that the camera saw as free.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.files import FileLock, check_writable
+from deworldsg_ros.files import FileLock, check_different, check_writable
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.parsing import parse_json, paused_collector
@@ -63,6 +63,25 @@ def write_state(state: Arrays, path: Path) -> None:
 def previous_of(path: Path) -> Path:
     """Path of the generation before the map `path`."""
     return path.with_name(f"{path.name}.previous")
+
+
+def check_paths(map_path: Path | None, others: Iterable[tuple[str, Path]]) -> None:
+    """Test that a map, the generation before it, and what is written beside it are different files.
+
+    Args:
+        map_path: None = no map.
+        others: what each is, in words, and its path.
+
+    Raises:
+        ConfigurationError: two are one file; the last one that is written would be left.
+    """
+    files = list(others)
+    if map_path is not None:
+        files += [("the map", map_path), ("the map's previous generation", previous_of(map_path))]
+    try:
+        check_different(files)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
 
 
 def claim_map(path: Path) -> FileLock:

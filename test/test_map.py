@@ -7,6 +7,7 @@ import os
 import signal
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -14,7 +15,9 @@ import pytest
 from support.killing import full_disk, killed, moments_s, names
 from support.merging import VOCABULARY, random_local_graphs
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab
+from typer.testing import CliRunner
 
+from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, continue_map, previous_of, read_map, write_map
@@ -221,6 +224,45 @@ def test_an_unwritable_map_is_refused_at_the_start(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigurationError, match=r"map .*room\.map cannot be written: \w+"):
         claim_map(tmp_path / "file" / "room.map")
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--map", "out/scene_graph.json"], "the result scene_graph.json and the map are one"),
+        (["--map", "link/run.json"], "the result run.json and the map are one"),
+        (["--map", "out/a", "--save-trajectory", "out/a"], "the trajectory and the map are one"),
+        (
+            ["--map", "a", "--save-trajectory", "./a.previous"],
+            "the trajectory and the map's previous generation are one",
+        ),
+        (
+            ["--save-trajectory", "out/../out/config.yaml"],
+            "the result config.yaml and the trajectory are one",
+        ),
+    ],
+)
+def test_a_run_does_not_write_over_its_own_files(tmp_path, monkeypatch, options, problem):
+    monkeypatch.chdir(tmp_path)
+    Path("out").mkdir()
+    Path("link").symlink_to("out")
+    # No such recording: the paths are looked at before it.
+    done = CliRunner().invoke(app, ["run", "none", "--out", "out", *options])
+    assert done.exit_code == 2
+    assert problem in " ".join(done.stderr.split())
+    assert names(tmp_path / "out") == []
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.frames.json", "a.space.npz"])
+def test_a_node_does_not_write_its_graph_over_its_map(tmp_path, name):
+    pytest.importorskip("rclpy")
+    from deworldsg_ros.ros.graph_files import GraphFiles
+    from deworldsg_ros.ros.options import NodeOptions, Parameters
+
+    parameters = Parameters(node=NodeOptions(str(tmp_path / "a.json"), str(tmp_path / name)))
+    with pytest.raises(ConfigurationError, match="and the map are one file"):
+        GraphFiles(SimpleNamespace(parameters=parameters))
+    assert names(tmp_path) == []
 
 
 def seen(times: int) -> GraphBuilder:

@@ -28,7 +28,7 @@ from deworldsg_ros.doctor import Finding
 from deworldsg_ros.evaluation.measures.temporal import UpdateLog
 from deworldsg_ros.graph_builder import warm_up
 from deworldsg_ros.kernels import COMPILING, on_compilation
-from deworldsg_ros.map_file import claim_map, continue_map, write_map
+from deworldsg_ros.map_file import check_paths, claim_map, continue_map, write_map
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
@@ -125,6 +125,7 @@ class _Ran:
 
 def run_recording(options: RunOptions, console: Console) -> None:
     """Run, write the results and print a summary; raises DeWorldSGError."""
+    _check_paths(options)
     # The map is ours from reading to writing: what another process adds to it would be lost.
     with claim_map(options.map_path) if options.map_path else nullcontext():
         ran = _run(options, console, lambda: outputs.check_folder(options.out))
@@ -132,6 +133,13 @@ def run_recording(options: RunOptions, console: Console) -> None:
     outputs.print_drops(console, ran.recording.losses, ran.drops, ran.recording.reasons)
     _print_summary(options, ran.pipeline, ran.processed, console)
     print_findings(console, ran.findings)
+
+
+def _check_paths(options: RunOptions) -> None:
+    files = [(f"the result {name}", options.out / name) for name in outputs.RESULTS]
+    if options.trajectory_out is not None:
+        files.append(("the trajectory", options.trajectory_out))
+    check_paths(options.map_path, files)
 
 
 def examine(options: RunOptions, console: Console) -> list[Finding]:

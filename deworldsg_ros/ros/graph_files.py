@@ -6,12 +6,12 @@ from pathlib import Path
 
 from deworldsg_ros.files import write_atomically
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import Continued
+from deworldsg_ros.map_file import Continued, check_paths
 from deworldsg_ros.ros.map_keeper import MapKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.seen_frames import write_seen
-from deworldsg_ros.scene.seen_space import write_space
+from deworldsg_ros.scene.seen_frames import path_beside, write_seen
+from deworldsg_ros.scene.seen_space import space_path, write_space
 from deworldsg_ros.words import counted
 
 
@@ -25,7 +25,7 @@ class GraphFiles:
         map: None without a map.
 
     Raises:
-        ConfigurationError: if the map file cannot be written.
+        ConfigurationError: if the map file cannot be written, or is that of `save_path`.
     """
 
     def __init__(self, node: StageNode) -> None:
@@ -34,7 +34,13 @@ class GraphFiles:
         self._save_path = Path(options.save_path).absolute()
         self.map: MapKeeper | None = None
         if options.map_path:
+            self._check_paths(Path(options.map_path))
             self.map = MapKeeper(node, Path(options.map_path).absolute(), options.map_period_s)
+
+    def _check_paths(self, map_path: Path) -> None:
+        path = self._save_path
+        beside = [("its frames", path_beside(path)), ("its space", space_path(path))]
+        check_paths(map_path, [("save_path", path), *beside])
 
     def continued_map(self) -> Continued | None:
         """The graph of the map file, if there is one; raises ConfigurationError if it has none."""
