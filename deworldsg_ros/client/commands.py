@@ -29,10 +29,18 @@ class GraphCommands:
 
     _node: Any
     _namespace: str
+    _thread: threading.Thread | None
+    _stop: threading.Event
 
     def _check_can_wait(self) -> None:
         """Raise ClientError if nothing can arrive any more while this thread waits."""
-        raise NotImplementedError
+        if threading.current_thread() is self._thread:
+            raise ClientError(
+                "the client's own thread cannot wait for what it has to receive itself: call this "
+                "from another thread"
+            )
+        if self._stop.is_set():
+            raise ClientError("the client is closed")
 
     def set_label(self, node: int, label: str) -> dict[str, Any]:
         """Set the class of an object."""

@@ -166,8 +166,7 @@ class SceneGraphClient(GraphCommands):
         """The graph, as soon as it contains the update with this number.
 
         Raises:
-            ClientError: if it does not arrive in time, or cannot: in a function of `on_change`, and
-                after `close`.
+            ClientError: if it does not arrive in time; in functions of `on_change`; after `close`.
         """
         end_s = time.monotonic() + min(timeout_s, threading.TIMEOUT_MAX)
         with self._changed:
@@ -219,15 +218,6 @@ class SceneGraphClient(GraphCommands):
         It runs in the thread of the client, as in `on_change`; an exception is logged, too.
         """
         self._replica.listeners.append(callback)
-
-    def _check_can_wait(self) -> None:
-        if threading.current_thread() is self._thread:
-            raise ClientError(
-                "the client's own thread cannot wait for what it has to receive itself: call this "
-                "from another thread"
-            )
-        if self._stop.is_set():
-            raise ClientError("the client is closed")
 
     def _spin(self) -> None:
         while not self._stop.is_set() and self._context.ok():
