@@ -21,7 +21,7 @@ def counted(count: int, noun: str) -> str:
 
 
 def visible(text: str) -> str:
-    """Text of a file or message for one line: what is no character to see becomes an escape.
+    """Text of a file or message for one line, with escapes for its control characters.
 
     The escapes are those of JSON, so that a line of JSON stays one.
     """

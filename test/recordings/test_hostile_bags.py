@@ -33,7 +33,7 @@ def read(path: Path) -> list[RawMessage]:
 
 
 def losses_of(path: Path) -> str:
-    """What is told about a bag after all its messages were read."""
+    """The notes on a bag, such as what was lost, after all its messages were read."""
     bag = RawBag(path)
     list(bag.messages([topic.key for topic in bag.topics]))
     bag.close()

@@ -45,7 +45,7 @@ def decompress_message(packed: bytes) -> bytes:
 
 
 class _File(zstd.ZstdFile):
-    """A compressed file, of which only a multiple of its size is read."""
+    """A compressed file. It unpacks to `MAX_FILE_RATIO` times its size at most."""
 
     def __init__(self, file: BinaryIO, mode: str) -> None:
         super().__init__(file, mode)

@@ -1,7 +1,7 @@
 """The readers of rosbags, bounded: no small file of a bag runs for ever or fills the memory.
 
-rosbags trusts its files. Here each file is checked when it is opened or read, whatever its name is
-and whoever names it.
+rosbags trusts its files. Here each file is checked when it is opened or read. Its name does not
+matter, nor whether the folder or `metadata.yaml` names it.
 """
 
 from __future__ import annotations
