@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import threading
-from contextlib import closing
+from contextlib import closing, nullcontext
 from types import SimpleNamespace
-from unittest.mock import MagicMock
+from unittest.mock import DEFAULT, create_autospec
 
 import numpy as np
 import pytest
 from support.view import make_graph, make_node
 
 pytest.importorskip("viser", reason="needs the extra view: viser")
+
+import viser
 
 from deworldsg_ros.view.live.client_labels import ClientLabels
 from deworldsg_ros.view.live.errors import LogOnce
@@ -22,11 +24,17 @@ LIMIT_S = 30.0
 PORT = 8580
 
 
-class Browser(MagicMock):
-    """A client of viser with a window of some size; it looks along +y."""
+class Browser:
+    """A client of viser with a window of some size; it looks along +y.
 
-    def __init__(self, width=800, height=600, **more):
-        super().__init__(**more)
+    Its scene has the methods of viser's and refuses other arguments.
+    """
+
+    atomic = nullcontext
+    client_id = 1
+
+    def __init__(self, width=800, height=600):
+        self.scene = create_autospec(viser.SceneApi, instance=True)
         self.camera = SimpleNamespace(
             position=np.zeros(3),
             wxyz=np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]),
@@ -60,7 +68,7 @@ def test_a_window_without_room_for_a_label_has_none(width, height):
 def test_small_windows_are_no_errors_and_others_get_their_labels(width, height, monkeypatch):
     errors, drawn = [], threading.Event()
     small, usual = Browser(width, height), Browser()
-    usual.scene.add_label.side_effect = lambda *_, **__: drawn.set() or MagicMock()
+    usual.scene.add_label.side_effect = lambda *_, **__: drawn.set() or DEFAULT
     with closing(Viewer("127.0.0.1", PORT, "", errors.append)) as viewer:
         monkeypatch.setattr(viewer._server, "get_clients", lambda: {1: small, 2: usual})
         viewer.reset(cups(2))
@@ -73,7 +81,7 @@ def test_a_step_of_the_page_that_fails_is_told_and_the_page_goes_on(monkeypatch)
     errors, drawn = [], threading.Event()
     broken, usual = Browser(), Browser()
     broken.scene.add_label.side_effect = RuntimeError("the browser has gone")
-    usual.scene.add_label.side_effect = lambda *_, **__: drawn.set() or MagicMock()
+    usual.scene.add_label.side_effect = lambda *_, **__: drawn.set() or DEFAULT
     with closing(Viewer("127.0.0.1", PORT, "", errors.append)) as viewer:
         show, asked = viewer._scene.show, []
 
