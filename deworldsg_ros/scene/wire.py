@@ -529,12 +529,9 @@ def _check_graph(message: Union[SceneGraphMessage, SceneGraphUpdateMessage]) -> 
     for node in nodes:
         if isinstance(node.box, GravityBox):
             _check_unit(f"box orientation of node {node.id}", node.box.orientation_xyzw)
-    ids = [node.id for node in nodes]
-    if len(set(ids)) < len(ids):
-        raise ValueError(f"node {_repeated(ids)} is there twice")
+    _check_once("node", [node.id for node in nodes])
     ends = [(edge.subject, edge.object) for edge in edges]
-    if len(set(ends)) < len(ends):
-        raise ValueError(f"edge {_repeated(ends)} is there twice")
+    _check_once("edge", ends)
     for subject, object_ in ends:
         if subject == object_:
             raise ValueError(f"an edge connects node {subject} with itself")
@@ -546,8 +543,9 @@ def _check_unit(name: str, values: list[float]) -> None:
         raise ValueError(f"{name} is {values}: expected length 1, its square is {squared:.4g}")
 
 
-def _repeated(items: list[Any]) -> Any:
-    return Counter(items).most_common(1)[0][0]
+def _check_once(name: str, items: list[Any]) -> None:
+    if len(set(items)) < len(items):
+        raise ValueError(f"{name} {Counter(items).most_common(1)[0][0]} is there twice")
 
 
 def json_schema(kind: type[Message]) -> dict[str, Any]:
