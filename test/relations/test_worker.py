@@ -105,6 +105,16 @@ class FailsAtFirst(RecordingModel):
         return super().predict(request)
 
 
+def observe_one_by_one(worker, frames):
+    worker.start()
+    try:
+        for stamp in range(frames):
+            worker.observe(pair_graph(stamp), picture(stamp))
+            assert worker.wait_idle(LONG_S)
+    finally:
+        assert worker.stop(LONG_S)
+
+
 def test_the_worker_survives_failures_of_world_model_and_receiver():
     reports, delivered = [], []
 
@@ -114,13 +124,7 @@ def test_the_worker_survives_failures_of_world_model_and_receiver():
         delivered.append(evidence)
 
     worker = worker_of(FailsAtFirst(), deliver, reports.append)
-    worker.start()
-    try:
-        for stamp in range(3):
-            worker.observe(pair_graph(stamp), picture(stamp))
-            assert worker.wait_idle(LONG_S)
-    finally:
-        assert worker.stop(LONG_S)
+    observe_one_by_one(worker, 3)
     assert [evidence.stamp_ns for evidence in delivered] == [2]
     assert reports == [
         "world model 'fake' failed: RuntimeError: not loaded yet",
@@ -164,12 +168,6 @@ def test_an_unexpected_error_of_the_reasoner_does_not_end_the_thread(monkeypatch
         return work()
 
     monkeypatch.setattr(worker.reasoner, "work", fail_once)
-    worker.start()
-    try:
-        for stamp in range(2):
-            worker.observe(pair_graph(stamp), picture(stamp))
-            assert worker.wait_idle(LONG_S)
-    finally:
-        assert worker.stop(LONG_S)
+    observe_one_by_one(worker, 2)
     assert len(receiver.evidence) == 2
     assert reports == ["a clip was not judged: IndexError: a mistake"]
