@@ -124,9 +124,10 @@ def to_device(
     device = choose_device("perception.device", choice)
     shape = (1, identity.clip_length, 3, identity.image_size, identity.image_size)
 
-    @torch.inference_mode()
+    # A decorator of torch has no type where torch is not installed.
     def of_test_clip(model: Any, dtype: torch.dtype) -> torch.Tensor:
-        return features(model, normalise(noise_pattern(*shape).to(device), dtype))
+        with torch.inference_mode():
+            return features(model, normalise(noise_pattern(*shape).to(device), dtype))
 
     with enough_memory(f"moving the backbone to {device}", REMEDY):
         placed, dtype = in_best_precision(
