@@ -11,6 +11,7 @@ from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import NodeStates
 
 # State of a rule besides the graph, as arrays by name.
 Memory = dict[str, NDArray[Any]]
@@ -21,7 +22,7 @@ def warm_up_graph() -> None:
     graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
     observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
     graph.observe(graph.add_node(*observation), *observation)
-    graph.node_states(1)
+    NodeStates(graph, 1, graph.even_gaussians).refresh()
 
 
 def check_fits(graph: SceneGraph, local: LocalGraph) -> None:

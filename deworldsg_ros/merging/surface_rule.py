@@ -30,6 +30,7 @@ from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import NodeStates
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0
@@ -59,7 +60,7 @@ class SurfaceMerging:
         spare, graph = SurfaceMerging(self._config), SceneGraph(SPARE, "world", even_gaussians=True)
         for stamp_ns in range(1, 4):
             spare.merge(graph, _spare_frame(stamp_ns))
-        graph.node_states(1)
+        NodeStates(graph, 1, graph.even_gaussians).refresh()
         spare.hidden(graph)
         spare._records.remove(1)
         graph.merge_nodes(1, 2)

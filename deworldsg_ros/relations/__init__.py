@@ -17,14 +17,15 @@ from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
 from deworldsg_ros.relations.world_model import (
+    WORLD_MODELS,
     ClipRequest,
     PairContext,
     WorldModel,
     build_world_model,
-    world_model_names,
 )
 
 __all__ = [
+    "WORLD_MODELS",
     "ClassPairPrior",
     "ClipPolicy",
     "ClipQueue",
@@ -51,5 +52,4 @@ __all__ = [
     "neighbour_pairs",
     "union_box",
     "visual_distribution",
-    "world_model_names",
 ]

@@ -8,14 +8,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.edge_map import EdgeMap
 from deworldsg_ros.scene.edges import EdgeArrays, EdgeEvidence, Pair
 from deworldsg_ros.scene.edits import Edit, EditLog
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.node_ids import IdState, NodeIds
-from deworldsg_ros.scene.node_states import NodeStates
 from deworldsg_ros.scene.node_store import NodeStore
 from deworldsg_ros.scene.nodes import SAVED_COLUMNS
 from deworldsg_ros.scene.votes import PairVotes, VoteMap, VotesByPair
@@ -75,7 +73,6 @@ class SceneGraph(NodeStore):
         self.even_gaussians = even_gaussians
         self._edges = EdgeMap(len(vocabulary.predicates))
         self._votes = VoteMap(len(vocabulary.predicates))
-        self._states: dict[int, NodeStates] = {}
 
     @classmethod
     def from_state(cls, state: GraphState) -> SceneGraph:
@@ -217,19 +214,6 @@ class SceneGraph(NodeStore):
         live = [pair for pair in pairs if pair[0] and pair[1] and pair[0] != pair[1]]
         self._edges.add_neighbours(live, stamp_ns, self.revision)
         self.revision += len(live)
-
-    def node_states(self, top_k: int, with_points: bool = False) -> dict[int, wire.NodeState]:
-        """Messages of the confirmed nodes by ascending id.
-
-        Messages without points of nodes that did not change are the same objects as before.
-        """
-        if (states := self._states.get(top_k)) is None:
-            states = self._states[top_k] = NodeStates(self, top_k, self.even_gaussians)
-        states.refresh()
-        known = dict(sorted(states.states.items()))
-        if not with_points:
-            return known
-        return {node_id: states.with_points(state) for node_id, state in known.items()}
 
     def partners(self, node_id: int) -> Collection[int]:
         """Ids of the nodes that share an edge with a node; do not change it."""

@@ -18,6 +18,7 @@ from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
 from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
 from deworldsg_ros.perception.networks import box_prompts
 from deworldsg_ros.relations.probing import backbone
+from deworldsg_ros.relations.probing.probed_world_model import build_probed
 from deworldsg_ros.relations.world_models import vjepa2
 from deworldsg_ros.scene.errors import RefusedInput
 
@@ -136,7 +137,7 @@ def test_nan_in_features_is_counted_by_name(tmp_path, monkeypatch) -> None:
     identity = vjepa2.load_backbone(config).identity
     probe = save_random_probe(tmp_path / "probe", identity)
     config = config_of("vjepa2", tmp_path / "model", probe_path=str(probe))
-    model = vjepa2.build(config, "cpu")
+    model = build_probed(config, vjepa2.load_backbone, "cpu")
     broken = lambda videos: torch.full((1, identity.feature_dim), float("nan"))  # noqa: E731
     object.__setattr__(model._backbone, "features", broken)
     with pytest.raises(RefusedInput, match="48 of 48 values of a feature of vjepa2 are NaN"):

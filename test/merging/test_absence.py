@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
+from support.node_states import node_states
 from support.surfaces import CAMERA, CHAIR, CUP, HERE, TABLE, WHOLE, depth_grid, frame, slab
 
 from deworldsg_ros.config import MergingConfig
@@ -30,7 +31,7 @@ class Scene:
         return self.merging.merge(self.graph, frame(self.stamp, *objects, depth_grid=grid))
 
     def published(self) -> dict[int, str]:
-        return {node_id: node.label for node_id, node in self.graph.node_states(1).items()}
+        return {node_id: node.label for node_id, node in node_states(self.graph, 1).items()}
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY, random_pose
+from support.node_states import node_states
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig
@@ -91,7 +92,7 @@ def test_what_is_inside_all_masks_stays() -> None:
     assert len(x) > 0.9 * graph.surface_point_capacity
     assert np.histogram(x, 10, (-TRUE_M, TRUE_M))[0].min() > 20
     # The published size is that of the picture, not of the wide masks.
-    deviation_m = graph.node_states(1)[1].covariance_m2[0] ** 0.5
+    deviation_m = node_states(graph, 1)[1].covariance_m2[0] ** 0.5
     assert deviation_m == pytest.approx(2 * TRUE_M / 12**0.5, rel=0.1)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from msgspec import UNSET
 from support.merging import VOCABULARY
+from support.node_states import node_states
 from support.surfaces import CUP, HERE, depth_grid, frame
 
 from deworldsg_ros.config import MergingConfig
@@ -65,7 +66,7 @@ class Walk:
 
     @property
     def published(self) -> list[int]:
-        return list(self.graph.node_states(1))
+        return list(node_states(self.graph, 1))
 
     @property
     def existence(self) -> float:
@@ -76,7 +77,7 @@ def test_one_sure_look_is_enough_if_there_are_few() -> None:
     walk = Walk(frames_per_s=1.0)
     walk.see(detected=True)
     assert walk.published == [1]
-    state = walk.graph.node_states(1)[1]
+    state = node_states(walk.graph, 1)[1]
     assert state.existence == walk.existence > 0.6
 
 
@@ -188,18 +189,18 @@ def test_the_message_of_a_node_changes_with_its_rounded_existence_only() -> None
     for _ in range(60):
         walk.see(detected=True)
     walk.see(detected=False, step_m=0.0)
-    before = walk.graph.node_states(1)[1]
+    before = node_states(walk.graph, 1)[1]
     walk.see(detected=False, step_m=0.0)
-    after = walk.graph.node_states(1)[1]
+    after = node_states(walk.graph, 1)[1]
     assert after is before or after.existence != before.existence
     walk.see(detected=False, step_m=9.0)  # out of view
-    assert walk.graph.node_states(1)[1] is walk.graph.node_states(1)[1]
+    assert node_states(walk.graph, 1)[1] is node_states(walk.graph, 1)[1]
 
 
 def test_the_rule_of_the_paper_does_not_estimate_existence() -> None:
     graph, merging = SceneGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
     merging.merge(graph, frame(1, (HERE, CUP), scores=np.array([0.01])))
-    assert graph.node_states(1)[1].existence is UNSET and merging.hidden(graph) == {}
+    assert node_states(graph, 1)[1].existence is UNSET and merging.hidden(graph) == {}
 
 
 def test_a_loaded_node_is_published(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
+from support.node_states import node_states
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab, view
 
 from deworldsg_ros.config import MergingConfig
@@ -43,7 +44,7 @@ def test_a_flipping_label_creates_no_node(graph, merging) -> None:
     for stamp in range(10):
         kind = CHAIR if stamp % 5 == 3 else TABLE
         assert merging.merge(graph, frame(stamp, (WHOLE, kind))) == [1]
-    state = graph.node_states(3)[1]
+    state = node_states(graph, 3)[1]
     assert state.label == VOCABULARY.classes[TABLE]
     assert state.classes[0].probability > 0.5
     assert state.classes[1].label == VOCABULARY.classes[CHAIR]  # the disagreement is visible

@@ -26,7 +26,7 @@ from deworldsg_ros.relations.physics_model import (
     floor_odds,
     load_physics_model,
 )
-from deworldsg_ros.relations.world_model import build_world_model, world_model_names
+from deworldsg_ros.relations.world_model import WORLD_MODELS, build_world_model
 from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES, VISUAL_GENOME_CLASSES
@@ -57,7 +57,7 @@ def test_the_shipped_file_loads_and_is_small() -> None:
 
 
 def test_it_is_a_world_model_that_needs_no_clips() -> None:
-    assert "physics" in world_model_names()
+    assert "physics" in WORLD_MODELS
     assert build_world_model(RelationsConfig(world_model="physics")) is None
     assert RelationsConfig().world_model == "physics"
 

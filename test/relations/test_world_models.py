@@ -7,7 +7,7 @@ import pytest
 from support.relations import VOCABULARY
 
 from deworldsg_ros.config import RelationsConfig, from_mapping
-from deworldsg_ros.relations import build_world_model, world_model_names
+from deworldsg_ros.relations import WORLD_MODELS, build_world_model
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.relations.world_models.fake import FakeWorldModel
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -23,7 +23,7 @@ def request(seed=0, classes=((0, 1), (1, 0))):
 
 
 def test_world_models_are_chosen_by_name():
-    assert {"none", "fake"} <= set(world_model_names())
+    assert {"none", "fake"} <= set(WORLD_MODELS)
     assert build_world_model(RelationsConfig()) is None
     model = build_world_model(RelationsConfig(world_model="fake", clip_length=8))
     assert isinstance(model, FakeWorldModel) and model.name == "fake" and model.clip_length == 8

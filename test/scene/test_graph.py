@@ -15,6 +15,7 @@ from support.merging import (
     seeds,
     set_confirmed,
 )
+from support.node_states import node_states
 
 from deworldsg_ros.scene import graph_io, wire
 from deworldsg_ros.scene.edge_map import EdgeMap
@@ -52,7 +53,7 @@ def test_an_empty_graph() -> None:
     assert len(graph) == 0
     assert graph.nodes.means.shape == (0, 3)
     assert dict(graph.edges) == {}
-    assert graph.node_states(3) == {}
+    assert node_states(graph, 3) == {}
     assert graph.take_removals() == {}
     assert graph.resolve(1) == 0
 
@@ -271,12 +272,12 @@ def test_invalid_requests_raise_and_change_nothing() -> None:
 
 def test_unchanged_nodes_keep_their_message() -> None:
     graph = graph_of(3)
-    first = graph.node_states(2)
+    first = node_states(graph, 2)
     graph.observe(2, np.ones(3), np.eye(3), SURE, 9)
-    second = graph.node_states(2)
+    second = node_states(graph, 2)
     assert [second[node_id] is first[node_id] for node_id in (1, 2, 3)] == [True, False, True]
     graph.merge_nodes(1, 2)
-    third = graph.node_states(2)
+    third = node_states(graph, 2)
     assert list(third) == [1, 3]
     assert third[1].observations == 3
     assert third[3] is first[3]
@@ -286,12 +287,12 @@ def test_hidden_nodes_have_no_message() -> None:
     graph = graph_of(1)
     for x in (5.0, 9.0):
         graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
-    assert list(graph.node_states(2)) == [1]
+    assert list(node_states(graph, 2)) == [1]
     set_confirmed(graph, 3, True)
-    assert list(graph.node_states(2)) == [1, 3]
-    assert graph.node_states(2)[3].confirmed
+    assert list(node_states(graph, 2)) == [1, 3]
+    assert node_states(graph, 2)[3].confirmed
     assert graph.merge_nodes(2, 3) == 2  # a confirmed node stays confirmed
-    assert list(graph.node_states(2)) == [1, 2]
+    assert list(node_states(graph, 2)) == [1, 2]
 
 
 def test_the_message_of_a_node() -> None:
@@ -299,7 +300,7 @@ def test_the_message_of_a_node() -> None:
     points = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]], np.float32)
     classes = np.array([0.1, 0.4, 0.4, 0.1])
     graph.add_node(np.array([1.0, 2, 3]), np.diag([1.0, 2, 3]), classes, 1_500_000_000, points)
-    state = graph.node_states(3, with_points=True)[1]
+    state = node_states(graph, 3, with_points=True)[1]
     assert state.label == "table"  # of equals the first
     assert [belief.label for belief in state.classes] == ["table", "chair", "cup"]
     assert state.mean_m == [1, 2, 3]
@@ -307,7 +308,7 @@ def test_the_message_of_a_node() -> None:
     assert state.observations == 1
     assert state.first_seen == state.last_seen == wire.Stamp(1, 500_000_000)
     assert len(surface_points(state)) == 2
-    assert len(surface_points(graph.node_states(3)[1])) == 0
+    assert len(surface_points(node_states(graph, 3)[1])) == 0
 
 
 def test_room_for_surface_points_grows_with_the_largest_surface() -> None:
@@ -369,7 +370,7 @@ def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, se
     assert [item.name for item in path.parent.iterdir()] == ["graph.npz"]
     loaded = graph_io.load(path)
     assert equal(loaded, graph)
-    assert loaded.node_states(4, with_points=True) == graph.node_states(4, with_points=True)
+    assert node_states(loaded, 4, with_points=True) == node_states(graph, 4, with_points=True)
     for name in ("log_determinants", "eigenvalue_bounds"):
         np.testing.assert_array_equal(getattr(loaded.nodes, name), getattr(graph.nodes, name))
     # Both go on alike.
@@ -423,6 +424,6 @@ def test_a_file_of_a_later_version_is_refused(tmp_path: Path, monkeypatch) -> No
 def test_the_entropy_of_a_node_measures_disagreement(classes, entropy_nats) -> None:
     graph = SceneGraph(VOCABULARY, "world")
     graph.add_node(np.zeros(3), np.eye(3), np.array(classes), 1)
-    (state,) = graph.node_states(1).values()
+    (state,) = node_states(graph, 1).values()
     assert len(state.classes) == 1  # the entropy is of all classes
     assert state.entropy_nats == pytest.approx(entropy_nats, abs=1e-4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
+from support.node_states import node_states
 from support.room_nodes import room, table, thing
 
 from deworldsg_ros.scene import wire
@@ -27,7 +28,7 @@ def points() -> np.ndarray:
 
 
 def test_a_message_has_a_box_and_the_rest_of_its_classes(points: np.ndarray) -> None:
-    (state,) = graph_of_one(points).node_states(2, with_points=True).values()
+    (state,) = node_states(graph_of_one(points), 2, with_points=True).values()
     assert sum(belief.probability for belief in state.classes) == pytest.approx(0.8)
     assert state.remainder == pytest.approx(0.2)
     assert isinstance(state.box, wire.GravityBox)

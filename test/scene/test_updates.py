@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from support.merging import VOCABULARY, edit_at_random, seeds
+from support.node_states import node_states
 from support.reference_updates import diff
 
 from deworldsg_ros.scene import wire
@@ -17,7 +18,7 @@ from deworldsg_ros.scene.wire import SceneGraphMessage, SceneGraphUpdateMessage
 
 
 def snapshot_of(graph: SceneGraph, sequence: int):
-    nodes = graph.node_states(2, with_points=True)
+    nodes = node_states(graph, 2, with_points=True)
     edges = []
     for subject, object_ in sorted(graph.edges):
         evidence = graph.edges[subject, object_]

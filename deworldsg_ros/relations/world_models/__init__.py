@@ -1,1 +1,1 @@
-"""World models, one per file, each with `build(config: RelationsConfig) -> WorldModel | None`."""
+"""World models of clips, one per file; `world_model.WORLD_MODELS` has their names."""

@@ -21,7 +21,6 @@ from deworldsg_ros.relations.probing.backbone import (
     to_device,
 )
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
-from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
 
 # Edge of the square input, pixels: that of the published processor, 16 patches of 14 pixels. The
 # checkpoints' own 518 pixels are the size of their last training.
@@ -72,8 +71,3 @@ def load_backbone(
 def clip_geometry(image_size: int) -> ClipGeometry:
     """Interpolation of the published processor."""
     return ClipGeometry(image_size, "bicubic")
-
-
-def build(config: RelationsConfig, device: str) -> ProbedWorldModel:
-    """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
-    return build_probed(config, load_backbone, device)

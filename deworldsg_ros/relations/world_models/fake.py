@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.softmax import softmax
@@ -63,8 +62,3 @@ def _uniform(key: Sequence[object], count: int) -> Float64:
     """`count` numbers in [0, 1) that depend only on the key."""
     digest = hashlib.shake_256(repr(tuple(key)).encode()).digest(4 * count)
     return np.frombuffer(digest, "<u4").astype(np.float64) / 2.0**32
-
-
-def build(config: RelationsConfig, device: str) -> FakeWorldModel:
-    """The fake world model for the configured clip length."""
-    return FakeWorldModel(config.clip_length)

@@ -21,7 +21,6 @@ from deworldsg_ros.relations.probing.backbone import (
     to_device,
 )
 from deworldsg_ros.relations.probing.preprocessing import ClipGeometry
-from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel, build_probed
 from deworldsg_ros.scene.errors import ConfigurationError
 
 
@@ -68,8 +67,3 @@ def load_backbone(
 def clip_geometry(image_size: int) -> ClipGeometry:
     """Interpolation of the published processor and of the paper's released code."""
     return ClipGeometry(image_size, "bilinear")
-
-
-def build(config: RelationsConfig, device: str) -> ProbedWorldModel:
-    """The backbone with its probe; raises ConfigurationError if one of them does not fit."""
-    return build_probed(config, load_backbone, device)

@@ -1,0 +1,29 @@
+"""The messages of the nodes of a graph, as a publication makes them."""
+
+from __future__ import annotations
+
+from weakref import WeakKeyDictionary
+
+from deworldsg_ros.scene import wire
+from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.scene.node_states import NodeStates
+
+_made: WeakKeyDictionary[SceneGraph, dict[int, NodeStates]] = WeakKeyDictionary()
+
+
+def node_states(
+    graph: SceneGraph, top_k: int, with_points: bool = False
+) -> dict[int, wire.NodeState]:
+    """Messages of the confirmed nodes by ascending id.
+
+    Messages without points of nodes that did not change since the last call are the same objects.
+    """
+    of_graph = _made.setdefault(graph, {})
+    if top_k not in of_graph:
+        of_graph[top_k] = NodeStates(graph, top_k, graph.even_gaussians)
+    states = of_graph[top_k]
+    states.refresh()
+    known = dict(sorted(states.states.items()))
+    if not with_points:
+        return known
+    return {node_id: states.with_points(state) for node_id, state in known.items()}
