@@ -7,10 +7,14 @@ import threading
 import time
 from typing import Any
 
+from diagnostic_msgs.srv import AddDiagnostics
+from std_srvs.srv import Trigger
+
 from deworldsg_ros.client.errors import ClientError, NoService
 from deworldsg_ros.client.objects import Point
-from deworldsg_ros.client.ros_messages import TEXT_SERVICE, TRIGGER_SERVICE
 
+# The types of the services of graph_node: with JSON in `load_namespace`, and without arguments.
+TEXT_SERVICE, TRIGGER_SERVICE = AddDiagnostics, Trigger
 # Either of these nodes has the graph.
 NODES = ("graph_node", "deworldsg_node")
 # The graph's thread may compile kernels, or write a large map.

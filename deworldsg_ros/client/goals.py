@@ -91,9 +91,18 @@ class Goal:
 
     def pose_stamped(self) -> Any:
         """The pose as geometry_msgs/PoseStamped; needs ROS 2."""
-        from deworldsg_ros.client.ros_messages import pose_stamped
+        from builtin_interfaces.msg import Time
+        from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+        from std_msgs.msg import Header
 
-        return pose_stamped(self.position_m, self.orientation_xyzw, self.frame_id, self.stamp_ns)
+        sec, nanosec = divmod(self.stamp_ns, 10**9)
+        x, y, z = self.position_m
+        qx, qy, qz, qw = self.orientation_xyzw
+        position, turn = Point(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+        return PoseStamped(
+            header=Header(stamp=Time(sec=sec, nanosec=nanosec), frame_id=self.frame_id),
+            pose=Pose(position=position, orientation=turn),
+        )
 
 
 def goal_near(
