@@ -19,8 +19,9 @@ from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived, Perception
 from deworldsg_ros.perception.upright import UprightFrame
 from deworldsg_ros.relations.graph_view import LiveGraph
+from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.relations.world_model import build_world_model, require_predicates
+from deworldsg_ros.relations.world_model import require_predicates
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput

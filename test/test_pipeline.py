@@ -25,8 +25,8 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perception
 from deworldsg_ros.pipeline import PERCEPTION_PARTS, FrameResult, Pipeline
+from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput

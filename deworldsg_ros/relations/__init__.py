@@ -14,15 +14,10 @@ from deworldsg_ros.relations.evidence import (
 from deworldsg_ros.relations.graph_view import GraphView, LiveGraph, NodeView, PublishedGraph
 from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
 from deworldsg_ros.relations.prior import ClassPairPrior
+from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
 from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
-from deworldsg_ros.relations.world_model import (
-    WORLD_MODELS,
-    ClipRequest,
-    PairContext,
-    WorldModel,
-    build_world_model,
-)
+from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 
 __all__ = [
     "WORLD_MODELS",

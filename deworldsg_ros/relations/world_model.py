@@ -1,18 +1,12 @@
-"""The interface of world models, and their choice by name."""
+"""The interface of world models of clips."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.scene.arrays import Float64, UInt8
-from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
-
-# Libraries of the optional world models; the extra `models` of this package installs them.
-MODEL_LIBRARIES = ("torch", "transformers", "safetensors")
 
 
 @dataclass(frozen=True)
@@ -88,65 +82,3 @@ def require_predicates(model: WorldModel | None, predicates: tuple[str, ...]) ->
     check = getattr(model, "require_predicates", None)
     if check is not None:
         check(predicates)
-
-
-def _no_clips(config: RelationsConfig, device: str) -> None:
-    """No model of clips: edges have visual evidence, and with ``physics`` that of surfaces."""
-    del config, device
-
-
-def _fake(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-
-    del device
-    return FakeWorldModel(config.clip_length)
-
-
-def _vjepa2(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.probing.probed_world_model import build_probed
-    from deworldsg_ros.relations.world_models.vjepa2 import load_backbone
-
-    return build_probed(config, load_backbone, device)
-
-
-def _dinov2(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.probing.probed_world_model import build_probed
-    from deworldsg_ros.relations.world_models.dinov2 import load_backbone
-
-    return build_probed(config, load_backbone, device)
-
-
-# By the name in the configuration. `physics` judges the fused geometry of pairs in the graph: it
-# needs no images.
-WORLD_MODELS: dict[str, Callable[[RelationsConfig, str], WorldModel | None]] = {
-    "dinov2": _dinov2,
-    "fake": _fake,
-    "none": _no_clips,
-    "physics": _no_clips,
-    "vjepa2": _vjepa2,
-}
-
-
-def build_world_model(config: RelationsConfig, device: str = "auto") -> WorldModel | None:
-    """The configured world model, on a device (auto, cpu or cuda).
-
-    None if the configured one reads no clips. The libraries of a network are imported only here.
-
-    Raises:
-        ConfigurationError: unknown name, missing library, or a checkpoint or probe that cannot be
-            used.
-    """
-    if config.world_model not in WORLD_MODELS:
-        raise ConfigurationError(
-            f"relations.world_model is '{config.world_model}': "
-            f"expected one of {', '.join(WORLD_MODELS)}"
-        )
-    try:
-        return WORLD_MODELS[config.world_model](config, device)
-    except ImportError as error:
-        if (error.name or "").split(".")[0] not in MODEL_LIBRARIES:
-            raise
-        raise ConfigurationError(
-            f"world model '{config.world_model}' needs {' and '.join(MODEL_LIBRARIES)}: "
-            f"pip install torch transformers safetensors ({error})"
-        ) from error

@@ -9,9 +9,10 @@ from deworldsg_ros.checkpoints.card import graph_predicates
 from deworldsg_ros.checkpoints.required import require_checkpoints
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations.graph_view import PublishedGraph
+from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.worker import EvidenceWorker
-from deworldsg_ros.relations.world_model import build_world_model, require_predicates
+from deworldsg_ros.relations.world_model import require_predicates
 from deworldsg_ros.ros.models import WORLD_MODEL_LIMIT_S, Supervised, parse_faults
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene import wire

@@ -26,7 +26,7 @@ from deworldsg_ros.relations.physics_model import (
     floor_odds,
     load_physics_model,
 )
-from deworldsg_ros.relations.world_model import WORLD_MODELS, build_world_model
+from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
 from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabularies import COCO_CLASSES, VISUAL_GENOME_CLASSES

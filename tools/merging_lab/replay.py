@@ -53,8 +53,8 @@ from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
 from deworldsg_ros.relations.graph_view import LiveGraph
+from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.relations.world_model import build_world_model
 from deworldsg_ros.scene import wire
 
 NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
