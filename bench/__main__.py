@@ -85,7 +85,7 @@ def run_all(entries: list[Entry], setup: Setup) -> dict[str, Any]:
 
 def circumstances() -> dict[str, Any]:
     """Commit, machine, date and versions."""
-    from deworldsg_ros.timing import device_name
+    from deworldsg_ros.base.timing import device_name
 
     now = datetime.datetime.now(datetime.timezone.utc)
     return {

@@ -21,13 +21,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from bench.figures import Figure, Setup
 from bench.synthetic_map import POINTS, RoomMap
+from deworldsg_ros.base.files import paused_collector
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.map_file import read_map, write_map
-from deworldsg_ros.parsing import paused_collector
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.graph_file import write_graph
+from deworldsg_ros.wire import messages as wire
 
 NODES, EDGES_PER_NODE = 100_000, 5
 LABELS = ["cup", "dining table", *(f"class {number}" for number in range(78))]

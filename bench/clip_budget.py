@@ -28,16 +28,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.relations import LiveGraph, RelationReasoner, build_world_model
 from deworldsg_ros.relations.stage import QUEUE_SIZE
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-from deworldsg_ros.scene import wire
+from deworldsg_ros.relations.world_model import FakeWorldModel
 from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.wire import messages as wire
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
 # The predicate of an edge is clear if its probability exceeds the second one by this.

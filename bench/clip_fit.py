@@ -23,7 +23,7 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.relations import union_box
-from deworldsg_ros.relations.pairing import neighbour_pairs
+from deworldsg_ros.relations.paper import neighbour_pairs
 
 BAG = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
 # V-JEPA 2's processor: short edge 292, middle 256.

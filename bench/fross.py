@@ -27,14 +27,16 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 from bench.figures import Figure, Paired, Setup, in_turn  # noqa: E402
 from deworldsg_ros.config import Config  # noqa: E402
-from deworldsg_ros.evaluation.baselines.fross import MAX_HELLINGER_DISTANCE, Fross  # noqa: E402
-from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode  # noqa: E402
-from deworldsg_ros.evaluation.baselines.pipeline import between  # noqa: E402
-from deworldsg_ros.evaluation.front_ends.choice import (  # noqa: E402
-    FrontEndChoice,
-    build_front_end,
+from deworldsg_ros.evaluation.baselines import (  # noqa: E402
+    MAX_HELLINGER_DISTANCE,
+    BaselineGraph,
+    BaselineNode,
+    Fross,
+    between,
 )
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end  # noqa: E402
 from deworldsg_ros.evaluation.recorded_room import open_annotations  # noqa: E402
+from deworldsg_ros.graph.graph import SceneGraph  # noqa: E402
 from deworldsg_ros.graph_builder import graph_settings  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402
 from deworldsg_ros.merging import Merging, build_merging  # noqa: E402
@@ -42,7 +44,6 @@ from deworldsg_ros.perception.stage import Perceived  # noqa: E402
 from deworldsg_ros.recordings.recording import Recording, open_source  # noqa: E402
 from deworldsg_ros.scene.camera import RgbdFrame  # noqa: E402
 from deworldsg_ros.scene.gaussian import fuse, hellinger_distance  # noqa: E402
-from deworldsg_ros.scene.graph import SceneGraph  # noqa: E402
 
 SCAN = "rooms_0"
 NODES = 50, 1000

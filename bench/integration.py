@@ -24,7 +24,7 @@ from bench.merging import LOCAL_NODES  # noqa: E402
 from bench.synthetic_map import RoomMap, publish  # noqa: E402
 from deworldsg_ros.config import Config  # noqa: E402
 from deworldsg_ros.graph_builder import warm_up  # noqa: E402
-from deworldsg_ros.scene import wire  # noqa: E402
+from deworldsg_ros.wire import messages as wire  # noqa: E402
 
 # Nodes of the map, and the times to reach, milliseconds.
 TARGETS_MS = {

@@ -31,16 +31,16 @@ import numpy as np
 
 from bench.figures import Figure, Setup
 from bench.steps import Marker, mark_node, read_marks, step_lines, write_marks
-from deworldsg_ros.cli.installation import dds_environment
-from deworldsg_ros.cli.processes import LoggedProcess, end_all
+from deworldsg_ros.cli.demo import LoggedProcess, end_all
+from deworldsg_ros.cli.terminal import dds_environment
 from deworldsg_ros.config import Config
-from deworldsg_ros.memory import keep_freed_memory
+from deworldsg_ros.nodes.start import keep_freed_memory
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import DROPPED, LOST_PREFIX, UNMATCHED_PREFIX, counts_in
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.wire import messages as wire
 
 RECORDING = Path(__file__).resolve().parents[1] / "bags" / "demo_room"
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -141,8 +141,8 @@ class Camera:
         from rclpy.serialization import serialize_message
         from sensor_msgs.msg import CameraInfo, Image
 
+        from deworldsg_ros.nodes.odometry_node import put_pose
         from deworldsg_ros.ros.qos import reliable
-        from deworldsg_ros.ros.transform_output import put_pose
         from deworldsg_ros.streams.images import fill_image
 
         kinds = {
@@ -235,10 +235,10 @@ def run_node(name: str, recorded: str, marks: str, *arguments: str) -> int:
     """
     module = importlib.import_module(f"deworldsg_ros.nodes.{name}")
     if recorded:
-        from deworldsg_ros.ros import perceiving
+        from deworldsg_ros.ros import models
 
         perceived = pickle.loads(Path(recorded).read_bytes())
-        perceiving.build_perception = lambda *_, **__: RecordedPerceiver(perceived)
+        models.build_perception = lambda *_, **__: RecordedPerceiver(perceived)
     marker = Marker()
     if marks:
         mark_node(marker)

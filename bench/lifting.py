@@ -23,14 +23,9 @@ from support.reference_lifting import reference_lift  # noqa: E402
 from bench.figures import Figure, Paired, Setup, in_turn  # noqa: E402
 from deworldsg_ros.config import LiftingConfig  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402
-from deworldsg_ros.memory import keep_freed_memory  # noqa: E402
+from deworldsg_ros.nodes.start import keep_freed_memory  # noqa: E402
 from deworldsg_ros.scene.camera import Intrinsics  # noqa: E402
-from deworldsg_ros.scene.frame_graph import (  # noqa: E402
-    FrameGraph,
-    LocalGraph,
-    Relations,
-    Vocabulary,
-)
+from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary  # noqa: E402
 
 HEIGHT, WIDTH, OBJECTS = 480, 640, 12
 REFERENCE = "lifting without optimisation (test/support/reference_lifting.py)"

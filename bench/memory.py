@@ -23,7 +23,7 @@ from bench.synthetic_map import publish
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 # Votes of each node with this many of the next ones: about what the rooms' graphs have.
 PARTNERS = 5

@@ -26,12 +26,12 @@ from support.reference_merging import class_distance, may_merge
 
 from bench.figures import Figure, Paired, Setup, in_turn
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import build_merging
-from deworldsg_ros.merging.nearest import bhattacharyya_bound, nearest_row, observed, warm_up
+from deworldsg_ros.merging.paper_rule import bhattacharyya_bound, nearest_row, observed, warm_up
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import hellinger_distance
-from deworldsg_ros.scene.graph import SceneGraph
 
 CLASSES = 80
 PREDICATES = 50

@@ -24,11 +24,11 @@ import transformers
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from deworldsg_ros.checkpoints.cards import BackboneIdentity
 from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.probing.backbone import FrozenBackbone
-from deworldsg_ros.relations.world_models import dinov2, vjepa2
+from deworldsg_ros.relations import clip_models
+from deworldsg_ros.relations.clip_models import FrozenBackbone
 from deworldsg_ros.scene.errors import ConfigurationError
 
 CLIP_LENGTH = RelationsConfig().clip_length
@@ -72,7 +72,7 @@ def vjepa2_of(layers: int, width: int, heads: int, mlp_ratio: float, size: int):
         def features(videos):
             return network(videos, skip_predictor=True).last_hidden_state.mean(1)
 
-        return _clips(choice, "vjepa2", width, size, vjepa2.clip_geometry(size), features)
+        return _clips(choice, "vjepa2", width, size, clip_models.vjepa2_geometry(size), features)
 
     return build
 
@@ -90,7 +90,7 @@ def dinov2_of(layers: int, width: int, heads: int):
             tokens = network(videos.flatten(0, 1)).last_hidden_state[:, 0]
             return tokens.reshape(*videos.shape[:2], -1).mean(1)
 
-        return _clips(choice, "dinov2", width, 224, dinov2.clip_geometry(224), features)
+        return _clips(choice, "dinov2", width, 224, clip_models.dinov2_geometry(224), features)
 
     return build
 

@@ -21,9 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from deworldsg_ros.poses.odometry import RgbdOdometry
 from deworldsg_ros.recordings.recording import open_recording
-from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
+from deworldsg_ros.scene.camera import RgbdFrame, invert_pose, rotation_angle_deg
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.rigid import rotation_angle_deg
 
 Pose = Any
 

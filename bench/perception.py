@@ -26,10 +26,10 @@ from segmenter_iou import Frame, grab_cut
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.nanodet import NanoDetDetector
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import SegmentedObjects
+from deworldsg_ros.perception.stage import instance_image
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 WIDTH, HEIGHT, OBJECTS = 640, 480, 12
 INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)

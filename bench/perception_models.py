@@ -19,17 +19,19 @@ import torch
 import transformers
 from safetensors.torch import save_file
 
-from deworldsg_ros.checkpoints.architectures import HEAD_FILE
-from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, write_card
+from deworldsg_ros.checkpoints.cards import (
+    DETECTOR_CARD,
+    CheckpointCard,
+    write_detector_card,
+)
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
+from deworldsg_ros.checkpoints.loading import HEAD_FILE
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
-from deworldsg_ros.perception.backends.sam import SamSegmenter
-from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
+from deworldsg_ros.perception.backends.sam import Sam2Segmenter, SamSegmenter
 from deworldsg_ros.perception.protocols import SegmentedObjects
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
 
 WIDTH, HEIGHT, OBJECTS = 640, 480, 12
 INTRINSICS = Intrinsics(525.0, 525.0, 319.5, 239.5, WIDTH, HEIGHT)
@@ -55,7 +57,7 @@ def rtdetr(folder: Path, device: str, **changes: Any) -> RtDetrDetector:
     )
     transformers.RTDetrForObjectDetection(config).save_pretrained(folder)
     card = CheckpointCard(class_scores="softmax", predicates=REPLICA_SSG_PREDICATES)
-    write_card(folder / CARD_FILE, card)
+    write_detector_card(folder / DETECTOR_CARD, card)
     head = EgtrNetwork(config.d_model, config.decoder_layers, len(REPLICA_SSG_PREDICATES))
     save_file(head.state_dict(), folder / HEAD_FILE)
     return RtDetrDetector(PerceptionConfig(detector_path=str(folder), device=device, threads=0))

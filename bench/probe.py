@@ -26,16 +26,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
 from support.checkpoints import save_dinov2, save_vjepa2
 from support.pair_rooms import CLASSES, PREDICATES, PairClip, render_room
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, relative_box_pair
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, relative_box_pair
 from deworldsg_ros.checkpoints.probe_network import load_probe
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations import ClassPairPrior, fuse_edges, union_box
-from deworldsg_ros.relations.probing.backbone import FrozenBackbone
-from deworldsg_ros.relations.probing.probed_world_model import ProbedWorldModel
+from deworldsg_ros.relations import ClassPairPrior, clip_models, fuse_edges, union_box
+from deworldsg_ros.relations.clip_models import FrozenBackbone, ProbedWorldModel
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext
-from deworldsg_ros.relations.world_models import dinov2, vjepa2
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.training.labelled_clips import LabelledClip
+from deworldsg_ros.training.clips import LabelledClip
 from deworldsg_ros.training.options import TrainingOptions
 from deworldsg_ros.training.train import train_probe
 
@@ -139,9 +137,9 @@ def main() -> None:
     held_pairs = [pair for pair in pairs if pair.room in held]
     print(f"{options.rooms} rooms, {len(pairs)} clips, {len(held_pairs)} of them in held-out rooms")
     loaders = {
-        "vjepa2": (vjepa2.load_backbone, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
+        "vjepa2": (clip_models.load_vjepa2, save_vjepa2, {"crop_size": 64, "hidden_size": 96}),
         "dinov2": (
-            partial(dinov2.load_backbone, image_size=56),
+            partial(clip_models.load_dinov2, image_size=56),
             save_dinov2,
             {"image_size": 56, "hidden_size": 96},
         ),

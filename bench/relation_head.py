@@ -23,10 +23,10 @@ from segmenter_iou import INTRINSICS, load
 
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch, SegmentedObjects
+from deworldsg_ros.perception.stage import instance_image
 from deworldsg_ros.scene.frame_graph import Relations
-from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 MAX_RELATIONS = 100
 ALL_RELATIONS = 10_000

@@ -29,7 +29,7 @@ from deworldsg_ros.relations import (
     neighbour_pairs,
 )
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 WIDTH, HEIGHT = 640, 480
 CLASSES, PREDICATES = 80, 50

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.__main__ import ROOT, git
-from deworldsg_ros.evaluation.measures.edge_measures import COMPLETE_PREDICATES
+from deworldsg_ros.evaluation.edge_measures import COMPLETE_PREDICATES
 
 PAGE = ROOT / "docs" / "dev" / "evaluation" / "results.md"
 # A table of the page: its name, and the lines that are made here.

@@ -20,8 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from bench.figures import Figure, Setup  # noqa: E402
-from deworldsg_ros.cli.installation import dds_environment  # noqa: E402
-from deworldsg_ros.scene import wire  # noqa: E402
+from deworldsg_ros.cli.terminal import dds_environment  # noqa: E402
+from deworldsg_ros.wire import messages as wire  # noqa: E402
 
 NODES = ("graph_node", "lifting_node", "segmentation_node")
 # The networks of the segmentation load before it is ready: it has no target.

@@ -27,9 +27,9 @@ from deworldsg_ros.config import Config  # noqa: E402
 from deworldsg_ros.graph_builder import warm_up  # noqa: E402
 from deworldsg_ros.perception.stage import Perceived  # noqa: E402
 from deworldsg_ros.pipeline import Pipeline  # noqa: E402
-from deworldsg_ros.scene import wire  # noqa: E402
 from deworldsg_ros.scene.camera import RgbdFrame  # noqa: E402
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations  # noqa: E402
+from deworldsg_ros.wire import messages as wire  # noqa: E402
 
 # Nodes of the map, and the time to reach, milliseconds.
 TARGETS_MS = {300: 4.0, 10_000: 5.0}

@@ -96,9 +96,9 @@ def mark_node(marker: Marker) -> None:
     from deworldsg_ros.perception.stage import Perception
     from deworldsg_ros.ros.graph_keeper import GraphKeeper
     from deworldsg_ros.ros.qos import AutoSubscription
-    from deworldsg_ros.scene.wire import ns_from_stamp
-    from deworldsg_ros.streams.frame_assemblers import FrameAssembler, LiftingAssembler
+    from deworldsg_ros.streams.frames import FrameAssembler, LiftingAssembler
     from deworldsg_ros.streams.poses import stamp_ns_of
+    from deworldsg_ros.wire.messages import ns_from_stamp
 
     receive = AutoSubscription._receive
 

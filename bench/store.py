@@ -23,10 +23,10 @@ import msgspec
 
 from bench.building import EDGES_PER_NODE, NODES, building
 from bench.figures import Figure, MissingError, Setup
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.graph_file import read_graph, write_graph
+from deworldsg_ros.graph.graph_files import read_graph, write_graph
 from deworldsg_ros.store import Store
 from deworldsg_ros.store.store import DATABASE_FILE, StoreWriter
+from deworldsg_ros.wire import messages as wire
 
 FRAMES, OBJECTS, RELATIONS = 60, 12, 60
 TWO_HOPS = (

@@ -22,9 +22,9 @@ from bench.merging import (
     local_graph,
 )
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
-from deworldsg_ros.scene.graph import SceneGraph
 
 ROOM_M = np.array([5.0, 2.5, 4.0])
 # Distance of rooms from one another: a wall, and a corridor along z.

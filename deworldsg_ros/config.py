@@ -14,10 +14,9 @@ from typing import Annotated, Any, Literal, Union
 
 import msgspec
 
-from deworldsg_ros.files import read_regular
-from deworldsg_ros.parsing import MAX_YAML_BYTES, parse_yaml
+from deworldsg_ros.base.files import MAX_YAML_BYTES, parse_yaml, read_regular
+from deworldsg_ros.base.words import suggestion
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.words import suggestion
 
 
 def option(description: str, **limits: Any) -> Any:

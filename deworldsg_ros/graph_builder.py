@@ -9,29 +9,26 @@ from collections import Counter
 from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.graph import SceneGraph, nodes_since
+from deworldsg_ros.graph.messages import hidden_node
+from deworldsg_ros.graph.pairs import frame_votes
+from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace
+from deworldsg_ros.graph.publication import Publication
 from deworldsg_ros.merging.common import check_fits
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
-from deworldsg_ros.relations import edge_beliefs
-from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
-from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.relations import beliefs
+from deworldsg_ros.relations.beliefs import EdgeBeliefs
+from deworldsg_ros.relations.paper import ClassPairPrior
+from deworldsg_ros.scene.arrays import Float64, softmax_weights
 from deworldsg_ros.scene.camera import check_pose, invert_pose
-from deworldsg_ros.scene.correction import nodes_since
-from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
 from deworldsg_ros.scene.limits import RESTART_NS
-from deworldsg_ros.scene.node_states import hidden_node
-from deworldsg_ros.scene.publication import Publication
-from deworldsg_ros.scene.seen_frames import FrameMemory
-from deworldsg_ros.scene.seen_space import SeenSpace
-from deworldsg_ros.scene.softmax import softmax_weights
 from deworldsg_ros.scene.up import UpEstimator
-from deworldsg_ros.scene.votes import frame_votes
+from deworldsg_ros.wire import messages as wire
 
 # Parts of the kernels that take about equally long to compile.
 KERNEL_PARTS = ("merging", "drift", "pairs")
@@ -156,7 +153,7 @@ class GraphBuilder:
     def apply_correction(self, T_correction: Float64, since_ns: int) -> list[int]:
         """Move the nodes first seen since a stamp, after a loop closure corrected the poses.
 
-        Older nodes stay, also those seen again since: see `scene.correction`. Frames to come must
+        Older nodes stay, also those seen again since: see `graph.graph`. Frames to come must
         have corrected poses. The nodes already contain the drift that was corrected; this part is
         taken back.
 
@@ -226,7 +223,7 @@ def warm_up(config: Config, *parts: str) -> None:
         elif part == "drift" and config.merging.association == "surface":
             Drift().warm_up()
         elif part == "pairs":
-            edge_beliefs.warm_up(config)
+            beliefs.warm_up(config)
 
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:

@@ -14,20 +14,25 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
+from deworldsg_ros.base.files import (
+    FileLock,
+    check_different,
+    check_writable,
+    parse_json,
+    paused_collector,
+)
+from deworldsg_ros.base.words import counted
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.files import FileLock, check_different, check_writable
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.provenance import FrameMemory, SeenFrames
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.merging.editing import EditReply
-from deworldsg_ros.parsing import parse_json, paused_collector
-from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
-from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.array_checks import checked, holds
-from deworldsg_ros.scene.array_file import Arrays
-from deworldsg_ros.scene.edits import EditRequest
+from deworldsg_ros.relations.paper import ClassPairPrior, PriorState
+from deworldsg_ros.scene.checks import checked, holds
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.seen_frames import FrameMemory, SeenFrames
-from deworldsg_ros.words import counted
 
 # Before the names of the arrays of merging.
 _MERGING = "merging."
@@ -47,7 +52,7 @@ def copy_state(builder: GraphBuilder) -> Arrays:
     """The content of a map, by name; the builder can go on while it is written."""
     prior = np.frombuffer(msgspec.json.encode(builder.prior.to_state()), np.uint8)
     memory = {_MERGING + name: np.array(v) for name, v in builder.merging.memory().items()}
-    arrays = graph_io.to_arrays(builder.graph.state())
+    arrays = graph_files.to_arrays(builder.graph.state())
     seen = np.frombuffer(msgspec.json.encode(builder.frames.all(builder.graph)), np.uint8)
     up = np.array(builder.up.state())
     more: Arrays = {"prior": prior, "up": up, "seen_frames": seen, **builder.space.arrays()}
@@ -57,7 +62,7 @@ def copy_state(builder: GraphBuilder) -> Arrays:
 def write_state(state: Arrays, path: Path) -> None:
     """Write the result of `copy_state`; as `write_map`."""
     with _writing(path), FileLock.unless_held(path):
-        graph_io.write(path, state, previous=previous_of(path))
+        graph_files.write(path, state, previous=previous_of(path))
 
 
 def previous_of(path: Path) -> Path:
@@ -153,13 +158,13 @@ def read_map(config: Config, path: Path) -> GraphBuilder:
         with paused_collector():
             return _read(config, path)
     except (RefusedInput, ValueError, MemoryError) as error:
-        reason = graph_io.reason_of(error).removeprefix(f"graph file {path}: ")
+        reason = graph_files.reason_of(error).removeprefix(f"graph file {path}: ")
         raise ConfigurationError(f"map {path} cannot be used: {reason}") from error
 
 
 def _read(config: Config, path: Path) -> GraphBuilder:
-    arrays = graph_io.read(path)
-    graph = graph_io.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
+    arrays = graph_files.read(path)
+    graph = graph_files.graph_from_arrays(arrays, str(path), **graph_settings(config.merging))
     for name in ("surface_points", "class_probabilities"):  # the largest that the graph has copied
         del arrays[name]
     prior = _prior(arrays, graph.vocabulary)
@@ -207,7 +212,7 @@ def edit_map(path: Path, request: EditRequest) -> EditReply:
 
 def _is_of_surface_rule(path: Path) -> bool:
     try:
-        return graph_io.header_of(graph_io.read(path)).even_gaussians
+        return graph_files.header_of(graph_files.read(path)).even_gaussians
     except (RefusedInput, ValueError) as error:
         raise ConfigurationError(f"map {path} cannot be used: {error}") from error
 

@@ -2,31 +2,104 @@
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import Future, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import ParamSpec, Protocol
+from typing import ParamSpec, Protocol, TypeVar
 
-from deworldsg_ros.ahead import apply_ahead, read_ahead
-from deworldsg_ros.checkpoints.required import require_checkpoints
+from deworldsg_ros.base.timing import Times, timed, watch
+from deworldsg_ros.checkpoints.catalogue import require_checkpoints
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.protocols import Detections
 from deworldsg_ros.perception.registry import build_perception
-from deworldsg_ros.perception.stage import Perceived, Perception
-from deworldsg_ros.perception.upright import UprightFrame
-from deworldsg_ros.relations.graph_view import LiveGraph
+from deworldsg_ros.perception.stage import Perceived, Perception, UprightFrame
+from deworldsg_ros.relations.clips import LiveGraph
 from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.relations.world_model import require_predicates
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.timing import Times, timed, watch
+from deworldsg_ros.wire import messages as wire
+
+# --- Work ahead of its use, in threads: bounded, in order, and ended with its consumer.
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# A reader that waits for its consumer looks this often whether there still is one, seconds.
+POLL_S = 0.1
+
+
+def read_ahead(items: Iterable[Item], count: int) -> Iterator[Item]:
+    """The items, read by a thread, at most `count` before they are taken.
+
+    An error of `items` is raised after the items before it. If the iteration is closed, the thread
+    ends after the item that it reads.
+    """
+    found: queue.Queue[tuple[Item] | BaseException | None] = queue.Queue(count)
+    ended = threading.Event()
+
+    def hand_over(entry: tuple[Item] | BaseException | None) -> bool:
+        while not ended.is_set():
+            try:
+                found.put(entry, timeout=POLL_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def read() -> None:
+        try:
+            for item in items:
+                if not hand_over((item,)):
+                    return
+        except BaseException as error:  # raised where the items are used
+            hand_over(error)
+        else:
+            hand_over(None)
+
+    reader = threading.Thread(target=read, name="read_ahead", daemon=True)
+    reader.start()
+    try:
+        while (entry := found.get()) is not None:
+            if isinstance(entry, BaseException):
+                raise entry
+            yield entry[0]
+    finally:
+        ended.set()
+        reader.join()
+
+
+def apply_ahead(
+    function: Callable[[Item], Result], items: Iterable[Item], threads: int
+) -> Iterator[tuple[Item, Future[Result]]]:
+    """Each item with the future result of a function of it, in order.
+
+    The function runs in `threads` threads, for as many items besides the one that is in use, and
+    one more. If the iteration is closed, items that wait are not started.
+    """
+    with ThreadPoolExecutor(threads, thread_name_prefix="apply_ahead") as pool:
+        running: deque[tuple[Item, Future[Result]]] = deque()
+        try:
+            for item in items:
+                running.append((item, pool.submit(function, item)))
+                if len(running) > threads + 1:
+                    yield running.popleft()
+            while running:
+                yield running.popleft()
+        finally:
+            for _, future in running:
+                future.cancel()
+
+
+# --- The four stages in one process, without ROS; the graph equals that of the four nodes.
 
 P = ParamSpec("P")
 

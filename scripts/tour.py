@@ -20,8 +20,8 @@ import numpy as np
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import combine
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.rigid import rigid_motion
+from deworldsg_ros.scene.camera import rigid_motion
+from deworldsg_ros.wire import messages as wire
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMAND = [sys.executable, "-m", "deworldsg_ros.cli"]

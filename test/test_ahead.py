@@ -9,7 +9,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from deworldsg_ros.ahead import apply_ahead, read_ahead
+from deworldsg_ros.pipeline import apply_ahead, read_ahead
 
 
 def wait_until(condition) -> None:  # type: ignore[no-untyped-def]

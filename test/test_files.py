@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from support.killing import full_disk, killed, moments_s, names
 
-from deworldsg_ros.files import (
+from deworldsg_ros.base.files import (
     PARTIAL,
     PREFIX,
     READY,

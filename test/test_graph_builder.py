@@ -14,8 +14,8 @@ from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.scene.wire import SceneGraphMessage
+from deworldsg_ros.wire.follow import GraphReplica
+from deworldsg_ros.wire.messages import SceneGraphMessage
 
 VOCABULARY = Vocabulary(("cup", "table", "chair"), ("near", "on", "above", "under"))
 

@@ -17,11 +17,11 @@ import pytest
 from support.merging import VOCABULARY
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
+from deworldsg_ros.base.array_file import read_arrays
 from deworldsg_ros.config import Config, OutputConfig
+from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
-from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.array_file import read_arrays
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
 CONFIG = Config(output=OutputConfig(min_existence=0.0))
@@ -189,28 +189,28 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
 @pytest.mark.parametrize("attack", ATTACKS)
 def test_a_hostile_map_is_refused(good: Path, tmp_path: Path, attack: str) -> None:
     path = tmp_path / "bad.map"
-    graph_io.write(path, ATTACKS[attack](graph_io.read(good)))
+    graph_files.write(path, ATTACKS[attack](graph_files.read(good)))
     with pytest.raises(ConfigurationError, match=r"map .*bad\.map cannot be used: \w+"):
         read_map(CONFIG, path)
 
 
 def test_an_edit_and_a_class_twice_are_no_attacks(good: Path, tmp_path: Path) -> None:
-    arrays = {**graph_io.read(good), "edits": as_json([LABEL])}
-    graph_io.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
+    arrays = {**graph_files.read(good), "edits": as_json([LABEL])}
+    graph_files.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
     with pytest.raises(ConfigurationError, match="classes and predicates of the graph"):
         read_map(CONFIG, tmp_path / "room.map")
     del arrays["seen_frames"]
-    graph_io.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
+    graph_files.write(tmp_path / "room.map", header(classes=["a", "a", "b", "c"])(arrays))
     nodes = read_map(CONFIG, tmp_path / "room.map").full().nodes
     assert [node.label for node in nodes] == ["pot", "a", "b"]
 
 
 def test_an_error_names_the_array_the_value_and_the_expectation(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "bad.map"
-    graph_io.write(path, ATTACKS["existence of 7"](graph_io.read(good)))
+    graph_files.write(path, ATTACKS["existence of 7"](graph_files.read(good)))
     with pytest.raises(ConfigurationError, match="existence contains 7.0: expected 0 to 1"):
         read_map(CONFIG, path)
-    graph_io.write(path, ATTACKS["blocks as int8"](graph_io.read(good)))
+    graph_files.write(path, ATTACKS["blocks as int8"](graph_files.read(good)))
     with pytest.raises(ConfigurationError, match="blocks is int8 .*: expected int64 of shape"):
         read_map(CONFIG, path)
 
@@ -262,7 +262,7 @@ def test_headers_of_arrays_are_not_evaluated(good: Path, tmp_path: Path, head: b
 
 def test_a_flipped_bit_is_noticed(good: Path, tmp_path: Path) -> None:
     content = bytearray(good.read_bytes())
-    at = content.index(graph_io.read(good)["means"].tobytes())
+    at = content.index(graph_files.read(good)["means"].tobytes())
     content[at + 3] ^= 1
     (tmp_path / "bad.map").write_bytes(content)
     with pytest.raises(ConfigurationError, match="Bad CRC-32"):
@@ -289,12 +289,12 @@ def test_the_arrays_of_a_map_are_those_that_numpy_reads(good: Path) -> None:
 
 def test_a_map_of_the_first_release_is_read(good: Path, tmp_path: Path) -> None:
     # Its records have padding between the fields.
-    arrays = graph_io.read(good)
+    arrays = graph_files.read(good)
     packed = arrays["merging.records"]
     aligned = np.dtype([(name, packed.dtype[name]) for name in packed.dtype.names], align=True)
     assert aligned.itemsize > packed.dtype.itemsize
     path = tmp_path / "old.map"
-    graph_io.write(path, {**arrays, "merging.records": packed.astype(aligned)})
+    graph_files.write(path, {**arrays, "merging.records": packed.astype(aligned)})
     write_map(read_map(CONFIG, path), tmp_path / "again.map")
     write_map(read_map(CONFIG, good), tmp_path / "new.map")
     assert (tmp_path / "again.map").read_bytes() == (tmp_path / "new.map").read_bytes()
@@ -335,7 +335,7 @@ def test_equal_graphs_give_equal_bytes_in_any_process(tmp_path: Path) -> None:
 
 def test_a_saved_graph_is_checked_as_well(good: Path, tmp_path: Path) -> None:
     path = tmp_path / "bad.npz"
-    graph_io.write(path, ATTACKS["duplicate ids"](graph_io.read(good)))
+    graph_files.write(path, ATTACKS["duplicate ids"](graph_files.read(good)))
     with pytest.raises(RefusedInput, match="ids contains a value twice") as refused:
-        graph_io.load(path)
+        graph_files.load(path)
     assert refused.value.reason == "invalid_graph_file"

@@ -19,10 +19,10 @@ from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, continue_map, previous_of, read_map, write_map
-from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.scene import graph_io
+from deworldsg_ros.relations.paper import ClassPairPrior
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Relations
 
@@ -62,7 +62,7 @@ def test_continuing_from_a_map_equals_not_stopping(tmp_path, association, seed):
     whole.graph.take_removals()
     for local in frames[30:]:
         assert again.integrate(local) == whole.integrate(local)
-    one, other = (graph_io.to_arrays(b.graph.state()) for b in (again, whole))
+    one, other = (graph_files.to_arrays(b.graph.state()) for b in (again, whole))
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
@@ -114,10 +114,10 @@ def test_a_map_of_an_older_release_has_no_up_direction_and_no_votes(tmp_path):
     for stamp in range(1, 5):
         builder.integrate(upright_frame(stamp))
     path = saved(builder, tmp_path)
-    arrays = graph_io.read(path)
+    arrays = graph_files.read(path)
     old = {name: values for name, values in arrays.items() if not name.startswith(("vote_", "up"))}
     assert len(old) == len(arrays) - 4
-    graph_io.write(path, old)
+    graph_files.write(path, old)
     again = read_map(Config(), path)
     np.testing.assert_array_equal(again.up.up_world(), [0, 0, 1])
     # Without an up direction, boxes stand on another axis.
@@ -132,7 +132,7 @@ def test_a_map_of_an_older_release_has_no_up_direction_and_no_votes(tmp_path):
 
 def test_an_up_direction_that_is_none_is_refused(tmp_path):
     path = saved(builder_of(), tmp_path)
-    graph_io.write(path, {**graph_io.read(path), "up": np.zeros(3)})
+    graph_files.write(path, {**graph_files.read(path), "up": np.zeros(3)})
     with pytest.raises(ConfigurationError, match=r"cannot be used: state of the up direction has"):
         read_map(Config(), path)
 
@@ -193,14 +193,14 @@ def test_objects_of_a_map_with_another_cell_size_are_recognised(tmp_path):
     path = saved(builder, tmp_path)
     # The cells themselves must not be used: they are not those of the object.
     other = {"merging.cell_m": np.array(0.02), "merging.blocks": np.zeros(0)}
-    graph_io.write(path, {**graph_io.read(path), **other})
+    graph_files.write(path, {**graph_files.read(path), **other})
     again = read_map(Config(), path)
     assert again.integrate(frame(6, (WHOLE, TABLE))) == [1]
 
 
 def test_other_files_are_refused(tmp_path):
     builder = builder_of()
-    graph_io.save(builder.graph, tmp_path / "graph.map")  # without priors
+    graph_files.save(builder.graph, tmp_path / "graph.map")  # without priors
     (tmp_path / "text.map").write_text("hello")
     (tmp_path / "folder.map").mkdir()
     for name in ("graph.map", "text.map", "folder.map"):
@@ -210,10 +210,10 @@ def test_other_files_are_refused(tmp_path):
 
 def test_priors_of_another_vocabulary_are_refused(tmp_path):
     path = saved(builder_of(), tmp_path)
-    arrays = graph_io.read(path)
+    arrays = graph_files.read(path)
     prior = ClassPairPrior(2, 5).to_state()
     arrays["prior"] = np.frombuffer(msgspec.json.encode(prior), np.uint8)
-    graph_io.write(path, arrays)
+    graph_files.write(path, arrays)
     with pytest.raises(ConfigurationError, match="priors are of 2 classes and 5 predicates: expec"):
         read_map(Config(), path)
 
@@ -256,7 +256,7 @@ def test_a_run_does_not_write_over_its_own_files(tmp_path, monkeypatch, options,
 @pytest.mark.parametrize("name", ["a.json", "a.frames.json", "a.space.npz"])
 def test_a_node_does_not_write_its_graph_over_its_map(tmp_path, name):
     pytest.importorskip("rclpy")
-    from deworldsg_ros.ros.graph_files import GraphFiles
+    from deworldsg_ros.ros.graph_keeper import GraphFiles
     from deworldsg_ros.ros.options import NodeOptions, Parameters
 
     parameters = Parameters(node=NodeOptions(str(tmp_path / "a.json"), str(tmp_path / name)))

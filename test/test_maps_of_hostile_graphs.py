@@ -11,15 +11,16 @@ import pytest
 from support.hostile import STEPS_NS, VOCABULARY, hostile_evidence, hostile_local_graph
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig
+from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
-from deworldsg_ros.scene import limits, wire
+from deworldsg_ros.scene import limits
+from deworldsg_ros.scene.camera import rigid_motion
 from deworldsg_ros.scene.checks import SUM_TOLERANCE
-from deworldsg_ros.scene.codec import local_graph_from_message, local_graph_to_message
-from deworldsg_ros.scene.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations
-from deworldsg_ros.scene.rigid import rigid_motion
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_from_message, local_graph_to_message
 
 ALL = OutputConfig(min_existence=0.0)
 CONFIGS = {

@@ -14,25 +14,19 @@ from support.failing_backend import Backend
 from support.relations import mean_of
 from support.scripted import CONFIGURATIONS, INTRINSICS, PAPER, VOCABULARY, Scripted, frame
 
-from deworldsg_ros.config import (
-    Config,
-    MergingConfig,
-    OutputConfig,
-    RelationsConfig,
-    load_config,
-)
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsConfig, load_config
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perception
 from deworldsg_ros.pipeline import PERCEPTION_PARTS, FrameResult, Pipeline
 from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 ASKING = msgspec.structs.replace(
     PAPER,

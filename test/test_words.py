@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from deworldsg_ros.words import counted, suggestion, visible, visible_lines, whole_number
+from deworldsg_ros.base.words import counted, suggestion, visible, visible_lines, whole_number
 
 KNOWN = ["perception.score_threshold", "perception.threads", "lifting.tau", "save_path"]
 

@@ -34,14 +34,14 @@ from typer.testing import CliRunner
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import described_yaml, effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.graph.edits import DeleteNode, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.ros.options import Parameters, ReplayParameters
-from deworldsg_ros.scene.edits import DeleteNode, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.scene.errors import RefusedInput
 
 ROOT = Path(__file__).resolve().parents[1]

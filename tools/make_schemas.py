@@ -18,7 +18,7 @@ import msgspec
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from deworldsg_ros.scene import wire  # noqa: E402
+from deworldsg_ros.wire import messages as wire  # noqa: E402
 
 CLASSES = ["cup", "table", "chair"]
 PREDICATES = ["on", "near", "under"]

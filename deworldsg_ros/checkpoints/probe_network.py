@@ -6,24 +6,28 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import safetensors
 import torch
 from safetensors.torch import load_file, save
 
-from deworldsg_ros.checkpoints.loading import check_names
-from deworldsg_ros.checkpoints.probe_card import (
-    CARD_FILE,
+from deworldsg_ros.base.files import together, write_atomically
+from deworldsg_ros.checkpoints.cards import (
+    PROBE_CARD,
     WEIGHTS_FILE,
+    BackboneIdentity,
     ProbeCard,
-    read_card,
-    write_card,
+    read_probe_card,
+    write_probe_card,
 )
-from deworldsg_ros.files import together, write_atomically
+from deworldsg_ros.checkpoints.loading import check_names, read_tensors
 from deworldsg_ros.scene.arrays import Float32, Float64
 from deworldsg_ros.scene.errors import ConfigurationError
 
-PROBE_FILES = (WEIGHTS_FILE, CARD_FILE)
+# --- The probe on torch: a small network that maps a clip's feature to a predicate distribution.
+
+PROBE_FILES = (WEIGHTS_FILE, PROBE_CARD)
 
 
 def build_network(card: ProbeCard) -> torch.nn.Sequential:
@@ -89,7 +93,7 @@ def write_probe(folder: Path, probe: Probe) -> None:
     """Write a probe's files into a folder that exists; raises OSError."""
     state = {name: value.contiguous() for name, value in probe.network.state_dict().items()}
     write_atomically(folder / WEIGHTS_FILE, save(state))
-    write_card(folder, probe.card)
+    write_probe_card(folder, probe.card)
 
 
 def load_probe(folder: Path) -> Probe:
@@ -98,7 +102,7 @@ def load_probe(folder: Path) -> Probe:
     Raises:
         ConfigurationError: a file is missing, or the weights do not fit the card.
     """
-    card = read_card(folder)
+    card = read_probe_card(folder)
     path = folder / WEIGHTS_FILE
     if not path.is_file():
         raise ConfigurationError(f"probe '{folder}' has no {WEIGHTS_FILE}: save it again")
@@ -132,3 +136,33 @@ def with_weights(card: ProbeCard, state: dict[str, torch.Tensor], where: str) ->
             )
     network.load_state_dict(state)
     return Probe(card, network.eval().requires_grad_(False))
+
+
+# --- Import of the published probe of V-JEPA 2, `vjepa_probe_mlp.pt`.
+
+# The backbone of the published probe: V-JEPA 2 ViT-g, 1408 features of 16 frames at 384 pixels.
+# The released code stretches the crops.
+PUBLISHED_BACKBONE = BackboneIdentity("vjepa2", 1408, 384, 16, fit="stretch")
+
+
+def import_published(path: Path, predicates: tuple[str, ...]) -> Probe:
+    """The probe in a published file, a plain dictionary of tensors.
+
+    Args:
+        path: the file; its code is not executed.
+        predicates: names of its outputs, in order; the file does not contain them.
+
+    Raises:
+        ConfigurationError: the file has another layout, with the names of its parameters.
+    """
+    state = read_tensors(path)
+    card = ProbeCard(
+        PUBLISHED_BACKBONE,
+        predicates,
+        layout="batch_norm",
+        training={"imported_from": path.name},
+    )
+    first = state.get("net.1.weight")
+    if first is not None and first.ndim == 2:
+        card = msgspec.structs.replace(card, hidden_dim=first.shape[0])
+    return with_weights(card, state, f"published probe {path}")

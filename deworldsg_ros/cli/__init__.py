@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import sys
 
-from deworldsg_ros.cli.exit_codes import EXIT_INTERRUPTED
+from deworldsg_ros.cli.configuration import EXIT_INTERRUPTED
 
 
 def main() -> None:

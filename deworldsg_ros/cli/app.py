@@ -12,11 +12,14 @@ from rich.console import Console
 from rich.text import Text
 
 from deworldsg_ros import __version__
-from deworldsg_ros.cli import ask, edit, exchange, mcp, probe, store
+from deworldsg_ros.base.words import visible_lines
+from deworldsg_ros.cli import ask, probe, store
+from deworldsg_ros.cli import evaluate_commands as evaluate
 from deworldsg_ros.cli import models as models_command
-from deworldsg_ros.cli.evaluate import commands as evaluate
-from deworldsg_ros.cli.exit_codes import EXIT_FINDINGS, EXIT_INTERRUPTED, EXIT_USAGE
-from deworldsg_ros.cli.options import (
+from deworldsg_ros.cli.configuration import (
+    EXIT_FINDINGS,
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
     CameraIntrinsics,
     ConfigFile,
     DepthSource,
@@ -41,7 +44,6 @@ from deworldsg_ros.cli.options import (
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
-from deworldsg_ros.words import visible_lines
 
 app = typer.Typer(
     name="deworldsg",
@@ -118,7 +120,7 @@ def run(
     """Build the scene graph of a recording in one process."""
     with _reporting_errors():
         from deworldsg_ros.cli.run import RunOptions, run_recording
-        from deworldsg_ros.poses.perturbation import parse_noise
+        from deworldsg_ros.poses.trajectory import parse_noise
         from deworldsg_ros.recordings.posing import PoseChoice
 
         run_recording(
@@ -279,7 +281,7 @@ def convert(
 ) -> None:
     """Convert a folder or bag to one MCAP file."""
     with _reporting_errors():
-        from deworldsg_ros.cli.convert import convert_recording
+        from deworldsg_ros.cli.run import convert_recording
 
         convert_recording(
             kind,
@@ -302,7 +304,7 @@ def info(
 ) -> None:
     """Show the topics of a recording and their use."""
     with _reporting_errors():
-        from deworldsg_ros.cli.info import show_recording
+        from deworldsg_ros.cli.run import show_recording
 
         show_recording(
             recording,
@@ -336,8 +338,7 @@ def doctor(
 ) -> None:
     """Say what is off with a recording or nodes."""
     with _reporting_errors():
-        from deworldsg_ros.cli.doctor import examine_nodes, examine_recording
-        from deworldsg_ros.cli.run import RunOptions
+        from deworldsg_ros.cli.run import RunOptions, examine_nodes, examine_recording
         from deworldsg_ros.recordings.posing import PoseChoice
 
         if (recording is None) is not live:
@@ -363,9 +364,9 @@ def doctor(
 def compile_kernels() -> None:
     """Compile the kernels ahead of the first run."""
     with _reporting_errors():
-        from deworldsg_ros.cli import compilation
+        from deworldsg_ros.cli import run
 
-        compilation.compile_kernels(Console())
+        run.compile_kernels(Console())
 
 
 @app.command("config")
@@ -388,11 +389,11 @@ for parent, function, summary in (
     (app, ask.query, "Ask a scene graph in words."),
     (app, ask.goal, "Print a pose from which an object is in view."),
     (app, ask.explain, "Explain an object, a relation or a class."),
-    (app, edit.edit, "Correct a map by hand, or undo it."),
-    (app, mcp.mcp, "Serve a scene graph to an LLM agent (MCP)."),
-    (app, exchange.export, "Write a scene graph in another format."),
-    (app, exchange.diff, "List what differs between two scene graphs."),
-    (app, exchange.merge, "Merge two scene graphs into one."),
+    (app, ask.edit, "Correct a map by hand, or undo it."),
+    (app, ask.mcp, "Serve a scene graph to an LLM agent (MCP)."),
+    (app, ask.export, "Write a scene graph in another format."),
+    (app, ask.diff, "List what differs between two scene graphs."),
+    (app, ask.merge, "Merge two scene graphs into one."),
     (store.app, store.add, "Add graphs, or follow the running graph_node."),
     (store.app, store.ask, "Ask in Cypher."),
     (store.app, store.at, "Print where objects were at a time."),

@@ -1,25 +1,39 @@
-"""`deworldsg query`, `goal` and `explain`: ask a scene graph."""
+"""`deworldsg query`, `goal`, `explain`, `edit`, `export`, `diff`, `merge` and `mcp`."""
 
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Optional
 
+import msgspec
+import numpy as np
 import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from deworldsg_ros.client.asking import ask
-from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.base.files import write_atomically
+from deworldsg_ros.base.words import counted, visible, whole_number
+from deworldsg_ros.client.combine import combine
+from deworldsg_ros.client.export import FORMATS
+from deworldsg_ros.client.export import export as export_graph
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.mcp_server import WatchedFile, make_server
 from deworldsg_ros.client.objects import SURE, odds_of
-from deworldsg_ros.client.patterns import Answers
-from deworldsg_ros.words import visible, whole_number
+from deworldsg_ros.client.questions import Answers, ask
+from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.camera import rigid_motion
+from deworldsg_ros.scene.errors import ClientError
+from deworldsg_ros.wire import messages as wire
+
+# --- `deworldsg query`, `goal` and `explain`: ask a scene graph.
 
 # typer evaluates these annotations at run time.
 Words = Annotated[
@@ -179,3 +193,186 @@ def _print_answers(answers: Answers, frame_id: str, console: Console) -> None:
         console.print(table)
     for note in answers.notes:
         console.print(plain(note), highlight=False, soft_wrap=True)
+
+
+# --- `deworldsg edit`: an operator's edits, in a map file or in a running graph.
+
+# typer evaluates these annotations at run time.
+Edits = Annotated[list[str], typer.Argument(metavar="[FILE] WORDS", help="map file, then the edit")]
+EditLive = Annotated[
+    bool, typer.Option("--live", help="edit the running graph_node instead of a file")
+]
+
+USAGE = (
+    "set_label ID LABEL, merge ID ID, split ID [X,Y,Z X,Y,Z], delete ID, or undo, after the map "
+    "file or --live"
+)
+
+
+def edit(
+    words: Edits, live: EditLive = False, namespace: Namespace = "", as_json: AsJson = False
+) -> None:
+    """Edit a map: set_label ID LABEL, merge ID ID, split ID, delete ID, undo.
+
+    With --live, the graph of the running graph_node. An edit holds for all later frames. `split`
+    takes two points, X,Y,Z each: every part of the object belongs to the nearer one.
+    """
+    path, rest = (None, words) if live else (Path(words[0]), words[1:])
+    request = parse_edit(rest)
+    if path is None:
+        reply = _edit_live(namespace, rest[0], request)
+    else:
+        from deworldsg_ros.map_file import edit_map  # with all stages: slow to import
+
+        reply = msgspec.to_builtins(edit_map(path, request))
+    if as_json:
+        print_json(reply)
+    else:
+        print_lines([reply["text"]])
+
+
+def parse_edit(words: list[str]) -> EditRequest:
+    """The request of words such as ``merge 4 7``; ClientError for others."""
+    verb, *rest = words or [""]
+    try:
+        if verb == "set_label" and len(rest) >= 2:
+            return SetLabel(_number(rest[0]), " ".join(rest[1:]))
+        if verb == "merge" and len(rest) == 2:
+            return MergeNodes([_number(word) for word in rest])
+        if verb == "split" and len(rest) in (1, 3):
+            points = [[float(value) for value in word.split(",")] for word in rest[1:]]
+            request = {"node": _number(rest[0]), "near_m": points or None}
+            return msgspec.convert(request, SplitNode)
+        if verb == "delete" and len(rest) == 1:
+            return DeleteNode(_number(rest[0]))
+        if verb == "undo" and not rest:
+            return Undo()
+    except ValueError as error:  # msgspec's errors are such
+        raise ClientError(f"'{' '.join(words)}': {error}; expected {USAGE}") from error
+    raise ClientError(f"'{' '.join(words)}': expected {USAGE}")
+
+
+def _number(word: str) -> int:
+    number = whole_number(word.removeprefix("#"))
+    if number is None:
+        raise ValueError(f"{word} is no id")
+    return number
+
+
+def _edit_live(namespace: str, verb: str, request: EditRequest) -> dict[str, Any]:
+    from deworldsg_ros.client import SceneGraphClient
+
+    with SceneGraphClient(namespace) as client:
+        if verb == "undo":
+            return client.undo()
+        values = json.loads(msgspec.json.encode(request))
+        return client.command(verb, **values)
+
+
+# --- `deworldsg mcp`: serve a scene graph to an LLM agent, over stdio.
+
+
+def mcp(
+    graph: Annotated[
+        Optional[Path],
+        typer.Argument(
+            metavar="[GRAPH]", help="file, or folder of a run; read again when it changes"
+        ),
+    ] = None,
+    live: Live = False,
+    namespace: Namespace = "",
+    edits: Annotated[
+        bool, typer.Option("--edit", help="with --live: the agent may edit the graph, too")
+    ] = False,
+) -> None:
+    """Serve a scene graph to an LLM agent: an MCP server on stdio, offline, without a key.
+
+    Needs the package mcp: pip install 'deworldsg_ros[mcp]'.
+    """
+    if live == (graph is not None):
+        raise ClientError("expected a graph or --live, and not both")
+    if edits and not live:
+        raise ClientError("--edit needs --live; edit a map file with deworldsg edit")
+    if graph is not None:
+        make_server(WatchedFile(graph)).run()
+        return
+    from deworldsg_ros.client import SceneGraphClient
+
+    with SceneGraphClient(namespace) as client:
+        make_server(lambda: client.graph, client, edits).run()
+
+
+# --- `deworldsg export`, `diff` and `merge`: graphs in other formats, compared, and merged.
+
+# typer evaluates these annotations at run time.
+Graph = Annotated[Path, typer.Argument(metavar="GRAPH", help="file, or folder of a run")]
+First = Annotated[Path, typer.Argument(metavar="A", help="file, or folder of a run")]
+Second = Annotated[Path, typer.Argument(metavar="B", help="file, or folder of a run")]
+
+
+def export(
+    kind: Annotated[str, typer.Argument(metavar="FORMAT", help=", ".join(FORMATS))],
+    graph: Graph,
+    output: Annotated[Path, typer.Argument(metavar="OUT", help="file to write")],
+) -> None:
+    """Write a scene graph in another format."""
+    for path in export_graph(SceneGraph.load(graph), kind, output):
+        typer.echo(str(path))
+
+
+def diff(before: First, after: Second, as_json: AsJson = False) -> None:
+    """List what differs between two scene graphs in one world frame.
+
+    Objects are added, gone, moved or relabelled.
+    """
+    changes = SceneGraph.load(after).changes_since(SceneGraph.load(before))
+    if as_json:
+        print_json(changes.to_dict())
+        return
+    print_lines(changes.lines)
+    typer.echo(f"unchanged: {counted(changes.same, 'object')}")
+
+
+def merge(
+    first: First,
+    second: Second,
+    output: Annotated[Path, typer.Argument(metavar="OUT", help="file to write")],
+    transform: Annotated[
+        str,
+        typer.Option(
+            "--transform",
+            metavar="X,Y,Z,DEGREES",
+            help="position of the world frame of B in that of A, and its turn about up; default: "
+            "find it from the objects",
+        ),
+    ] = "",
+) -> None:
+    """Merge a scene graph into another one: objects at one place become one."""
+    a, b = SceneGraph.load(first), SceneGraph.load(second)
+    combined = combine(a, b, _transform(transform, a) if transform else None)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(output, wire.encode(combined.message).encode())
+    except OSError as error:
+        raise ClientError(f"{output} cannot be written: {error.strerror}") from error
+    console = Console(highlight=False, soft_wrap=True)
+    if not transform:
+        turn = combined.T_a_b[:3, :3]
+        angle = math.degrees(math.acos(min(max((np.trace(turn) - 1) / 2, -1.0), 1.0)))
+        place = " ".join(f"{value:.3f}" for value in combined.T_a_b[:3, 3])
+        console.print(
+            f"transform found: {place} m, {angle:.1f} degrees; confidence {combined.confidence:.2f}"
+        )
+    console.print(
+        f"{output}: {counted(len(combined.message.nodes), 'object')}; {len(combined.pairs)} of the "
+        f"{len(a)} and {len(b)} objects are in both"
+    )
+
+
+def _transform(text: str, a: SceneGraph) -> Float64:
+    parts = re.split(r"[,\s]+", text.strip())
+    try:
+        x, y, z, degrees = map(float, parts)
+    except ValueError as error:
+        raise ClientError(f"--transform {text}: expected four numbers X,Y,Z,DEGREES") from error
+    return rigid_motion(np.array([x, y, z]), math.radians(degrees) * np.array(a.up))

@@ -2,41 +2,394 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import itertools
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import threading
 import time
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+import msgspec
 import numpy as np
 from rich.console import Console
 
 from deworldsg_ros import __version__
-from deworldsg_ros.checkpoints.required import require_checkpoints
+from deworldsg_ros.base.kernels import COMPILING
+from deworldsg_ros.base.words import counted
+from deworldsg_ros.checkpoints.catalogue import require_checkpoints
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.demo_view import DemoView
-from deworldsg_ros.cli.installation import dds_environment, find_shared, node_command
-from deworldsg_ros.cli.observing import as_report, print_findings, sizes_of
-from deworldsg_ros.cli.processes import LoggedProcess, ending, one_interrupt
-from deworldsg_ros.cli.replay_progress import ReplayProgress
+from deworldsg_ros.cli.outputs import as_report, print_findings, sizes_of
+from deworldsg_ros.cli.terminal import (
+    dds_environment,
+    find_shared,
+    frame_progress,
+    node_command,
+    working,
+)
 from deworldsg_ros.config import Config
 from deworldsg_ros.doctor import Finding, find
-from deworldsg_ros.recordings import events
+from deworldsg_ros.graph.graph_files import GRAPH_FILE, read_graph
+from deworldsg_ros.recordings import replaying
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.messages import ODOMETRY, Role
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.recordings.source import ODOMETRY, Role
 from deworldsg_ros.ros.diagnosed import observations_of
 from deworldsg_ros.ros.health import DROPPED, LEFT_OUT, counts_in
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.graph_file import GRAPH_FILE, read_graph
+from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError, RecordingError
 from deworldsg_ros.view.photos import Album
-from deworldsg_ros.words import counted
+from deworldsg_ros.wire import messages as wire
+
+# --- Processes of the demo: each in its own session with its own log, ended one after the other.
+
+PR_SET_PDEATHSIG = 1  # of Linux's prctl
+# Time to end after each signal. graph_node writes its map after SIGINT.
+GRACE_S = ((signal.SIGINT, 8.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
+
+
+class LoggedProcess:
+    """A process in its own session, which Ctrl-C in the terminal does not reach.
+
+    Args:
+        name: name in messages.
+        command: program and arguments.
+        environment: the complete environment.
+        log: file of its standard error, and of its standard output unless `read_output`.
+        read_output: whether the parent reads `output`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        log: Path,
+        *,
+        read_output: bool = False,
+    ) -> None:
+        self.name = name
+        self.log = log
+        with log.open("wb") as file:
+            self._process = subprocess.Popen(
+                list(command),
+                env=dict(environment),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE if read_output else file,
+                stderr=file,
+                start_new_session=True,
+                preexec_fn=_end_with_parent(),
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def output(self) -> IO[bytes]:
+        """Standard output."""
+        assert self._process.stdout is not None
+        return self._process.stdout
+
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code; None while it runs."""
+        return self._process.poll()
+
+    def last_lines(self, count: int = 12) -> str:
+        """End of its log."""
+        lines = self.log.read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(lines[-count:])
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal, if it still runs."""
+        if self.exit_code is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def wait(self, timeout_s: float | None) -> int | None:
+        """Exit code; None on timeout. A timeout of None waits without end."""
+        try:
+            return self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+
+def _end_with_parent() -> Callable[[], None] | None:
+    """On Linux, the first call of a child: request SIGINT for the death of its parent."""
+    try:
+        prctl = ctypes.CDLL(None, use_errno=True).prctl
+    except (OSError, AttributeError):
+        return None
+    return lambda: prctl(PR_SET_PDEATHSIG, signal.SIGINT)
+
+
+def end_all(processes: Sequence[LoggedProcess]) -> dict[str, int | None]:
+    """End all by SIGINT, then SIGTERM, then SIGKILL; return the exit codes by name."""
+    for number, grace_s in GRACE_S:
+        running = [process for process in processes if process.exit_code is None]
+        for process in running:
+            process.signal(number)
+        for process in running:
+            process.wait(grace_s)
+    return {process.name: process.exit_code for process in processes}
+
+
+@contextlib.contextmanager
+def ending(console: Console) -> Iterator[list[LoggedProcess]]:
+    """A list of processes, the source of messages last; all are ended on the way out."""
+    processes: list[LoggedProcess] = []
+    try:
+        yield processes
+    finally:
+        with console.status("ending the nodes …"):
+            # The last one first, so that no new message arrives.
+            codes = end_all(processes[-1:]) | end_all(processes[:-1])
+        for name, code in codes.items():
+            # A node that is still loading has no handler: SIGINT itself ends it.
+            if code not in (0, -signal.SIGINT):
+                line = f"{name} ended with exit code {code}"
+                console.print(line, style="yellow", highlight=False)
+
+
+@contextlib.contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Only the first SIGINT or SIGTERM interrupts: a second one must not stop the clean-up."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+
+    def interrupt(*_: Any) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    previous = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+# --- The live view of the demo: viewer_node as one more process, and its address on the terminal.
+
+VIEWER = "viewer_node"
+# The line of viewer_node with its address.
+ADDRESS = re.compile(r"^view: (http\S+)$", re.MULTILINE)
+LOOK_PERIOD_S = 0.2
+VIEW_START_LIMIT_S = 60.0
+
+
+class DemoView:
+    """The viewer of a demo. Without it the demo goes on, and says why.
+
+    Args:
+        processes: the process is put there, to be ended.
+        config: ROS parameter file.
+        logs: folder of its log.
+        console: terminal.
+
+    Attributes:
+        url: of the page; None = not known yet.
+    """
+
+    def __init__(
+        self,
+        processes: list[LoggedProcess],
+        config: Path,
+        logs: Path,
+        console: Console,
+    ) -> None:
+        self.url: str | None = None
+        self._processes = processes
+        self._config = config
+        self._log = logs / f"{VIEWER}.log"
+        self._console = console
+
+    def start(self) -> None:
+        """Start the process; its address is printed when the page is there.
+
+        The demo calls it when the nodes are ready, so that they do not start later.
+        """
+        if find_spec("viser") is None:
+            self._note("it needs the package viser: pip install 'deworldsg_ros[view]'")
+            return
+        command = [*node_command(VIEWER), "--ros-args", "--params-file", str(self._config)]
+        process = LoggedProcess(VIEWER, command, dds_environment(), self._log)
+        self._processes.append(process)
+        threading.Thread(target=self._announce, args=[process], daemon=True).start()
+
+    def stay_open(self) -> None:
+        """Keep the page until Ctrl-C if someone is at the terminal."""
+        if self.url is not None and self._console.is_terminal and sys.stdin.isatty():
+            text = f"the view stays at {self.url}: press Ctrl-C to end"
+            self._console.print(text, highlight=False, soft_wrap=True)
+            with suppress(KeyboardInterrupt):
+                self._processes[-1].wait(None)
+
+    def _announce(self, process: LoggedProcess) -> None:
+        end_s = time.monotonic() + VIEW_START_LIMIT_S
+        while process.exit_code is None and time.monotonic() < end_s:
+            found = ADDRESS.search(self._log.read_text(encoding="utf-8", errors="replace"))
+            if found:
+                self.url = found[1]
+                self._console.print(f"live view: {self.url}", highlight=False, soft_wrap=True)
+                return
+            time.sleep(LOOK_PERIOD_S)
+        if process.exit_code not in (None, 0):
+            self._note(f"{VIEWER} ended with exit code {process.exit_code}; its log: {self._log}")
+
+    def _note(self, reason: str) -> None:
+        outputs.print_noted(self._console, "no live view:", reason)
+
+
+# --- The progress of a replay on the terminal, read from the events that replay_node prints.
+
+STARTING = "starting the nodes …"
+
+
+class DemoFailed(DeWorldSGError):
+    """A process of the demo ended early, or there is no graph."""
+
+
+class ReplayProgress:
+    """Shows the start of the nodes, then a bar over the frames.
+
+    Args:
+        replay: the process of replay_node, which prints events.
+        nodes: the other processes.
+        frames: number of RGB images in the recording.
+        console: terminal.
+    """
+
+    def __init__(
+        self, replay: LoggedProcess, nodes: Sequence[LoggedProcess], frames: int, console: Console
+    ) -> None:
+        self._replay = replay
+        self._nodes = nodes
+        self._frames = frames
+        self._lines: queue.Queue[bytes | None] = queue.Queue()
+        self._status = working(console, STARTING)
+        self._progress = frame_progress(console)
+        self._task = self._progress.add_task("replaying", total=frames, start=False, note="")
+        self._saved: replaying.Saved | None = None
+        self._finished: replaying.Finished | None = None
+
+    def follow(self, on_started: Callable[[], None] | None = None) -> replaying.Finished:
+        """Show events until the replay has finished.
+
+        Args:
+            on_started: called when the nodes are ready and the first frame is published.
+
+        Raises:
+            DemoFailed: if a process ends early, or graph_node does not save its graph.
+        """
+        threading.Thread(target=self._read, name="replay events", daemon=True).start()
+        self._status.start()
+        try:
+            while self._finished is None:
+                event = self._next()
+                self._show(event)
+                if on_started is not None and isinstance(event, replaying.Started):
+                    on_started()
+        finally:
+            self._status.stop()
+            self._progress.stop()
+        if self._saved is None or not self._saved.success:
+            problem = self._saved.message if self._saved else "replay_node did not request it"
+            raise DemoFailed(f"graph_node saved no graph: {problem}{_hint(self._finished)}")
+        return self._finished
+
+    def _read(self) -> None:
+        for line in self._replay.output:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def _next(self) -> replaying.Event | None:
+        """The next event; None if there is none yet."""
+        self._check_running()
+        try:
+            line = self._lines.get(timeout=0.2)
+        except queue.Empty:
+            return None
+        if line is None:
+            self._replay.wait(2.0)  # its output ends before its process
+            self._check_running()
+            raise DemoFailed(_early_end(self._replay))
+        try:
+            return replaying.decode(line.decode())
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            return None  # other output, e.g. of a library
+
+    def _show(self, event: replaying.Event | None) -> None:
+        if isinstance(event, replaying.Waiting):
+            compiling = any(COMPILING in node.last_lines() for node in self._nodes)
+            self._status.update(_waiting_text(event, compiling))
+        elif isinstance(event, replaying.Started):
+            self._status.stop()
+            self._progress.start_task(self._task)
+            self._progress.start()
+        elif isinstance(event, replaying.Progress):
+            finishing = event.published >= self._frames
+            note = "finishing …" if finishing else counted(event.nodes, "node")
+            self._progress.update(self._task, completed=event.published, note=note)
+        elif isinstance(event, replaying.Saved):
+            self._saved = event
+        elif isinstance(event, replaying.Finished):
+            self._finished = event
+            self._progress.update(self._task, completed=event.published, note="")
+
+    def _check_running(self) -> None:
+        """Raise DemoFailed if a node has ended, or replay_node has failed."""
+        for process in self._nodes:
+            if process.exit_code is not None:
+                raise DemoFailed(_early_end(process))
+        if self._replay.exit_code not in (None, 0):
+            raise DemoFailed(_early_end(self._replay))
+
+
+def _waiting_text(event: replaying.Waiting, compiling: bool) -> str:
+    words = [words[0] for item in event.missing if (words := item.split())[0].endswith("_node")]
+    names = ", ".join(dict.fromkeys(words)) or event.missing[0]
+    text = f"{STARTING} waiting for {names}"
+    if compiling:
+        text += f"\n  {COMPILING}"
+    return text
+
+
+def _early_end(process: LoggedProcess) -> str:
+    lines = process.last_lines()
+    return (
+        f"{process.name} ended early with exit code {process.exit_code}. The end of its log, "
+        f"{process.log}:\n{lines or '(it is empty)'}"
+    )
+
+
+def _hint(finished: replaying.Finished) -> str:
+    """Missing inputs and drops of every node, from its diagnostics."""
+    texts = [
+        f"{name}: {text}" if key.startswith("waiting for") else f"{name}: {key} {text}"
+        for name, values in finished.diagnostics.items()
+        for key, text in values.items()
+        if key.startswith(("waiting for", DROPPED))
+    ]
+    return f" ({'; '.join(texts)})" if texts else ""
+
+
+# --- `deworldsg demo`: a recording through the four nodes, as separate processes, over DDS.
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 ODOMETRY_NODE = "odometry_node"
@@ -237,7 +590,7 @@ def _write_report(
     out: Path,
     recording: _Recording,
     graph: wire.SceneGraphMessage,
-    finished: events.Finished,
+    finished: replaying.Finished,
     wall_s: float,
     findings: list[Finding],
 ) -> None:
@@ -265,7 +618,7 @@ def _write_report(
     outputs.write_report(out, report)
 
 
-def _findings(graph: wire.SceneGraphMessage, finished: events.Finished) -> list[Finding]:
+def _findings(graph: wire.SceneGraphMessage, finished: replaying.Finished) -> list[Finding]:
     """What is off, from the diagnostics of the nodes and the graph."""
     seen = replace(
         observations_of(finished.diagnostics),
@@ -279,7 +632,7 @@ def _findings(graph: wire.SceneGraphMessage, finished: events.Finished) -> list[
     return find(seen)
 
 
-def _drops(finished: events.Finished) -> dict[str, dict[str, int]]:
+def _drops(finished: replaying.Finished) -> dict[str, dict[str, int]]:
     """Drops by reason: of the recording, and of each node."""
     nodes = sorted(finished.diagnostics.items())
     return {"recording": finished.drops} | {
@@ -287,7 +640,7 @@ def _drops(finished: events.Finished) -> dict[str, dict[str, int]]:
     }
 
 
-def _print_summary(out: Path, finished: events.Finished, console: Console) -> None:
+def _print_summary(out: Path, finished: replaying.Finished, console: Console) -> None:
     outputs.print_drops(console, finished.losses, _drops(finished), {})
     if finished.without_result or not finished.drained:
         outputs.print_noted(

@@ -1,29 +1,37 @@
-"""The results of run and demo: files in the output folder, and tables on the terminal."""
+"""The results of run and demo: files in the output folder, tables, and the doctor's findings."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from deworldsg_ros.base.files import check_writable, together, write_atomically
+from deworldsg_ros.base.words import visible
 from deworldsg_ros.config import Config, to_yaml
-from deworldsg_ros.files import check_writable, together, write_atomically
+from deworldsg_ros.doctor import Finding, FrameSampler, Observations, find
+from deworldsg_ros.graph.graph_files import GRAPH_FILE
+from deworldsg_ros.graph.provenance import path_beside, space_path
+from deworldsg_ros.recordings.recording import Recording
 from deworldsg_ros.ros.health import UNMATCHED_PREFIX
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.graph_file import GRAPH_FILE
-from deworldsg_ros.scene.seen_frames import path_beside
-from deworldsg_ros.scene.seen_space import space_path
 from deworldsg_ros.scene.up import UpEstimator
-from deworldsg_ros.words import visible
+from deworldsg_ros.wire import messages as wire
+
+if TYPE_CHECKING:
+    from deworldsg_ros.pipeline import FrameResult, Pipeline
+
+# --- The results of run and demo: files in the output folder, and tables on the terminal.
 
 PICTURE_FILE = "scene_graph.png"
 PAGE_FILE = "scene_graph.html"
@@ -163,3 +171,69 @@ def print_noted(console: Console, note: str, text: str) -> None:
     """Print a line that begins with a yellow note. Its text comes from files: no markup in it."""
     line = Text.assemble((note, "yellow"), f" {visible(text)}")
     console.print(line, highlight=False, soft_wrap=True)
+
+
+# --- Observations of a run for the doctor, and the output of its findings.
+
+
+class RunObserver:
+    """Notes each frame of a run and its result."""
+
+    def __init__(self) -> None:
+        self._sampler = FrameSampler()
+        self._turns: Counter[int] = Counter()
+        self._detections = 0
+
+    def note(self, frame: RgbdFrame, result: FrameResult) -> None:
+        """Note a processed frame."""
+        self._sampler.add(frame)
+        self._turns[result.perceived.turns] += 1
+        self._detections += len(result.perceived.frame_graph)
+
+    def findings(
+        self, recording: Recording, pipeline: Pipeline, drops: Mapping[str, Mapping[str, int]]
+    ) -> list[Finding]:
+        """What is off with the run so far.
+
+        Args:
+            recording: of the frames.
+            pipeline: that processed them.
+            drops: counts by owner and reason.
+        """
+        from deworldsg_ros.perception.stage import Perception
+
+        perception, builder = pipeline.perception, pipeline.builder
+        graph = None if builder is None else pipeline.graph()
+        reasons: Counter[str] = Counter()
+        for counts in drops.values():
+            reasons.update(counts)
+        seen = Observations(
+            images=recording.frame_count,
+            frames=self._turns.total(),
+            drops=reasons,
+            examples=recording.reasons,
+            nodes=0 if graph is None else len(graph.nodes),
+            hidden={} if builder is None else builder.hidden,
+            detections=self._detections,
+            classes=perception.vocabulary.classes if isinstance(perception, Perception) else (),
+            sizes=() if graph is None else sizes_of(graph),
+            turns=self._turns,
+            checks=self._sampler.checks(),
+        )
+        return find(seen)
+
+
+def sizes_of(graph: wire.SceneGraphMessage) -> tuple[tuple[str, float], ...]:
+    """Label and longest side in metres of each node."""
+    return tuple((node.label, max(node.box.size_m)) for node in graph.nodes if node.box)
+
+
+def print_findings(console: Console, findings: Sequence[Finding]) -> None:
+    """Print each finding as a paragraph of one line."""
+    for finding in findings:
+        print_noted(console, "note:" if finding.harmless else "check:", str(finding))
+
+
+def as_report(findings: Sequence[Finding]) -> list[dict[str, Any]]:
+    """Findings for run.json."""
+    return [asdict(finding) for finding in findings]

@@ -11,11 +11,11 @@ from typing import Annotated, Any, Optional
 import typer
 from rich.console import Console
 
-from deworldsg_ros.checkpoints.card import CARD_FILE, read_card
-from deworldsg_ros.cli.progress import frame_progress
+from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, read_detector_card
+from deworldsg_ros.cli.terminal import frame_progress
 from deworldsg_ros.config import RelationsConfig, from_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
+from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 from deworldsg_ros.training.options import FitOptions, TrainingOptions
 
 # Options of the command by the configuration fields that they set, for error messages.
@@ -188,7 +188,7 @@ def train_probe(
 
 def run_training(options: ProbeTraining, console: Console) -> None:
     """Train and save a probe, and print its accuracy; raises DeWorldSGError."""
-    from deworldsg_ros.training.dataset_clips import ClipChoice, is_data_set, read_clips
+    from deworldsg_ros.training.clips import ClipChoice, is_data_set, read_clips
     from deworldsg_ros.training.train import Progress
     from deworldsg_ros.training.train import train_probe as train
 
@@ -245,8 +245,7 @@ def import_probe(
     """Convert the published probe of V-JEPA 2 ViT-g 384 to a folder for relations.probe_path."""
     names = read_predicates(predicates)
     with _needing_torch():
-        from deworldsg_ros.checkpoints.probe_network import save_probe
-        from deworldsg_ros.checkpoints.published_probe import import_published
+        from deworldsg_ros.checkpoints.probe_network import import_published, save_probe
 
         probe = import_published(checkpoint, names)
         save_probe(out, probe)
@@ -264,8 +263,8 @@ def read_predicates(choice: str) -> tuple[str, ...]:
     """Predicates of a named set, a file or a checkpoint's card; raises ConfigurationError."""
     if choice in PREDICATE_SETS:
         return PREDICATE_SETS[choice]
-    card_path = Path(choice) / CARD_FILE
-    if card_path.is_file() and (names := read_card(card_path).predicates):
+    card_path = Path(choice) / DETECTOR_CARD
+    if card_path.is_file() and (names := read_detector_card(card_path).predicates):
         return names
     try:
         lines = Path(choice).read_text(encoding="utf-8").splitlines()
@@ -281,9 +280,9 @@ def read_predicates(choice: str) -> tuple[str, ...]:
 
 
 def _load_backbone(options: ProbeTraining) -> Any:
-    from deworldsg_ros.relations.world_models import dinov2, vjepa2
+    from deworldsg_ros.relations import clip_models
 
-    loaders = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
+    loaders = {"vjepa2": clip_models.load_vjepa2, "dinov2": clip_models.load_dinov2}
     load = loaders[_one_of("world-model", options.relations.world_model, tuple(loaders))]
     try:
         return load(options.relations, device=options.device, download=options.download)

@@ -1,12 +1,17 @@
-"""`deworldsg run`: build the scene graph of a recording in one process, without ROS."""
+"""`deworldsg run`, `doctor`, `convert`, `info` and `compile`: commands on a recording."""
 
 from __future__ import annotations
 
+import gc
 import itertools
+import multiprocessing
+import os
 import threading
 import time
+import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,39 +19,51 @@ from typing import Any
 
 import cv2
 import numpy as np
+from rich import box
 from rich.console import Console
+from rich.progress import Progress, TaskID
 from rich.table import Table
 from rich.text import Text
 
 from deworldsg_ros import __version__
+from deworldsg_ros.base.kernels import COMPILING, on_compilation
+from deworldsg_ros.base.timing import STAGES, Times, device_name, total_ms
+from deworldsg_ros.base.words import counted, visible
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.observing import RunObserver, as_report, print_findings
-from deworldsg_ros.cli.progress import frame_progress, say_instead, working
+from deworldsg_ros.cli.outputs import (
+    RunObserver,
+    as_report,
+    print_drops,
+    print_findings,
+    print_noted,
+)
+from deworldsg_ros.cli.terminal import frame_progress, say_instead, working
 from deworldsg_ros.config import Config
-from deworldsg_ros.doctor import Finding
-from deworldsg_ros.evaluation.measures.temporal import UpdateLog
+from deworldsg_ros.doctor import Finding, find
+from deworldsg_ros.evaluation.temporal import UpdateLog
+from deworldsg_ros.graph.graph_files import write_graph
+from deworldsg_ros.graph.provenance import write_seen, write_space
 from deworldsg_ros.graph_builder import warm_up
-from deworldsg_ros.kernels import COMPILING, on_compilation
+from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.map_file import check_paths, claim_map, continue_map, write_map
+from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import FrameResult, Pipeline
 from deworldsg_ros.poses.odometry import HAS_ODOMETRY, WITHOUT_ODOMETRY
 from deworldsg_ros.poses.trajectory import write_tum
+from deworldsg_ros.recordings.bags.storage import RawBag
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.posing import PoseChoice, PosedSource, choose_poses, posed_frames
-from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene import wire
+from deworldsg_ros.recordings.recording import Recording, detect_kind, open_source
+from deworldsg_ros.recordings.source import RawRoleMessage, Role, Source
+from deworldsg_ros.recordings.writer import check_output, write_mcap
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.graph_file import write_graph
-from deworldsg_ros.scene.seen_frames import write_seen
-from deworldsg_ros.scene.seen_space import write_space
-from deworldsg_ros.timing import STAGES, Times, device_name, total_ms
+from deworldsg_ros.scene.errors import DeWorldSGError, RecordingError, RefusedInput
 from deworldsg_ros.view.photos import Album
-from deworldsg_ros.words import counted
+from deworldsg_ros.wire import messages as wire
+
+# --- `deworldsg run`: build the scene graph of a recording in one process, without ROS.
 
 # Clips that the world model lost.
 FAILURES = ("world_model_error", "nan_features")
@@ -362,3 +379,173 @@ def _print_timings(console: Console, times_s: dict[str, Times], frames: int, wal
     table.add_row("sum of the stages", f"{in_turn_ms:.2f}", "", "")
     table.add_row("frame (stages overlap)", f"{1e3 * wall_s / frames:.2f}", "", "")
     console.print(table)
+
+
+# --- `deworldsg doctor`: say what is off with a recording, or with the nodes that run now.
+
+NOTHING = "nothing is off"
+
+
+def examine_recording(options: RunOptions, console: Console) -> bool:
+    """Run a recording without results and print the findings; whether all is well."""
+    return _told(examine(options, console), console)
+
+
+def examine_nodes(seconds: float, console: Console) -> bool:
+    """Listen to running nodes and print the findings; whether all is well."""
+    from deworldsg_ros.ros.observing import observe_nodes
+
+    with console.status(f"listening for {seconds:g} s …"):
+        seen = observe_nodes(seconds)
+    return _told(find(seen), console)
+
+
+def _told(findings: Sequence[Finding], console: Console) -> bool:
+    print_findings(console, findings)
+    is_well = all(finding.harmless for finding in findings)
+    if is_well:
+        console.print(NOTHING, highlight=False)
+    return is_well
+
+
+# --- `deworldsg convert`: convert a folder or bag to one MCAP file.
+
+
+def convert_recording(
+    kind: str,
+    path: Path,
+    output: Path,
+    *,
+    topics: TopicChoice,
+    options: DatasetOptions,
+    console: Console,
+) -> None:
+    """Write a recording as an MCAP file; raises RecordingError."""
+    check_output(output)
+    source = open_source(path, kind=kind, topics=topics, options=options)
+    try:
+        with frame_progress(console) as progress:
+            task = progress.add_task("converting", total=source.frame_count, note="")
+            count = write_mcap(_counted(source, progress, task), output)
+            progress.update(task, total=progress.tasks[0].completed)
+    finally:
+        source.close()
+    print_drops(console, source.losses, {"recording": source.drops}, {})
+    size_mb = output.stat().st_size / 1e6
+    console.print(
+        f"{output}: {counted(count, 'message')}, {size_mb:.1f} MB", highlight=False, soft_wrap=True
+    )
+
+
+def _counted(source: Source, progress: Progress, task: TaskID) -> Iterator[RawRoleMessage]:
+    for message in source.raw_messages():
+        yield message
+        if message.role is Role.RGB:
+            progress.advance(task)
+
+
+# --- `deworldsg info`: show the topics of a recording.
+
+
+def show_recording(
+    path: Path, topics: TopicChoice, options: DatasetOptions, console: Console
+) -> None:
+    """Print the kind, the topics and their use, and the lost data; raises RecordingError.
+
+    Args:
+        path: of the recording.
+        topics: topics of a bag that the user named.
+        options: intrinsics that the user gave.
+        console: terminal.
+    """
+    kind = detect_kind(path)
+    used: dict[str, str] = {}
+    problem = None
+    losses: list[str] = []
+    frames = 0
+    try:
+        source = open_source(path, kind=kind, topics=topics, options=options, need_poses=False)
+    except RecordingError as error:
+        if kind != "rosbag2":
+            raise
+        problem = str(error)
+    else:
+        used = {topic.name: role.value for role, topic in source.topics.items()}
+        rows = [(topic.name, topic.msgtype, topic.count) for topic in source.topics.values()]
+        frames, losses = source.frame_count, source.losses
+        source.close()
+    if kind == "rosbag2":
+        bag = RawBag(path)
+        rows = [(topic.name, topic.msgtype, topic.count) for topic in bag.topics]
+        losses = bag.losses
+        bag.close()
+    console.print(
+        f"{path}: {kind}, {counted(frames, 'RGB image')}", highlight=False, soft_wrap=True
+    )
+    table = Table(box=box.SIMPLE)
+    table.add_column("topic" if kind == "rosbag2" else "files", overflow="fold")
+    table.add_column("type", overflow="fold")
+    table.add_column("messages", justify="right")
+    table.add_column("used as")
+    for name, msgtype, count in rows:
+        kind_of = Text(visible(msgtype.split("/")[-1]))
+        table.add_row(Text(visible(name)), kind_of, str(count), used.get(name, ""))
+    console.print(table)
+    if used and Role.POSE.value not in used.values():
+        print_noted(
+            console, "no poses:", "use run or demo with --odometry, or run with --poses FILE"
+        )
+    for loss in losses:
+        print_noted(console, "lost:", loss)
+    if problem:
+        raise RecordingError(problem)
+
+
+# --- `deworldsg compile`: compile the kernels ahead, so that no first frame waits for the
+# compiler.
+
+# The longest first, so that all processes end at about the same time.
+PARTS: dict[str, Callable[[Config], object]] = {
+    "merging": lambda config: warm_up(config, "merging"),
+    "pairs": lambda config: warm_up(config, "pairs"),
+    "lifting": lambda config: Lifting(config.lifting).warm_up(),
+    "drift": lambda config: warm_up(config, "drift"),
+    "perception": lambda config: build_perception(config.perception),
+}
+
+
+class CompilationFailed(DeWorldSGError):
+    """A part could not be compiled."""
+
+
+def compile_kernels(console: Console) -> None:
+    """Compile the kernels of the default configuration into the cache, in a process for each core.
+
+    Numba compiles one kernel at a time in a process. A process that compiles several parts
+    compiles numba's own functions, which most kernels use, only once. Kernels that are in the cache
+    are only loaded.
+
+    Raises:
+        CompilationFailed: with the error of the process.
+    """
+    start = time.perf_counter()
+    # A forked process would have the threads' locks of this one, but not its threads.
+    context = multiprocessing.get_context("spawn")
+    processes = min(len(PARTS), len(os.sched_getaffinity(0)))
+    with (
+        working(console, "compiling the kernels …"),
+        ProcessPoolExecutor(processes, mp_context=context) as pool,
+    ):
+        try:
+            list(pool.map(_compile, PARTS))
+        except Exception as error:  # numba can fail in more ways than can be listed
+            text = "".join(traceback.format_exception(error))
+            raise CompilationFailed(f"the kernels could not be compiled:\n{text}") from error
+    console.print(f"the kernels are ready ({time.perf_counter() - start:.1f} s)", highlight=False)
+
+
+def _compile(part: str) -> None:
+    # The compiler's objects live to its end. To look at them again and again takes 8 % of the time.
+    gc.disable()
+    PARTS[part](Config())
+    gc.collect()  # 0.4 GB

@@ -15,13 +15,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from deworldsg_ros.base.words import counted
 from deworldsg_ros.cli.ask import AsJson, Live, Namespace, plain, print_json
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import join
 from deworldsg_ros.store import Store, StoreError
-from deworldsg_ros.store.store import StoreWriter
-from deworldsg_ros.store.times import EXAMPLES, time_ns_from_text
-from deworldsg_ros.words import counted
+from deworldsg_ros.store.store import EXAMPLES, StoreWriter, time_ns_from_text
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import join
 
 # The updates of a live graph are joined for this time: objects in view change with every frame.
 PERIOD_S = 2.0

@@ -16,15 +16,14 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.cli.installation import node_command
 from deworldsg_ros.cli.outputs import print_drops
-from deworldsg_ros.cli.progress import frame_progress
+from deworldsg_ros.cli.terminal import frame_progress, node_command
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.graph_file import read_graph
 
 if TYPE_CHECKING:
     from deworldsg_ros.view.live.sources import Sink

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from deworldsg_ros.client.changes import Changes, Pairing
-from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.explain import Explanation
 from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import HiddenObject, Relation, SceneObject
+from deworldsg_ros.scene.errors import ClientError
 
 if TYPE_CHECKING:
     from deworldsg_ros.client.live import SceneGraphClient

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import pose_from_quaternion
-from deworldsg_ros.scene.extent import horizontal_axes
+from deworldsg_ros.wire import messages as wire
 
 Triple = tuple[float, float, float]
 

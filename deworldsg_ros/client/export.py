@@ -12,13 +12,13 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.base.files import write_atomically
+from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
-from deworldsg_ros.files import write_atomically
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
-from deworldsg_ros.words import visible
+from deworldsg_ros.scene.errors import ClientError
 
 # A node of spark_dsg has the symbol of its layer in the upper byte: O for objects, layer 2.
 SPARK_SYMBOL = ord("O") << 56

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from deworldsg_ros.client.boxes import Footprint, point_gaps_m, polygon_gap_m
-from deworldsg_ros.client.errors import ClientError
 from deworldsg_ros.client.objects import Point, SceneObject
+from deworldsg_ros.graph.extent import horizontal_axes
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
-from deworldsg_ros.scene.extent import horizontal_axes
-from deworldsg_ros.scene.seen_space import SeenSpace
+from deworldsg_ros.scene.errors import ClientError
 
 # Directions around an object that are tried.
 DIRECTIONS = 72

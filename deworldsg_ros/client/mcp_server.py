@@ -3,13 +3,262 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
-from deworldsg_ros.client.errors import ClientError
+from deworldsg_ros.base.words import whole_number
 from deworldsg_ros.client.graph import SceneGraph
-from deworldsg_ros.client.tools import EditTools, GraphTools
-from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.client.objects import SceneObject
+from deworldsg_ros.client.questions import ask
+from deworldsg_ros.graph.graph_files import GRAPH_FILE
+from deworldsg_ros.scene.errors import ClientError, DeWorldSGError, RefusedInput
+from deworldsg_ros.scene.limits import MAX_SECONDS
+
+# --- The tools of the MCP server: questions with plain arguments, answers as plain values.
+
+# Graphs that are remembered for `what_changed`.
+MOST_GRAPHS = 256
+# Objects and relations of one answer; an agent reads all of them.
+MOST_ANSWERS = 50
+
+
+class GraphTools:
+    """Answers questions about the newest graph, and remembers earlier graphs.
+
+    Args:
+        newest: returns the newest graph; called before each answer.
+        client: a `SceneGraphClient`, which knows walls; None = the graph is of a file.
+    """
+
+    def __init__(self, newest: Callable[[], SceneGraph], client: Any = None) -> None:
+        self._newest = newest
+        self._client = client
+        self._known: deque[SceneGraph] = deque(maxlen=MOST_GRAPHS)
+
+    def list_objects(
+        self, label: str = "", min_probability: float = 0.0, limit: int = MOST_ANSWERS
+    ) -> dict[str, Any]:
+        """List the objects of the scene, the most probable first.
+
+        Args:
+            label: only this class, e.g. "cup"; empty = all classes.
+            min_probability: only objects that exist and are of their class with this probability.
+            limit: greatest number of objects in the answer.
+        """
+        graph = self._graph()
+        found = graph.objects(label or None, min_probability=min_probability or None)
+        return {
+            **_about(graph),
+            "classes": graph.labels,
+            "count": len(found),
+            "objects": [_short(item) for item in found[: max(limit, 0)]],
+        }
+
+    def list_relations(
+        self, subject: str = "", predicate: str = "", object: str = "", limit: int = MOST_ANSWERS
+    ) -> dict[str, Any]:
+        """List the relations between objects, e.g. every cup (subject) on (predicate) a table.
+
+        Args:
+            subject: class or id of the subject; empty = any.
+            predicate: e.g. "on", "in", "near"; empty = any.
+            object: class or id of the object; empty = any.
+            limit: greatest number of relations in the answer.
+        """
+        graph = self._graph()
+        found = graph.relations(_which(subject), predicate or None, _which(object))
+        return {
+            **_about(graph),
+            "count": len(found),
+            "relations": [
+                {"text": relation.text, **relation.to_dict(), "evidence": relation.evidence}
+                for relation in found[: max(limit, 0)]
+            ],
+        }
+
+    def find(self, question: str) -> dict[str, Any]:
+        """Find objects by a pattern. Every answer has odds, evidence, and whether it is sure.
+
+        Args:
+            question: e.g. "cup on dining table", "chair within 0.5 m of table and near window",
+                "anything near (1, 2, 0.5) within 1 m".
+        """
+        graph = self._graph()
+        return {**_about(graph), **ask(graph, question).to_dict()}
+
+    def get_object_context(self, object: str) -> dict[str, Any]:
+        """Tell everything about one object: class, place, size, relations, neighbours, evidence.
+
+        Args:
+            object: id, or class; of a class, the most probable object.
+        """
+        graph = self._graph()
+        which = _which(object)
+        if which is None or (isinstance(which, str) and not graph.objects(which)):
+            return {**_about(graph), "explanation": str(graph.explain(object))}
+        item = graph.one(which)
+        return {
+            **_about(graph),
+            "object": item.to_dict(),
+            "relations": [relation.to_dict() for relation in graph.relations_of(item)],
+            "neighbours": [
+                {"id": other.id, "label": other.label, "gap_m": round(gap, 3)}
+                for other, gap in graph.neighbours(item)[:MOST_ANSWERS]
+            ],
+            "explanation": str(graph.explain(item)),
+        }
+
+    def what_changed(self, seconds_ago: float = 60.0) -> dict[str, Any]:
+        """Tell which objects were added, went, moved or were renamed since a time.
+
+        Args:
+            seconds_ago: before the newest frame of the graph.
+        """
+        if not abs(seconds_ago) <= MAX_SECONDS:
+            raise ClientError(f"seconds_ago {seconds_ago:g}: expected at most {MAX_SECONDS}")
+        graph = self._graph()
+        start_ns = graph.stamp_ns - round(seconds_ago * 1e9)
+        earlier = [known for known in self._known if known.stamp_ns <= start_ns]
+        before = earlier[-1] if earlier else self._known[0]
+        answer: dict[str, Any] = {
+            **_about(graph),
+            "compared_with_s": before.stamp_ns / 1e9,
+            "first_seen_since": [_short(item) for item in graph if item.first_seen_ns >= start_ns],
+        }
+        if before is not graph:
+            changes = graph.changes_since(before)
+            answer.update(changes.to_dict(), lines=changes.lines)
+        if not earlier:
+            answer["note"] = (
+                "no graph of that time is known: the comparison starts when this server started"
+            )
+        return answer
+
+    def goal_near(self, object: str, distance_m: float = 1.0) -> dict[str, Any]:
+        """Give a pose on the floor from which an object is in view, for a navigation goal.
+
+        `seen_free` is the share of the robot's volume there that was seen as free; null = walls are
+        not known.
+
+        Args:
+            object: id, or class.
+            distance_m: from the box of the object, metres.
+        """
+        which = _which(object)
+        if which is None:
+            raise ClientError("object is empty: expected an id or a class")
+        if self._client is not None:
+            return dict(self._client.goal_near(which, distance_m))
+        return self._graph().goal_near(which, distance_m).to_dict()
+
+    def _graph(self) -> SceneGraph:
+        graph = self._newest()
+        if not self._known or self._known[-1] is not graph:
+            self._known.append(graph)
+        return graph
+
+
+class EditTools:
+    """The edits of an operator, as tools.
+
+    Args:
+        client: a `SceneGraphClient`.
+    """
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def __iter__(self) -> Iterator[Callable[..., dict[str, Any]]]:
+        return iter((self.set_label, self.merge, self.split, self.delete, self.undo))
+
+    def set_label(self, object: int, label: str) -> dict[str, Any]:
+        """Correct the class of an object. It stays for later frames; undo takes it back.
+
+        Args:
+            object: id.
+            label: e.g. "cup".
+        """
+        return dict(self._client.set_label(object, label))
+
+    def merge(self, object: int, other: int) -> dict[str, Any]:
+        """Say that two objects are one. The answer has the id of the new object.
+
+        Args:
+            object: id.
+            other: id.
+        """
+        return dict(self._client.merge(object, other))
+
+    def split(self, object: int) -> dict[str, Any]:
+        """Say that an object is two, one beside the other along its longest axis.
+
+        Args:
+            object: id.
+        """
+        return dict(self._client.split(object))
+
+    def delete(self, object: int) -> dict[str, Any]:
+        """Say that there is no such object. It does not come back from its place and class.
+
+        Args:
+            object: id.
+        """
+        return dict(self._client.delete(object))
+
+    def undo(self) -> dict[str, Any]:
+        """Undo the newest edit that was not undone yet, of any user."""
+        return dict(self._client.undo())
+
+
+class WatchedFile:
+    """The graph of a file, which is read again after it was written again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._seen = self._written()
+        self._graph = SceneGraph.load(path)
+
+    def __call__(self) -> SceneGraph:
+        """The newest readable graph of the file."""
+        written = self._written()
+        if written not in (None, self._seen):
+            self._seen = written
+            # Something else was written there: the last graph is still the newest one.
+            with suppress(RefusedInput):
+                self._graph = SceneGraph.load(self._path)
+        return self._graph
+
+    def _written(self) -> tuple[int, int] | None:
+        """Time of the last write, and the size; None = there is no file."""
+        file = self._path / GRAPH_FILE if self._path.is_dir() else self._path
+        try:
+            status = file.stat()
+        except OSError:
+            return None
+        return status.st_mtime_ns, status.st_size
+
+
+def _about(graph: SceneGraph) -> dict[str, Any]:
+    return {"frame_id": graph.frame_id, "stamp_s": graph.stamp_ns / 1e9, "up": list(graph.up)}
+
+
+def _short(item: SceneObject) -> dict[str, Any]:
+    names = ("id", "label", "probability", "sure", "position_m", "size_m", "observations")
+    values = item.to_dict()
+    return {name: values[name] for name in names}
+
+
+def _which(text: str) -> int | str | None:
+    text = text.strip().removeprefix("#")
+    number = whole_number(text)
+    return (text or None) if number is None else number
+
+
+# --- An MCP server on stdio, so that an LLM agent can ask a robot's graph. Offline, without a
+# key.
 
 INSTRUCTIONS = (
     "A live 3D scene graph of a robot's surroundings: objects with positions and sizes in metres, "

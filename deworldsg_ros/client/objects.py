@@ -8,13 +8,53 @@ from typing import Any
 
 import numpy as np
 
+from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.boxes import Footprint, footprint
-from deworldsg_ros.client.words import is_class, predicate_names
-from deworldsg_ros.scene import wire
+from deworldsg_ros.graph.extent import box_of, surface_points
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.extent import box_of, surface_points
-from deworldsg_ros.scene.predicates import plain
-from deworldsg_ros.words import counted
+from deworldsg_ros.scene.vocabulary import PREDICATES, plain
+from deworldsg_ros.wire import messages as wire
+
+# --- Names of classes and predicates as people write them.
+
+
+def words_of(name: str) -> list[str]:
+    """The words of a name in lower case; hyphens and underscores separate words."""
+    return plain(name).replace("-", " ").split()
+
+
+def is_class(asked: str, label: str) -> bool:
+    """Whether a name means a class: "table" and "tables" mean "table" and "dining table"."""
+    wanted, known = words_of(asked), words_of(label)
+    if not wanted or len(wanted) > len(known):
+        return False
+    return any(form == known[-len(form) :] for form in _singular_forms(wanted))
+
+
+def _singular_forms(words: list[str]) -> list[list[str]]:
+    *first, last = words
+    forms = [last]
+    if last.endswith("ies"):
+        forms.append(last[:-3] + "y")
+    if last.endswith("ves"):
+        forms.append(last[:-3] + "f")
+    if last.endswith("es"):
+        forms.append(last[:-2])
+    if last.endswith("s"):
+        forms.append(last[:-1])
+    return [[*first, form] for form in forms]
+
+
+def predicate_names(asked: str) -> frozenset[str]:
+    """The predicates that a name means: "on" means every way to be on something."""
+    name = " ".join(words_of(asked))
+    for names in PREDICATES:
+        if name == names[0]:
+            return frozenset(names)
+    return frozenset({name})
+
+
+# --- The answers of the client: objects, relations and hidden objects, as frozen values.
 
 Point = tuple[float, float, float]
 
@@ -272,7 +312,7 @@ def scene_object(node: wire.NodeState, frame_id: str, up: Point) -> SceneObject:
     )
 
 
-def relation(
+def relation_of(
     edge: wire.EdgeState, subject: SceneObject, object_: SceneObject, asked: str | None
 ) -> Relation:
     """The relation of a message, for a predicate that was asked, or for the most probable one."""

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from msgspec import structs
 
 from deworldsg_ros.client.boxes import box_of
-from deworldsg_ros.client.objects import Point
-from deworldsg_ros.client.words import is_class
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.client.objects import Point, is_class
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import empty_scene_graph
 
 
 @dataclass(frozen=True)

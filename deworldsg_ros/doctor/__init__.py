@@ -5,7 +5,6 @@ measures a few frames of a recording. `findings` turns all of it into causes and
 """
 
 from deworldsg_ros.doctor.findings import Finding, find
-from deworldsg_ros.doctor.frame_checks import FrameSampler
-from deworldsg_ros.doctor.observations import FrameChecks, Observations
+from deworldsg_ros.doctor.frame_checks import FrameChecks, FrameSampler, Observations
 
 __all__ = ["Finding", "FrameChecks", "FrameSampler", "Observations", "find"]

@@ -7,9 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deworldsg_ros.doctor.frame_checks import BODY, FACTOR, GIVEN, INVERSE, LATE, STILL
-from deworldsg_ros.doctor.observations import Observations
-from deworldsg_ros.words import counted
+from deworldsg_ros.base.words import counted
+from deworldsg_ros.doctor.frame_checks import (
+    BODY,
+    FACTOR,
+    GIVEN,
+    INVERSE,
+    LATE,
+    STILL,
+    Observations,
+)
 
 # Longest side of usual indoor objects, metres, of the classes that several detectors know.
 USUAL_SIZES_M = {

@@ -1,1 +1,1 @@
-"""Evaluation: the official protocol, measures beside it, front ends, baselines, reports, tables."""
+"""Evaluation: the official protocol, measures beside it, front ends, baselines, tables."""

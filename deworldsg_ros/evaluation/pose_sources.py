@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Literal
 
-from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.poses.frames import track_poses
-from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
-from deworldsg_ros.poses.trajectory import read_trajectory
+from deworldsg_ros.poses.odometry import track_poses
+from deworldsg_ros.poses.trajectory import PoseNoise, perturb_poses, read_trajectory
 from deworldsg_ros.recordings.folders.sequence import SequenceDataset, rotated_pose
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
 
 Kind = Literal["ground-truth", "slam", "odometry", "perturbed"]
 KINDS: tuple[Kind, ...] = ("ground-truth", "slam", "odometry", "perturbed")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.base.array_file import read_arrays
 from deworldsg_ros.recordings.folders.annotations import (
     Annotations,
     Layout,
@@ -23,10 +23,10 @@ from deworldsg_ros.recordings.folders.annotations import (
 )
 from deworldsg_ros.recordings.folders.dataset import read_json
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene.array_file import read_arrays
 from deworldsg_ros.scene.arrays import UInt8, UInt16
+from deworldsg_ros.scene.errors import RecordingError
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 LAYOUT = Layout("recording", "", "", "", "", "", "", "", "bags/README.md describes the files")
 # Older names of COCO classes, which ground truth may contain.

@@ -8,41 +8,188 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from deworldsg_ros.checkpoints.probe_card import read_card
-from deworldsg_ros.checkpoints.required import WORLD_MODELS, require_checkpoints
+from deworldsg_ros.base.files import confined, together, write_atomically
+from deworldsg_ros.base.timing import device_name, total_ms
+from deworldsg_ros.checkpoints.cards import read_probe_card
+from deworldsg_ros.checkpoints.catalogue import WORLD_MODELS, require_checkpoints
 from deworldsg_ros.config import Config, RelationsConfig, to_yaml
 from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
-from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
-from deworldsg_ros.evaluation.measures.edge_list import EDGES_FILE, write_edge_list
-from deworldsg_ros.evaluation.measures.graph_measures import (
+from deworldsg_ros.evaluation.edge_measures import EDGES_FILE, write_edge_list
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.graph_measures import (
     Measures,
     ReferenceScene,
     measure,
     read_reference,
 )
 from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
-from deworldsg_ros.evaluation.protocol.labels import translate
-from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
-from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, ScanResult, score_scan
+from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.recorded_room import open_annotations
-from deworldsg_ros.files import confined, together, write_atomically
+from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, score_scan
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.graph.graph_files import GRAPH_FILE, write_graph
 from deworldsg_ros.pipeline import Perceiver, Pipeline
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.graph_file import GRAPH_FILE, write_graph
-from deworldsg_ros.timing import device_name, total_ms
+from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.wire import messages as wire
+
+# --- Translation of detector labels to the classes of a data set.
+#
+# The protocol scores classes of the data set. A label that is a class stays. Other labels (of COCO)
+# are translated by the data set's own mapping, else by the synonyms below. A label without a
+# translation stays, and its probability counts for no class.
+
+# COCO classes to labels or classes of the data sets, the first known one counts.
+SYNONYMS: dict[str, tuple[str, ...]] = {
+    "apple": ("fruit",),
+    "bicycle": ("bike",),
+    "cell phone": ("phone",),
+    "couch": ("sofa",),
+    "dining table": ("table",),
+    "keyboard": ("computer-keyboard",),
+    "oven": ("major-appliance",),
+    "potted plant": ("indoor-plant", "plant"),
+    "suitcase": ("bag",),
+    "tv": ("tv-screen", "tv"),
+    "wine glass": ("glass",),
+}
+
+
+def translation(annotations: Annotations) -> dict[str, str]:
+    """Class by label, for labels that are not classes themselves."""
+    classes = set(annotations.vocabulary.classes)
+    known = {label: name for label, name in annotations.class_of_label.items() if name in classes}
+    for label, names in SYNONYMS.items():
+        for name in (label, *names):
+            found = name if name in classes else known.get(name)
+            if found is not None:
+                known.setdefault(label, found)
+    return {label: name for label, name in known.items() if label not in classes}
+
+
+def translate(graph: wire.SceneGraphMessage, annotations: Annotations) -> wire.SceneGraphMessage:
+    """The graph with classes of the data set; probabilities of labels of one class are added.
+
+    Mutual edges are in both directions, as in the ground truth.
+    """
+    if any(edge.mutual is True for edge in graph.edges):
+        graph = msgspec.structs.replace(graph, edges=_both_directions(graph.edges))
+    names = translation(annotations)
+    if not any(belief.label in names for node in graph.nodes for belief in node.classes):
+        return graph
+    nodes = []
+    for node in graph.nodes:
+        sums: dict[str, float] = {}
+        for belief in node.classes:
+            label = names.get(belief.label, belief.label)
+            sums[label] = sums.get(label, 0.0) + belief.probability
+        # A stable sort: labels with equal probability keep their order.
+        beliefs = [
+            wire.Belief(label, min(probability, 1.0))
+            for label, probability in sorted(sums.items(), key=lambda item: -item[1])
+        ]
+        label = beliefs[0].label if beliefs else node.label
+        nodes.append(msgspec.structs.replace(node, classes=beliefs, label=label))
+    return msgspec.structs.replace(graph, nodes=nodes)
+
+
+def _both_directions(edges: Sequence[wire.EdgeState]) -> list[wire.EdgeState]:
+    swapped = [
+        msgspec.structs.replace(edge, subject=edge.object, object=edge.subject)
+        for edge in edges
+        if edge.mutual is True
+    ]
+    return sorted([*edges, *swapped], key=lambda edge: (edge.subject, edge.object))
+
+
+# --- Conversion of scene graphs of this package to predictions of the protocol.
+
+# About the number of surface points that one observation adds to a node.
+POINTS_PER_OBSERVATION = 64
+
+
+def to_prediction(
+    graph: wire.SceneGraphMessage, vocabulary: Vocabulary, *, sampled: bool = True
+) -> ScanPrediction:
+    """Nodes with their surface points, edges with their predicate distributions, in graph order.
+
+    Of several predictions for one object the protocol takes the one with most points. A graph
+    stores a bounded sample of each surface; therefore the first `POINTS_PER_OBSERVATION` points
+    count once per observation of the node.
+
+    A graph contains the k most probable labels. The rest of the probability is spread evenly over
+    the other labels. Classes outside the vocabulary are left out (see `labels`).
+
+    Args:
+        graph: scene graph with surface points.
+        vocabulary: classes and predicates of the data set.
+        sampled: False if the graph contains all points of a node; then each point counts once.
+
+    Raises:
+        EvaluationError: all classes, or some predicate, are outside the vocabulary.
+    """
+    classes = {name: index for index, name in enumerate(vocabulary.classes)}
+    predicates = {name: index for index, name in enumerate(vocabulary.predicates)}
+    index_of = {node.id: index for index, node in enumerate(graph.nodes)}
+    points = tuple(_segment(node) if sampled else surface_points(node) for node in graph.nodes)
+    labels = {belief.label for node in graph.nodes for belief in node.classes}
+    if labels and not labels & set(classes):
+        raise _foreign("class", labels)
+    unknown = {belief.label for edge in graph.edges for belief in edge.predicates} - set(predicates)
+    if unknown:
+        raise _foreign("predicate", unknown)
+    class_scores = [_expand(node.classes, classes) for node in graph.nodes]
+    edge_scores = [_expand(edge.predicates, predicates) for edge in graph.edges]
+    edges = [(index_of[edge.subject], index_of[edge.object]) for edge in graph.edges]
+    return ScanPrediction(
+        points,
+        np.array(class_scores).reshape(-1, len(classes)),
+        np.array(edges, np.int64).reshape(-1, 2),
+        np.array(edge_scores).reshape(-1, len(predicates)),
+        [] if all(map(len, points)) else ["a node has no surface points: it supports no object"],
+    )
+
+
+def _segment(node: wire.NodeState) -> Float64:
+    """Points (n, 3) of a node. The stored sample is in random order, so its start is random too."""
+    return np.tile(surface_points(node)[:POINTS_PER_OBSERVATION], (node.observations, 1))
+
+
+def _expand(beliefs: Sequence[wire.Belief], indices: dict[str, int]) -> Float64:
+    others = len(indices) - sum(belief.label in indices for belief in beliefs)
+    left = max(0.0, 1.0 - sum(belief.probability for belief in beliefs))
+    scores = np.full(len(indices), left / others if others else 0.0)
+    for belief in beliefs:
+        if belief.label in indices:
+            scores[indices[belief.label]] = belief.probability
+    return scores
+
+
+def _foreign(kind: str, labels: set[str]) -> EvaluationError:
+    return EvaluationError(
+        f"scene graph has the {kind} '{min(labels)}', which is not in the data set: make the graph "
+        "with the vocabulary of the data set"
+    )
+
+
+# --- Run of the pipeline on one scan, and evaluation of its graph.
+#
+# `evaluate_scan` is a function of a picklable task, so that scans can run in other processes or on
+# a cluster. Its only side effect is the folder of its results.
 
 logger = logging.getLogger(__name__)
 
@@ -152,7 +299,7 @@ def warn_of_training(config: RelationsConfig, scan: str) -> None:
     """Log a warning if the configured probe was trained on this scan."""
     if config.world_model not in WORLD_MODELS:
         return
-    if scan in read_card(Path(config.probe_path).expanduser()).seen_groups:
+    if scan in read_probe_card(Path(config.probe_path).expanduser()).seen_groups:
         logger.warning(
             "scan %s was in the training of probe %s: its figures say nothing about other scans",
             scan,

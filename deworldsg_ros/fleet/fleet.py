@@ -9,15 +9,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from deworldsg_ros.client.align import Alignment, align
-from deworldsg_ros.client.combine import MIN_CONFIDENCE, Known, combine
+from deworldsg_ros.client.combine import MIN_CONFIDENCE, Alignment, Known, align, combine
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import SceneObject
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.delta import empty_scene_graph
 from deworldsg_ros.scene.errors import DeWorldSGError
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import empty_scene_graph
 
 FRAME_ID = "fleet"
 # Two objects of one graph lie on two of another one in many wrong ways. Four do not.
@@ -35,7 +34,7 @@ class Member:
     Attributes:
         graph: its newest graph, in its own world frame.
         T_fleet_world: (4, 4), from its world frame to the fleet's; None = not found yet.
-        confidence: of the transform, from 0 to 1; see `client.align`.
+        confidence: of the transform, from 0 to 1; see `client.combine`.
         matched: number of its objects that the transform puts onto objects of others.
         reason: why there is no transform, in words.
     """

@@ -16,10 +16,9 @@ from typing import Any
 
 from msgspec import UNSET
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.change_log import ChangeLog
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import ChangeLog, GraphReplica
 
 PREFIX = "deworldsg"
 # Level 1 takes a quarter of the time of level 6, and a tenth more bytes.

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from dataclasses import dataclass
 from itertools import accumulate
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting.constants import (
-    DEPTH_GRID_STRIDE_PX,
-    LiftingConstants,
+from deworldsg_ros.lifting.refine import (
+    Pixels,
+    dominant_layer,
+    masks_of,
+    spatial_inliers,
+    valid_depth,
+    valid_pixel_count,
 )
-from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.moments import Estimate, estimate_gaussian
-from deworldsg_ros.lifting.pixels import valid_depth
-from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
-from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
 from deworldsg_ros.scene.errors import RefusedInput
@@ -30,6 +32,216 @@ from deworldsg_ros.scene.frame_graph import (
     lifted,
 )
 from deworldsg_ros.scene.gaussian import transform
+
+# --- Fixed values of the lifting stage.
+
+
+@dataclass(frozen=True)
+class LiftingConstants:
+    """Values that no configuration changes; tests vary them.
+
+    Attributes:
+        epsilon_m: absolute tolerance to the local median, metres (Eq. 1). Printed in the paper.
+        alpha: factor of the median depth step (Eq. 2). Printed in the paper.
+        beta: factor of the reference depth (Eq. 2). Printed in the paper.
+        min_pixels: an object with fewer valid pixels is dropped. Printed in the paper, which
+            checks the mask; here it is checked after each refinement step too.
+        surface_points: surface points sampled from an object in one frame. An object with a large
+            surface gets up to `LARGE_SURFACE_FACTOR` times as many.
+    """
+
+    epsilon_m: float = 1e-3
+    alpha: float = 10.0
+    beta: float = 0.02
+    min_pixels: int = 10
+    surface_points: int = 200
+
+
+# Every N-th pixel of the depth image is kept, in both directions, for the negative evidence of the
+# merging stage: 4800 samples of a 640 x 480 image.
+DEPTH_GRID_STRIDE_PX = 8
+# A surface gets one point for each 30 cm², up to LARGE_SURFACE_FACTOR times the usual number. Two
+# samples of a wardrobe then meet in the 3 cm cells of the merging stage, or in adjacent cells.
+POINT_AREA_M2 = 0.003
+LARGE_SURFACE_FACTOR = 4
+
+
+# --- Pixels of each object without depth refinement: the paper's ablations (a) and (b).
+
+
+def mask_pixels(depth_m: Float32, runs: Int32) -> Pixels:
+    """Every valid pixel of an object's mask: ablation (b).
+
+    The arguments are those of `spatial_inliers`.
+    """
+    return spatial_inliers(depth_m, runs, 0.0, np.inf)
+
+
+def box_pixels(depth_m: Float32, box_xyxy: Float64) -> Pixels:
+    """Every valid pixel of an object's box: ablation (a).
+
+    Boxes may overlap; a pixel then belongs to several objects.
+
+    Args:
+        depth_m: (H, W) float32 metres, 0 = invalid.
+        box_xyxy: (4,) pixels; a box contains the pixels whose centres lie in it.
+    """
+    height, width = depth_m.shape
+    x1, y1, x2, y2 = box_xyxy.tolist()
+    left, top = max(math.ceil(x1), 0), max(math.ceil(y1), 0)
+    right, bottom = min(math.floor(x2) + 1, width), min(math.floor(y2) + 1, height)
+    box_m = depth_m[top:bottom, left:right]
+    rows, columns = np.nonzero(box_m > 0)
+    return Pixels(
+        np.add(columns, left, dtype=np.int32),
+        np.add(rows, top, dtype=np.int32),
+        box_m[rows, columns],
+    )
+
+
+# --- Back-projection (Eq. 3) and the Gaussian of an object (Eq. 4).
+
+# Points that are computed at once; they fit into the first-level cache.
+CHUNK = 256
+
+
+class Estimate(NamedTuple):
+    """An object in the camera frame.
+
+    Attributes:
+        pixel_count: number of its inliers. With fewer than the minimum, the rest is empty.
+        mean: (3,) float64, metres.
+        covariance: (3, 3) float64, square metres, N - 1 in the denominator, without the ridge εI.
+        points: (k, 3) float64, metres, a sample of the inliers: evenly spaced in row order.
+    """
+
+    pixel_count: int
+    mean: Float64
+    covariance: Float64
+    points: Float64
+
+
+def estimate_gaussian(
+    pixels: Pixels,
+    layer_m: tuple[float, float],
+    intrinsics: Intrinsics,
+    min_pixels: int,
+    surface_points: int,
+) -> Estimate:
+    """Sample mean and covariance of an object's points, camera frame (Eq. 4), and some points.
+
+    The Gaussian of the points in the world frame follows by `scene.gaussian.transform`: μ → Rμ + t,
+    Σ → RΣRᵀ. All points together are never stored.
+
+    Args:
+        pixels: of the object.
+        layer_m: lowest and highest depth of its inliers, metres (Eq. 2).
+        intrinsics: of the depth image.
+        min_pixels: an object with fewer inliers is not estimated; at least 2.
+        surface_points: usual size of the sample. A large surface gets more points, see
+            `POINT_AREA_M2`; no object gets more than it has inliers.
+    """
+    camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    arrays = pixels.columns, pixels.rows, pixels.depths_m
+    return Estimate(*_estimate(*arrays, *layer_m, *camera, min_pixels, surface_points))
+
+
+@kernel
+def back_project(
+    column: int, row: int, depth_m: float, fx: float, fy: float, cx: float, cy: float
+) -> tuple[float, float, float]:
+    """`Intrinsics.back_project` of one pixel, with the same operations (Eq. 3)."""
+    return (column - cx) / fx * depth_m, (row - cy) / fy * depth_m, depth_m
+
+
+@kernel
+def _estimate(
+    all_columns: Int32,
+    all_rows: Int32,
+    all_depths_m: Float32,
+    lowest_m: float,
+    highest_m: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    min_pixels: int,
+    surface_points: int,
+) -> tuple[int, Float64, Float64, Float64]:
+    columns = np.empty(all_columns.size, np.int32)
+    rows, depths_m = np.empty(columns.size, np.int32), np.empty(columns.size, np.float32)
+    count = 0
+    for index in range(all_depths_m.size):
+        z = all_depths_m[index]
+        columns[count], rows[count], depths_m[count] = all_columns[index], all_rows[index], z
+        count += (z >= lowest_m) & (z <= highest_m)
+    if count < min_pixels:
+        nothing = np.empty((0, 0), np.float64)
+        return count, np.empty(0, np.float64), nothing, nothing
+    mean, covariance = _moments(columns[:count], rows[:count], depths_m[:count], fx, fy, cx, cy)
+    area_m2 = count * mean[2] ** 2 / (fx * fy)
+    by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * surface_points)
+    points = np.empty((min(max(by_area, surface_points), count), 3), np.float64)
+    for index in range(len(points)):
+        place = index * count // len(points)
+        x, y, z = back_project(
+            columns[place], rows[place], np.float64(depths_m[place]), fx, fy, cx, cy
+        )
+        points[index, 0], points[index, 1], points[index, 2] = x, y, z
+    return count, mean, covariance, points
+
+
+@kernel
+def _moments(
+    columns: Int32, rows: Int32, depths_m: Float32, fx: float, fy: float, cx: float, cy: float
+) -> tuple[Float64, Float64]:
+    """Sample mean and covariance of the points of pixels."""
+    count = depths_m.size
+    # The sums are taken about a point of the object, not about the origin. A covariance of square
+    # centimetres at a distance of metres would lose its digits otherwise.
+    middle = count // 2
+    z0 = np.float64(depths_m[middle])
+    x0 = (columns[middle] - cx) / fx * z0
+    y0 = (rows[middle] - cy) / fy * z0
+    per_fx, per_fy = 1.0 / fx, 1.0 / fy
+    sx = sy = sz = 0.0
+    sxx = sxy = sxz = syy = syz = szz = 0.0
+    # Points are computed in parallel, sums one after the other: their order decides the rounding.
+    xs, ys = np.empty(CHUNK, np.float64), np.empty(CHUNK, np.float64)
+    zs = np.empty(CHUNK, np.float64)
+    for start in range(0, count, CHUNK):
+        u, v = columns[start : start + CHUNK], rows[start : start + CHUNK]
+        depths = depths_m[start : start + CHUNK]
+        for index in range(depths.size):
+            depth = np.float64(depths[index])
+            xs[index] = (u[index] - cx) * per_fx * depth - x0
+            ys[index] = (v[index] - cy) * per_fy * depth - y0
+            zs[index] = depth - z0
+        for index in range(depths.size):
+            x, y, z = xs[index], ys[index], zs[index]
+            sx += x
+            sy += y
+            sz += z
+            sxx += x * x
+            sxy += x * y
+            sxz += x * z
+            syy += y * y
+            syz += y * z
+            szz += z * z
+    mean, covariance = np.empty(3, np.float64), np.empty((3, 3), np.float64)
+    mean[0], mean[1], mean[2] = sx / count, sy / count, sz / count
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = sxx, syy, szz
+    covariance[0, 1] = covariance[1, 0] = sxy
+    covariance[0, 2] = covariance[2, 0] = sxz
+    covariance[1, 2] = covariance[2, 1] = syz
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] = (covariance[i, j] - count * mean[i] * mean[j]) / (count - 1)
+    mean[0], mean[1], mean[2] = mean[0] + x0, mean[1] + y0, mean[2] + z0
+    return mean, covariance
+
+
+# --- The lifting stage: frame graph, instance image and depth become a local 3D graph.
 
 
 class PosedDepth(Protocol):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from deworldsg_ros.kernels import kernel
+from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int32, Int64, UInt64
 
 # Cell indices lie in ±2^20: with cells of 3 cm, 31 km around the origin.

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import NodeStates
 
 # State of a rule besides the graph, as arrays by name.
 Memory = dict[str, NDArray[Any]]

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Protocol
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.graph import SceneGraph
 
 
 class Merging(Protocol):

@@ -10,27 +10,25 @@ from __future__ import annotations
 import numpy as np
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.edits import EditRequest
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.common import Memory, add_relations, check_fits
-from deworldsg_ros.merging.edited_frames import as_edited, may_merge, reject_deleted
-from deworldsg_ros.merging.editing import EditReply, SurfaceEditor
+from deworldsg_ros.merging.editing import (
+    EditReply,
+    SurfaceEditor,
+    as_edited,
+    may_merge,
+    reject_deleted,
+)
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import Matches, match
-from deworldsg_ros.merging.node_records import NodeRecords, apply_correction
-from deworldsg_ros.merging.views import (
-    FrameArrays,
-    View,
-    frame_arrays,
-    see,
-    see_nothing,
-    with_seen,
-)
+from deworldsg_ros.merging.records import NodeRecords, apply_correction
+from deworldsg_ros.merging.views import FrameArrays, View, frame_arrays, see, see_nothing, with_seen
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
-from deworldsg_ros.scene.edits import EditRequest
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import NodeStates
 
 # Gaussians are weighted by their number of pixels; this number gives weight 1.
 PIXELS_PER_WEIGHT = 1000.0

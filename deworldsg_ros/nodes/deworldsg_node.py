@@ -12,15 +12,14 @@ from typing import Any
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.graph_services import GraphServices
+from deworldsg_ros.ros.models import PerceivingNode, Relating
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.options import LIVE_GRAPH, LIVE_LIFTING, LIVE_RELATIONS
-from deworldsg_ros.ros.perceiving import PerceivingNode
-from deworldsg_ros.ros.relating import Relating
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import RelationEvidence
-from deworldsg_ros.streams.frame_assemblers import PairingFrame
+from deworldsg_ros.streams.frames import PairingFrame
 from deworldsg_ros.view.markers import markers
+from deworldsg_ros.wire import messages as wire
 
 
 class DeworldsgNode(PerceivingNode):

@@ -14,12 +14,12 @@ from deworldsg_ros.fleet.zenoh_link import (
     part_key,
     robot_key,
 )
-from deworldsg_ros.ros.graph_topics import GraphTopics
+from deworldsg_ros.ros.graph_output import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import FleetLinkParameters
-from deworldsg_ros.ros.repeating import Repeating
-from deworldsg_ros.scene.change_log import ChangeLog
+from deworldsg_ros.ros.threads import Repeating
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire.follow import ChangeLog
 
 
 class FleetLinkNode(StageNode):

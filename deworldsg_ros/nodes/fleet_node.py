@@ -9,11 +9,11 @@ from typing import Any
 
 from deworldsg_ros.fleet.fleet import Fleet
 from deworldsg_ros.fleet.zenoh_link import Feed, Robots, open_session, part_key
-from deworldsg_ros.ros.graph_topics import GraphTopics
+from deworldsg_ros.ros.graph_output import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import FleetParameters
-from deworldsg_ros.ros.repeating import Repeating
-from deworldsg_ros.scene.change_log import ChangeLog
+from deworldsg_ros.ros.threads import Repeating
+from deworldsg_ros.wire.follow import ChangeLog
 
 # A robot that did not answer for this time is reported.
 SILENCE_S = 5.0

@@ -11,9 +11,9 @@ from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.graph_services import GraphServices
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import LIVE_GRAPH
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.codec import evidence_from_message, local_graph_from_message
 from deworldsg_ros.view.markers import markers
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import evidence_from_message, local_graph_from_message
 
 # /diagnostics warns after this time without a local graph.
 SILENCE_S = 2.0

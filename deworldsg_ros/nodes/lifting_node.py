@@ -13,10 +13,10 @@ from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.options import LIVE_LIFTING
 from deworldsg_ros.ros.qos import source
-from deworldsg_ros.scene.codec import frame_graph_from_message, local_graph_to_message
-from deworldsg_ros.scene.wire import FrameGraphMessage
-from deworldsg_ros.streams.frame_assemblers import LiftingAssembler, LiftingFrame
+from deworldsg_ros.streams.frames import LiftingAssembler, LiftingFrame
 from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.wire.codec import frame_graph_from_message, local_graph_to_message
+from deworldsg_ros.wire.messages import FrameGraphMessage
 
 
 class LiftingNode(JoiningNode[LiftingFrame]):

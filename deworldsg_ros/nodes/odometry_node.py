@@ -24,10 +24,10 @@ from deworldsg_ros.ros.inputs import (
 from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.transform_output import TransformOutput, put_pose
+from deworldsg_ros.ros.transforms import TransformOutput, put_pose
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.streams.frames import UnposedAssembler, UnposedFrame
 from deworldsg_ros.streams.poses import set_stamp
-from deworldsg_ros.streams.unposed import UnposedAssembler, UnposedFrame
 
 
 class OdometryNode(JoiningNode[UnposedFrame]):

@@ -12,7 +12,7 @@ from geometry_msgs.msg import PoseStamped
 
 from deworldsg_ros.client.live import GraphMessage, SceneGraphClient
 from deworldsg_ros.client.region import Region, RegionPart
-from deworldsg_ros.ros.graph_topics import GraphTopics
+from deworldsg_ros.ros.graph_output import GraphTopics
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import RegionOptions, RegionParameters
 from deworldsg_ros.ros.qos import best_effort

@@ -13,14 +13,14 @@ from std_msgs.msg import String
 
 from deworldsg_ros.ros.inputs import listen_rgb
 from deworldsg_ros.ros.joining import JoiningNode
+from deworldsg_ros.ros.models import Relating
 from deworldsg_ros.ros.node import run
 from deworldsg_ros.ros.options import LIVE_RELATIONS
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.relating import Relating
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.codec import evidence_to_message, local_graph_from_message
 from deworldsg_ros.scene.frame_graph import RelationEvidence
-from deworldsg_ros.streams.frame_assemblers import PairingFrame, RelationAssembler
+from deworldsg_ros.streams.frames import PairingFrame, RelationAssembler
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import evidence_to_message, local_graph_from_message
 
 
 class RelationNode(JoiningNode[PairingFrame]):

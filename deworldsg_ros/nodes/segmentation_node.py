@@ -7,13 +7,13 @@ from typing import Any
 
 from sensor_msgs.msg import Image
 
+from deworldsg_ros.ros.models import PerceivingNode
 from deworldsg_ros.ros.node import run
-from deworldsg_ros.ros.perceiving import PerceivingNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.codec import frame_graph_to_message
 from deworldsg_ros.streams.images import fill_image
 from deworldsg_ros.streams.poses import set_stamp
+from deworldsg_ros.wire.codec import frame_graph_to_message
 
 
 class SegmentationNode(PerceivingNode):

@@ -16,15 +16,15 @@ from deworldsg_ros.ros.inputs import listen_rgb
 from deworldsg_ros.ros.node import StageNode, run
 from deworldsg_ros.ros.options import ViewerOptions, ViewerParameters
 from deworldsg_ros.ros.qos import reliable, source
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.codec import local_graph_from_message
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.following import GraphFollower
 from deworldsg_ros.streams.images import instances_from_message, rgb_from_message
 from deworldsg_ros.streams.poses import stamp_ns_of
-from deworldsg_ros.view.live.errors import OnError
-from deworldsg_ros.view.live.joining import FrameJoiner
+from deworldsg_ros.view.live.camera import FrameJoiner
 from deworldsg_ros.view.live.sources import Sink, open_sink
+from deworldsg_ros.view.live.state import OnError
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_from_message
+from deworldsg_ros.wire.follow import GraphFollower
 
 # Frames of the camera are shown at most so often; the others are not decoded.
 VIEW_PERIOD_S = 0.15

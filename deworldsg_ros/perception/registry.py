@@ -17,7 +17,7 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception.protocols import Detector, RelationHead, Segmenter
 from deworldsg_ros.perception.stage import Perception
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import PREDICATE_SETS
+from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
 
 Made = TypeVar("Made")
 
@@ -43,7 +43,7 @@ def _rgbd(config: PerceptionConfig) -> Segmenter:
 
 def _sam2(config: PerceptionConfig) -> Segmenter:
     with _torch("perception.segmenter", config.segmenter, config):
-        from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
+        from deworldsg_ros.perception.backends.sam import Sam2Segmenter
 
     return Sam2Segmenter(config)
 
@@ -57,7 +57,7 @@ def _sam(config: PerceptionConfig) -> Segmenter:
 
 def _sam3(config: PerceptionConfig) -> Segmenter:
     with _torch("perception.segmenter", config.segmenter, config):
-        from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
+        from deworldsg_ros.perception.backends.sam import Sam3Segmenter
 
     return Sam3Segmenter(config)
 
@@ -75,7 +75,7 @@ def _geometric(config: PerceptionConfig, detector: Detector) -> RelationHead:
 
 def _egtr(config: PerceptionConfig, detector: Detector) -> RelationHead:
     with _torch("perception.relation_head", config.relation_head, config):
-        from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
+        from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead
 
     return EgtrRelationHead(config, detector)
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from deworldsg_ros.config import PerceptionConfig
-from deworldsg_ros.perception.instance_image import instance_image
-from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import (
     Detections,
     Detector,
@@ -21,13 +19,259 @@ from deworldsg_ros.perception.protocols import (
     SegmentedObjects,
     Segmenter,
 )
-from deworldsg_ros.perception.upright import Uprighter, UprightFrame, turned_back
-from deworldsg_ros.scene.arrays import Bool, Float64, UInt16
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
-from deworldsg_ros.scene.names import check_names
-from deworldsg_ros.scene.up import UpEstimator
+from deworldsg_ros.scene.limits import check_names
+from deworldsg_ros.scene.up import UpEstimator, quarter_turns
+
+# --- Frames of a camera that is mounted on its side, turned upright for the detector.
+#
+# A quarter turn moves pixels and does not change them: the pixel (u, v) of an image of width W
+# becomes (v, W - 1 - u). Boxes and instances are turned back exactly.
+
+# R_camera_turned of one quarter turn: the new x axis is y, the new y axis is -x.
+QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class UprightFrame:
+    """A frame, and the same frame turned upright.
+
+    Attributes:
+        original: as the camera took it.
+        upright: the same object if it needs no turn.
+        turns: quarter turns counter-clockwise from `original` to `upright`, 0 to 3.
+    """
+
+    original: RgbdFrame
+    upright: RgbdFrame
+    turns: int = 0
+
+
+class Uprighter:
+    """Decides for each frame, in order of time, how it is turned.
+
+    The turn changes only when up is clearly in the direction of another side of the image. A camera
+    that looks straight down keeps its turn.
+
+    Args:
+        world_up: as `UpEstimator`.
+    """
+
+    def __init__(self, world_up: str) -> None:
+        self._up = UpEstimator(world_up)
+        self._turns = 0
+
+    def turn(self, frame: RgbdFrame) -> UprightFrame:
+        """The frame, upright."""
+        self._up.observe(frame.T_world_camera)
+        turns = quarter_turns(frame.T_world_camera[:3, :3].T @ self._up.up_world())
+        self._turns = self._turns if turns is None else turns
+        return UprightFrame(frame, turned(frame, self._turns), self._turns)
+
+
+def turned(frame: RgbdFrame, turns: int) -> RgbdFrame:
+    """A frame after so many quarter turns counter-clockwise; its pose is that of the turned camera.
+
+    The same object for no turn.
+    """
+    if turns % 4 == 0:
+        return frame
+    intrinsics, T_world_camera = frame.intrinsics, frame.T_world_camera.copy()
+    for _ in range(turns % 4):
+        i = intrinsics
+        intrinsics = Intrinsics(i.fy, i.fx, i.cy, i.width - 1 - i.cx, i.height, i.width)
+        T_world_camera[:3, :3] = T_world_camera[:3, :3] @ QUARTER_TURN
+    return replace(
+        frame,
+        rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)),
+        depth_m=np.ascontiguousarray(np.rot90(frame.depth_m, turns)),
+        intrinsics=intrinsics,
+        T_world_camera=T_world_camera,
+    )
+
+
+def turned_back(
+    frame_graph: FrameGraph, instances: UInt16, turns: int
+) -> tuple[FrameGraph, UInt16]:
+    """Frame graph and instance image (H, W) of `turned`, for the image before the turns."""
+    if turns % 4 == 0:
+        return frame_graph, instances
+    instances = np.ascontiguousarray(np.rot90(instances, -turns))
+    boxes, height = frame_graph.boxes_xyxy, frame_graph.height
+    width = frame_graph.width
+    for _ in range(turns % 4):
+        boxes = _turned_back_once(boxes, height)
+        width, height = height, width
+    return replace(frame_graph, boxes_xyxy=boxes, width=width, height=height), instances
+
+
+def _turned_back_once(boxes_xyxy: Float64, height: int) -> Float64:
+    """Boxes (n, 4) before one quarter turn, which led to an image of this height."""
+    u1, v1, u2, v2 = boxes_xyxy.T
+    return np.stack([height - 1 - v2, u1, height - 1 - v1, u2], axis=1)
+
+
+# --- Boxes inside other boxes of a frame: nested detections of one object, and weak detections.
+#
+# Suppression by IoU keeps a small box inside a large one of the same class.
+
+# Two objects have one class if the dot product of their class distributions exceeds this.
+SAME_CLASS = 0.3
+# A box is nested if more than this fraction of it is inside another: edges are a few pixels off.
+NESTED_FRACTION = 0.8
+# A part has less than this fraction of the area of the whole. From there on the IoU is 0.5 or more,
+# and detectors suppress one of two such boxes. Objects in a row have similar sizes.
+PART_OF_AREA = 0.5
+# Two surfaces are at one depth if their median depths differ by less: a constant, and a fraction of
+# the depth for the noise of the sensor.
+DEPTH_STEP_M = 0.05
+DEPTH_STEP_FRACTION = 0.03
+
+
+def join_nested(
+    objects: Detections, masks: list[MaskPatch], depth_m: Float32
+) -> tuple[Detections, list[MaskPatch]]:
+    """Join nested detections of one object.
+
+    A box inside a larger box of its class and at its depth is a part of the same object, such as
+    the lit part of a screen. The joined object has both boxes and both masks, and the class and
+    score of the better detection. A box with several such boxes inside is a group of objects and
+    is removed. At different depths, both objects are kept: one is seen through the other's gaps. A
+    row of equal objects is kept: a box of similar size, or beside another one of similar size.
+
+    Args:
+        objects: n objects, best score first.
+        masks: n masks.
+        depth_m: (H, W) float32, metres; 0 = invalid.
+
+    Returns:
+        The objects, best score first, and their masks.
+    """
+    within = _nested(objects)
+    for inner, outer in np.argwhere(within):
+        within[inner, outer] = _at_one_depth(masks[inner], masks[outer], depth_m)
+    if not within.any():
+        return objects, masks
+    boxes, masks = objects.boxes_xyxy.copy(), list(masks)
+    # A chain of three nested boxes is no group: each box counts only for the largest around it.
+    outermost = within & ~(within.astype(int) @ within > 0)
+    removed = outermost.sum(axis=0) > 1
+    for inner, outer in np.argwhere(within):
+        if removed[inner] or removed[outer]:
+            continue
+        keep, other = min(inner, outer), max(inner, outer)  # the better score comes first
+        boxes[keep] = _hull(boxes[inner], boxes[outer])
+        masks[keep] = _union(masks[inner], masks[outer], depth_m.shape)
+        removed[other] = True
+    kept = np.flatnonzero(~removed)
+    return replace(objects, boxes_xyxy=boxes).take(kept), [masks[row] for row in kept]
+
+
+def in_front_of(objects: Detections, weak: Detections) -> Detections:
+    """The weak detections inside a larger object of another class.
+
+    A weak detection that overlaps an object of its own class may be a part of it, and is left out.
+    """
+    inside, overlaps, same_class = _compare(weak, objects)
+    part = (overlaps & same_class).any(axis=1)
+    return weak.take(np.flatnonzero((inside & ~same_class).any(axis=1) & ~part))
+
+
+def _nested(objects: Detections) -> Bool:
+    """(n, n) bool: the row's box may be a part of the object of the column's box, of its class.
+
+    Neighbours in a row of equal objects, such as books, also have boxes inside each other.
+    """
+    inside, overlaps, same_class = _compare(objects, objects)
+    area = areas(objects.boxes_xyxy)
+    ratio = area[:, None] / area[None, :]
+    part = inside & same_class & (ratio < PART_OF_AREA)
+    similar = (ratio > PART_OF_AREA) & (ratio < 1.0 / PART_OF_AREA)
+    beside = overlaps & same_class & similar & ~inside & ~inside.T
+    np.fill_diagonal(beside, False)
+    in_row = np.flatnonzero(beside.any(axis=1))
+    part[:, in_row] = False
+    return np.asarray(part)
+
+
+def _compare(a: Detections, b: Detections) -> tuple[Bool, Bool, Bool]:
+    """(n, m) bool each: a is inside b, which is larger; they overlap; they have one class."""
+    area_a, area_b = areas(a.boxes_xyxy), areas(b.boxes_xyxy)
+    shared = shared_areas(a.boxes_xyxy, b.boxes_xyxy)
+    inside = (shared > NESTED_FRACTION * area_a[:, None]) & (area_a[:, None] < area_b[None, :])
+    same_class = a.class_probabilities @ b.class_probabilities.T > SAME_CLASS
+    return inside, shared > 0, same_class
+
+
+def _at_one_depth(inner: MaskPatch, outer: MaskPatch, depth_m: Float32) -> bool:
+    """Whether the median depths agree; masks without depth count as being at one depth."""
+    medians = [_median_depth(mask, depth_m) for mask in (inner, outer)]
+    step_m = DEPTH_STEP_M + DEPTH_STEP_FRACTION * min(medians)
+    return not abs(medians[0] - medians[1]) > step_m
+
+
+def _median_depth(mask: MaskPatch, depth_m: Float32) -> float:
+    values = depth_m[mask.window][mask.pixels]
+    values = values[values > 0]
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _hull(a_xyxy: Float64, b_xyxy: Float64) -> Float64:
+    return np.concatenate([np.minimum(a_xyxy[:2], b_xyxy[:2]), np.maximum(a_xyxy[2:], b_xyxy[2:])])
+
+
+def _union(a: MaskPatch, b: MaskPatch, shape: tuple[int, ...]) -> MaskPatch:
+    image = np.zeros(shape, dtype=bool)
+    image[a.window] |= a.pixels
+    image[b.window] |= b.pixels
+    return MaskPatch(0, 0, image)
+
+
+# --- Masks of one frame → its instance image.
+
+
+def instance_image(
+    masks: Sequence[MaskPatch], classes: Int64, scores: Float64, shape: tuple[int, int]
+) -> UInt16:
+    """The instance image of masks that may overlap (paper, Section 4.1).
+
+    A pixel in masks of different classes is ambiguous and belongs to no object. A pixel in several
+    masks of one class belongs to the one with the highest score, or the first of equal scores.
+
+    Args:
+        masks: n masks.
+        classes: (n,) most likely class of each.
+        scores: (n,) detection scores.
+        shape: H, W of the image.
+
+    Returns:
+        (H, W) uint16: k + 1 on the pixels of row k, else 0.
+
+    Raises:
+        ValueError: more masks than uint16 can number.
+    """
+    if len(masks) > np.iinfo(np.uint16).max:
+        raise ValueError(f"{len(masks)} masks, expected at most {np.iinfo(np.uint16).max}")
+    labels = np.zeros(shape, dtype=np.uint16)
+    ambiguous = np.zeros(shape, dtype=bool)
+    # The class of each label; label 0 is the background and has none.
+    class_of_label = np.concatenate(([-1], np.asarray(classes, dtype=np.int64)))
+    # Best first: a later mask takes only free pixels.
+    for row in np.argsort(-np.asarray(scores, dtype=np.float64), kind="stable"):
+        mask = masks[row]
+        here = labels[mask.window]
+        taken = mask.pixels & (here != 0)
+        if taken.any():
+            ambiguous[mask.window] |= taken & (class_of_label[here] != classes[row])
+        here[mask.pixels & (here == 0)] = row + 1
+    labels[ambiguous] = 0
+    return labels
+
+
+# --- Stage a: one RGB-D frame → its 2D scene graph and its instance image.
 
 logger = logging.getLogger(__name__)
 

@@ -1,9 +1,4 @@
-"""Correction of poses that drift or tremble, before a frame is merged. Beyond the paper.
-
-A map of the depth images (`surfels`) gives the error of each pose. Its mean is the drift, the rest
-trembles. Each is corrected as far as the noise of its own estimate does not explain it (James and
-Stein), so that exact poses stay as they are.
-"""
+"""Correction of poses that drift or tremble, by a map of surfels. Beyond the paper."""
 
 from __future__ import annotations
 
@@ -12,11 +7,377 @@ from itertools import accumulate
 
 import numpy as np
 
-from deworldsg_ros.poses.surfels import JOINT, SurfelMap, about_camera, difference, stepped
-from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.base.kernels import kernel, read_only
+from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, derived
 from deworldsg_ros.scene.gaussian import transform
+
+# --- A map of surfels, small planes of the depth images, that frames are registered with.
+
+# A full map drops the half that was not in view for the longest time. A room needs 10 000.
+MAX_SURFELS = 20_000
+# At most this number of surfels is compared with a frame; fewer than MIN_MATCHES decide nothing.
+SAMPLES, MIN_MATCHES = 400, 100
+# Maximum distance of a surfel from the depth image in each Gauss-Newton step: coarse, then fine.
+REACHES_M = (0.3, 0.2, 0.1, 0.1)
+# Weight of no motion, as a fraction of the mean weight of a translation axis. A radian weighs as
+# much as RADIAN_M metres: the usual distance of surfaces.
+DAMPING, RADIAN_M = 0.03, 2.5
+JOINT = np.array([RADIAN_M**2] * 3 + [1.0] * 3)  # squared rotation and translation, in m²
+# Standard deviation of depth, metres: constant, and times squared depth (structured light).
+# Residuals beyond OUTLIER of them have small weights (Cauchy).
+NOISE_M, NOISE_PER_M, OUTLIER_NOISE = 0.004, 0.002, 3.0
+# Depth is used in this range: noise grows with its square.
+NEAR_M, FAR_M = 0.2, 4.0
+# A surfel covers this distance around it. It moves onto depth at most ON_M away.
+SURFEL_M, ON_M = 0.05, 0.05
+# A surfel is the mean of its first MAX_COUNT frames: a map that follows its frames would drift
+# with them. Beyond TRUSTED of them, its weight grows no more.
+MAX_COUNT, TRUSTED = 50.0, 10.0
+# Inverse depth is linear on a plane; if it bends by more than this fraction, there is an edge.
+MAX_BEND = 0.02
+
+# fx, fy, cx, cy in pixels of a depth grid, and that grid.
+_View = tuple[float, float, float, float, UInt16]
+
+
+class SurfelMap:
+    """Surfels: position, normal (metres, world frame), number of frames, newest frame."""
+
+    def __init__(self) -> None:
+        self._rows = np.zeros((MAX_SURFELS, 8))
+        self._count = self._frame = 0
+        self._seen = np.zeros(0, np.int64)
+        self._view: _View
+
+    def register(self, T_world_camera: Float64, grid: DepthGrid) -> Float64 | None:
+        """The pose (4, 4) near a given one at which a frame fits the map; None if unknown.
+
+        Gauss-Newton on the distances of the frame's depth from the planes of the surfels in view,
+        projected into the frame. Directions that these planes leave open are not corrected.
+        """
+        self._view = view = _view(grid)
+        rows = self._rows[: self._count]
+        self._seen = _in_view(rows, invert_pose(T_world_camera), view)
+        # Contiguous: a kernel is compiled for one layout.
+        sample = np.ascontiguousarray(self._seen[:: max(1, len(self._seen) // SAMPLES)])
+        is_found, T_fitted = _fit(rows, sample, T_world_camera, view)
+        return T_fitted if is_found else None
+
+    def add(self, T_world_camera: Float64) -> None:
+        """Fuse the frame of the last `register`."""
+        new = self._view[4].size // 4
+        if self._count + new > MAX_SURFELS:
+            newest = np.argsort(-self._rows[: self._count, 7], kind="stable")[: MAX_SURFELS // 2]
+            self._count = len(newest)
+            self._rows[: self._count] = self._rows[newest]
+            self._seen = np.zeros(0, np.int64)
+        if self._count + new > len(self._rows):  # an image with more cells than half of a full map
+            self._rows = np.concatenate((self._rows, np.zeros((new, 8))))
+        self._frame += 1
+        arguments = T_world_camera, invert_pose(T_world_camera), self._view, self._frame
+        self._count = _fuse(self._rows, self._count, self._seen, *arguments)
+
+
+@kernel
+def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
+    """A rotation vector about the camera and a translation (6,), world axes, as (4, 4)."""
+    T, turn = np.zeros((4, 4), np.float64), _turn(step)
+    T[3, 3] = 1.0
+    for i in range(3):
+        T[i, 3] = step[3 + i] + T_world_camera[i, 3]
+        for j in range(3):
+            T[i, j] = turn[i, j]
+            T[i, 3] -= turn[i, j] * T_world_camera[j, 3]
+    return T
+
+
+@kernel
+def stepped(step: Float64, T_world_camera: Float64) -> Float64:
+    """The camera pose (4, 4) after a step (6,) of `about_camera`."""
+    T, turn = T_world_camera.copy(), _turn(step)
+    for i in range(3):
+        T[i, 3] += step[3 + i]
+        for j in range(3):
+            T[i, j] = 0.0
+            for k in range(3):
+                T[i, j] += turn[i, k] * T_world_camera[k, j]
+    return T
+
+
+@kernel
+def _turn(step: Float64) -> Float64:
+    """The rotation (3, 3) of a rotation vector (Rodrigues)."""
+    turn, cross = np.zeros((3, 3), np.float64), np.zeros((3, 3), np.float64)
+    x, y, z = step[0], step[1], step[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle > 0:
+        x, y, z = x / angle, y / angle, z / angle
+        cross[0, 1], cross[0, 2], cross[1, 2] = -z, y, -x
+        cross[1, 0], cross[2, 0], cross[2, 1] = z, -y, x
+    sine, versine = math.sin(angle), 1 - math.cos(angle)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = sine * cross[i, j] + (1.0 if i == j else 0.0)
+            for k in range(3):
+                turn[i, j] += versine * cross[i, k] * cross[k, j]
+    return turn
+
+
+@kernel
+def difference(T_a: Float64, T_b: Float64) -> Float64:
+    """The step (6,) of `about_camera` from camera pose a to b."""
+    R, step, double_sine = np.zeros((3, 3), np.float64), np.empty(6, np.float64), 0.0
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                R[i, j] += T_b[i, k] * T_a[j, k]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        step[i], step[3 + i] = R[k, j] - R[j, k], T_b[i, 3] - T_a[i, 3]
+        double_sine += step[i] * step[i]
+    double_sine = math.sqrt(double_sine)
+    angle = math.atan2(double_sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
+    for i in range(3):
+        step[i] *= angle / double_sine if double_sine > 1e-12 else 0.5
+    return step
+
+
+def _view(grid: DepthGrid) -> _View:
+    camera, stride = grid.intrinsics, grid.stride_px
+    cx, cy = (camera.cx - stride // 2) / stride, (camera.cy - stride // 2) / stride
+    return camera.fx / stride, camera.fy / stride, cx, cy, read_only(grid.depth_mm)
+
+
+@kernel
+def _pixel(T: Float64, surfel: Float64, view: _View) -> tuple[int, int, float, float]:
+    """Row and column of a surfel, its depth and the measured one, metres; row -1 if not in view."""
+    fx, fy, cx, cy, depth_mm = view
+    x, y, z = surfel[0], surfel[1], surfel[2]
+    ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    if ahead < NEAR_M:
+        return -1, 0, ahead, 0.0
+    right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    column, row = int(fx * right / ahead + cx + 0.5), int(fy * down / ahead + cy + 0.5)
+    if row < 0 or column < 0 or row >= depth_mm.shape[0] or column >= depth_mm.shape[1]:
+        return -1, 0, ahead, 0.0
+    measured = 0.001 * depth_mm[row, column]
+    return (row if measured > NEAR_M else -1), column, ahead, measured
+
+
+@kernel
+def _in_view(rows: Float64, T_camera_world: Float64, view: _View) -> Int64:
+    """Indices of the surfels in view that the depth image does not hide."""
+    indices, count = np.empty(len(rows), np.int64), 0
+    for index in range(len(rows)):
+        row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
+        if row >= 0 and depth < measured + REACHES_M[0]:
+            indices[count] = index
+            count += 1
+    return indices[:count]
+
+
+@kernel
+def _ray(row: int, column: int, view: _View) -> tuple[float, float, float]:
+    fx, fy, cx, cy, depth_mm = view
+    z = 0.001 * depth_mm[row, column]
+    return (column - cx) / fx * z, (row - cy) / fy * z, z
+
+
+@kernel
+def _turned(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
+
+
+@kernel
+def _system(
+    rows: Float64, sample: Int64, T: Float64, view: _View, reach_m: float
+) -> tuple[Float64, Float64, int]:
+    """Damped normal equations (6, 6) and (6,) of a point-to-plane step; the number of matches."""
+    hessian, gradient = np.zeros((6, 6), np.float64), np.zeros(6, np.float64)
+    jacobian, matches = np.empty(6, np.float64), 0
+    inverse = np.zeros((3, 4), np.float64)
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] = T[j, i]
+            inverse[i, 3] -= T[j, i] * T[j, 3]
+    for index in sample:
+        surfel = rows[index]
+        row, column, _, measured = _pixel(inverse, surfel, view)
+        if row < 0 or measured > FAR_M:
+            continue
+        x, y, z = _ray(row, column, view)
+        x, y, z = _turned(T, x, y, z)
+        a, b, c = surfel[0] - T[0, 3] - x, surfel[1] - T[1, 3] - y, surfel[2] - T[2, 3] - z
+        distance = a * surfel[3] + b * surfel[4] + c * surfel[5]
+        if abs(distance) > reach_m or a * a + b * b + c * c > 4 * reach_m**2:
+            continue
+        noise_m = NOISE_M + NOISE_PER_M * measured**2
+        outlier_m = OUTLIER_NOISE * noise_m * reach_m / REACHES_M[-1]
+        weight = min(surfel[6], TRUSTED) / (1 + (distance / outlier_m) ** 2) / noise_m**2
+        jacobian[0] = y * surfel[5] - z * surfel[4]
+        jacobian[1] = z * surfel[3] - x * surfel[5]
+        jacobian[2] = x * surfel[4] - y * surfel[3]
+        for i in range(6):
+            if i > 2:
+                jacobian[i] = surfel[i]
+            gradient[i] += weight * distance * jacobian[i]
+            for j in range(i + 1):
+                hessian[i, j] += weight * jacobian[i] * jacobian[j]
+        matches += 1
+    for i in range(6):
+        for j in range(i):
+            hessian[j, i] = hessian[i, j]
+    mean = (hessian[3, 3] + hessian[4, 4] + hessian[5, 5]) / 3
+    for i in range(6):
+        hessian[i, i] += DAMPING * mean * (RADIAN_M**2 if i < 3 else 1.0)
+    return hessian, gradient, matches
+
+
+@kernel
+def _solve(matrix: Float64, vector: Float64) -> bool:
+    """Solve positive definite equations in place (Gauss); false if they are singular."""
+    size = len(vector)
+    for k in range(size):
+        if not matrix[k, k] > 0.0:
+            return False
+        for i in range(k + 1, size):
+            factor = matrix[i, k] / matrix[k, k]
+            vector[i] -= factor * vector[k]
+            for j in range(k, size):
+                matrix[i, j] -= factor * matrix[k, j]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            vector[i] -= matrix[i, j] * vector[j]
+        vector[i] /= matrix[i, i]
+    return True
+
+
+@kernel
+def _fit(rows: Float64, sample: Int64, T: Float64, view: _View) -> tuple[bool, Float64]:
+    """Whether enough surfels fit, and the pose at which they do."""
+    for reach_m in REACHES_M:
+        hessian, gradient, matches = _system(rows, sample, T, view, reach_m)
+        if matches < MIN_MATCHES or not _solve(hessian, gradient):
+            return False, T
+        T = stepped(gradient, T)
+    return True, T
+
+
+@kernel
+def _normal(row: int, column: int, view: _View) -> tuple[float, float, float]:
+    """Unit normal of the depth image at a pixel, camera axes; zero at edges."""
+    depth_mm = view[4]
+    if not (0 < row < depth_mm.shape[0] - 1 and 0 < column < depth_mm.shape[1] - 1):
+        return 0.0, 0.0, 0.0
+    a, b = depth_mm[row, column - 1], depth_mm[row, column + 1]
+    c, d = depth_mm[row - 1, column], depth_mm[row + 1, column]
+    if min(a, b, c, d, depth_mm[row, column]) == 0:
+        return 0.0, 0.0, 0.0
+    middle = 2.0 / depth_mm[row, column]
+    if max(abs(1 / a + 1 / b - middle), abs(1 / c + 1 / d - middle)) > MAX_BEND * middle:
+        return 0.0, 0.0, 0.0
+    (ax, ay, az), (bx, by, bz) = _ray(row, column - 1, view), _ray(row, column + 1, view)
+    (cx, cy, cz), (dx, dy, dz) = _ray(row - 1, column, view), _ray(row + 1, column, view)
+    ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, dx - cx, dy - cy, dz - cz
+    x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+@kernel
+def _cover(covered: Bool, row: int, column: int, half: int) -> None:
+    """Mark the odd pixels at most `half` pixels away."""
+    for i in range(max(0, (row - half) // 2), min(len(covered), (row + half + 1) // 2)):
+        for j in range(
+            max(0, (column - half) // 2), min(covered.shape[1], (column + half + 1) // 2)
+        ):
+            covered[i, j] = True
+
+
+@kernel
+def _update(surfel: Float64, row: int, column: int, T: Float64, view: _View) -> bool:
+    """Average a surfel with a pixel; false if the pixel does not lie on its plane."""
+    x, y, z = _ray(row, column, view)
+    x, y, z = _turned(T, x, y, z)
+    x, y, z = x + T[0, 3] - surfel[0], y + T[1, 3] - surfel[1], z + T[2, 3] - surfel[2]
+    distance = x * surfel[3] + y * surfel[4] + z * surfel[5]
+    if abs(distance) > ON_M or x * x + y * y + z * z > REACHES_M[0] ** 2:
+        return False
+    if surfel[6] < MAX_COUNT:
+        share = 1.0 / (surfel[6] + 1.0)
+        for axis in range(3):
+            surfel[axis] += share * distance * surfel[3 + axis]
+        x, y, z = _normal(row, column, view)
+        if x * x + y * y + z * z > 0:
+            x, y, z = _turned(T, x, y, z)
+            x = (1.0 - share) * surfel[3] + share * x
+            y = (1.0 - share) * surfel[4] + share * y
+            z = (1.0 - share) * surfel[5] + share * z
+            length = np.sqrt(x * x + y * y + z * z)
+            surfel[3], surfel[4], surfel[5] = x / length, y / length, z / length
+        surfel[6] += 1.0
+    return True
+
+
+@kernel
+def _fuse(
+    rows: Float64,
+    count: int,
+    seen: Int64,
+    T: Float64,
+    T_camera_world: Float64,
+    view: _View,
+    frame: int,
+) -> int:
+    """Update the surfels in view, and add new ones where there are none; returns their number."""
+    depth_mm = view[4]
+    covered = np.zeros((depth_mm.shape[0] // 2, depth_mm.shape[1] // 2), np.bool_)
+    for index in seen[::-1]:
+        surfel = rows[index]
+        row, column, depth, measured = _pixel(T_camera_world, surfel, view)
+        if row < 0:
+            continue
+        if measured > depth + REACHES_M[0]:  # seen through: the surface is gone
+            surfel[6] *= 0.8
+            if surfel[6] < 0.5:
+                count -= 1
+                for item in range(8):
+                    rows[index, item] = rows[count, item]
+        elif measured <= FAR_M and _update(surfel, row, column, T, view):
+            surfel[7] = frame
+            _cover(covered, row, column, int(SURFEL_M * view[0] / depth))
+    for i in range(covered.shape[0]):
+        for j in range(covered.shape[1]):
+            row, column = 2 * i + 1, 2 * j + 1
+            depth = 0.001 * depth_mm[row, column]
+            if covered[i, j] or not NEAR_M < depth < FAR_M:
+                continue
+            x, y, z = _normal(row, column, view)
+            if x * x + y * y + z * z == 0:
+                continue
+            surfel = rows[count]
+            surfel[3], surfel[4], surfel[5] = _turned(T, x, y, z)
+            x, y, z = _ray(row, column, view)
+            x, y, z = _turned(T, x, y, z)
+            surfel[0], surfel[1], surfel[2] = x + T[0, 3], y + T[1, 3], z + T[2, 3]
+            surfel[6], surfel[7] = 1.0, frame
+            count += 1
+            _cover(covered, row, column, int(SURFEL_M * view[0] / depth))
+    return count
+
+
+# --- Correction of poses that drift or tremble, before a frame is merged. Beyond the paper.
+#
+# A map of the depth images (`surfels`) gives the error of each pose. Its mean is the drift, the
+# rest trembles. Each is corrected as far as the noise of its own estimate does not explain it
+# (James and Stein), so that exact poses stay as they are.
 
 # Squared errors add rotation and translation: a radian counts as `surfels.RADIAN_M` metres.
 # Error of a registration: with exact poses of two rendered rooms, 5-7 mm.
@@ -36,7 +397,7 @@ LEAK_PATH = 10.0
 # The variance of trembling is a mean over 20 frames. A frame counts at most 9 times the mean.
 VARIANCE_GAIN, MAX_RATIO = 0.05, 9.0
 # A frame's own error counts beyond twice the error of a registration.
-OUTLIER = 4.0
+OUTLIER_STEP = 4.0
 
 
 class Drift:
@@ -101,7 +462,7 @@ class Drift:
         self._error = error
         gain = max(VARIANCE_GAIN, 1.0 / (self._frames + 1))
         self._trembling_m2 += gain * (change_m2 - self._trembling_m2)
-        own = _shrunk(max(self._trembling_m2, _squared(step) / OUTLIER), FIT_VARIANCE_M2)
+        own = _shrunk(max(self._trembling_m2, _squared(step) / OUTLIER_STEP), FIT_VARIANCE_M2)
         return own, difference(self._T_map_poses @ T_given, fitted)
 
     def _leak(self, T_given: Float64) -> float:

@@ -11,24 +11,24 @@ from pathlib import Path
 import numpy as np
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.poses.frames import OnRefusal, track_poses
-from deworldsg_ros.poses.odometry import ODOMETRY_FRAME
-from deworldsg_ros.poses.perturbation import PoseNoise, perturb_poses
-from deworldsg_ros.poses.trajectory import Trajectory, read_trajectory
+from deworldsg_ros.poses.odometry import ODOMETRY_FRAME, OnRefusal, track_poses
+from deworldsg_ros.poses.trajectory import PoseNoise, Trajectory, perturb_poses, read_trajectory
 from deworldsg_ros.recordings.folders.sequence import rotated_pose
-from deworldsg_ros.recordings.messages import (
+from deworldsg_ros.recordings.recording import Recording
+from deworldsg_ros.recordings.source import (
     POSE_STAMPED,
+    RawRoleMessage,
     Role,
     RoleMessage,
+    Source,
+    UsedTopic,
     pose_stamped_from_matrix,
+    serialize,
 )
-from deworldsg_ros.recordings.recording import Recording
-from deworldsg_ros.recordings.source import RawRoleMessage, Source, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.streams.jump_gate import JumpGate
-from deworldsg_ros.streams.poses import pose_from_message
+from deworldsg_ros.streams.poses import JumpGate, pose_from_message
 
 # World frame of a trajectory if the recording has no poses.
 TRAJECTORY_FRAME = "world"

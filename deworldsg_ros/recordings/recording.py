@@ -14,14 +14,12 @@ from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings.bags.bag import BagSource
 from deworldsg_ros.recordings.bags.storage import SALVAGERS, storage_files
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders import detect_dataset, open_dataset
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.folders.registry import expectations
-from deworldsg_ros.recordings.messages import Role
-from deworldsg_ros.recordings.source import Source
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions, expectations
+from deworldsg_ros.recordings.source import Role, Source
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.streams.frame_assemblers import FrameAssembler
+from deworldsg_ros.scene.errors import RecordingError
+from deworldsg_ros.streams.frames import FrameAssembler
 
 BAG_SUFFIXES = frozenset(SALVAGERS)
 

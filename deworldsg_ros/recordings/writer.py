@@ -17,15 +17,9 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from deworldsg_ros.files import check_writable, together
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import (
-    COMPRESSED_IMAGE,
-    IMAGE,
-    Role,
-    typestore,
-)
-from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.base.files import check_writable, together
+from deworldsg_ros.recordings.source import COMPRESSED_IMAGE, IMAGE, RawRoleMessage, Role, typestore
+from deworldsg_ros.scene.errors import RecordingError
 
 # Foxglove and RViz expect the CameraInfo beside the image, and the transport as the last word.
 TOPICS = {

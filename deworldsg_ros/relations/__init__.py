@@ -1,22 +1,30 @@
 """Stage d: neighbour pairs (Eq. 8), clips, world models, evidence and fusion (Eq. 9-10)."""
 
-from deworldsg_ros.relations.clip_policy import ClipPolicy
-from deworldsg_ros.relations.clip_queue import ClipQueue
-from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, crop_clip, union_box
-from deworldsg_ros.relations.edge_beliefs import EdgeBeliefs
-from deworldsg_ros.relations.evidence import (
+from deworldsg_ros.relations.beliefs import EdgeBeliefs
+from deworldsg_ros.relations.clips import (
+    ClipPolicy,
+    ClipQueue,
+    FrameBuffer,
+    GraphView,
+    LiveGraph,
+    NodeView,
+    PublishedGraph,
+    QueuedClip,
+    crop_clip,
+    union_box,
+)
+from deworldsg_ros.relations.paper import (
+    ClassPairPrior,
     FusedEdges,
     entropy_nats,
     fuse_distributions,
     fuse_edges,
+    geometric_costs,
+    neighbour_pairs,
     visual_distribution,
 )
-from deworldsg_ros.relations.graph_view import GraphView, LiveGraph, NodeView, PublishedGraph
-from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
-from deworldsg_ros.relations.prior import ClassPairPrior
 from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
-from deworldsg_ros.relations.stage import RelationCounters, RelationReasoner
-from deworldsg_ros.relations.worker import EvidenceWorker
+from deworldsg_ros.relations.stage import EvidenceWorker, RelationCounters, RelationReasoner
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 
 __all__ = [

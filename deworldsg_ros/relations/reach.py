@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.kernels import kernel
+from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
 # About the size of furniture: most objects touch one cell or two.

@@ -21,24 +21,22 @@ def _no_clips(config: RelationsConfig, device: str) -> None:
 
 
 def _fake(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+    from deworldsg_ros.relations.world_model import FakeWorldModel
 
     del device
     return FakeWorldModel(config.clip_length)
 
 
 def _vjepa2(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.probing.probed_world_model import build_probed
-    from deworldsg_ros.relations.world_models.vjepa2 import load_backbone
+    from deworldsg_ros.relations.clip_models import build_probed, load_vjepa2
 
-    return build_probed(config, load_backbone, device)
+    return build_probed(config, load_vjepa2, device)
 
 
 def _dinov2(config: RelationsConfig, device: str) -> WorldModel:
-    from deworldsg_ros.relations.probing.probed_world_model import build_probed
-    from deworldsg_ros.relations.world_models.dinov2 import load_backbone
+    from deworldsg_ros.relations.clip_models import build_probed, load_dinov2
 
-    return build_probed(config, load_backbone, device)
+    return build_probed(config, load_dinov2, device)
 
 
 # By the name in the configuration. `physics` judges the fused geometry of pairs in the graph: it

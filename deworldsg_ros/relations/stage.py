@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -10,16 +11,139 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.clip_policy import ClipPolicy
-from deworldsg_ros.relations.clip_queue import ClipQueue
-from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip, Rgb, interval_start, union_box
-from deworldsg_ros.relations.encoding import ClipEncoder
-from deworldsg_ros.relations.graph_view import GraphView
-from deworldsg_ros.relations.pairing import neighbour_pairs
-from deworldsg_ros.relations.world_model import WorldModel
+from deworldsg_ros.relations.clips import (
+    ClipPolicy,
+    ClipQueue,
+    FrameBuffer,
+    GraphView,
+    QueuedClip,
+    Rgb,
+    crop_clip,
+    interval_start,
+    union_box,
+    without_first,
+)
+from deworldsg_ros.relations.paper import neighbour_pairs
+from deworldsg_ros.relations.world_model import ClipRequest, PairContext, WorldModel
 from deworldsg_ros.scene.arrays import Float64, Int64
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
+from deworldsg_ros.scene.limits import MAX_PREDICTION_SUM_ERROR
+
+# --- One clip at a time through the world model, with its output checked.
+
+
+class ClipEncoder:
+    """Runs the world model on clips. A failure of the model costs one clip and nothing else.
+
+    Args:
+        world_model: encodes the clips.
+        report: called with one sentence on each new failure; default: the log.
+
+    Attributes:
+        failure: reason of the last failure: that of a refusal, else ``world_model_error``.
+    """
+
+    def __init__(
+        self, world_model: WorldModel, report: Callable[[str], None] | None = None
+    ) -> None:
+        self._world_model = world_model
+        self._report = logging.getLogger(__name__).warning if report is None else report
+        self._last_report = ""
+        self.failure = ""
+
+    def encode(self, clip: QueuedClip, images: list[Rgb]) -> RelationEvidence | None:
+        """Predictions for both directions of a clip's pair; None if the world model failed.
+
+        Args:
+            clip: a queued clip.
+            images: its frames, oldest first; not used if the clip holds its pixels.
+        """
+        request = clip_request(clip, images, self._world_model.clip_length)
+        try:
+            predictions = checked_distributions(
+                self._world_model.predict(request),
+                len(request.pairs),
+                len(request.vocabulary.predicates),
+            )
+        except Exception as error:  # a backend may raise anything; the other stages go on
+            self.failure = "world_model_error"
+            if isinstance(error, RefusedInput):
+                self.failure = error.reason
+            self._report_once(
+                f"world model '{self._world_model.name}' failed: {type(error).__name__}: {error}"
+            )
+            return None
+        i, j = clip.rows
+        return RelationEvidence(
+            stamp_ns=clip.stamp_ns,
+            vocabulary=clip.vocabulary,
+            pairs=np.array([[i, j], [j, i]], np.int64),
+            pair_classes=np.array([clip.classes, clip.classes[::-1]], np.int64),
+            geo_costs=np.full(2, clip.geo_cost),
+            predictions=predictions,
+            source=self._world_model.name,
+        )
+
+    def _report_once(self, message: str) -> None:
+        """Report a failure unless it repeats the last one; the caller counts all of them."""
+        if message != self._last_report:
+            self._last_report = message
+            self._report(message)
+
+
+def clip_request(clip: QueuedClip, images: list[Rgb], clip_length: int) -> ClipRequest:
+    """The pixels of a queued clip and both directions of its pair, in pixels of the crop."""
+    x1, y1, _, _ = clip.crop_xyxy
+    boxes = [box - np.array([x1, y1, x1, y1], np.float64) for box in clip.boxes_xyxy]
+    names = [clip.vocabulary.classes[index] for index in clip.classes]
+    directions = tuple(
+        PairContext(
+            subject_box_xyxy=boxes[subject],
+            object_box_xyxy=boxes[object_],
+            subject_class=clip.classes[subject],
+            object_class=clip.classes[object_],
+            subject_name=names[subject],
+            object_name=names[object_],
+        )
+        for subject, object_ in ((0, 1), (1, 0))
+    )
+    pixels = clip.pixels
+    if pixels is None:
+        pixels = crop_clip(images, clip.crop_xyxy, clip_length)
+    return ClipRequest(without_first(pixels, clip.skipped), directions, clip.vocabulary)
+
+
+def checked_distributions(output: Float64, pair_count: int, predicate_count: int) -> Float64:
+    """A world model's output as float64 rows that sum to one.
+
+    Args:
+        output: (pair_count, predicate_count), any float type; sums within
+            `MAX_PREDICTION_SUM_ERROR` of one.
+        pair_count: rows expected.
+        predicate_count: columns expected.
+
+    Raises:
+        ValueError: another shape, or rows that are not distributions.
+    """
+    values = np.asarray(output, dtype=np.float64)
+    if values.shape != (pair_count, predicate_count):
+        raise ValueError(
+            f"output has shape {values.shape}: expected {(pair_count, predicate_count)}"
+        )
+    sums = values.sum(axis=1)
+    if (
+        not (np.isfinite(values).all() and (values >= 0).all())
+        or (np.abs(sums - 1) > MAX_PREDICTION_SUM_ERROR).any()
+    ):
+        raise ValueError(
+            f"output is {values.tolist()}: expected rows >= 0 that sum to one, one per pair"
+        )
+    distributions: Float64 = values / sums[:, None]
+    return distributions
+
+
+# --- Stage d on a stream of frames: neighbour pairs at once, predictions when time allows.
 
 # Length of the frame buffer, in clip lengths. With 2, a clip can still be cut from the buffer one
 # whole clip length of frames after it was queued.
@@ -256,3 +380,107 @@ def _clip_of(
         boxes_xyxy=boxes,
         geo_cost=geo_cost,
     )
+
+
+# --- A thread for the world model, so that frames never wait for it.
+
+
+class EvidenceWorker:
+    """Runs `work` of a reasoner in a separate thread.
+
+    `observe` returns the neighbour pairs at once. Predictions come later, through `deliver`, in the
+    worker's thread. To run in one thread, call `observe` and `drain` of the reasoner instead.
+
+    Args:
+        reasoner: queues the clips; its counters report dropped clips.
+        deliver: called with each prediction. An exception in it is reported, and the worker
+            continues.
+        report: called with one sentence on each error; default: the log.
+    """
+
+    def __init__(
+        self,
+        reasoner: RelationReasoner,
+        deliver: Callable[[RelationEvidence], None],
+        report: Callable[[str], None] | None = None,
+    ) -> None:
+        self.reasoner = reasoner
+        self._deliver = deliver
+        self._report = logging.getLogger(__name__).warning if report is None else report
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._busy = False
+        # A frame or a change of the graph came since the worker last ran out of ready clips.
+        self._news = False
+        # A daemon: a world model that never returns cannot keep the process alive.
+        self._thread = threading.Thread(target=self._run, name="world-model", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread; once."""
+        self._thread.start()
+
+    def observe(self, local: LocalGraph, rgb: Rgb) -> RelationEvidence:
+        """Find the neighbour pairs of a frame; see `RelationReasoner.observe`."""
+        evidence = self.reasoner.observe(local, rgb)
+        self._wake()
+        return evidence
+
+    def learn(self, change: Callable[[], None]) -> None:
+        """Change the graph by which clips are chosen; see `RelationReasoner.learn`."""
+        self.reasoner.learn(change)
+        self._wake()
+
+    def wait_idle(self, timeout_s: float) -> bool:
+        """Wait until all ready clips are encoded and delivered; False after the timeout."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._stopping or not (self._busy or self._news), timeout_s
+            )
+
+    def stop(self, timeout_s: float = 5.0) -> bool:
+        """Drop all queued clips and end the thread.
+
+        Returns:
+            False if the world model still encodes its last clip after the timeout. The thread then
+            ends as soon as the model returns, and delivers nothing.
+        """
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self.reasoner.clear()
+        if self._thread.is_alive():
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._news = True
+            self._changed.notify_all()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._stopping or self._news)
+                self._news = False
+                self._busy = True
+            while not self._stopping and (evidence := self._work_safely()) is not None:
+                self._deliver_safely(evidence)
+            if self._stopping:
+                return
+
+    def _work_safely(self) -> RelationEvidence | None:
+        try:
+            return self.reasoner.work()
+        except Exception as error:  # the next frame begins again; without a thread, none would
+            self._report(f"a clip was not judged: {type(error).__name__}: {error}")
+            return None
+
+    def _deliver_safely(self, evidence: RelationEvidence) -> None:
+        if self._stopping:
+            return
+        try:
+            self._deliver(evidence)
+        except Exception as error:  # an error in the receiver must not end this thread
+            self._report(f"evidence was not delivered: {type(error).__name__}: {error}")

@@ -1,31 +1,259 @@
-"""The global graph of a node, in a thread of its own: merged, published, saved.
-
-Diagnostics and signals are served by the executor's thread, so they do not wait for the graph.
-"""
+"""The global graph of a node, in a thread of its own: merged, published, saved."""
 
 from __future__ import annotations
 
 import secrets
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from geometry_msgs.msg import PoseStamped
 
+from deworldsg_ros.base.array_file import Arrays
+from deworldsg_ros.base.files import write_atomically
+from deworldsg_ros.base.words import counted
+from deworldsg_ros.config import Config
+from deworldsg_ros.graph.provenance import path_beside, space_path, write_seen, write_space
 from deworldsg_ros.graph_builder import GraphBuilder, warm_up
-from deworldsg_ros.ros.graph_files import GraphFiles
+from deworldsg_ros.map_file import (
+    Continued,
+    check_paths,
+    claim_map,
+    continue_map,
+    copy_state,
+    write_map,
+    write_state,
+)
+from deworldsg_ros.ros.graph_output import MakeMarkers, WholeGraph
 from deworldsg_ros.ros.health import HIDDEN
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.ros.pose_corrections import CORRECTION_TOPIC, PoseCorrections
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.update_times import UpdateTimes
-from deworldsg_ros.ros.whole_graph import MakeMarkers, WholeGraph
-from deworldsg_ros.ros.worker import Worker
-from deworldsg_ros.scene import wire
+from deworldsg_ros.ros.threads import UpdateTimes, Worker
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence
-from deworldsg_ros.streams.clock_gate import ClockGate, jump_text
-from deworldsg_ros.streams.pending import PendingEvidence
+from deworldsg_ros.streams.assembler import PendingEvidence
+from deworldsg_ros.streams.poses import ClockGate, jump_text, pose_from_message, stamp_ns_of
+from deworldsg_ros.wire import messages as wire
+
+# --- The map file of a node: continued at the start, written while the node works and at its end.
+
+# Of the graph's thread: 34 nodes take 5 ms, so a large graph is copied less often.
+MAX_SHARE = 0.02
+# Longest time in which a disk may take a checkpoint, before the map itself is written.
+SLOW_DISK_S = 20.0
+
+
+class MapKeeper:
+    """Owns a map file; no other process may write it until `close`.
+
+    A node that is killed has lost at most the last period: its graph is copied in the graph's
+    thread, and written in another.
+
+    Args:
+        node: for the log and the counts.
+        path: of the map file.
+        period_s: seconds between two checkpoints of a graph that changes; 0 = none.
+
+    Raises:
+        ConfigurationError: if the map cannot be written, or another process writes it.
+    """
+
+    def __init__(self, node: StageNode, path: Path, period_s: float) -> None:
+        self.path = path
+        self._node = node
+        self._period_s = period_s
+        self._due_s: float | None = None  # None = nothing changed since the last checkpoint
+        self._copying_s = 0.0
+        self._lock = claim_map(path)
+        self._worker: Worker[Arrays] = Worker(
+            "map", self._write, size=1, on_overrun=lambda state: None
+        )
+
+    def continued(self, config: Config) -> Continued | None:
+        """The graph of the map file, if there is one; raises ConfigurationError if it has none."""
+        try:
+            return continue_map(config, self.path)
+        except ConfigurationError:
+            self.close()
+            raise
+
+    def changed(self) -> None:
+        """Note that the graph differs from the last checkpoint."""
+        if self._due_s is None and self._period_s:
+            self._due_s = time.monotonic() + max(self._period_s, self._copying_s / MAX_SHARE)
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until the next checkpoint is due, 0 = now; None without a change."""
+        return None if self._due_s is None else max(0.0, self._due_s - now_s)
+
+    def checkpoint(self, builder: GraphBuilder) -> None:
+        """Copy the graph, and write the map in the background."""
+        self._due_s = None
+        started_s = time.monotonic()
+        self._worker.submit(copy_state(builder))
+        self._copying_s = time.monotonic() - started_s
+
+    def save(self, builder: GraphBuilder | None) -> tuple[bool, str]:
+        """Write the map now; returns whether it was written, and a sentence."""
+        if builder is None:
+            return False, "no map written: no local graph has arrived"
+        if not self._worker.wait_idle(SLOW_DISK_S):
+            return False, f"map {self.path}: not written, the disk takes nothing"
+        try:
+            write_map(builder, self.path)
+        except ConfigurationError as error:
+            return False, str(error)
+        self._due_s = None
+        return True, f"map {self.path}: {counted(builder.confirmed, 'node')}"
+
+    def close(self) -> None:
+        """End the thread, and let other processes write the map."""
+        self._worker.stop()
+        self._lock.release()
+
+    def _write(self, state: Arrays) -> None:
+        with self._node.refusing():  # the thread also writes the next one
+            try:
+                write_state(state, self.path)
+            except ConfigurationError as error:
+                self._node.drop("map_not_written", str(error))
+
+
+# --- The files of a node's graph: its map, and the JSON that ~/save writes.
+
+
+class GraphFiles:
+    """Reads and writes the files that the parameters name.
+
+    Args:
+        node: for its parameters, the log and the counts.
+
+    Attributes:
+        map: None without a map.
+
+    Raises:
+        ConfigurationError: if the map file cannot be written, or is that of `save_path`.
+    """
+
+    def __init__(self, node: StageNode) -> None:
+        self._node = node
+        options = node.parameters.node
+        self._save_path = Path(options.save_path).absolute()
+        self.map: MapKeeper | None = None
+        if options.map_path:
+            self._check_paths(Path(options.map_path))
+            self.map = MapKeeper(node, Path(options.map_path).absolute(), options.map_period_s)
+
+    def _check_paths(self, map_path: Path) -> None:
+        path = self._save_path
+        beside = [("its frames", path_beside(path)), ("its space", space_path(path))]
+        check_paths(map_path, [("save_path", path), *beside])
+
+    def continued_map(self) -> Continued | None:
+        """The graph of the map file, if there is one; raises ConfigurationError if it has none."""
+        continued = None if self.map is None else self.map.continued(self._node.parameters)
+        if continued is not None:
+            log = self._node.get_logger()
+            log.info(continued.message) if continued.newest else log.warning(continued.message)
+        return continued
+
+    def save(self, builder: GraphBuilder | None) -> tuple[bool, str]:
+        """Write the whole graph, with surface points, as JSON; and the map file.
+
+        Returns:
+            whether everything was written, and a sentence.
+        """
+        if builder is None:
+            return False, "no graph yet: no local graph has arrived"
+        message = builder.full()
+        try:
+            self._save_path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(self._save_path, wire.encode(message))
+            stamp_ns = wire.ns_from_stamp(message.stamp)
+            write_seen(self._save_path, stamp_ns, builder.frames.all(builder.graph))
+            write_space(self._save_path, builder.space)
+        except OSError as error:
+            return False, f"{self._save_path}: {error}"
+        nodes, edges = counted(len(message.nodes), "node"), counted(len(message.edges), "edge")
+        said = f"{self._save_path}: {nodes}, {edges}"
+        if self.map is None:
+            return True, said
+        saved, about_map = self.map.save(builder)
+        return saved, f"{said}; {about_map}"
+
+    def changed(self) -> None:
+        """Note that the graph differs from the last checkpoint of the map."""
+        if self.map is not None:
+            self.map.changed()
+
+    def wait_s(self, now_s: float) -> float | None:
+        """Seconds until the next checkpoint is due, 0 = now; None = there is none."""
+        return None if self.map is None else self.map.wait_s(now_s)
+
+    def checkpoint(self, builder: GraphBuilder | None) -> None:
+        """Copy the graph, and write the map in the background."""
+        if self.map is not None and builder is not None:
+            self.map.checkpoint(builder)
+
+    def close(self, builder: GraphBuilder | None, *, busy: bool) -> None:
+        """Write the map, unless its graph is busy, and log it."""
+        if self.map is None:
+            return
+        written, message = False, f"map {self.map.path}: not written, the graph is busy"
+        if not busy:
+            written, message = self.map.save(builder)
+        self.map.close()
+        log = self._node.get_logger()
+        log.info(message) if written else log.warning(message)
+
+
+# --- Pose corrections after loop closures: the nodes follow.
+
+CORRECTION_TOPIC = "deworldsg/pose_correction"
+
+
+class PoseCorrections:
+    """Applies the corrections, and counts them and the nodes that moved."""
+
+    def __init__(self) -> None:
+        self._corrections = self._nodes = 0
+
+    def apply(self, message: Any, builder: GraphBuilder | None) -> None:
+        """Move the nodes first observed at the stamp or later; the pose is the rigid transform.
+
+        Args:
+            message: PoseStamped.
+            builder: of the graph; None before the first local graph.
+
+        Raises:
+            RefusedInput: ``no_graph``, ``wrong_frame`` or ``invalid_pose``.
+        """
+        T_correction, frame_id = pose_from_message(message)
+        if builder is None:
+            raise RefusedInput(
+                "no_graph", "pose correction before the first local graph: no node to correct"
+            )
+        if frame_id != builder.graph.frame_id:
+            raise RefusedInput(
+                "wrong_frame",
+                f"pose correction is in frame '{frame_id}', expected '{builder.graph.frame_id}'",
+            )
+        self._nodes += len(builder.apply_correction(T_correction, stamp_ns_of(message)))
+        self._corrections += 1
+
+    def values(self) -> dict[str, str]:
+        """Both counts, for /diagnostics."""
+        return {
+            "pose corrections": str(self._corrections),
+            "nodes moved by corrections": str(self._nodes),
+        }
+
+
+# --- The global graph of a node, in a thread of its own: merged, published, saved.
+#
+# Diagnostics and signals are served by the executor's thread, so they do not wait for the graph.
 
 # Local graphs and evidence that may wait: a second of both at 30 Hz. A graph takes milliseconds a
 # frame, so they wait only while kernels are compiled or a file is written.

@@ -18,25 +18,18 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from deworldsg_ros.client.asking import ask
+from deworldsg_ros.base.files import parse_json
 from deworldsg_ros.client.goals import Goal
 from deworldsg_ros.client.graph import SceneGraph
+from deworldsg_ros.client.questions import ask
+from deworldsg_ros.graph.edits import DeleteNode, EditRequest, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
-from deworldsg_ros.parsing import parse_json
 from deworldsg_ros.ros.graph_keeper import GraphKeeper
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene.edits import (
-    DeleteNode,
-    EditRequest,
-    MergeNodes,
-    SetLabel,
-    SplitNode,
-    Undo,
-)
 from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
-from deworldsg_ros.scene.wire import Point
+from deworldsg_ros.wire.messages import Point
 
 GOAL_TOPIC = "deworldsg/goal"
 # A question is a line. An edit is a few numbers.
@@ -46,7 +39,7 @@ Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1000)]
 
 
 class Query(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A question in words; see `client.asking`."""
+    """A question in words; see `client.questions`."""
 
     question: Text
 

@@ -14,7 +14,7 @@ from deworldsg_ros.ros.joining import JoiningNode
 from deworldsg_ros.ros.node import CHECK_PERIOD_S, StageNode
 from deworldsg_ros.ros.qos import AutoSubscription, Source, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.streams.posed import PosedAssembler
+from deworldsg_ros.streams.frames import PosedAssembler
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 try:  # Part of ROS 2, but not of its wheels.

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from deworldsg_ros.ros.node import CHECK_PERIOD_S, SPIN_PERIOD_S, StageNode
-from deworldsg_ros.ros.worker import Worker
+from deworldsg_ros.ros.threads import Worker
 from deworldsg_ros.streams.assembler import Assembler
-from deworldsg_ros.streams.posed import TOPICS
+from deworldsg_ros.streams.frames import TOPICS
 
 # A third of a second of a 30 Hz camera: a longer queue of a slow node adds latency only.
 QUEUE_FRAMES = 10

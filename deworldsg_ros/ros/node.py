@@ -6,6 +6,7 @@ import contextlib
 import faulthandler
 import gc
 import os
+import signal
 import sys
 import threading
 import time
@@ -16,23 +17,203 @@ from typing import Any
 
 import msgspec
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from deworldsg_ros.kernels import COMPILING, on_compilation
-from deworldsg_ros.ros.diagnosing import LOG_PERIOD_S, DropLog, diagnostic_array
-from deworldsg_ros.ros.health import ERROR, INTERNAL_ERROR, LISTENERS, LOST_PREFIX, Health
-from deworldsg_ros.ros.live_parameters import LiveParameters
+from deworldsg_ros.base.kernels import COMPILING, on_compilation
+from deworldsg_ros.base.words import visible, visible_lines
+from deworldsg_ros.ros.health import (
+    ERROR,
+    INTERNAL_ERROR,
+    LISTENERS,
+    LOST_PREFIX,
+    UNMATCHED_PREFIX,
+    Health,
+    Report,
+)
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.ros.overrides import OverridableNode
-from deworldsg_ros.ros.parameters import declare
-from deworldsg_ros.ros.process import EXIT_HUNG, RESPAWN_VARIABLE, run_process
+from deworldsg_ros.ros.parameters import LiveParameters, OverridableNode, declare
 from deworldsg_ros.ros.qos import AutoSubscription, LossCounter, Source, reliable
-from deworldsg_ros.ros.waiting import Waiting, take_waiting
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError, RefusedInput
+from deworldsg_ros.wire import messages as wire
+
+# --- Waiting for messages without rclpy's executor, which serves timers and services only.
+#
+# For every message, the executor makes a new wait set of all entities of the node, QoS events
+# included: a millisecond of Python on a busy machine, as much as a node's work on a small message.
+
+# Messages of each topic that are taken in one go; then timers and services have their turn.
+MAX_PASSES = 10
+
+
+def take_waiting(node: Node) -> None:
+    """Take all messages that are wanted now, at most `MAX_PASSES` of each topic."""
+    for _ in range(MAX_PASSES):
+        taken = 0
+        for subscription in list(node.subscriptions):
+            with subscription.handle:
+                if not subscription.callback_group.can_execute(subscription):
+                    continue
+                message = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if message is not None:
+                taken += 1
+                has_info = subscription._callback_type is not Subscription.CallbackType.MessageOnly
+                subscription.callback(*message if has_info else message[:1])
+        if not taken:
+            return
+
+
+class Waiting:
+    """Waits until a node has something to do.
+
+    Args:
+        node: its callbacks run in the thread that waits.
+        executor: serves the timers and services of the node.
+    """
+
+    def __init__(self, node: Node, executor: SingleThreadedExecutor) -> None:
+        self._node = node
+        self._executor = executor
+        self._sizes: tuple[int, ...] = ()
+        self._set: Any = None
+
+    def spin_once(self, timeout_s: float) -> None:
+        """Wait for wanted messages, a timer or a service, and serve the timer or service."""
+        node = self._node
+        wanted = [item for item in node.subscriptions if item.callback_group.can_execute(item)]
+        others = {
+            "timer": list(node.timers),
+            "client": list(node.clients),
+            "service": list(node.services),
+            "guard_condition": [self._executor._guard],
+        }
+        guards = [*node.guards, self._executor._guard]
+        sizes = (len(wanted), len(guards), *map(len, list(others.values())[:3]))
+        if sizes != self._sizes:
+            self._sizes = sizes
+            self._set = rcl.WaitSet(*sizes, 0, node.context.handle)
+        wait_set = self._set
+        wait_set.clear_entities()
+        for item in wanted:
+            wait_set.add_subscription(item.handle)
+        for item in guards:
+            wait_set.add_guard_condition(item.handle)
+        for kind in ("timer", "client", "service"):
+            for item in others[kind]:
+                getattr(wait_set, f"add_{kind}")(item.handle)
+        wait_set.wait(int(timeout_s * 1e9))
+        if any(
+            item.handle.pointer in ready
+            for kind, items in others.items()
+            if (ready := wait_set.get_ready_entities(kind))
+            for item in items
+        ):
+            self._executor.spin_once(timeout_sec=0)
+
+
+# --- What a node says about itself: the message of /diagnostics, and log lines of drops.
+
+# Minimum time between two log lines with the same reason.
+LOG_PERIOD_S = 10.0
+
+
+class DropLog:
+    """Logs drops, each reason at most once per LOG_PERIOD_S; safe to use from several threads.
+
+    Args:
+        logger: of rclpy.
+    """
+
+    def __init__(self, logger: Any) -> None:
+        self._logger = logger
+        self._logged_s: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    def write(self, reason: str, message: str) -> None:
+        """Log a drop."""
+        now_s = time.monotonic()
+        with self._lock:
+            if now_s - self._logged_s.get(reason, -LOG_PERIOD_S) < LOG_PERIOD_S:
+                return
+            self._logged_s[reason] = now_s
+        if reason == INTERNAL_ERROR:  # with a traceback
+            self._logger.error(f"{reason}: {visible_lines(message)}")
+        elif reason.startswith(UNMATCHED_PREFIX):
+            self._logger.debug(f"{reason}: {visible(message)}")
+        else:
+            self._logger.warning(f"{reason}: {visible(message)}")
+
+
+def diagnostic_array(report: Report, name: str, full_name: str) -> DiagnosticArray:
+    """The message of a report, without a stamp."""
+    status = DiagnosticStatus(
+        level=bytes([report.level]),
+        name=f"{name}: {full_name}",
+        message=report.message,
+        hardware_id="deworldsg_ros",
+        values=[KeyValue(key=key, value=value) for key, value in report.values.items()],
+    )
+    return DiagnosticArray(status=[status])
+
+
+# --- The process of a node: signals and exit codes.
+
+EXIT_USAGE = 2
+# A model never returns: EX_SOFTWARE of sysexits.h.
+EXIT_HUNG = 70
+# "true": a launch file or systemd starts the process again when it ends.
+RESPAWN_VARIABLE = "DEWORLDSG_RESPAWN"
+NO_SECURITY = ConfigurationError(
+    "ROS_SECURITY_ENABLE is true, but this middleware was built without security, as the wheels of "
+    "ROS 2 are: source a ROS 2 Jazzy of the system, or unset ROS_SECURITY_ENABLE"
+)
+
+
+def run_process(body: Callable[[threading.Event], int], args: list[str] | None = None) -> int:
+    """Initialise ROS, run a function, shut ROS down.
+
+    Args:
+        body: called with an event that SIGINT and SIGTERM set; returns the exit code.
+        args: command line; None = that of the process.
+
+    Returns:
+        The exit code of `body`; 2 for unusable input; 0 after an interrupt.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    # rclpy's own handlers would shut the context down while callbacks still publish.
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:  # an unreadable parameter file, or malformed --ros-args
+        return refuse(error)
+    try:
+        return body(stop)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except DeWorldSGError as error:
+        return refuse(error)
+    except RuntimeError as error:  # RCLError, which rclpy does not export
+        if "security libraries" not in str(error):
+            raise
+        return refuse(NO_SECURITY)
+    finally:
+        rclpy.try_shutdown()
+
+
+def refuse(error: Exception, code: int = EXIT_USAGE) -> int:
+    """Print an error on the standard error; return the exit code."""
+    print(f"error: {visible_lines(str(error))}", file=sys.stderr)
+    return code
+
+
+# --- The base of every node: parameters, guarded callbacks, subscriptions, diagnostics, shutdown.
 
 # Publishers that appear or change are noticed after this time.
 CHECK_PERIOD_S = 0.25

@@ -1,4 +1,4 @@
-"""ROS parameters of a node: declared from its typed options, and checked."""
+"""ROS parameters of a node: declared from its typed options, checked, and changed while it runs."""
 
 from __future__ import annotations
 
@@ -8,13 +8,76 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import msgspec
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from deworldsg_ros.base.words import suggestion
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.ros.overrides import PREFIX, OverridableNode
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.words import suggestion
+
+# --- A node whose topics take `qos_overrides.*`, as those of other ROS 2 nodes do.
+
+PREFIX = "qos_overrides."
+
+
+class OverridableNode(Node):
+    """Applies ``qos_overrides./TOPIC.publisher.POLICY`` and ``….subscription.POLICY``.
+
+    Only overrides that are given become parameters: the QoS of the camera's topics follows their
+    publishers without one.
+    """
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
+        """As rclpy's; raises ConfigurationError for an override that rclpy does not take."""
+        arguments = (msg_type, topic, qos_profile)
+        return self._create(super().create_publisher, "publisher", arguments, options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Any:
+        """As rclpy's; raises ConfigurationError for an override that rclpy does not take."""
+        arguments = (msg_type, topic, callback, qos_profile)
+        return self._create(super().create_subscription, "subscription", arguments, options)
+
+    def unused_overrides(self) -> list[str]:
+        """The overrides of topics that the node does not have so far."""
+        return [name for name in self._qos_overrides() if not self.has_parameter(name)]
+
+    def _qos_overrides(self) -> list[str]:
+        # rclpy's own publishers are made before it has read the overrides.
+        given = getattr(self, "_parameter_overrides", {})
+        return [name for name in given if name.startswith(PREFIX)]
+
+    def _create(
+        self, create: Any, kind: str, arguments: tuple[Any, ...], options: dict[str, Any]
+    ) -> Any:
+        prefix = f"{PREFIX}{self.resolve_topic_name(arguments[1])}.{kind}."
+        names = [name for name in self._qos_overrides() if name.startswith(prefix)]
+        if not names:
+            return create(*arguments, **options)
+        try:
+            policies = [QoSPolicyKind[name[len(prefix) :].upper()] for name in names]
+            options["qos_overriding_options"] = QoSOverridingOptions(policies)
+            return create(*arguments, **options)
+        except (KeyError, RuntimeError, InvalidParameterTypeException, ParameterException) as error:
+            given = ", ".join(
+                f"{name} = {self._parameter_overrides[name].value!r}" for name in names
+            )
+            raise ConfigurationError(
+                f"{self.get_name()}: {given}: {error}; expected policies of "
+                "rclpy.qos.QoSPolicyKind with their values, e.g. reliability: best_effort"
+            ) from error
+
+
+# --- ROS parameters of a node: declared from its typed options, and checked.
 
 # Parameters that rclpy reads itself.
 CLIP_RATE = "relations.max_clips_per_s"
@@ -212,3 +275,37 @@ def _complaint(field: Field, value: Any) -> str:
     if field.kind is str and isinstance(value, bool):
         hint = " (YAML reads a bare y, n, on or off as a boolean: put it in quotes)"
     return f"parameter {field.name} is {value!r}, expected {expected}{hint}: {field.description}"
+
+
+# --- Parameters that change while a node runs.
+
+
+class LiveParameters:
+    """Checks changes and passes them on; rclpy refuses those of read-only parameters.
+
+    Args:
+        node: with the attribute `parameters`, and `configure` to take changed ones.
+    """
+
+    def __init__(self, node: Any) -> None:
+        self._node: Any = node
+        ros_node: Node = node
+        ros_node.add_on_set_parameters_callback(self._check)
+        ros_node.add_post_set_parameters_callback(self._take)
+
+    def _changed(self, parameters: list[Any]) -> Any:
+        values = {item.name: item.value for item in parameters}
+        return changed(self._node.parameters, values, self._node.get_name())
+
+    def _check(self, parameters: list[Any]) -> SetParametersResult:
+        try:
+            self._changed(parameters)
+        except ConfigurationError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: list[Any]) -> None:
+        before = self._node.parameters
+        self._node.parameters = self._changed(parameters)
+        if self._node.parameters != before:
+            self._node.configure()

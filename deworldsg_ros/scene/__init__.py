@@ -1,1 +1,1 @@
-"""The nouns: cameras and frames, Gaussians, frame graphs, the global graph, messages, errors."""
+"""The nouns: cameras, frames, Gaussians, surfaces, the graphs of a frame, vocabularies, errors."""

@@ -13,7 +13,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from deworldsg_ros.kernels import kernel
+from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Int64, UInt32, UInt64
 
 # The constants of SplitMix64.

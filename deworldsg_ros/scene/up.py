@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.scene.array_checks import holds, within
 from deworldsg_ros.scene.arrays import Float64
+from deworldsg_ros.scene.checks import holds, within
 from deworldsg_ros.scene.errors import ConfigurationError
 
 AXES = {"z": (0.0, 0.0, 1.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0)}

@@ -4,7 +4,7 @@ A store is a folder. `messages.jsonl` has the JSON messages of the graph, as the
 truth. `graph.lbug` is a database of ladybug that is made from them, and can be made anew.
 """
 
-from deworldsg_ros.store.errors import StoreError
+from deworldsg_ros.scene.errors import StoreError
 from deworldsg_ros.store.store import Store
 
 __all__ = ["Store", "StoreError"]

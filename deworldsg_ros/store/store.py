@@ -1,23 +1,291 @@
-"""Writes a store, and asks it."""
+"""Writes a store, and asks it: a journal of messages, and a database made of it."""
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from datetime import datetime, time
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from deworldsg_ros.client.words import is_class
-from deworldsg_ros.files import FileLock
-from deworldsg_ros.parsing import paused_collector
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.graph_file import MAX_GRAPH_BYTES, read_content
-from deworldsg_ros.store.batch import Batch
-from deworldsg_ros.store.database import Database, Head, Rows, opened, stay_of
-from deworldsg_ros.store.errors import StoreError
-from deworldsg_ros.store.history import History, Stay
-from deworldsg_ros.store.journal import GraphMessage, Journal, read_messages
-from deworldsg_ros.store.question import checked_question
+import msgspec
+
+from deworldsg_ros.base.files import FileLock, paused_collector
+from deworldsg_ros.base.words import stamp_ns_from_text
+from deworldsg_ros.client.objects import is_class
+from deworldsg_ros.graph.graph_files import MAX_GRAPH_BYTES, read_content
+from deworldsg_ros.scene.errors import RefusedInput, StoreError
+from deworldsg_ros.store.database import (
+    Database,
+    Head,
+    History,
+    Rows,
+    Stay,
+    checked_question,
+    opened,
+    stay_of,
+)
+from deworldsg_ros.wire import messages as wire
+
+# --- The messages of a store: one JSON document a line, in their order; only ever appended to.
+
+# A whole graph, or the changes of one.
+GraphMessage = wire.SceneGraphMessage | wire.SceneGraphUpdateMessage
+# Of the end of the file that are searched at a time for the end of a line.
+_BLOCK = 1 << 20
+# How the line of an update begins.
+_UPDATE = b'{"schema":' + msgspec.json.encode(wire.schema_of(wire.SceneGraphUpdateMessage))[:-1]
+_UPDATE = _UPDATE.partition(b',"version"')[0]
+
+
+class Journal:
+    """The file of messages; the caller has the right to write it.
+
+    Args:
+        path: of the file; it is made if it is missing. A last line without an end, of a writer that
+            was killed, is cut off.
+
+    Raises:
+        OSError: if the file cannot be made or read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("ab")
+        self._file.truncate(_end_of_lines(path))
+
+    @property
+    def size(self) -> int:
+        """Bytes of all messages."""
+        return os.fstat(self._file.fileno()).st_size
+
+    def append(self, content: bytes) -> None:
+        """Add a message. It survives the end of this process, and after `sync` that of the machine.
+
+        Raises:
+            OSError: if it cannot be written; then the file is as before.
+        """
+        if b"\n" in content:  # between tokens only: JSON has no line breaks inside of strings
+            content = content.replace(b"\n", b" ")
+        size = self.size
+        try:
+            self._file.writelines((content, b"\n"))
+            self._file.flush()
+        except OSError:
+            self._file.truncate(size)
+            raise
+
+    def sync(self) -> None:
+        """Wait until the messages are on the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_messages(path: Path, start: int = 0) -> Iterator[tuple[GraphMessage, int]]:
+    """The messages from a position on, each with the position after it.
+
+    Raises:
+        StoreError: for a line that is no message, with its position.
+    """
+    with path.open("rb") as file:
+        file.seek(start)
+        for line in file:
+            end = start + len(line)
+            if not line.endswith(b"\n"):
+                return  # a writer is at work, or was killed
+            try:
+                yield decode(line), end
+            except RefusedInput as refusal:
+                raise StoreError(f"{path}, byte {start}: {refusal}") from refusal
+            start = end
+
+
+def decode(content: bytes) -> GraphMessage:
+    """The whole graph or the update of a line; raises RefusedInput."""
+    # Updates are written by `StoreWriter.add`, with their fields in the order of their type.
+    if content.startswith(_UPDATE):
+        return wire.decode(content, wire.SceneGraphUpdateMessage, MAX_GRAPH_BYTES)
+    return wire.decode(content, wire.SceneGraphMessage, MAX_GRAPH_BYTES)
+
+
+def _end_of_lines(path: Path) -> int:
+    """Position after the last line that is whole."""
+    with path.open("rb") as file:
+        end = file.seek(0, os.SEEK_END)
+        while end:
+            start = max(0, end - _BLOCK)
+            file.seek(start)
+            found = file.read(end - start).rfind(b"\n")
+            if found >= 0:
+                return start + found + 1
+            end = start
+    return 0
+
+
+# --- Messages that are not in the database yet, joined into one change of it.
+
+
+class Batch:
+    """The changes since the last `clear`.
+
+    Args:
+        head: what the database contains.
+        history: the stays of the objects in the database.
+
+    Attributes:
+        head: what it will contain.
+    """
+
+    def __init__(self, head: Head, history: History) -> None:
+        self.head = head
+        self._history = history
+        self._stored = set(history.current)
+        self.clear()
+
+    def __bool__(self) -> bool:
+        return self._changed
+
+    def clear(self) -> None:
+        """Forget the changes: they are in the database."""
+        self._changed = self._is_whole = False
+        self._nodes: dict[int, wire.NodeState | None] = {}
+        self._edges: dict[tuple[int, int], wire.EdgeState | None] = {}
+
+    def follows(self, message: GraphMessage) -> bool:
+        """Whether a message is the next one; False if it is known. Raises as `StoreWriter.add`."""
+        head, session = self.head, _session(message)
+        is_known = session == head.session and message.sequence <= head.sequence
+        if session and is_known:
+            return False
+        if message.nodes and head.frame_id not in ("", message.frame_id):
+            raise RefusedInput(
+                "wrong_frame", f"graph is in frame '{message.frame_id}': expected '{head.frame_id}'"
+            )
+        if isinstance(message, wire.SceneGraphUpdateMessage) and not self._begins(message):
+            if session == head.session and _before(message) <= head.sequence:
+                return True
+            raise RefusedInput(
+                "lost_updates",
+                f"update {message.sequence} of session '{session}' after {head.sequence} of "
+                f"'{head.session}': expected the next one, or the whole graph",
+            )
+        stamp_ns = wire.ns_from_stamp(message.stamp)
+        if stamp_ns < head.stamp_ns:
+            raise RefusedInput(
+                "old_graph",
+                f"graph of {stamp_ns / 1e9:.3f} s is older than the newest one of the store, "
+                f"{head.stamp_ns / 1e9:.3f} s: expected graphs in the order of their time",
+            )
+        return True
+
+    def add(self, message: GraphMessage) -> None:
+        """Add the next message."""
+        # Within a session, a late frame may have an earlier stamp.
+        stamp_ns = max(wire.ns_from_stamp(message.stamp), self.head.stamp_ns)
+        removed = set()
+        if self._begins(message):
+            self._is_whole = True
+            self._nodes, self._edges = {}, {}
+            removed = set(self._history.current) - {node.id for node in message.nodes}
+        if isinstance(message, wire.SceneGraphUpdateMessage):
+            removed.update(node.id for node in message.removed_nodes)
+            for pair in message.removed_edges:
+                self._edges[pair.subject, pair.object] = None
+        for node_id in removed:
+            self._history.end(node_id, stamp_ns)
+            self._nodes[node_id] = None
+        for node in message.nodes:
+            self._history.see(node, stamp_ns)
+            self._nodes[node.id] = node
+        self._edges.update(zip(map(attrgetter("subject", "object"), message.edges), message.edges))
+        self.head = Head(
+            self.head.position,
+            stamp_ns,
+            message.frame_id,
+            _session(message),
+            message.sequence,
+        )
+        self._changed = True
+
+    def write(self, database: Database) -> None:
+        """Write the changes; the caller has begun a transaction."""
+        nodes = {i: node for i, node in self._nodes.items() if node is not None}
+        edges = [edge for edge in self._edges.values() if edge is not None]
+        if self._is_whole:
+            database.replace_graph(nodes, edges)
+            self._stored = set(nodes)
+        else:
+            gone = self._nodes.keys() - nodes.keys()
+            cut = [pair for pair, edge in self._edges.items() if edge is None]
+            database.remove(gone & self._stored, cut)
+            new = [node for i, node in nodes.items() if i not in self._stored]
+            changed = [node for i, node in nodes.items() if i in self._stored]
+            database.put(new, changed, edges)
+            self._stored = (self._stored - gone) | nodes.keys()
+        database.put_stays(*self._history.take())
+        database.write_head(replace(self.head))
+
+    def _begins(self, message: GraphMessage) -> bool:
+        """Whether a message replaces the graph: a whole one, or the first update of a session."""
+        if isinstance(message, wire.SceneGraphMessage) or message.since == 0:
+            return True
+        return _before(message) == 0 and _session(message) != self.head.session
+
+
+def _before(update: wire.SceneGraphUpdateMessage) -> int:
+    """Number of the update that this one follows."""
+    return update.sequence - 1 if isinstance(update.since, msgspec.UnsetType) else update.since
+
+
+def _session(message: GraphMessage) -> str:
+    return "" if isinstance(message.session, msgspec.UnsetType) else message.session
+
+
+# --- Times as people write them.
+
+_AGO = re.compile(r"([\d.]+)\s*(s|min|h|d)\s+ago")
+_UNIT_S = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+EXAMPLES = "10:00, 2026-03-01T10:00, '5 min ago' or the seconds of a stamp"
+
+
+def time_ns_from_text(text: str, newest_ns: int) -> int:
+    """Nanoseconds of a time on the clock of the graph's stamps.
+
+    Args:
+        text: seconds of a stamp; a date and time of ISO 8601, of the machine's time zone if it has
+            none; a time of the day on which the graph is newest; or ``5 min ago``, counted from the
+            newest stamp.
+        newest_ns: the newest stamp of the graph.
+
+    Raises:
+        StoreError: for other text.
+    """
+    text = text.strip()
+    try:
+        ago = _AGO.fullmatch(text)
+        if ago is not None:
+            return newest_ns - stamp_ns_from_text(ago[1]) * _UNIT_S[ago[2]]
+        if re.fullmatch(r"[\d.]+", text):
+            return stamp_ns_from_text(text)
+        if re.fullmatch(r"\d{1,2}:\d\d(:\d\d)?", text):
+            day = datetime.fromtimestamp(newest_ns // 10**9)
+            moment = datetime.combine(
+                day, time.fromisoformat(text.rjust(8 if text[5:] else 5, "0"))
+            )
+        else:
+            moment = datetime.fromisoformat(text)
+        return round(moment.timestamp() * 1e6) * 1000
+    except (ValueError, OverflowError) as error:
+        raise StoreError(f"time '{text[:40]}': expected {EXAMPLES}") from error
+
+
+# --- Writes a store, and asks it.
 
 MESSAGES_FILE, DATABASE_FILE = "messages.jsonl", "graph.lbug"
 # Messages that go to the database at a time when it is made anew.

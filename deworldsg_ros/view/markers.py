@@ -1,4 +1,4 @@
-"""Markers for RViz and Foxglove, without ROS; `ros.markers` converts them to messages."""
+"""Markers for RViz and Foxglove, without ROS; `ros.graph_output` converts them to messages."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ from typing import Literal
 
 import numpy as np
 
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
-from deworldsg_ros.view.colours import class_colours, to_rgb
-from deworldsg_ros.view.geometry import SIGMAS, covariances_of, means_of, principal_axes
+from deworldsg_ros.view.colours import (
+    SIGMAS,
+    class_colours,
+    covariances_of,
+    means_of,
+    principal_axes,
+    to_rgb,
+)
+from deworldsg_ros.wire import messages as wire
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

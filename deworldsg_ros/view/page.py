@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from deworldsg_ros.base.files import write_atomically
 from deworldsg_ros.client.objects import SceneObject, scene_object
-from deworldsg_ros.files import write_atomically
-from deworldsg_ros.scene import wire
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import pose_from_quaternion
-from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.view.colours import class_colours, predicate_colours
-from deworldsg_ros.view.geometry import drawable_edges, view_axes
+from deworldsg_ros.view.colours import class_colours, drawable_edges, predicate_colours, view_axes
+from deworldsg_ros.wire import messages as wire
 
 ASSETS = Path(__file__).with_name("assets")
 # More add megabytes, not detail.

@@ -7,10 +7,10 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.arrays import Float64, UInt8
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
-from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.wire import messages as wire
 
 # Frames of a recording that are kept: 64 MB, and at least as many as a walk around a room needs.
 MOST_BYTES, LEAST_FRAMES = 64 << 20, 8

@@ -7,11 +7,11 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
+from deworldsg_ros.base.words import visible
 from deworldsg_ros.client.graph import SceneGraph
 from deworldsg_ros.client.objects import scene_object
-from deworldsg_ros.scene import wire
 from deworldsg_ros.view.colours import class_colours
-from deworldsg_ros.words import visible
+from deworldsg_ros.wire import messages as wire
 
 MOST_ROWS = 60
 PROVENANCE_STYLES = {"visual": "", "prior": "yellow", "fused": "cyan"}

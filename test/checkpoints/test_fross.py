@@ -17,18 +17,12 @@ from support.torch_models import (
 )
 from typer.testing import CliRunner
 
-from deworldsg_ros.checkpoints.card import read_card
-from deworldsg_ros.checkpoints.fross import (
-    Names,
-    import_checkpoint,
-    infer_config,
-    split,
-)
+from deworldsg_ros.checkpoints.cards import read_detector_card
+from deworldsg_ros.checkpoints.fross import Names, import_checkpoint, infer_config, split
 from deworldsg_ros.cli.models import app
-from deworldsg_ros.perception.backends.egtr import EgtrRelationHead
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import SCANNET_CLASSES, SCANNET_PREDICATES
+from deworldsg_ros.scene.vocabulary import SCANNET_CLASSES, SCANNET_PREDICATES
 
 pytestmark = pytest.mark.models
 
@@ -264,7 +258,7 @@ def test_the_first_architecture_in_its_own_spelling(tmp_path, bottleneck):
     wanted = state[f"{DETECTOR}encoder.input_proj.1.0.weight"]
     assert torch.equal(model.model.encoder_input_proj[1][0].weight, wanted)
     # Without a config.json: FROSS's three layers, no statistics.
-    card = read_card(tmp_path / "out" / "deworldsg.json")
+    card = read_detector_card(tmp_path / "out" / "deworldsg.json")
     assert (card.decoder_layers, card.frequency_bias, card.class_scores) == (3, False, "softmax")
 
 
@@ -357,7 +351,7 @@ def test_names_have_to_fit_the_outputs(tmp_path):
     arguments = ["import-fross", str(path), str(tmp_path / "out"), "--names", str(file)]
     result = CliRunner().invoke(app, [*arguments, "--frequency-bias"])
     assert result.exit_code == 0, result.output
-    card = read_card(tmp_path / "out" / "deworldsg.json")
+    card = read_detector_card(tmp_path / "out" / "deworldsg.json")
     assert card.classes == tuple(classes) and card.frequency_bias
     # A second import does not overwrite the first.
     again = CliRunner().invoke(app, arguments)
@@ -379,7 +373,7 @@ def test_statistics_without_a_config_json_are_asked_about(tmp_path, config, flag
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert ("Put FROSS's config.json" in result.output) == told
-    assert not read_card(tmp_path / "out" / "deworldsg.json").frequency_bias
+    assert not read_detector_card(tmp_path / "out" / "deworldsg.json").frequency_bias
 
 
 class Surprise:

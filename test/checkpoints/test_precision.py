@@ -10,16 +10,13 @@ import pytest
 from support.checkpoints import clip, config_of, request, save_random_probe, save_vjepa2
 from support.torch_models import image, save_rtdetr, save_sam2, save_sam3, settings, torch
 
-from deworldsg_ros.checkpoints import precision
-from deworldsg_ros.checkpoints.loading import choose_dtype
-from deworldsg_ros.checkpoints.precision import in_best_precision, require_finite
+from deworldsg_ros.checkpoints import loading
+from deworldsg_ros.checkpoints.loading import choose_dtype, in_best_precision, require_finite
+from deworldsg_ros.perception.backends import sam
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
-from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
-from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
-from deworldsg_ros.perception.networks import box_prompts
-from deworldsg_ros.relations.probing import backbone
-from deworldsg_ros.relations.probing.probed_world_model import build_probed
-from deworldsg_ros.relations.world_models import vjepa2
+from deworldsg_ros.perception.backends.sam import Sam2Segmenter, Sam3Segmenter
+from deworldsg_ros.relations import clip_models
+from deworldsg_ros.relations.clip_models import build_probed
 from deworldsg_ros.scene.errors import RefusedInput
 
 pytestmark = pytest.mark.models
@@ -99,7 +96,7 @@ def test_sam_in_bfloat16_gives_nearly_the_masks_of_float32(
     config = settings(segmenter_path=str(save(tmp_path)))
     boxes = np.array([[5.0, 5, 30, 40], [20, 10, 70, 50]])
     exact = family(config)._masks(image(60, 80), boxes)
-    monkeypatch.setattr(box_prompts, "choose_dtype", lambda device, **_: torch.bfloat16)
+    monkeypatch.setattr(sam, "choose_dtype", lambda device, **_: torch.bfloat16)
     reduced = family(config)
     assert reduced.dtype == torch.bfloat16
     assert (reduced._masks(image(60, 80), boxes) != exact).mean() < 0.05
@@ -107,7 +104,7 @@ def test_sam_in_bfloat16_gives_nearly_the_masks_of_float32(
 
 def test_a_segmenter_that_overflows_runs_in_single_precision(tmp_path, monkeypatch, caplog) -> None:
     config = settings(segmenter_path=str(save_sam2(tmp_path)))
-    monkeypatch.setattr(box_prompts, "choose_dtype", lambda device, **_: torch.float16)
+    monkeypatch.setattr(sam, "choose_dtype", lambda device, **_: torch.float16)
     logits = Sam2Segmenter._test_logits
 
     def overflowing(self, model, dtype):
@@ -122,29 +119,29 @@ def test_a_segmenter_that_overflows_runs_in_single_precision(tmp_path, monkeypat
 
 def test_a_backbone_in_half_precision_gives_nearly_its_features(tmp_path, monkeypatch) -> None:
     config = config_of("vjepa2", save_vjepa2(tmp_path))
-    exact = vjepa2.load_backbone(config).encode([clip()])
-    monkeypatch.setattr(backbone, "choose_dtype", lambda device: torch.float16)
-    reduced = vjepa2.load_backbone(config)
+    exact = clip_models.load_vjepa2(config).encode([clip()])
+    monkeypatch.setattr(clip_models, "choose_dtype", lambda device: torch.float16)
+    reduced = clip_models.load_vjepa2(config)
     assert reduced.dtype == torch.float16
     found = reduced.encode([clip()])
     assert np.linalg.norm(found - exact) < 0.02 * np.linalg.norm(exact)
 
 
 def test_nan_in_features_is_counted_by_name(tmp_path, monkeypatch) -> None:
-    from deworldsg_ros.relations.encoding import ClipEncoder
+    from deworldsg_ros.relations.stage import ClipEncoder
 
     config = config_of("vjepa2", save_vjepa2(tmp_path / "model"))
-    identity = vjepa2.load_backbone(config).identity
+    identity = clip_models.load_vjepa2(config).identity
     probe = save_random_probe(tmp_path / "probe", identity)
     config = config_of("vjepa2", tmp_path / "model", probe_path=str(probe))
-    model = build_probed(config, vjepa2.load_backbone, "cpu")
+    model = build_probed(config, clip_models.load_vjepa2, "cpu")
     broken = lambda videos: torch.full((1, identity.feature_dim), float("nan"))  # noqa: E731
     object.__setattr__(model._backbone, "features", broken)
     with pytest.raises(RefusedInput, match="48 of 48 values of a feature of vjepa2 are NaN"):
         model.predict(request())
     reports: list[str] = []
     encoder = ClipEncoder(model, reports.append)
-    monkeypatch.setattr("deworldsg_ros.relations.encoding.clip_request", lambda *_: request())
+    monkeypatch.setattr("deworldsg_ros.relations.stage.clip_request", lambda *_: request())
     assert encoder.encode(None, []) is None
     assert encoder.failure == "nan_features"
     assert "are NaN or infinite in float32" in reports[0]
@@ -162,4 +159,4 @@ def test_nan_of_a_detector_is_an_error_and_not_an_empty_image(tmp_path) -> None:
 
 def test_finite_values_pass() -> None:
     require_finite(torch.ones(3), "nan_features", "a feature")
-    assert torch.equal(precision.noise_pattern(4, 4), precision.noise_pattern(4, 4))
+    assert torch.equal(loading.noise_pattern(4, 4), loading.noise_pattern(4, 4))

@@ -20,20 +20,17 @@ from support.checkpoints import (  # noqa: E402  after the guards
 )
 from support.relations import VOCABULARY  # noqa: E402
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, read_card  # noqa: E402
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, read_probe_card  # noqa: E402
 from deworldsg_ros.checkpoints.probe_network import (  # noqa: E402
+    PUBLISHED_BACKBONE,
     Probe,
     build_network,
+    import_published,
     load_probe,
     save_probe,
 )
-from deworldsg_ros.checkpoints.published_probe import (  # noqa: E402
-    PUBLISHED_BACKBONE,
-    import_published,
-)
-from deworldsg_ros.relations import build_world_model  # noqa: E402
+from deworldsg_ros.relations import build_world_model, clip_models  # noqa: E402
 from deworldsg_ros.relations.world_model import require_predicates  # noqa: E402
-from deworldsg_ros.relations.world_models import vjepa2  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 BACKBONE = BackboneIdentity("vjepa2", 48, 32, 4, "0123456789abcdef", "stretch")
@@ -177,7 +174,7 @@ def test_a_probe_of_version_0_2_is_refused(tmp_path):
 def warnings_of(tmp_path, caplog, identity_changes, edge_belief="robust", **card_changes):
     """Warnings at the start of a world model with a probe."""
     folder = save_vjepa2(tmp_path / "backbone")
-    identity = vjepa2.load_backbone(config_of("vjepa2", folder)).identity
+    identity = clip_models.load_vjepa2(config_of("vjepa2", folder)).identity
     identity = msgspec.structs.replace(identity, **identity_changes)
     probe = save_random_probe(tmp_path / "probe", identity, **card_changes)
     config = config_of("vjepa2", folder, probe_path=str(probe), edge_belief=edge_belief)
@@ -219,7 +216,7 @@ def test_incomplete_folders_are_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="has no config.json"):
         load_probe(tmp_path)
     save_random_probe(tmp_path, BACKBONE)
-    assert read_card(tmp_path).predicates == VOCABULARY.predicates
+    assert read_probe_card(tmp_path).predicates == VOCABULARY.predicates
     (tmp_path / "model.safetensors").unlink()
     with pytest.raises(ConfigurationError, match="has no model.safetensors"):
         load_probe(tmp_path)

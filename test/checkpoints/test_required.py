@@ -8,7 +8,7 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from deworldsg_ros.checkpoints.required import require_checkpoints
+from deworldsg_ros.checkpoints.catalogue import require_checkpoints
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, PerceptionConfig, load_config, to_mapping
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from support.torch_models import settings, torch
 
-from deworldsg_ros.checkpoints.architectures import DETECTORS
-from deworldsg_ros.checkpoints.loading import CheckpointSource
+from deworldsg_ros.checkpoints.loading import DETECTORS, CheckpointSource
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
@@ -28,8 +27,7 @@ def saved_id(path: Path) -> str:
 def load(name: str, folder: Path):
     """The network of a checkpoint, by the loader of its backend."""
     if name.startswith("sam"):
-        from deworldsg_ros.perception.backends.sam import SamSegmenter
-        from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
+        from deworldsg_ros.perception.backends.sam import Sam2Segmenter, SamSegmenter
 
         backend = SamSegmenter if name == "sam" else Sam2Segmenter
         return backend(settings(segmenter_path=str(folder))).model

@@ -10,21 +10,21 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from deworldsg_ros.cli import compilation
+from deworldsg_ros.cli import run
 from deworldsg_ros.graph_builder import KERNEL_PARTS
 
 SCRIPT = """
 import sys
 from small import twice, thrice
 assert "numba" not in sys.modules
-from deworldsg_ros.kernels import on_compilation
+from deworldsg_ros.base.kernels import on_compilation
 on_compilation(lambda: print("compiling"))
 assert twice(2) == 4 and thrice(2) == 6
 import small
 assert small.twice is twice.dispatcher and small.thrice.signatures
 """
 KERNELS = """
-from deworldsg_ros.kernels import kernel
+from deworldsg_ros.base.kernels import kernel
 
 @kernel
 def twice(x):
@@ -54,15 +54,15 @@ def test_compilation_is_announced_once_and_only_if_it_happens(tmp_path: Path) ->
 
 
 def test_all_kernels_of_a_run_have_a_part() -> None:
-    assert set(compilation.PARTS) == {"perception", "lifting", *KERNEL_PARTS}
+    assert set(run.PARTS) == {"perception", "lifting", *KERNEL_PARTS}
 
 
 def test_a_part_is_compiled_in_another_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "PARTS", {"pairs": None})  # only here, not in that process
-    compilation.compile_kernels(Console(quiet=True))
+    monkeypatch.setattr(run, "PARTS", {"pairs": None})  # only here, not in that process
+    run.compile_kernels(Console(quiet=True))
 
 
 def test_a_failed_part_is_reported_with_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compilation, "PARTS", {"nothing": None})
-    with pytest.raises(compilation.CompilationFailed, match="KeyError: 'nothing'"):
-        compilation.compile_kernels(Console(quiet=True))
+    monkeypatch.setattr(run, "PARTS", {"nothing": None})
+    with pytest.raises(run.CompilationFailed, match="KeyError: 'nothing'"):
+        run.compile_kernels(Console(quiet=True))

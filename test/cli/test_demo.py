@@ -15,11 +15,11 @@ import pytest
 from rich.console import Console
 from support.cli import DEMO_ROOM, deworldsg, first_frames, start
 
-from deworldsg_ros.cli import demo_view
-from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.cli import demo
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.recordings.recording import open_source
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.recordings.source import Role
+from deworldsg_ros.wire import messages as wire
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 FRAMES = 15
@@ -129,9 +129,9 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
 
 def test_the_demo_goes_on_without_the_viewer(tmp_path, monkeypatch):
     console = Console(file=io.StringIO(), width=200)
-    monkeypatch.setattr(demo_view, "find_spec", lambda name: None)
+    monkeypatch.setattr(demo, "find_spec", lambda name: None)
     processes = []
-    view = demo_view.DemoView(processes, tmp_path / "config.yaml", tmp_path, console)
+    view = demo.DemoView(processes, tmp_path / "config.yaml", tmp_path, console)
     view.start()
     view.stay_open()
     assert processes == []

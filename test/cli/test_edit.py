@@ -10,12 +10,12 @@ from support.merging import VOCABULARY
 from support.surfaces import CUP, HERE, view
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.cli.edit import parse_edit
+from deworldsg_ros.cli.ask import parse_edit
 from deworldsg_ros.client import ClientError
 from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.graph.edits import SplitNode
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, read_map, write_map
-from deworldsg_ros.scene.edits import SplitNode
 
 runner = typer.testing.CliRunner()
 

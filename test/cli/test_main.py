@@ -14,7 +14,7 @@ from support.recordings import camera_items, write_bag, write_seven_scenes
 import deworldsg_ros
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import described_yaml, effective_config
-from deworldsg_ros.cli.progress import working
+from deworldsg_ros.cli.terminal import working
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.errors import ConfigurationError

@@ -14,7 +14,7 @@ pytest.importorskip("huggingface_hub")
 safetensors = pytest.importorskip("safetensors.numpy")
 
 from deworldsg_ros.checkpoints.catalogue import CATALOGUE, GROUPS  # noqa: E402  after the guards
-from deworldsg_ros.checkpoints.headers import read_headers  # noqa: E402
+from deworldsg_ros.checkpoints.hub import read_headers  # noqa: E402
 from deworldsg_ros.cli.app import app  # noqa: E402
 from deworldsg_ros.cli.demo import configuration_of  # noqa: E402
 from deworldsg_ros.config import load_config  # noqa: E402

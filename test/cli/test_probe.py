@@ -16,12 +16,12 @@ from support.checkpoints import save_vjepa2  # noqa: E402  after the guards
 from support.pair_rooms import render_room  # noqa: E402
 from typer.testing import CliRunner  # noqa: E402
 
-from deworldsg_ros.checkpoints.card import CheckpointCard, write_card  # noqa: E402
+from deworldsg_ros.checkpoints.cards import CheckpointCard, write_detector_card  # noqa: E402
 from deworldsg_ros.checkpoints.probe_network import load_probe  # noqa: E402
 from deworldsg_ros.cli.app import app  # noqa: E402
 from deworldsg_ros.cli.probe import read_predicates  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
-from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES  # noqa: E402
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES  # noqa: E402
 
 NAMES = ("above", "on")
 
@@ -150,8 +150,8 @@ def test_a_published_probe_is_imported(tmp_path):
 
 
 def test_predicates_are_those_of_an_imported_checkpoint(tmp_path):
-    write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=("on", "near")))
+    write_detector_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=("on", "near")))
     assert read_predicates(str(tmp_path)) == ("on", "near")
-    write_card(tmp_path / "deworldsg.json", CheckpointCard())
+    write_detector_card(tmp_path / "deworldsg.json", CheckpointCard())
     with pytest.raises(ConfigurationError, match="checkpoint with a relation head"):
         read_predicates(str(tmp_path))

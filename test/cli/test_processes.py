@@ -9,9 +9,9 @@ import time
 
 import pytest
 
-from deworldsg_ros.cli import installation, processes
-from deworldsg_ros.cli.installation import dds_environment, find_shared, node_command
-from deworldsg_ros.cli.processes import LoggedProcess, end_all
+from deworldsg_ros.cli import demo, terminal
+from deworldsg_ros.cli.demo import LoggedProcess, end_all
+from deworldsg_ros.cli.terminal import dds_environment, find_shared, node_command
 
 GENTLE = """
 import signal, sys, time
@@ -46,7 +46,7 @@ def test_ending_no_process():
 
 def test_sigint_ends_a_process_and_sigkill_one_that_ignores_it(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        processes,
+        demo,
         "GRACE_S",
         ((signal.SIGINT, 5.0), (signal.SIGTERM, 0.3), (signal.SIGKILL, 5.0)),
     )
@@ -55,7 +55,7 @@ def test_sigint_ends_a_process_and_sigkill_one_that_ignores_it(tmp_path, monkeyp
     assert gentle.exit_code is None
     assert end_all([gentle]) == {"gentle": 0}
     monkeypatch.setattr(
-        processes,
+        demo,
         "GRACE_S",
         ((signal.SIGINT, 0.3), (signal.SIGTERM, 0.3), (signal.SIGKILL, 5.0)),
     )
@@ -114,8 +114,8 @@ def test_an_installation_runs_the_installed_executables(tmp_path, monkeypatch):
     executable = tmp_path / "lib" / "deworldsg_ros" / "graph_node"
     executable.parent.mkdir(parents=True)
     executable.write_text("#!/bin/sh\n")
-    monkeypatch.setattr(installation, "checkout", lambda: None)
-    monkeypatch.setattr(installation, "prefixes", lambda: [tmp_path])
+    monkeypatch.setattr(terminal, "checkout", lambda: None)
+    monkeypatch.setattr(terminal, "prefixes", lambda: [tmp_path])
     module = [sys.executable, "-m", "deworldsg_ros.nodes.graph_node"]
     assert node_command("graph_node") == module  # it cannot be executed
     executable.chmod(0o755)

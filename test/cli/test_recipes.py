@@ -13,10 +13,10 @@ from support.fake_hub import FakeHub
 from support.torch_models import PREDICATES, save_paper_checkpoint, save_sam2, torch
 from typer.testing import CliRunner, Result
 
-from deworldsg_ros.checkpoints.probe_card import ProbeCard
+from deworldsg_ros.checkpoints.cards import ProbeCard
 from deworldsg_ros.checkpoints.probe_network import Probe, build_network, save_probe
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.relations.world_models import vjepa2
+from deworldsg_ros.relations import clip_models
 
 pytestmark = pytest.mark.models
 
@@ -58,7 +58,7 @@ def test_the_paper_runs_with_models_of_a_hub_and_on_a_machine_without_network(
     world_model = save_vjepa2(tmp_path / "vjepa2")
     get("facebook/vjepa2-vitg-fpc64-384", world_model, monkeypatch)
     save_paper_checkpoint(here / "models" / "fross_3dssg")
-    identity = vjepa2.load_backbone(config_of("vjepa2", world_model, clip_length=16)).identity
+    identity = clip_models.load_vjepa2(config_of("vjepa2", world_model, clip_length=16)).identity
     torch.manual_seed(0)
     card = ProbeCard(identity, PREDICATES)
     save_probe(here / "models" / "probe_3dssg", Probe(card, build_network(card).eval()))

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 from deworldsg_ros import pipeline
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import load_config
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.wire import messages as wire
 
 pytestmark = pytest.mark.slow
 

@@ -18,9 +18,9 @@ import deworldsg_ros.client
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.edits import SetLabel
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import write_map
-from deworldsg_ros.scene.edits import SetLabel
 
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -91,9 +91,9 @@ def test_the_commands_of_the_page_run(
 ) -> None:
     served: list[Any] = []
     # The MCP server itself is tested in test_mcp.py.
-    from deworldsg_ros.cli import mcp
+    from deworldsg_ros.cli import ask
 
-    monkeypatch.setattr(mcp, "make_server", lambda *_: served.append(1) or _Server())
+    monkeypatch.setattr(ask, "make_server", lambda *_: served.append(1) or _Server())
     lines = [line for language, text in page if not language for line in text.splitlines()]
     commands = [shlex.split(line, comments=True) for line in lines if line.strip()]
     assert len(commands) >= 18

@@ -16,14 +16,12 @@ from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraph
-from deworldsg_ros.client.align import align
-from deworldsg_ros.client.combine import Known, combine
+from deworldsg_ros.client.combine import Known, align, combine
 from deworldsg_ros.client.export import FORMATS, SPARK_SYMBOL, _colour, export
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import invert_pose
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion, rotation_angle_deg
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.scene.rigid import rigid_motion, rotation_angle_deg
+from deworldsg_ros.wire import messages as wire
 
 EMPTY = SceneGraph(make_graph())
 FOLDER = SceneGraph.load(Path(__file__).parent / "saved" / "scene_graph_v1.json")

@@ -12,8 +12,8 @@ from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.boxes import footprint, gap_m, point_gaps_m, polygon_gap_m
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.wire import messages as wire
 
 FLAT = (0.0, 0.0, 0.0, 1.0)
 

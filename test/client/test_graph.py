@@ -12,10 +12,9 @@ import pytest
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraph
-from deworldsg_ros.client.objects import odds_of
-from deworldsg_ros.client.words import is_class, predicate_names
-from deworldsg_ros.scene import wire
+from deworldsg_ros.client.objects import is_class, odds_of, predicate_names
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.wire import messages as wire
 
 
 @pytest.fixture

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from deworldsg_ros.client import SceneGraph
-from deworldsg_ros.client.asking import ask
 from deworldsg_ros.client.boxes import gap_m
-from deworldsg_ros.client.content import _fits, distance_m
-from deworldsg_ros.scene import wire
+from deworldsg_ros.client.graph import _fits, distance_m
+from deworldsg_ros.client.questions import ask
+from deworldsg_ros.wire import messages as wire
 
 LABELS = ["cup", "table", "dining table", "chair", "mug cup"]
 

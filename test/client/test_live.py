@@ -19,7 +19,7 @@ from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.client import ClientError, SceneGraph, SceneGraphClient
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 LIMIT_S = 20.0
 

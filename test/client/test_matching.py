@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from support.view import make_graph, make_node
 
-from deworldsg_ros.client import SceneGraph, align, changes
+from deworldsg_ros.client import SceneGraph, changes, combine
 from deworldsg_ros.client.objects import SceneObject
 
 
@@ -44,24 +44,24 @@ def test_scores_of_a_motion_are_those_of_all_pairs(offset_m: float) -> None:
     rng = np.random.default_rng(0)
     a, b = rng.uniform(0, 3, (50, 3)) + offset_m, rng.uniform(0, 3, (40, 3))
     of_a, of_b, rarity = rng.integers(0, 4, 50), rng.integers(0, 5, 40), rng.uniform(0.1, 1, 40)
-    scene, others = align._Scene(a, of_a), align._Objects(b, of_b, rarity)
+    scene, others = combine._Scene(a, of_a), combine._Objects(b, of_b, rarity)
     for _ in range(10):
         motion = np.array([rng.uniform(-3, 3), *rng.uniform(-1, 1, 3) + offset_m])
         gaps = np.linalg.norm(a[:, None] - others.moved(motion)[None], axis=2)
         gaps[of_a[:, None] != of_b[None]] = np.inf
-        near = np.clip(1.0 - gaps.min(axis=0) / (2 * align.REACH_M), 0.0, 1.0)
-        scores = align._scores([motion, motion + 100.0, motion], scene, others)
+        near = np.clip(1.0 - gaps.min(axis=0) / (2 * combine.REACH_M), 0.0, 1.0)
+        scores = combine._scores([motion, motion + 100.0, motion], scene, others)
         assert scores == pytest.approx([rarity @ near, 0.0, rarity @ near], abs=1e-9)
         expected = []
-        gaps[gaps > align.REACH_M] = np.inf
+        gaps[gaps > combine.REACH_M] = np.inf
         while np.isfinite(gaps.min()):
             row, column = divmod(int(gaps.argmin()), gaps.shape[1])
             expected.append((row, column))
             gaps[row], gaps[:, column] = np.inf, np.inf
-        assert align._matches(motion, scene, others) == expected
+        assert combine._matches(motion, scene, others) == expected
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7])
 def test_pairs_of_rare_objects_come_first(count: int) -> None:
     every = [(a, b) for a in range(count) for b in range(a + 1, count)]
-    assert list(align._pairs(count)) == sorted(every, key=sum)
+    assert list(combine._pairs(count)) == sorted(every, key=sum)

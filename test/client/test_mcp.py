@@ -17,8 +17,8 @@ from support.cli import COMMAND, ROOT
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraph
-from deworldsg_ros.client.tools import GraphTools, WatchedFile
-from deworldsg_ros.scene import wire
+from deworldsg_ros.client.mcp_server import GraphTools, WatchedFile
+from deworldsg_ros.wire import messages as wire
 
 TOOLS = {
     "list_objects", "list_relations", "find", "get_object_context", "what_changed", "goal_near",

@@ -10,8 +10,7 @@ import typer.testing
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraph
-from deworldsg_ros.client.asking import ask
-from deworldsg_ros.client.patterns import Condition, Pattern, Since, parse
+from deworldsg_ros.client.questions import Condition, Pattern, Since, ask, parse
 
 
 @pytest.mark.parametrize(

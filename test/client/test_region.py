@@ -11,10 +11,8 @@ from support.reference_updates import diff
 from support.view import make_graph, make_node
 
 from deworldsg_ros.client.region import Region, RegionPart
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.change_log import ChangeLog
-from deworldsg_ros.scene.delta import empty_scene_graph
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import ChangeLog, GraphReplica, empty_scene_graph
 
 HERE = Region((0.0, 0.0, 0.0), 2.0)
 CUPS = Region((0.0, 0.0, 0.0), 2.0, ("cup", "tables"))

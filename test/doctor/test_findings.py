@@ -6,8 +6,8 @@ import pytest
 
 from deworldsg_ros.doctor import FrameChecks, Observations, find
 from deworldsg_ros.doctor.findings import DROPS, USUAL_SIZES_M
-from deworldsg_ros.ros.reasons import REASONS
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES
+from deworldsg_ros.ros.health import REASONS
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
 GOOD = FrameChecks(0.9, fits={"given": 0.97, "still": 0.5}, travel_m=2.0, turn_deg=90.0)
 

@@ -12,8 +12,8 @@ from support.wrong import WRONG, write_wrong
 from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.recordings.recording import open_recording
-from deworldsg_ros.scene.graph_file import read_graph
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -12,12 +12,11 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray
 from support.nodes import ROOT, Camera, NodeProcess, Peer
 
-from deworldsg_ros.cli.installation import dds_environment
-from deworldsg_ros.recordings.messages import Role
+from deworldsg_ros.cli.terminal import dds_environment
 from deworldsg_ros.recordings.recording import open_source
-from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.recordings.source import RawRoleMessage, Role
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 RECORDING = ROOT / "bags" / "demo_room"

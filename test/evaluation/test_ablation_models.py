@@ -20,7 +20,7 @@ from support.sequences import BLOCKS, RELATIONS, ROWS, write_room, write_sequenc
 from typer.testing import CliRunner  # noqa: E402
 
 from deworldsg_ros.cli.app import app  # noqa: E402
-from deworldsg_ros.scene.graph_file import read_graph  # noqa: E402
+from deworldsg_ros.graph.graph_files import read_graph  # noqa: E402
 
 SAVERS = {"vjepa2": save_vjepa2, "dinov2": save_dinov2}
 ROWS_OF_MODELS = {"d": "dinov2", "e": "vjepa2"}

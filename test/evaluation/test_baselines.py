@@ -8,27 +8,31 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from deworldsg_ros.evaluation.baselines import BASELINES, BaselinePipeline, build_baseline
-from deworldsg_ros.evaluation.baselines.fross import Fross, box_covariance, evaluation_points
-from deworldsg_ros.evaluation.baselines.graph import BaselineGraph, BaselineNode
-from deworldsg_ros.evaluation.baselines.kim import (
+from deworldsg_ros.evaluation.baselines import (
+    BASELINES,
+    BaselineGraph,
+    BaselineNode,
+    BaselinePipeline,
+    Fross,
     Kim,
+    box_covariance,
+    build_baseline,
     class_similarity,
     colour_histogram,
     densest_colour,
+    evaluation_points,
     position_similarities,
     top_classes,
     window_points,
     without_outliers,
 )
-from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
+from deworldsg_ros.evaluation.runner import to_prediction
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.perception.stage import Perceived
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.extent import surface_points
+from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
+from deworldsg_ros.wire import messages as wire
 
 VOCABULARY = Vocabulary(("book", "chair", "table", "lamp"), ("near", "on"))
 CAMERA = Intrinsics(500.0, 500.0, 320.0, 240.0, 640, 480)

@@ -9,23 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deworldsg_ros.evaluation.measures.calibration import (
+from deworldsg_ros.evaluation.edge_measures import (
     Calibrated,
+    EdgeView,
+    ReferenceScene,
     ReliabilityBin,
     calibration_error,
     reliability,
     total_log_loss,
+    write_edge_list,
 )
-from deworldsg_ros.evaluation.measures.edge_list import write_edge_list
-from deworldsg_ros.evaluation.measures.edge_measures import EdgeView
-from deworldsg_ros.evaluation.measures.graph_measures import (
-    Measures,
-    NodeView,
-    measure_views,
-    pool,
-)
-from deworldsg_ros.evaluation.measures.reference import ReferenceScene
-from deworldsg_ros.evaluation.reports.plots import plot_reliability
+from deworldsg_ros.evaluation.graph_measures import Measures, NodeView, measure_views, pool
+from deworldsg_ros.evaluation.reports import plot_reliability
 
 # Objects 10, 20, 30, 40 stand at x = 0, 2, 4, 6 m. Object 99 cannot be detected.
 NAMES = ("cup", "table", "lamp", "chair")

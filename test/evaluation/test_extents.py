@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.evaluation.recorded_room import SPELLINGS
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 RECORDING = Path(__file__).resolve().parents[2] / "bags" / "demo_room"
 # Promised for perfect masks. Nothing is fitted to this recording.

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, parse_faults
-from deworldsg_ros.evaluation.front_ends.assembly import (
+from deworldsg_ros.evaluation.injection import (
     Detection,
     FrameDetections,
+    FrameFaults,
+    Injection,
     Relation,
     spread,
 )
-from deworldsg_ros.evaluation.front_ends.injection import FrameFaults, Injection
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 HEIGHT, WIDTH, RATE_HZ = 120, 160, 10.0

@@ -18,13 +18,13 @@ from support.sequences import (
 )
 
 from deworldsg_ros.config import Config, PerceptionConfig
-from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice, build_front_end
-from deworldsg_ros.evaluation.front_ends.assembly import logits, spread, visible_box
+from deworldsg_ros.evaluation.injection import logits, spread, visible_box
 from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.sequence import SequenceDataset
 from deworldsg_ros.recordings.recording import open_recording
+from deworldsg_ros.scene.errors import EvaluationError
 
 
 def perceived(root: Path, choice: FrontEndChoice, config: Config = Config()) -> list[Perceived]:

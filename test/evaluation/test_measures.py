@@ -10,17 +10,17 @@ import pytest
 from support.evaluation import write_dataset
 from support.sequences import write_ground_truth
 
-from deworldsg_ros.evaluation.measures.graph_measures import (
+from deworldsg_ros.evaluation.edge_measures import ReferenceScene, read_reference
+from deworldsg_ros.evaluation.graph_measures import (
     Measures,
     NodeView,
     measure_prediction,
     measure_views,
     pool,
 )
-from deworldsg_ros.evaluation.measures.reference import ReferenceScene, read_reference
-from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.scene.errors import RecordingError
 
 SCENE = ReferenceScene(
     ids=[10, 20],

@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 from support.evaluation import one_hot, write_predictions
 
-from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.protocol.predictions import (
-    ScanPrediction,
-    read_predictions,
-)
+from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.scene.errors import EvaluationError
 
 
 def official(dtype: Any = np.float64) -> dict[str, Any]:

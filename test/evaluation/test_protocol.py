@@ -12,12 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.evaluation import one_hot, segment, surface, write_dataset, write_json, write_ply
 
-from deworldsg_ros.evaluation.protocol.matching import match
-from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction, read_predictions
-from deworldsg_ros.evaluation.protocol.ranking import NO_RANK, rank, triple_rank
-from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.evaluation.scoring import (
+    NO_RANK,
+    ProtocolOptions,
+    evaluate_predictions,
+    match,
+    rank,
+    triple_rank,
+)
 from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.scene.errors import RecordingError
 
 LAYOUT_NAMES = {"replica": "replica", "scannet": "3rscan"}
 CASES = ("case_00", "case_01", "case_03", "case_05")

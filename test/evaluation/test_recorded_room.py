@@ -11,12 +11,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.evaluation.measures.graph_measures import read_reference
+from deworldsg_ros.evaluation.graph_measures import read_reference
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom, open_annotations
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.recordings.folders.annotations import Annotations
-from deworldsg_ros.scene.graph_file import read_graph
-from deworldsg_ros.scene.wire import ns_from_stamp
+from deworldsg_ros.scene.errors import RecordingError
+from deworldsg_ros.wire.messages import ns_from_stamp
 
 RECORDING = Path(__file__).resolve().parents[2] / "bags" / "demo_room"
 

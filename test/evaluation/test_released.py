@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import load_config, to_mapping
-from deworldsg_ros.evaluation.tables.paper_numbers import REPLICA_TEST_SCANS
+from deworldsg_ros.evaluation.rows import REPLICA_TEST_SCANS
 
 SCAN = ((("chair", 1), ("table", 2)), ((1, 2, "near"),))
 

@@ -12,27 +12,28 @@ from support.evaluation import write_dataset, write_json, write_predictions
 from support.sequences import BLOCKS, RELATIONS, write_room, write_sequence, write_surface
 from typer.testing import CliRunner
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, write_card
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, RelationsConfig, load_config
-from deworldsg_ros.evaluation.errors import EvaluationError
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
-from deworldsg_ros.evaluation.protocol.labels import translate, translation
-from deworldsg_ros.evaluation.protocol.predictions import read_predictions
-from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
-from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions, evaluate_predictions
-from deworldsg_ros.evaluation.reports.csv_latex import latex_rows, latex_text
+from deworldsg_ros.evaluation.predictions import read_predictions
+from deworldsg_ros.evaluation.reports import latex_rows, latex_text
 from deworldsg_ros.evaluation.runner import (
     ScanOutcome,
     ScanTask,
     evaluate_graph,
     evaluate_scan,
+    to_prediction,
+    translate,
+    translation,
     warn_of_training,
 )
+from deworldsg_ros.evaluation.scoring import ProtocolOptions, evaluate_predictions
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.recordings.folders.annotations import Annotations
+from deworldsg_ros.scene.errors import EvaluationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.graph_file import read_graph
-from deworldsg_ros.scene.wire import Belief
+from deworldsg_ros.wire.messages import Belief
 
 # The objects of the small rooms are flat and apart: only frames say how they are related.
 CONFIG = Config(relations=RelationsConfig(world_model="none"))
@@ -252,7 +253,7 @@ def test_a_scan_of_the_training_of_the_probe_is_told(
 ) -> None:
     parts = {"train": ["a"], "validation": ["b"], "held_out": ["c"]}
     backbone = BackboneIdentity("vjepa2", 48, 32, 4)
-    write_card(tmp_path, ProbeCard(backbone, ("on",), training={"groups_by_part": parts}))
+    write_probe_card(tmp_path, ProbeCard(backbone, ("on",), training={"groups_by_part": parts}))
     probed = RelationsConfig(world_model="vjepa2", probe_path=str(tmp_path))
     for scan in "abcd":
         warn_of_training(probed, scan)

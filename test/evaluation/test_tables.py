@@ -18,31 +18,38 @@ from support.evaluation import write_predictions
 from support.sequences import write_room
 from typer.testing import CliRunner, Result
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard, write_card
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
-from deworldsg_ros.evaluation.errors import EvaluationError
+from deworldsg_ros.evaluation import tables
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
-from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
-from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
-from deworldsg_ros.evaluation.runner import ScanTask
-from deworldsg_ros.evaluation.tables import parallel
-from deworldsg_ros.evaluation.tables.jobs import Job, fingerprint, run_job
-from deworldsg_ros.evaluation.tables.paper_numbers import (
+from deworldsg_ros.evaluation.rows import (
     ABLATION_3DSSG,
     MAIN_3DSSG,
     POSE_REPLICA,
     REPLICA_TEST_SCANS,
     RUNTIME_MS,
+    SWITCHES,
+    TABLES,
+    Configurations,
+    table_rows,
 )
-from deworldsg_ros.evaluation.tables.parallel import run_jobs
-from deworldsg_ros.evaluation.tables.row_results import paper_rows, total_ms
-from deworldsg_ros.evaluation.tables.rows import SWITCHES, TABLES, Configurations, table_rows
+from deworldsg_ros.evaluation.runner import ScanTask, to_prediction
+from deworldsg_ros.evaluation.scoring import ProtocolOptions
+from deworldsg_ros.evaluation.tables import (
+    Job,
+    fingerprint,
+    paper_rows,
+    run_job,
+    run_jobs,
+    total_ms,
+)
+from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.recordings.recording import Recording, open_source
+from deworldsg_ros.scene.errors import EvaluationError
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.graph_file import read_graph
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +146,7 @@ def test_processes_give_the_same_results_and_survive_a_crash(
     deadly = job(root, tmp_path / "deadly", scan="deadly", config=Deadly())
     jobs = [job(root, tmp_path / "fross", method="fross"), deadly, job(root, tmp_path / "kim")]
     results = {result.scan: result for result in run_jobs(jobs, workers=2)}
-    assert results["deadly"].failure == parallel.DIED
+    assert results["deadly"].failure == tables.DIED
     expected = run_job(job(root, tmp_path / "here"))
     assert results["room_0"].outcome is not None
     assert expected.outcome is not None
@@ -339,7 +346,7 @@ def test_a_probe_that_knows_the_subject_has_no_printed_row(
 ) -> None:
     files = configurations(root_dir, tmp_path)
     backbone = BackboneIdentity("vjepa2", 48, 32, 16)
-    write_card(tmp_path, ProbeCard(backbone, ("on",), inputs=inputs))
+    write_probe_card(tmp_path, ProbeCard(backbone, ("on",), inputs=inputs))
     rows = table_rows("ablation", [PoseSource()], FrontEndChoice("backend"), files)
     assert {row.name: bool(row.printed) for row in rows}["e"] == printed
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.evaluation.measures.temporal import measure_stream, true_objects
-from deworldsg_ros.scene import wire
+from deworldsg_ros.evaluation.temporal import measure_stream, true_objects
+from deworldsg_ros.wire import messages as wire
 
 ZERO = wire.stamp_from_ns(0)
 

@@ -12,9 +12,8 @@ from support.view import make_graph, make_node
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import moved_object
 from deworldsg_ros.fleet.fleet import FRAME_ID, Fleet
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.rigid import rigid_motion
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion
+from deworldsg_ros.wire import messages as wire
 
 SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"
 ROOM = SceneGraph.load(SAVED)

@@ -14,7 +14,7 @@ from support.nodes import NodeProcess, peer, wait_until
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"
 LIMIT_S = 60.0

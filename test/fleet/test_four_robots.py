@@ -23,14 +23,13 @@ from support.nodes import ROOT, NodeProcess, peer
 
 from deworldsg_ros.client import SceneGraph, SceneGraphClient
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.recorded_room import SPELLINGS, open_annotations
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.codec import local_graph_to_message
-from deworldsg_ros.scene.rigid import rigid_motion
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_to_message
 
 RECORDING = ROOT / "bags" / "demo_room"
 EVERY = 2  # frames of the recording

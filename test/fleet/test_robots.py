@@ -12,9 +12,9 @@ from support.view import make_graph, make_node
 
 from deworldsg_ros.fleet import zenoh_link
 from deworldsg_ros.fleet.zenoh_link import GONE_S, Robots, robot_key
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.change_log import ChangeLog
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import ChangeLog
 
 
 class Network:

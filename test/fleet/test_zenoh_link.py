@@ -11,9 +11,9 @@ import pytest
 from support.view import make_graph, make_node
 
 from deworldsg_ros.fleet.zenoh_link import Feed, Follower, Robots, open_session, robot_key
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.change_log import ChangeLog
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import ChangeLog
 
 pytest.importorskip("zenoh", reason="needs the extra fleet: eclipse-zenoh")
 LIMIT_S = 20.0

@@ -37,20 +37,19 @@ from support.sequences import write_ground_truth, write_room, write_sequence
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.checkpoints import card, headers, probe_card
+from deworldsg_ros.checkpoints import cards, hub
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig, to_mapping, to_yaml
-from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.poses.trajectory import read_trajectory, write_tum
-from deworldsg_ros.recordings.folders.annotations import Annotations
-from deworldsg_ros.recordings.folders.instances import read_instances
-from deworldsg_ros.recordings.folders.ply import read_vertices
-from deworldsg_ros.recordings.folders.rooms import read_ground_truth
-from deworldsg_ros.recordings.messages import TF_MESSAGE
+from deworldsg_ros.recordings.folders.annotations import Annotations, read_vertices
+from deworldsg_ros.recordings.folders.sequence import read_ground_truth, read_instances
 from deworldsg_ros.recordings.recording import open_recording
-from deworldsg_ros.scene import graph_file, wire
+from deworldsg_ros.recordings.source import TF_MESSAGE
+from deworldsg_ros.wire import messages as wire
 from fuzz.target import Target
 
 # --- hypothesis: whole documents -------------------------------------------------------------
@@ -300,20 +299,18 @@ def _read_predictions(folder: Path) -> None:
 
 
 def _write_card(folder: Path) -> None:
-    made = card.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
-    card.write_card(folder / card.CARD_FILE, made)
+    made = cards.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
+    cards.write_detector_card(folder / cards.DETECTOR_CARD, made)
 
 
 def _write_probe_card(folder: Path) -> None:
-    identity = probe_card.BackboneIdentity("vjepa2", 48, 32, 4)
-    made = probe_card.ProbeCard(
-        identity, ("on", "near"), training={"groups_by_part": {"train": []}}
-    )
-    probe_card.write_card(folder, made)
+    identity = cards.BackboneIdentity("vjepa2", 48, 32, 4)
+    made = cards.ProbeCard(identity, ("on", "near"), training={"groups_by_part": {"train": []}})
+    cards.write_probe_card(folder, made)
 
 
 def _read_probe_card(folder: Path) -> None:
-    found = probe_card.read_card(folder)
+    found = cards.read_probe_card(folder)
     assert found.seen_groups is not None and found.input_dim > 0
     str(found.backbone)
 
@@ -328,7 +325,7 @@ def _write_headers(folder: Path) -> None:
 
 def _write_graph(folder: Path) -> None:
     nodes = [make_node(1, "cup", points=[(0, 0, 0)]), make_node(2, "table", (0.3, 0, 0))]
-    graph_file.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
+    graph_files.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
 
 
 TARGETS: list[Target] = [
@@ -372,14 +369,14 @@ TARGETS: list[Target] = [
     Target(
         "checkpoint_card",
         _write_card,
-        lambda folder: card.read_card(folder / card.CARD_FILE),
+        lambda folder: cards.read_detector_card(folder / cards.DETECTOR_CARD),
         documents=JSON_DOCUMENTS,
     ),
     Target("probe_card", _write_probe_card, _read_probe_card, documents=JSON_DOCUMENTS),
     Target(
         "safetensors",
         _write_headers,
-        lambda folder: headers.read_headers(folder / "model.safetensors"),
+        lambda folder: hub.read_headers(folder / "model.safetensors"),
     ),
-    Target("scene_graph", _write_graph, graph_file.read_graph, documents=JSON_DOCUMENTS),
+    Target("scene_graph", _write_graph, graph_files.read_graph, documents=JSON_DOCUMENTS),
 ]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from deworldsg_ros.parsing import check_yaml
+from deworldsg_ros.base.files import check_yaml
 
 Mutation = Callable[[bytes, random.Random], bytes]
 

@@ -24,21 +24,22 @@ from support.hostile import (
 )
 
 from deworldsg_ros.client import ClientError, SceneGraph
-from deworldsg_ros.client.asking import ask
 from deworldsg_ros.client.export import FORMATS
+from deworldsg_ros.client.questions import ask
 from deworldsg_ros.config import Config, MergingConfig, RelationsConfig
 from deworldsg_ros.fleet.fleet import Fleet
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations.graph_view import PublishedGraph
-from deworldsg_ros.scene import codec, wire
+from deworldsg_ros.relations.clips import PublishedGraph
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, RelationEvidence
-from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.view import picture
-from deworldsg_ros.view.geometry import view_axes
+from deworldsg_ros.view.colours import view_axes
 from deworldsg_ros.view.live.state import LiveState
 from deworldsg_ros.view.markers import markers
 from deworldsg_ros.view.page import content_of
+from deworldsg_ros.wire import codec
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 from fuzz.target import Target
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -9,10 +9,14 @@ from hypothesis import strategies as st
 from support.reference_lifting import kept_layer, reference_lift
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting.constants import LiftingConstants
-from deworldsg_ros.lifting.depth_layer import dominant_layer
-from deworldsg_ros.lifting.pixels import valid_depth
-from deworldsg_ros.lifting.spatial import masks_of, spatial_inliers, valid_pixel_count
+from deworldsg_ros.lifting.refine import (
+    dominant_layer,
+    masks_of,
+    spatial_inliers,
+    valid_depth,
+    valid_pixel_count,
+)
+from deworldsg_ros.lifting.stage import LiftingConstants
 from deworldsg_ros.scene.camera import Intrinsics
 
 PAPER, PRINTED = LiftingConfig(), LiftingConstants()

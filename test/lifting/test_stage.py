@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from support.reference_lifting import reference_lift
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting import Lifting, depth_layer, moments, pixels, spatial
-from deworldsg_ros.lifting.constants import LiftingConstants
+from deworldsg_ros.lifting import Lifting, refine, stage
+from deworldsg_ros.lifting.stage import LiftingConstants
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
@@ -277,12 +277,12 @@ def test_inputs_of_another_size_or_range_are_refused(change, reason):
 def test_warm_up_compiles_everything_that_a_frame_needs():
     Lifting(LiftingConfig()).warm_up()
     entry_points = (
-        pixels._valid_depth,
-        pixels._is_valid,
-        spatial._masks_of,
-        spatial._spatial_inliers,
-        depth_layer._dominant_layer,
-        moments._estimate,
+        refine._valid_depth,
+        refine._is_valid,
+        refine._masks_of,
+        refine._spatial_inliers,
+        refine._dominant_layer,
+        stage._estimate,
     )
     # Other tests of this process may have compiled more.
     known = {kernel: len(kernel.signatures) for kernel in entry_points}

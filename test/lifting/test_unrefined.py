@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting.spatial import masks_of
-from deworldsg_ros.lifting.stage import Lifting
-from deworldsg_ros.lifting.unrefined import box_pixels, mask_pixels
+from deworldsg_ros.lifting.refine import masks_of
+from deworldsg_ros.lifting.stage import Lifting, box_pixels, mask_pixels
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
 

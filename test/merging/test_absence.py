@@ -9,9 +9,9 @@ from support.node_states import node_states
 from support.surfaces import CAMERA, CHAIR, CUP, HERE, TABLE, WHOLE, depth_grid, frame, slab
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.scene.frame_graph import DepthGrid
-from deworldsg_ros.scene.graph import SceneGraph
 
 THERE = slab((-0.4, -0.1, 0.7), (0.08, 0.08, 0.06))
 

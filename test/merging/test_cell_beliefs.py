@@ -13,17 +13,24 @@ from support.node_states import node_states
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.merging import SurfaceMerging
-from deworldsg_ros.merging.cell_beliefs import HIT, MAX_SCORE, MISS, SHOWN_FRACTION, SHOWN_M
 from deworldsg_ros.merging.cell_kernels import CellSets
+from deworldsg_ros.merging.surface_map import (
+    CELL_M,
+    HIT,
+    MAX_SCORE,
+    MISS,
+    SHOWN_FRACTION,
+    SHOWN_M,
+    VoxelMap,
+)
 from deworldsg_ros.merging.views import frame_arrays
-from deworldsg_ros.merging.voxel_map import CELL_M, VoxelMap
-from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
-from deworldsg_ros.scene.graph import SceneGraph
 
 SHAPE = (60, 80)
 WALL_M = 1.0
@@ -141,11 +148,11 @@ def test_a_map_of_an_older_release_starts_without_evidence(tmp_path: Path) -> No
         whole.integrate(view(stamp, TRUE_M))
     path = tmp_path / "room.map"
     write_map(whole, path)
-    arrays = graph_io.read(path)
+    arrays = graph_files.read(path)
     for name in ("scores", "records", "looks", "fates", "last_ns"):
         del arrays[f"merging.{name}"]
     del arrays["existence"]
-    graph_io.write(path, arrays)
+    graph_files.write(path, arrays)
     again = read_map(config, path)
     assert again.integrate(view(4, TRUE_M)) == [1]
     assert again.full().nodes[0].existence > 0.5

@@ -8,18 +8,12 @@ from support.merging import VOCABULARY
 from support.surfaces import CHAIR, CUP, HERE, TABLE, frame, slab, view
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.edits import MAX_UNDO, DeleteNode, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
-from deworldsg_ros.scene import graph_io, wire
-from deworldsg_ros.scene.edits import (
-    MAX_UNDO,
-    DeleteNode,
-    MergeNodes,
-    SetLabel,
-    SplitNode,
-    Undo,
-)
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.wire import messages as wire
 
 # A long table as two halves, which a detector may see as two tables, and something in its place.
 LEFT, RIGHT = slab((-0.3, 0.1, 0.7), (0.5, 0.3, 0.01)), slab((0.22, 0.1, 0.7), (0.5, 0.3, 0.01))
@@ -271,7 +265,7 @@ def test_a_map_with_wrong_edits_is_refused(tmp_path, damage, message):
     room = Room((HERE, CUP), (WHOLE, TABLE))
     path = tmp_path / "room.map"
     write_map(room.builder, path)
-    graph_io.write(path, {**graph_io.read(path), "edits": np.frombuffer(damage, np.uint8)})
+    graph_files.write(path, {**graph_files.read(path), "edits": np.frombuffer(damage, np.uint8)})
     with pytest.raises(Exception, match=message):
         read_map(Config(), path)
 

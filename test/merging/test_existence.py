@@ -13,11 +13,11 @@ from support.node_states import node_states
 from support.surfaces import CUP, HERE, depth_grid, frame
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.merging import PaperMerging, SurfaceMerging, existence
-from deworldsg_ros.merging.node_records import NodeRecords
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.merging import PaperMerging, SurfaceMerging, beliefs
+from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import FULL, HALF, QUARTER
-from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.graph import SceneGraph
 
 STEP_M = 0.05  # 4 degrees, seen from the cup
 
@@ -59,8 +59,8 @@ class Walk:
 
     def reload(self, path: Path) -> None:
         """Continue with the saved graph alone, without the memory of the rule."""
-        graph_io.save(self.graph, path)
-        self.graph = graph_io.load(path)
+        graph_files.save(self.graph, path)
+        self.graph = graph_files.load(path)
         self.merging = SurfaceMerging(MergingConfig())
         self.merging.restore(self.graph, {})
 
@@ -231,7 +231,7 @@ def look(
     weight: float = 1.0,
 ) -> None:
     arrays = np.array([score]), np.array([visibility]), np.zeros((1, 3))
-    records.last_ns = stamp_ns - round(weight * existence.LOOK_NS)
+    records.last_ns = stamp_ns - round(weight * beliefs.LOOK_NS)
     records.look([owner], *arrays, camera_world, stamp_ns)
 
 
@@ -269,7 +269,7 @@ def test_the_fate_of_a_node_is_counted_once_and_only_after_a_clear_miss() -> Non
     records = records_of(3)
     records.rows["missed_since"][:3] = 0.0, 2.0, 0.0
     for _ in range(2):
-        existence.settle(records.rows, records.fates, np.arange(3), np.array([0.95, 0.05, 0.05]))
+        beliefs.settle(records.rows, records.fates, np.arange(3), np.array([0.95, 0.05, 0.05]))
         assert records.fates.tolist() == [11, 11]
 
 
@@ -291,24 +291,24 @@ def reference(looks: list[list[tuple[float, int, float]]], rates: dict[int, floa
         rates: of detection, by visibility.
     """
     best = max(score for frames in looks for score, _, _ in frames)
-    best = min(max(best, existence.MIN_SCORE), existence.MAX_SCORE)
+    best = min(max(best, beliefs.MIN_SCORE), beliefs.MAX_SCORE)
     detected = missed = since = 0.0
     for frames in looks:
         total = sum(weight for _, _, weight in frames)
         fraction = sum(weight for score, _, weight in frames if score) / total
         visibility = max(visibility for _, visibility, _ in frames)
         evidence = (
-            -min(existence.MAX_WEIGHT, total) * (1.0 - fraction) * math.log(1.0 - rates[visibility])
+            -min(beliefs.MAX_WEIGHT, total) * (1.0 - fraction) * math.log(1.0 - rates[visibility])
         )
-        detected += min(existence.MAX_WEIGHT, total) * fraction
+        detected += min(beliefs.MAX_WEIGHT, total) * fraction
         missed += evidence
         since = 0.0 if fraction else since + evidence
     return (
-        existence.OFFSET
-        + existence.SCORE * math.log(best / (1 - best))
-        + existence.LOOKS * math.log(detected)
-        - existence.MISSES * math.log(1 + missed)
-        - existence.MOMENT * math.log(1 + since)
+        beliefs.OFFSET
+        + beliefs.SCORE * math.log(best / (1 - best))
+        + beliefs.LOOKS * math.log(detected)
+        - beliefs.MISSES * math.log(1 + missed)
+        - beliefs.MOMENT * math.log(1 + since)
     )
 
 

@@ -12,29 +12,27 @@ from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
 from support.merging import local_graph, random_classes, random_covariances, seeds
 
-from deworldsg_ros.merging.assignment import assign
-from deworldsg_ros.merging.joint import (
-    NESTED_FRACTION,
-    OVERLAPPING_WEIGHT,
-    SEPARATE_WEIGHT,
-    SURE_SCORE,
-    TOUCHING_WEIGHT,
-    WIDE_STEP_M,
-    JointEvidence,
-)
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.matching import (
     CLASS_AGREEMENT,
     CLASS_WEIGHT,
     GAUSSIAN_WEIGHT,
     MAX_DEVIATIONS,
     MIN_FRACTION_OTHER_CLASS,
+    NESTED_FRACTION,
     OVERLAP_THRESHOLD_OTHER_CLASS,
+    OVERLAPPING_WEIGHT,
+    SEPARATE_WEIGHT,
+    SURE_SCORE,
+    TOUCHING_WEIGHT,
+    WIDE_STEP_M,
+    JointEvidence,
     Matches,
+    assign,
     match,
     one_to_one,
 )
 from deworldsg_ros.scene.gaussian import bhattacharyya_distance
-from deworldsg_ros.scene.nodes import NodeTable
 
 OVERLAP_THRESHOLD = 0.3
 CELL_M = 0.03

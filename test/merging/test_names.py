@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.merging import names
-from deworldsg_ros.merging.node_records import NodeRecords
+from deworldsg_ros.merging import beliefs
+from deworldsg_ros.merging.records import NodeRecords
 
 COUNT = 12
 
@@ -65,22 +65,22 @@ def test_more_labels_than_places_keep_the_probable_ones(seed: int) -> None:
 def reference(frames: list[np.ndarray], step_s: float) -> np.ndarray:
     """The same filter with all labels, by matrices; for few classes."""
     count = len(frames[0])
-    drawn = np.full((count, count), names.WRONG / (count - 1))
-    np.fill_diagonal(drawn, 1 - names.WRONG)
+    drawn = np.full((count, count), beliefs.WRONG / (count - 1))
+    np.fill_diagonal(drawn, 1 - beliefs.WRONG)
     joint = drawn * frames[0][None]
     for seen in frames[1:]:
-        leave = 1 - np.exp(-step_s / names.SPELL_S)
+        leave = 1 - np.exp(-step_s / beliefs.SPELL_S)
         joint = (1 - leave) * joint + leave * drawn * joint.sum(axis=1, keepdims=True)
-        joint = joint * ((1 - names.OUTLIERS) * seen + names.OUTLIERS / count)[None]
+        joint = joint * ((1 - beliefs.OUTLIERS) * seen + beliefs.OUTLIERS / count)[None]
         joint /= joint.sum()
-    return names.OTHERS / count + (1 - names.OTHERS) * joint.sum(axis=1)
+    return beliefs.OTHERS / count + (1 - beliefs.OTHERS) * joint.sum(axis=1)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_the_filter_is_that_of_the_definition(seed: int) -> None:
     """With no more classes than places, all labels are considered."""
     rng = np.random.default_rng(seed)
-    frames = [rng.dirichlet(np.full(names.LABELS, 0.5)) for _ in range(15)]
+    frames = [rng.dirichlet(np.full(beliefs.LABELS, 0.5)) for _ in range(15)]
     records = NodeRecords()
     records.add(1, frames[0], 0)
     for index, seen in enumerate(frames[1:], 1):

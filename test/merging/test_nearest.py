@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from support.merging import random_classes, random_covariances, random_pose, seeds
 from support.reference_merging import class_distance, may_merge
 
-from deworldsg_ros.merging.nearest import (
+from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.merging.paper_rule import (
     _nearest,
     bhattacharyya_bound,
     nearest_row,
@@ -21,7 +22,6 @@ from deworldsg_ros.scene.gaussian import (
     eigenvalue_bound,
     hellinger_distance,
 )
-from deworldsg_ros.scene.nodes import NodeTable
 
 
 def table_of(means, covariances, classes, ids=None) -> NodeTable:

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from support.merging import seeds
 from support.surfaces import depth_grid
 
-from deworldsg_ros.merging.node_grid import BALL_DEVIATIONS, NodeGrid
-from deworldsg_ros.merging.views import FrameArrays, frame_arrays
+from deworldsg_ros.merging.views import BALL_DEVIATIONS, FrameArrays, NodeGrid, frame_arrays
 from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion
 
 # Margin of the comparison with sampled points of a ball, metres.

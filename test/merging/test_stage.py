@@ -16,11 +16,11 @@ from support.merging import (
 from support.reference_merging import ReferenceMerging
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import PaperMerging
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import transform
-from deworldsg_ros.scene.graph import SceneGraph
 
 CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])
 

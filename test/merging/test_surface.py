@@ -9,11 +9,11 @@ from support.node_states import node_states
 from support.surfaces import CHAIR, CUP, TABLE, WHOLE, frame, slab, view
 
 from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import SurfaceMerging
-from deworldsg_ros.merging.voxel_map import CELL_M
+from deworldsg_ros.merging.surface_map import CELL_M
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
 
 
 @pytest.fixture

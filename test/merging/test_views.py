@@ -11,6 +11,7 @@ from support.gaussians import moments
 from support.merging import seeds
 from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
 
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.views import (
     FULL,
     HALF,
@@ -24,7 +25,6 @@ from deworldsg_ros.merging.views import (
 )
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
-from deworldsg_ros.scene.nodes import NodeTable
 
 BOARD = slab((0, 0, 1), (0.8, 0.8, 0.004))
 LEFT = slab((-0.2, 0, 1), (0.3, 0.3, 0.004))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deworldsg_ros.merging.cell_kernels import MIN_OWNER_CELLS
-from deworldsg_ros.merging.voxel_map import VoxelMap
+from deworldsg_ros.merging.surface_map import VoxelMap
 
 seeds = st.integers(0, 10**6)
 CELL_M = 0.05

@@ -16,14 +16,14 @@ from support.nodes import Camera, NodeProcess, Peer, peer
 from visualization_msgs.msg import MarkerArray
 
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.pipeline import Pipeline
-from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.recordings.source import Role
 from deworldsg_ros.ros.health import LISTENERS
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
 FRAMES = 12

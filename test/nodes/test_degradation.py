@@ -20,13 +20,13 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.perception import Perception
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-from deworldsg_ros.ros import models, perceiving, relating
+from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.health import ERROR, WARN
 from deworldsg_ros.ros.models import Faults, parse_faults
-from deworldsg_ros.ros.process import EXIT_HUNG, RESPAWN_VARIABLE
-from deworldsg_ros.scene import wire
+from deworldsg_ros.ros.node import EXIT_HUNG, RESPAWN_VARIABLE
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 LIMIT_S = 0.5
 HANG_S = 3.0
@@ -41,9 +41,9 @@ def short_limits(monkeypatch: pytest.MonkeyPatch) -> None:
         return Perception(backend, backend, backend, config, world_up=world_up)
 
     loaded_on.clear()
-    monkeypatch.setattr(perceiving, "build_perception", build)
-    monkeypatch.setattr(perceiving, "PERCEPTION_LIMIT_S", LIMIT_S)
-    monkeypatch.setattr(relating, "WORLD_MODEL_LIMIT_S", LIMIT_S)
+    monkeypatch.setattr(models, "build_perception", build)
+    monkeypatch.setattr(models, "PERCEPTION_LIMIT_S", LIMIT_S)
+    monkeypatch.setattr(models, "WORLD_MODEL_LIMIT_S", LIMIT_S)
     monkeypatch.setattr(models, "SLOW_S", LIMIT_S / 2)
     monkeypatch.setattr(models, "RELOAD_PERIOD_S", 0.2)
 
@@ -207,7 +207,7 @@ def test_a_model_that_keeps_failing_is_loaded_again(segmentation: MakeBench) -> 
 def test_relations_go_on_without_the_world_model(
     monkeypatch: pytest.MonkeyPatch, fault: str
 ) -> None:
-    monkeypatch.setattr(relating, "build_world_model", lambda config, device: FakeWorldModel(2))
+    monkeypatch.setattr(models, "build_world_model", lambda config, device: FakeWorldModel(2))
     options = {
         "relations.clip_length": 2,
         "relations.max_clips_per_s": 0.0,

@@ -14,6 +14,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "test")]
 
 from support import abnormal  # noqa: E402
 
+from deworldsg_ros.ros.health import REASONS  # noqa: E402
 from deworldsg_ros.ros.options import (  # noqa: E402
     FleetLinkParameters,
     FleetParameters,
@@ -23,7 +24,6 @@ from deworldsg_ros.ros.options import (  # noqa: E402
     ViewerParameters,
 )
 from deworldsg_ros.ros.parameters import Field, fields  # noqa: E402
-from deworldsg_ros.ros.reasons import REASONS  # noqa: E402
 
 PAGES = (
     ROOT / "docs" / "dev" / "nodes.md",
@@ -45,7 +45,7 @@ PACKAGES = (
     "relations",
     "graph_builder.py",
 )
-SCENE = ("camera.py", "codec.py", "wire.py")
+SCENE = ("camera.py", "codec.py", "wire/messages.py")
 
 
 def reasons_table() -> str:

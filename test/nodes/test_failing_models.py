@@ -11,7 +11,7 @@ from support.nodes_bench import CAMERA, Bench, bench, send_frame, works
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.perception import Perception
-from deworldsg_ros.ros import perceiving
+from deworldsg_ros.ros import models
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def segmentation(backend: Backend) -> Iterator[Bench]:
         return Perception(backend, backend, backend, config, world_up=world_up)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(perceiving, "build_perception", build)
+        patch.setattr(models, "build_perception", build)
         yield from bench(SegmentationNode, CAMERA)
 
 

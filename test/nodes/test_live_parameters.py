@@ -17,12 +17,12 @@ from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.perception import Perception
-from deworldsg_ros.ros import perceiving
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import fields
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
@@ -37,7 +37,7 @@ def perception(monkeypatch: pytest.MonkeyPatch) -> None:
         backend = Backend()
         return Perception(backend, backend, backend, config, world_up=world_up)
 
-    monkeypatch.setattr(perceiving, "build_perception", build)
+    monkeypatch.setattr(models, "build_perception", build)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from std_msgs.msg import String
 from support.nodes_bench import Bench, local_graph
 
 from deworldsg_ros.nodes.graph_node import GraphNode
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 LOCAL = "deworldsg/local_graph"
 

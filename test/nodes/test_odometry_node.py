@@ -14,13 +14,15 @@ from support.corner_room import INTRINSICS, LEVEL, corner_frame, walk
 from support.nodes_bench import Bench, bench, camera_info, image, works
 from support.streams import tf, transform
 
-from deworldsg_ros.nodes.odometry_node import OdometryNode
+from deworldsg_ros.nodes.odometry_node import OdometryNode, camera_transform
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.transform_output import camera_transform
-from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.rigid import rigid_motion
-from deworldsg_ros.streams.poses import pose_from_message, pose_from_transform, stamp_ns_of
-from deworldsg_ros.streams.transforms import TransformTree
+from deworldsg_ros.scene.camera import invert_pose, rigid_motion
+from deworldsg_ros.streams.poses import (
+    TransformTree,
+    pose_from_message,
+    pose_from_transform,
+    stamp_ns_of,
+)
 
 STAMP_NS = 1_700_000_000_123_456_789
 TOPICS = {"rgb/image_raw": Image, "depth/image_raw": Image, "rgb/camera_info": CameraInfo}

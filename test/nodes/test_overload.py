@@ -31,15 +31,14 @@ from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-from deworldsg_ros.ros import perceiving, relating
+from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.graph_keeper import QUEUE_JOBS
 from deworldsg_ros.ros.health import received_in
 from deworldsg_ros.ros.joining import COLLECT_PERIOD_S, MAX_BUSY_S
-from deworldsg_ros.ros.node import serve
+from deworldsg_ros.ros.node import Waiting, serve
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.ros.waiting import Waiting
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
@@ -111,7 +110,7 @@ class Hanging(FakeWorldModel):
 
 
 def test_evidence_continues_while_the_world_model_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(relating, "build_world_model", lambda config, device: Hanging(2))
+    monkeypatch.setattr(models, "build_world_model", lambda config, device: Hanging(2))
     options = {"relations.clip_length": 2, "relations.max_clips_per_s": 0.0}
     at = Bench(
         RelationNode,
@@ -138,7 +137,7 @@ def whole() -> Iterator[Bench]:
         return Perception(backend, backend, backend, config, world_up=world_up)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(perceiving, "build_perception", build)
+        patch.setattr(models, "build_perception", build)
         made = Bench(DeworldsgNode, CAMERA, parameter_overrides=PAPER)
         yield made
         made.close()

@@ -36,17 +36,17 @@ from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
 from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
-from deworldsg_ros.ros import joining, perceiving
-from deworldsg_ros.scene import wire
-from deworldsg_ros.streams import frame_assemblers
+from deworldsg_ros.ros import joining, models
+from deworldsg_ros.streams import frames
 from deworldsg_ros.streams.poses import stamp_ns_of
+from deworldsg_ros.wire import messages as wire
 
 
 @pytest.fixture(scope="module")
 def segmentation() -> Iterator[Bench]:
     with pytest.MonkeyPatch.context() as patch:
         # A busy machine delays the worker for longer. One test below is about this wait.
-        patch.setattr(perceiving, "MAX_BUSY_S", LIMIT_S)
+        patch.setattr(models, "MAX_BUSY_S", LIMIT_S)
         yield from bench(SegmentationNode, CAMERA)
 
 
@@ -123,7 +123,7 @@ def test_a_slow_node_drops_the_oldest_frames(
 ) -> None:
     """It decodes only the frames that it processes, the newest among them."""
     begin = threading.Event()
-    perceive, decode = segmentation.node._perception.perceive, frame_assemblers.rgb_from_message
+    perceive, decode = segmentation.node._perception.perceive, frames.rgb_from_message
     processed: list[int] = []
     decoded: list[int] = []
 
@@ -138,7 +138,7 @@ def test_a_slow_node_drops_the_oldest_frames(
 
     with monkeypatch.context() as patch:
         patch.setattr(segmentation.node._perception, "perceive", wait)
-        patch.setattr(frame_assemblers, "rgb_from_message", note)
+        patch.setattr(frames, "rgb_from_message", note)
         worker = segmentation.node._worker
         patch.setattr(worker, "_max_busy_s", 0.0)
 

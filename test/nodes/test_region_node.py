@@ -17,8 +17,8 @@ from deworldsg_ros.client import SceneGraph, SceneGraphClient
 from deworldsg_ros.nodes.region_node import RegionNode, region_of
 from deworldsg_ros.ros.options import RegionOptions
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"
 LIMIT_S = 60.0

@@ -13,13 +13,13 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from support.nodes_bench import Bench, changed, local_graph, rgb
 
-from deworldsg_ros.checkpoints.card import CheckpointCard, write_card
+from deworldsg_ros.checkpoints.cards import CheckpointCard, write_detector_card
 from deworldsg_ros.nodes.relation_node import RelationNode
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
-from deworldsg_ros.ros import relating
+from deworldsg_ros.relations.world_model import FakeWorldModel
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 WORLD_MODEL = [
     Parameter("relations.world_model", value="fake"),
@@ -167,10 +167,10 @@ def test_predicates_of_an_imported_checkpoint_are_known(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The relation node runs no perception, and may run where its checkpoint is not."""
-    monkeypatch.setattr(relating, "build_world_model", lambda config, device: Bound(4))
+    monkeypatch.setattr(models, "build_world_model", lambda config, device: Bound(4))
     chosen = {"perception__predicate_set": "checkpoint"}
     for predicates in (("on", "under"), ("on", "near"), ()):
-        write_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
+        write_detector_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
         if predicates == ("on", "under"):
             start(**chosen, perception__detector_path=str(tmp_path))
             continue

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from std_msgs.msg import String
 from support.nodes_bench import local_graph
 
-from deworldsg_ros.nodes.replay_monitor import (
+from deworldsg_ros.nodes.replay_node import (
     BETWEEN,
     EVIDENCE_QUIET_S,
     FIRST_RESULT_S,
@@ -19,7 +19,7 @@ from deworldsg_ros.nodes.replay_monitor import (
     WINDOW_FRAMES,
     PipelineMonitor,
 )
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 STALL_S = 30.0
 

@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from support.nodes import NodeProcess, peer, wait_until
 from support.recordings import camera_items, pose, stamp_ns, transform, write_bag
 
-from deworldsg_ros.recordings import events, messages
+from deworldsg_ros.recordings import replaying, source
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.streams.poses import stamp_ns_of
 
@@ -41,7 +41,7 @@ def events_of(process):
     found = []
     for line in process.log.splitlines():
         try:
-            found.append(events.decode(line))
+            found.append(replaying.decode(line))
         except msgspec.MsgspecError:
             continue
     return found
@@ -79,7 +79,7 @@ def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
     assert clocks
     assert clocks[-1].clock.sec * 10**9 + clocks[-1].clock.nanosec == stamp_ns(COUNT - 1)
     finished = events_of(process)[-1]
-    assert isinstance(finished, events.Finished)
+    assert isinstance(finished, replaying.Finished)
     assert finished.published == COUNT
 
 
@@ -88,7 +88,7 @@ def test_poses_from_tf_are_published_as_poses(tmp_path):
     items += [
         (
             "/tf",
-            messages.TF_MESSAGE,
+            source.TF_MESSAGE,
             stamp_ns(i),
             transform(stamp_ns(i), "map", "camera_optical", pose(i)),
         )
@@ -128,7 +128,7 @@ def test_without_the_nodes_it_replays_at_the_recorded_rate(tmp_path, bag):
     finally:
         process.end()
     printed = events_of(process)
-    assert any(isinstance(event, events.Waiting) for event in printed)
+    assert any(isinstance(event, replaying.Waiting) for event in printed)
     assert printed[-1].published == COUNT
     assert "replaying without waiting for results" in process.log
 
@@ -185,12 +185,12 @@ def test_named_topics_and_a_parameter_file_are_used(tmp_path, bag):
 
 def test_events_survive_their_line():
     for event in (
-        events.Waiting(["a \n b"]),
-        events.Started(3),
-        events.Progress(1, 2, 3),
-        events.Saved(True, "ok"),
-        events.Finished(1, 1, 0, True, {"n": {"a": "b"}}, {}, ["lost"], [[0.1] * 16]),
+        replaying.Waiting(["a \n b"]),
+        replaying.Started(3),
+        replaying.Progress(1, 2, 3),
+        replaying.Saved(True, "ok"),
+        replaying.Finished(1, 1, 0, True, {"n": {"a": "b"}}, {}, ["lost"], [[0.1] * 16]),
     ):
-        line = events.encode(event)
+        line = replaying.encode(event)
         assert "\n" not in line
-        assert events.decode(line) == event
+        assert replaying.decode(line) == event

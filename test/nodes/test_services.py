@@ -24,14 +24,14 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.client import ClientError, SceneGraphClient
-from deworldsg_ros.client.tools import EditTools, GraphTools
+from deworldsg_ros.client.mcp_server import EditTools, GraphTools
+from deworldsg_ros.graph.graph_files import read_graph
+from deworldsg_ros.graph.provenance import SeenSpace
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.scene.codec import local_graph_to_message
-from deworldsg_ros.scene.graph_file import read_graph
-from deworldsg_ros.scene.seen_space import SeenSpace
+from deworldsg_ros.wire.codec import local_graph_to_message
 
 LOCAL = "deworldsg/local_graph"
 SERVICES = {

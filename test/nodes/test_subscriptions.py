@@ -35,8 +35,8 @@ from deworldsg_ros.ros import inputs
 from deworldsg_ros.ros.inputs import TFMessage
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import AutoSubscription, best_effort, reliable, source
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 
 def published(topics: dict[str, type], **options: Any) -> Iterator[Bench]:

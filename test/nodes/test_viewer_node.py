@@ -12,8 +12,8 @@ from support.view import make_graph, make_node
 import deworldsg_ros.nodes.viewer_node as module
 from deworldsg_ros.nodes.viewer_node import ViewerNode
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 TOPICS = {
     "/scene_graph/updates": String,

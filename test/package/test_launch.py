@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from deworldsg_ros.ros.process import RESPAWN_VARIABLE
+from deworldsg_ros.ros.node import RESPAWN_VARIABLE
 
 
 class Kept:

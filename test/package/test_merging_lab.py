@@ -17,11 +17,11 @@ from support.recordings import write_seven_scenes
 from support.sequences import write_room
 
 from deworldsg_ros.config import Config
+from deworldsg_ros.evaluation.edge_measures import ReferenceScene
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
-from deworldsg_ros.evaluation.measures.reference import ReferenceScene
-from deworldsg_ros.evaluation.protocol.scoring import ProtocolOptions
 from deworldsg_ros.evaluation.runner import ScanTask, evaluate_scan
-from deworldsg_ros.scene.graph_file import read_graph
+from deworldsg_ros.evaluation.scoring import ProtocolOptions
+from deworldsg_ros.graph.graph_files import read_graph
 
 NAMES = ("captures", "capture", "replay")
 

@@ -13,14 +13,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from deworldsg_ros.checkpoints.card import DEFAULT_SCORE_THRESHOLD
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard
+from deworldsg_ros.checkpoints.cards import DEFAULT_SCORE_THRESHOLD, BackboneIdentity, ProbeCard
 from deworldsg_ros.config import Config, LiftingConfig, load_config
-from deworldsg_ros.evaluation.tables.paper_numbers import REPLICA_TEST_SCANS, RUNTIME_MS
+from deworldsg_ros.evaluation.rows import REPLICA_TEST_SCANS, RUNTIME_MS
 from deworldsg_ros.lifting import Lifting
-from deworldsg_ros.lifting.constants import LiftingConstants
-from deworldsg_ros.merging.nearest import bhattacharyya_bound
-from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
+from deworldsg_ros.lifting.stage import LiftingConstants
+from deworldsg_ros.merging.paper_rule import bhattacharyya_bound
+from deworldsg_ros.relations.paper import geometric_costs, neighbour_pairs
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 
@@ -213,8 +212,7 @@ def test_eq_8_halves_the_distance_in_the_image_and_compares_with_0_45() -> None:
 @pytest.mark.models
 def test_the_probe_has_two_fully_connected_layers() -> None:
     torch = pytest.importorskip("torch")
-    from deworldsg_ros.checkpoints.probe_network import build_network
-    from deworldsg_ros.checkpoints.published_probe import PUBLISHED_BACKBONE
+    from deworldsg_ros.checkpoints.probe_network import PUBLISHED_BACKBONE, build_network
 
     assert PUBLISHED_BACKBONE.clip_length == 16
     network = build_network(ProbeCard(BackboneIdentity("vjepa2", 8, 32, 16), ("on", "near")))

@@ -14,7 +14,7 @@ from deworldsg_ros.ros.options import FleetOptions, ViewerOptions
 LOADERS = {"from_pretrained": "use_safetensors", "load": "weights_only"}
 CONFIGURATIONS = {"AutoConfig"}  # without weights
 # Reads pickles without running them.
-UNPICKLER = "deworldsg_ros/evaluation/protocol/pickles.py"
+UNPICKLER = "deworldsg_ros/evaluation/predictions.py"
 ANYWHERE = ("0.0.0.0", "::", "[::]")
 
 

@@ -11,7 +11,7 @@ from support.failing_backend import SHAPE, Backend
 
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception, build_perception
-from deworldsg_ros.ros.reasons import REASONS
+from deworldsg_ros.ros.health import REASONS
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.perception import on_image
 
-from deworldsg_ros.perception.instance_image import instance_image
 from deworldsg_ros.perception.protocols import MaskPatch
+from deworldsg_ros.perception.stage import instance_image
 
 SHAPE = (6, 7)
 

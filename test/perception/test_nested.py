@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.perception import on_image
 
-from deworldsg_ros.perception.nested import in_front_of, join_nested
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
+from deworldsg_ros.perception.stage import in_front_of, join_nested
 
 SCREEN, CUP = [0.9, 0.1], [0.1, 0.9]
 OUTER, INNER, SECOND = [10, 10, 90, 70], [20, 20, 45, 60], [50, 20, 80, 60]

@@ -19,15 +19,15 @@ from support.perception import (
     segmented,
 )
 
-from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
-from deworldsg_ros.perception.geometry.layout import measure_layout, upright_axes
-from deworldsg_ros.perception.geometry.predicates import (
+from deworldsg_ros.perception.backends.geometric import (
     CEILING_LOGIT,
     FLOOR_LOGIT,
+    GeometricRelationHead,
     predicate_logits,
 )
+from deworldsg_ros.perception.backends.layout import measure_layout, upright_axes
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.vocabularies import REPLICA_SSG_PREDICATES, SCANNET_PREDICATES
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES, SCANNET_PREDICATES
 
 SHELF = Slab((-0.5, 2.6, 0.75), (0.5, 2.95, 1.05), (90, 90, 100))
 CHEST = Slab((-0.5, 2.5, 0.0), (0.5, 2.98, 0.4), (100, 60, 60))

@@ -17,15 +17,15 @@ from support.perception import (
     render,
 )
 
-from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.perception.superpixels.mask_upsampling import (
+from deworldsg_ros.perception.backends.regions import adjacency
+from deworldsg_ros.perception.backends.rgbd import (
     COLOUR_STEP,
     DEPTH_STEP,
     DISTANCE_WEIGHT,
     MAX_DEPTH_COST,
+    RgbdSegmenter,
     upsample_labels,
 )
-from deworldsg_ros.perception.superpixels.regions import adjacency
 
 SEGMENTER = RgbdSegmenter()
 

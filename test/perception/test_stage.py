@@ -22,7 +22,7 @@ from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import (
+from deworldsg_ros.scene.vocabulary import (
     COCO_CLASSES,
     PREDICATE_SETS,
     REPLICA_SSG_PREDICATES,

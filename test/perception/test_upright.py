@@ -13,7 +13,7 @@ from support.perception import INTRINSICS, SHAPE
 from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception
 from deworldsg_ros.perception.protocols import MaskPatch
-from deworldsg_ros.perception.upright import Uprighter, turned, turned_back
+from deworldsg_ros.perception.stage import Uprighter, turned, turned_back
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 

@@ -11,8 +11,7 @@ from support.surfaces import CAMERA, CUP, frame, slab
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.poses.drift import Drift, moved
-from deworldsg_ros.poses.surfels import MAX_SURFELS, SurfelMap, difference
+from deworldsg_ros.poses.drift import MAX_SURFELS, Drift, SurfelMap, difference, moved
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
 # Floor, ceiling and walls of a room, and two sides of a box in it: normals n and offsets n · x.

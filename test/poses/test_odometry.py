@@ -8,11 +8,24 @@ import numpy as np
 import pytest
 from support.corner_room import INTRINSICS, LEVEL, camera_at, corner_frame, walk
 
-from deworldsg_ros.poses.depth_alignment import fit_fraction, points_of, refine, surface_of
-from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, check_pose, invert_pose
+from deworldsg_ros.poses.odometry import (
+    HAS_ODOMETRY,
+    LEVEL_CAMERA,
+    RgbdOdometry,
+    fit_fraction,
+    points_of,
+    refine,
+    surface_of,
+)
+from deworldsg_ros.scene.camera import (
+    Intrinsics,
+    RgbdFrame,
+    check_pose,
+    invert_pose,
+    rigid_motion,
+    rotation_angle_deg,
+)
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.rigid import rigid_motion, rotation_angle_deg
 
 
 def track(odometry: RgbdOdometry, frame: RgbdFrame) -> np.ndarray:

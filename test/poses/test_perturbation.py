@@ -11,17 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.corner_room import corner_frame, walk
 
-from deworldsg_ros.poses.frames import track_poses
-from deworldsg_ros.poses.perturbation import (
-    Perturbation,
-    PoseNoise,
-    parse_noise,
-    perturb_poses,
-)
+from deworldsg_ros.poses.odometry import track_poses
+from deworldsg_ros.poses.trajectory import Perturbation, PoseNoise, parse_noise, perturb_poses
 from deworldsg_ros.recordings.posing import gate_jumps
-from deworldsg_ros.scene.camera import RgbdFrame, check_pose, invert_pose
+from deworldsg_ros.scene.camera import RgbdFrame, check_pose, invert_pose, rotation_angle_deg
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.rigid import rotation_angle_deg
 
 STEPS = 400
 

@@ -26,11 +26,10 @@ from support.recordings import (
 
 from deworldsg_ros.config import Config
 from deworldsg_ros.poses.trajectory import TrajectoryError, read_trajectory, write_tum
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.sequence import ROTATED_AXES
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses, posed_frames
 from deworldsg_ros.recordings.recording import Recording, open_source
-from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
+from deworldsg_ros.scene.errors import ConfigurationError, RecordingError, RefusedInput
 
 S = 10**9
 SLOP_NS = 100_000_000

@@ -14,12 +14,12 @@ from support.recordings import (
     write_seven_scenes,
 )
 
-from deworldsg_ros.files import confined
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.base.files import confined
 from deworldsg_ros.recordings.folders.annotations import Annotations
 from deworldsg_ros.recordings.folders.dataset import read_file
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.scene.errors import RecordingError
 
 SECRET = b"root:x:0:0:secret"
 
@@ -123,7 +123,7 @@ def test_a_scan_is_the_name_of_a_folder(tmp_path, name):
 
 def test_a_clip_of_an_index_is_in_its_folder(tmp_path, secret):
     from deworldsg_ros.scene.errors import ConfigurationError
-    from deworldsg_ros.training.labelled_clips import read_clip_folder
+    from deworldsg_ros.training.clips import read_clip_folder
 
     (tmp_path / "clips").mkdir()
     line = '{"clip": "../secret.png", "predicate": "on", "group": "g"}'

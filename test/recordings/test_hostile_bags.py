@@ -11,13 +11,12 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from support.recordings import camera_items, stamp_ns, write_bag
 
-from deworldsg_ros.recordings.bags import chunks, readers, salvage_mcap
-from deworldsg_ros.recordings.bags.salvage_sqlite import salvage_sqlite
-from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import CAMERA_INFO, POSE_STAMPED, typestore
+from deworldsg_ros.recordings.bags import storage
+from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, salvage_sqlite
 from deworldsg_ros.recordings.recording import open_recording, open_source
+from deworldsg_ros.recordings.source import CAMERA_INFO, POSE_STAMPED, typestore
 from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.scene.errors import RecordingError
 
 STRING = "std_msgs/msg/String"
 COUNT = 4
@@ -116,7 +115,7 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
 ) -> None:
     bag = text_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE, [1, 2, 3])
     assert [message.log_time_ns for message in read(bag)] == [1, 2, 3]
-    monkeypatch.setattr(chunks, "MIN_FILE_BYTES", 1_000_000)
+    monkeypatch.setattr(storage, "MIN_FILE_BYTES", 1_000_000)
     with pytest.raises(RecordingError, match="unpacks to more than 1000000 bytes; if you trust"):
         read(bag)
 
@@ -132,7 +131,7 @@ def test_a_compressed_message_unpacks_to_a_limit(
     metadata.rename(tmp_path / "metadata.yaml")
     assert read(bag) == whole
     (tmp_path / "metadata.yaml").rename(metadata)
-    monkeypatch.setattr(chunks, "MAX_CHUNK_BYTES", 500_000)
+    monkeypatch.setattr(storage, "MAX_CHUNK_BYTES", 500_000)
     assert read(bag) == []
     assert (
         "compressed messages are damaged and lost (a message is cut, or unpacks to more than "
@@ -150,7 +149,7 @@ def test_chunks_that_overlap_in_time_are_few(
         tmp_path / "b", StoragePlugin.MCAP, CompressionMode.STORAGE, [0, 9, 1, 8, 2, 7, 3, 6]
     )
     assert len(read(overlapping)) == 8
-    monkeypatch.setattr(readers, "MAX_BYTES_AT_ONCE", 4_000_000)
+    monkeypatch.setattr(storage, "MAX_BYTES_AT_ONCE", 4_000_000)
     assert len(read(one_by_one)) == 12
     for path in (overlapping, overlapping / "b.mcap"):
         with pytest.raises(RecordingError, match=r"4800\d+ bytes would be unpacked at once"):
@@ -158,28 +157,28 @@ def test_chunks_that_overlap_in_time_are_few(
 
 
 def test_bytes_of_chunks_at_once() -> None:
-    assert readers.bytes_at_once([]) == 0
-    assert readers.bytes_at_once([(0, 1, 5), (2, 3, 7), (4, 5, 6)]) == 7
+    assert storage.bytes_at_once([]) == 0
+    assert storage.bytes_at_once([(0, 1, 5), (2, 3, 7), (4, 5, 6)]) == 7
     # A chunk ends after the message at its end.
-    assert readers.bytes_at_once([(0, 2, 5), (2, 3, 7), (4, 5, 6)]) == 12
-    assert readers.bytes_at_once([(0, 9, 1)] * 5 + [(7, 6, 2)]) == 7
+    assert storage.bytes_at_once([(0, 2, 5), (2, 3, 7), (4, 5, 6)]) == 12
+    assert storage.bytes_at_once([(0, 9, 1)] * 5 + [(7, 6, 2)]) == 7
 
 
 def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[int] = []
-    take = salvage_mcap._Tables.take
+    take = storage._Tables.take
 
     def count(self: Any, opcode: int, content: bytes) -> Any:
         taken.append(opcode)
         return take(self, opcode, content)
 
-    monkeypatch.setattr(salvage_mcap._Tables, "take", count)
+    monkeypatch.setattr(storage._Tables, "take", count)
     size = 9 * 1000
-    packed = chunks.zstd.compress(bytes(size))
+    packed = storage.zstd.compress(bytes(size))
     chunk = struct.pack("<QQQI", 0, 1, size, 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
     path = tmp_path / "zeros.mcap"
-    record = struct.pack("<BQ", salvage_mcap.CHUNK, len(chunk + packed)) + chunk + packed
-    path.write_bytes(salvage_mcap.MAGIC + record)
+    record = struct.pack("<BQ", storage.CHUNK, len(chunk + packed)) + chunk + packed
+    path.write_bytes(storage.MAGIC + record)
     with pytest.raises(RecordingError, match="no message could be read"):
         RawBag(path)
     assert not taken

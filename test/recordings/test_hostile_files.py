@@ -13,18 +13,15 @@ import numpy as np
 import pytest
 from support.images import SCAN, many_scans
 
+from deworldsg_ros.base.files import parse_any_json, parse_yaml, read_regular
+from deworldsg_ros.base.words import stamp_ns_from_text
 from deworldsg_ros.cli.configuration import effective_config
-from deworldsg_ros.evaluation.errors import EvaluationError
-from deworldsg_ros.evaluation.protocol.pickles import load_pickle
-from deworldsg_ros.evaluation.protocol.predictions import read_predictions
-from deworldsg_ros.files import read_regular
-from deworldsg_ros.parsing import parse_any_json, parse_yaml
+from deworldsg_ros.evaluation.predictions import load_pickle, read_predictions
 from deworldsg_ros.poses.trajectory import FRAME_NAME
-from deworldsg_ros.recordings.bags.chunks import MAX_CHUNK_BYTES, bound_decompression, decompress
+from deworldsg_ros.recordings.bags.storage import MAX_CHUNK_BYTES, bound_decompression, decompress
 from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
-from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.stamps import stamp_ns_from_text
-from deworldsg_ros.streams.encoded import decode, encoded_size
+from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
+from deworldsg_ros.streams.images import decode, encoded_size
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.recordings.messages import Role
-from deworldsg_ros.recordings.pacing import MAX_UNDECIDED, Pace, Window
+from deworldsg_ros.recordings.replaying import MAX_UNDECIDED, Pace, Window
+from deworldsg_ros.recordings.source import Role
 
 
 @pytest.mark.parametrize(("rate", "due_s"), [(1.0, 12.0), (2.0, 11.0), (0.5, 14.0)])

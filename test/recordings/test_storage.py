@@ -12,8 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from support.recordings import camera_items, stamp_ns, write_bag
 
 from deworldsg_ros.recordings.bags.storage import RawBag
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import typestore
+from deworldsg_ros.recordings.source import typestore
+from deworldsg_ros.scene.errors import RecordingError
 
 RGB = "/camera/color/image_raw/compressed"
 COUNT = 40

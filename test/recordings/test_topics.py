@@ -6,8 +6,7 @@ import pytest
 
 from deworldsg_ros.recordings.bags.storage import Topic
 from deworldsg_ros.recordings.bags.topics import TopicChoice, find_topics
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import (
+from deworldsg_ros.recordings.source import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
@@ -16,6 +15,7 @@ from deworldsg_ros.recordings.messages import (
     TF_MESSAGE,
     Role,
 )
+from deworldsg_ros.scene.errors import RecordingError
 
 REALSENSE = [
     Topic("/camera/camera/color/image_raw", IMAGE, 100),

@@ -10,10 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.relations import VOCABULARY, config
 
-from deworldsg_ros.relations import clip_queue
-from deworldsg_ros.relations.clip_policy import ClipPolicy, PairKey, Rank
-from deworldsg_ros.relations.clip_queue import ClipQueue
-from deworldsg_ros.relations.clips import FrameBuffer, QueuedClip
+from deworldsg_ros.relations import clips
+from deworldsg_ros.relations.clips import (
+    ClipPolicy,
+    ClipQueue,
+    FrameBuffer,
+    PairKey,
+    QueuedClip,
+    Rank,
+)
 
 
 def clip(stamp_ns, geo_cost=0.1, rows=(0, 1)):
@@ -44,7 +49,7 @@ class ByPair(ClipPolicy):
         return [Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes)) for clip in clips]
 
 
-clips = st.lists(
+QUEUES = st.lists(
     st.builds(clip, st.integers(0, 5), st.sampled_from([0.1, 0.2]), st.just((0, 1))), max_size=12
 )
 
@@ -54,7 +59,7 @@ def test_empty_queue_gives_nothing():
     assert len(queue) == 0 and queue.take() is None and queue.ready() == 0 and queue.clear() == 0
 
 
-@given(clips, st.integers(1, 5))
+@given(QUEUES, st.integers(1, 5))
 def test_keeps_the_best_in_order_and_counts_the_rest(items, size):
     queue, dropped = queue_of(size)
     for item in items:
@@ -97,7 +102,7 @@ def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_becom
 
 
 def test_cut_clips_have_bounded_memory_and_the_lowest_ranks_are_dropped(monkeypatch):
-    monkeypatch.setattr(clip_queue, "MAX_CUT_BYTES", 2 * 4 * 300)
+    monkeypatch.setattr(clips, "MAX_CUT_BYTES", 2 * 4 * 300)
     frames = FrameBuffer(3)
     queue, dropped = queue_of(10, ByPair(config()))
     for stamp in (1, 2, 3):

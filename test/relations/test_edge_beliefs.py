@@ -26,21 +26,19 @@ from support.room_nodes import (
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
+from deworldsg_ros.graph import publication
+from deworldsg_ros.graph.pairs import ends_of, frame_votes
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations import edge_beliefs
-from deworldsg_ros.relations.edge_beliefs import MAX_DISTANCE_M, EdgeBeliefs
-from deworldsg_ros.relations.evidence import entropy_nats, fuse_distributions
-from deworldsg_ros.relations.naming import DECIMALS, MIN_PROBABILITY
-from deworldsg_ros.relations.pair_table import PairTable
-from deworldsg_ros.relations.physics_model import load_physics_model
-from deworldsg_ros.relations.predicted_prior import PredictedPrior
-from deworldsg_ros.relations.prior import Prior
-from deworldsg_ros.relations.robust_beliefs import RobustBeliefs, fuse_prior
-from deworldsg_ros.scene import publication, wire
-from deworldsg_ros.scene.edges import ends_of
+from deworldsg_ros.relations import beliefs
+from deworldsg_ros.relations.beliefs import MAX_DISTANCE_M, EdgeBeliefs, PredictedPrior
+from deworldsg_ros.relations.pairs import PairTable
+from deworldsg_ros.relations.paper import Prior, entropy_nats, fuse_distributions
+from deworldsg_ros.relations.physics import load_physics_model
+from deworldsg_ros.relations.settled import RobustBeliefs, fuse_prior
+from deworldsg_ros.relations.states import DECIMALS, MIN_PROBABILITY
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Relations
-from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.scene.votes import frame_votes
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 seeds = st.integers(0, 10_000)
 PREDICATES = VOCABULARY.predicates
@@ -552,7 +550,7 @@ def test_a_large_graph_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> 
     }
     things["table"] = table(0.4, 0.4, 1.2, 1.2)
     at_once = room(things, config())[0].update()
-    for module in (publication, edge_beliefs):
+    for module in (publication, beliefs):
         monkeypatch.setattr(module, "NEW_A_CALL", 3)
     builder, ids = room(things, config())
     calls = 0

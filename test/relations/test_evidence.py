@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.relations import fuse_edge, provenances
 
-from deworldsg_ros.relations.evidence import (
+from deworldsg_ros.relations.paper import (
     PROVENANCES,
     entropy_nats,
     fuse_distributions,

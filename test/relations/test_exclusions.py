@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.special import softmax
 from support.reference_near import near_probabilities
 
-from deworldsg_ros.relations.exclusions import (
+from deworldsg_ros.relations.rules import (
     CARRIED_FIRST,
     CARRIED_SECOND,
     NEAR_CERTAINTY,
@@ -21,7 +21,7 @@ from deworldsg_ros.relations.exclusions import (
     SEAT_GAP_M,
     one_support,
 )
-from deworldsg_ros.relations.physical_states import RELATIONS_OF_STATE, STATE_COUNT, SUPPORTS
+from deworldsg_ros.relations.states import RELATIONS_OF_STATE, STATE_COUNT, SUPPORTS
 
 seeds = st.integers(0, 10_000)
 REST = ~(CARRIED_FIRST | CARRIED_SECOND)

@@ -12,13 +12,8 @@ from support.scripted import PAPER, VOCABULARY, Scripted, frame
 from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.pipeline import Pipeline
-from deworldsg_ros.relations import (
-    LiveGraph,
-    PublishedGraph,
-    RelationReasoner,
-    build_world_model,
-)
-from deworldsg_ros.scene import wire
+from deworldsg_ros.relations import LiveGraph, PublishedGraph, RelationReasoner, build_world_model
+from deworldsg_ros.wire import messages as wire
 
 SURE, UNSURE = (3.0, -3.0, -3.0), (0.001, 0.0, 0.0)
 
@@ -129,7 +124,7 @@ def test_merged_nodes_are_followed_and_removed_ones_may_return():
 
 
 def test_the_number_of_remembered_frames_is_bounded(monkeypatch):
-    monkeypatch.setattr("deworldsg_ros.relations.graph_view.REMEMBERED_FRAMES", 3)
+    monkeypatch.setattr("deworldsg_ros.relations.clips.REMEMBERED_FRAMES", 3)
     published = PublishedGraph()
     stamps_ns = []
     for _, update, _, stamp_ns in running():

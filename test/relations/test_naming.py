@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.relations.naming import (
+from deworldsg_ros.relations.states import (
     DECIMALS,
     MIN_PROBABILITY,
     SAME_PROBABILITY,

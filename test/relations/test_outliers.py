@@ -12,7 +12,7 @@ from support import merging
 
 from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations.evidence import OUTLIER_RATE, bounded_logits
+from deworldsg_ros.relations.paper import OUTLIER_RATE, bounded_logits
 
 rates = st.sampled_from([0.01, 0.1, 0.5, 0.9])
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.room_nodes import bowl, box, surface, table, thing
 
-from deworldsg_ros.relations.pair_geometry import (
+from deworldsg_ros.relations.geometry import (
     FEATURES,
     LAYER_M,
     MARGIN_M,

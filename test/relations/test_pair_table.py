@@ -24,28 +24,27 @@ from support.room_nodes import (
 )
 
 from deworldsg_ros.config import Config
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.pairs import key
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations import pair_table
-from deworldsg_ros.relations.pair_geometry import NodeShapes
-from deworldsg_ros.relations.pair_table import (
+from deworldsg_ros.relations import pairs
+from deworldsg_ros.relations.beliefs import MIN_RELATED, PredictedPrior
+from deworldsg_ros.relations.geometry import NodeShapes
+from deworldsg_ros.relations.pairs import (
     FLOOR_QUANTILE,
     FLOOR_STEP_M,
     PairTable,
     floor_height,
     stepped_up,
 )
-from deworldsg_ros.relations.physical_states import (
+from deworldsg_ros.relations.physics import load_physics_model, relation_counts
+from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS
+from deworldsg_ros.relations.states import (
     NONE,
     RELATIONS_OF_STATE,
     canonical_predicates,
     relation_of_predicates,
 )
-from deworldsg_ros.relations.physics_model import load_physics_model
-from deworldsg_ros.relations.predicted_prior import MIN_RELATED, PredictedPrior
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS
-from deworldsg_ros.relations.vote_model import relation_counts
-from deworldsg_ros.scene.edges import key
-from deworldsg_ros.scene.graph import SceneGraph
 
 seeds = st.integers(0, 10_000)
 Z = np.array([0.0, 0.0, 1.0])
@@ -345,7 +344,7 @@ def test_another_up_direction_turns_all_pairs() -> None:
 
 
 def test_a_large_graph_turns_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pair_table, "NEW_A_CALL", 4)
+    monkeypatch.setattr(pairs, "NEW_A_CALL", 4)
     graph = room({str(index): item for index, item in enumerate(THINGS)})[0].graph
     followed = table_of(graph)
     followed.refresh(Z)

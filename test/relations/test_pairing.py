@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.relations.pairing import geometric_costs, neighbour_pairs
+from deworldsg_ros.relations.paper import geometric_costs, neighbour_pairs
 
 WIDTH, HEIGHT = 640, 480
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.relations.physical_states import (
+from deworldsg_ros.relations.states import (
     ABOVE,
     AGAINST,
     ATTACHED,
@@ -24,7 +24,7 @@ from deworldsg_ros.relations.physical_states import (
     relation_of_predicates,
     states_of_relations,
 )
-from deworldsg_ros.scene.vocabularies import (
+from deworldsg_ros.scene.vocabulary import (
     PREDICATE_SETS,
     REPLICA_SSG_PREDICATES,
     SCANNET_PREDICATES,

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from scipy.special import softmax
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.evidence import entropy_nats
-from deworldsg_ros.relations.pair_geometry import FEATURES
-from deworldsg_ros.relations.physical_states import DIRECTED, STATE_COUNT
-from deworldsg_ros.relations.physics_model import (
+from deworldsg_ros.relations.geometry import FEATURES
+from deworldsg_ros.relations.paper import entropy_nats
+from deworldsg_ros.relations.physics import (
     INPUT_COUNT,
     MAX_INPUT,
     PATH,
@@ -27,9 +26,15 @@ from deworldsg_ros.relations.physics_model import (
     load_physics_model,
 )
 from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
-from deworldsg_ros.scene.class_kinds import KINDS, fixed_table, kind_table
+from deworldsg_ros.relations.states import DIRECTED, STATE_COUNT
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, VISUAL_GENOME_CLASSES
+from deworldsg_ros.scene.vocabulary import (
+    COCO_CLASSES,
+    KINDS,
+    VISUAL_GENOME_CLASSES,
+    fixed_table,
+    kind_table,
+)
 
 seeds = st.integers(0, 10_000)
 MODEL = load_physics_model()

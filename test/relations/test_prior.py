@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.relations import mean_of
 
-from deworldsg_ros.relations.prior import ClassPairPrior, PriorState
+from deworldsg_ros.relations.paper import ClassPairPrior, PriorState
 from deworldsg_ros.scene.errors import RefusedInput
 
 CLASSES, PREDICATES = 4, 3

@@ -8,21 +8,16 @@ from hypothesis import strategies as st
 from scipy.special import expit, logit
 from support.reference_near import near_probabilities
 
-from deworldsg_ros.relations.exclusions import (
+from deworldsg_ros.relations.pairs import link
+from deworldsg_ros.relations.rules import (
     CARRIED_FIRST,
     CARRIED_SECOND,
     MOST,
     NEAR_CERTAINTY,
     one_support,
+    settle,
 )
-from deworldsg_ros.relations.pair_links import link
-from deworldsg_ros.relations.physical_states import (
-    NEAR,
-    NONE,
-    RELATIONS_OF_STATE,
-    STATE_COUNT,
-)
-from deworldsg_ros.relations.settling import settle
+from deworldsg_ros.relations.states import NEAR, NONE, RELATIONS_OF_STATE, STATE_COUNT
 
 seeds = st.integers(0, 10_000)
 

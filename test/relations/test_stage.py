@@ -18,8 +18,8 @@ from support.relations import (
 )
 
 from deworldsg_ros.relations import ClassPairPrior, RelationReasoner, build_world_model
-from deworldsg_ros.scene import codec
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import codec
 
 
 def reasoner(model=None, queue_size=8):

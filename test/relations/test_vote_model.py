@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.relations.physical_states import (
+from deworldsg_ros.relations.physics import (
+    VoteScales,
+    count_votes,
+    load_physics_model,
+    near_logits,
+    relation_counts,
+    vote_logits,
+)
+from deworldsg_ros.relations.states import (
     ABOVE,
     DIRECTED,
     NEAR,
@@ -19,14 +27,6 @@ from deworldsg_ros.relations.physical_states import (
     STATE_COUNT,
     UNDER,
     relation_of_predicates,
-)
-from deworldsg_ros.relations.physics_model import load_physics_model
-from deworldsg_ros.relations.vote_model import (
-    VoteScales,
-    count_votes,
-    near_logits,
-    relation_counts,
-    vote_logits,
 )
 
 SCALES = VoteScales(slope=1.2, n_half=3.0, floor=0.05, even=0.2)

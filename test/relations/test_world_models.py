@@ -8,8 +8,7 @@ from support.relations import VOCABULARY
 
 from deworldsg_ros.config import RelationsConfig, from_mapping
 from deworldsg_ros.relations import WORLD_MODELS, build_world_model
-from deworldsg_ros.relations.world_model import ClipRequest, PairContext
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.relations.world_model import ClipRequest, FakeWorldModel, PairContext
 from deworldsg_ros.scene.errors import ConfigurationError
 
 BOX = np.array([0.0, 0, 4, 4])

@@ -10,11 +10,10 @@ from geometry_msgs.msg import Pose, PoseWithCovariance, Quaternion, Vector3
 from std_msgs.msg import Header
 from support.view import make_graph, make_node
 
-from deworldsg_ros.ros import detections
-from deworldsg_ros.ros import object_transforms as object_transforms_module
-from deworldsg_ros.ros.object_transforms import object_transforms
-from deworldsg_ros.scene import wire
+from deworldsg_ros.ros import graph_output, transforms
+from deworldsg_ros.ros.transforms import object_transforms
 from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.wire import messages as wire
 
 IMITATED = Value(
     Detection3DArray=lambda: Value(header=Header(), detections=[]),
@@ -36,11 +35,11 @@ def boxed(node_id: int) -> wire.NodeState:
 
 @pytest.mark.parametrize("installed", [False, True])
 def test_every_object_with_a_box_is_a_detection(installed: bool) -> None:
-    if installed and detections.VISION_MSGS is None:
+    if installed and graph_output.VISION_MSGS is None:
         pytest.skip("vision_msgs is not installed")
-    messages = detections.VISION_MSGS if installed else IMITATED
+    messages = graph_output.VISION_MSGS if installed else IMITATED
     graph = make_graph([boxed(7), make_node(8, "shadow")])
-    array = detections.detection_array(graph, Time(sec=3), messages)
+    array = graph_output.detection_array(graph, Time(sec=3), messages)
     assert array.header.frame_id == "map"
     (found,) = array.detections
     assert (found.id, found.header.stamp.sec) == ("7", 3)
@@ -65,6 +64,6 @@ def test_every_object_with_a_box_is_a_frame() -> None:
 
 
 def test_frames_of_objects_need_tf2_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(object_transforms_module, "TFMessage", None)
+    monkeypatch.setattr(transforms, "TFMessage", None)
     with pytest.raises(ConfigurationError, match="output.publish_tf is true, but tf2_msgs"):
-        object_transforms_module.ObjectTransforms(Value())
+        transforms.ObjectTransforms(Value())

@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import pytest
 
 from deworldsg_ros.ros.diagnosed import observations_of
-from deworldsg_ros.ros.diagnosing import DropLog
 from deworldsg_ros.ros.health import (
     DROPPED,
     ERROR,
@@ -20,6 +19,7 @@ from deworldsg_ros.ros.health import (
     counts_in,
     received_in,
 )
+from deworldsg_ros.ros.node import DropLog
 
 
 def test_a_report_before_the_first_message() -> None:

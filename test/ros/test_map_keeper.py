@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from deworldsg_ros.ros import map_keeper
-from deworldsg_ros.ros.map_keeper import MapKeeper
+from deworldsg_ros.ros import graph_keeper
+from deworldsg_ros.ros.graph_keeper import MapKeeper
 from deworldsg_ros.scene.errors import ConfigurationError
 
 LIMIT_S = 30.0
@@ -46,8 +46,8 @@ def test_a_checkpoint_that_fails_does_not_end_the_thread(
             raise outcome
         written.append(path)
 
-    monkeypatch.setattr(map_keeper, "copy_state", lambda builder: {})
-    monkeypatch.setattr(map_keeper, "write_state", write)
+    monkeypatch.setattr(graph_keeper, "copy_state", lambda builder: {})
+    monkeypatch.setattr(graph_keeper, "write_state", write)
     node = Counter()
     keeper = MapKeeper(node, tmp_path / "map.npz", 10.0)
     for left in (2, 1, 0):

@@ -13,13 +13,13 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CompressedImage, Image
 from visualization_msgs.msg import Marker
 
+from deworldsg_ros.ros.graph_output import marker_array
 from deworldsg_ros.ros.inputs import image_sources
-from deworldsg_ros.ros.markers import marker_array
 from deworldsg_ros.ros.qos import LossCounter, Offer, choose
-from deworldsg_ros.ros.worker import Worker
+from deworldsg_ros.ros.threads import Worker
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Vocabulary
-from deworldsg_ros.streams.pending import PendingEvidence
+from deworldsg_ros.streams.assembler import PendingEvidence
 
 RAW = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.ros.update_times import RATE_SLACK, UpdateTimes
+from deworldsg_ros.ros.threads import RATE_SLACK, UpdateTimes
 
 RATE_HZ = 30.0
 PERIOD_S = 1 / RATE_HZ

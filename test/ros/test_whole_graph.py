@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from support.room_nodes import add_node, room, table, thing
 
-from deworldsg_ros.ros import whole_graph
-from deworldsg_ros.ros.whole_graph import PiecewiseEncoder
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.ros import graph_output
+from deworldsg_ros.ros.graph_output import PiecewiseEncoder
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import empty_scene_graph
 
 
 def test_an_empty_graph_has_the_text_of_the_plain_encoder() -> None:
@@ -19,7 +19,7 @@ def test_an_empty_graph_has_the_text_of_the_plain_encoder() -> None:
 
 
 def test_the_text_follows_the_graph(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whole_graph, "PIECE_IDS", 2)
+    monkeypatch.setattr(graph_output, "PIECE_IDS", 2)
     cups = {f"cup {i}": thing("cup", 0.3 * i - 0.6, 0.0, 0.74, 0.08, 0.08, 0.1) for i in range(5)}
     builder, ids = room({"table": table(0.0, 0.0), **cups})
     encoder, rng = PiecewiseEncoder(), np.random.default_rng(0)
@@ -46,7 +46,7 @@ def test_unchanged_pieces_are_not_encoded_again(monkeypatch: pytest.MonkeyPatch)
     encoded: list[object] = []
     plain = msgspec.json.encode
     monkeypatch.setattr(
-        whole_graph.msgspec.json, "encode", lambda item: (encoded.append(item), plain(item))[1]
+        graph_output.msgspec.json, "encode", lambda item: (encoded.append(item), plain(item))[1]
     )
     message = builder.snapshot()
     encoder.encode(message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.scene.beliefs import listed
+from deworldsg_ros.graph.messages import listed
 
 NAMES = tuple("abcdefgh")
 

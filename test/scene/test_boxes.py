@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.scene.boxes import areas, pairwise_iou, shared_areas
+from deworldsg_ros.scene.arrays import areas, pairwise_iou, shared_areas
 
 
 def raster(box: np.ndarray) -> np.ndarray:

@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.scene import change_log
-from deworldsg_ros.scene.change_log import ChangeLog
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import follow
+from deworldsg_ros.wire.follow import ChangeLog, GraphReplica
 
 
 def graph(session: str, sequence: int, names: dict[int, str], pairs=()) -> object:
@@ -37,7 +36,7 @@ def test_a_reader_that_asks_at_random_times_has_the_graph(seed: int, most: int) 
     log, reader, session, sequence = ChangeLog(), GraphReplica(), "a", 0
     names: dict[int, str] = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(change_log, "MOST_REMOVED", most)
+        patch.setattr(follow, "MOST_REMOVED", most)
         for _ in range(30):
             if rng.random() < 0.05:
                 session, sequence, names = session + "x", 0, {}

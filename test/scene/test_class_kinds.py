@@ -5,8 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.scene.class_kinds import FIXED_TO, KINDS, fixed_table, kind_table
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, SCANNET_CLASSES, VISUAL_GENOME_CLASSES
+from deworldsg_ros.scene.vocabulary import (
+    COCO_CLASSES,
+    FIXED_TO,
+    KINDS,
+    SCANNET_CLASSES,
+    VISUAL_GENOME_CLASSES,
+    fixed_table,
+    kind_table,
+)
 
 VOCABULARIES = (COCO_CLASSES, SCANNET_CLASSES, VISUAL_GENOME_CLASSES)
 

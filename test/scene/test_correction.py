@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from support.merging import local_graph, random_local_graphs, random_pose, seeds
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.graph.graph import nodes_since
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.camera import invert_pose
-from deworldsg_ros.scene.correction import nodes_since
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.scene.wire import NodeState, SceneGraphMessage
+from deworldsg_ros.wire.messages import NodeState, SceneGraphMessage
 
 S = 10**9
 

@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.camera import pose_from_quaternion
-from deworldsg_ros.scene.extent import (
+from deworldsg_ros.graph.extent import (
     box_of,
     even_moments,
     horizontal_axes,
@@ -17,7 +15,9 @@ from deworldsg_ros.scene.extent import (
     surface_bytes,
     surface_points,
 )
-from deworldsg_ros.scene.wire import Stamp
+from deworldsg_ros.scene.camera import pose_from_quaternion
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.messages import Stamp
 
 UPS = ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.1, 0.2, 0.95])
 

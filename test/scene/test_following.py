@@ -7,8 +7,7 @@ import pytest
 from support.reference_updates import diff
 from support.view import make_graph, make_node
 
-from deworldsg_ros.scene.following import GraphFollower
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire.follow import GraphFollower, GraphReplica
 
 
 def graph(sequence, session="a"):

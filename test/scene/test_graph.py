@@ -17,13 +17,14 @@ from support.merging import (
 )
 from support.node_states import node_states
 
-from deworldsg_ros.scene import graph_io, wire
-from deworldsg_ros.scene.edge_map import EdgeMap
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.pairs import EdgeMap
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.extent import surface_points
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
-from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.wire import messages as wire
 
 SURE = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -36,8 +37,8 @@ def graph_of(count: int, **options: int) -> SceneGraph:
     return graph
 
 
-def arrays_of(graph: SceneGraph) -> graph_io.Arrays:
-    return graph_io.to_arrays(graph.state())
+def arrays_of(graph: SceneGraph) -> graph_files.Arrays:
+    return graph_files.to_arrays(graph.state())
 
 
 def equal(a: SceneGraph, b: SceneGraph) -> bool:
@@ -61,7 +62,7 @@ def test_an_empty_graph() -> None:
 def test_a_graph_without_predicates_is_saved_and_loaded() -> None:
     graph = SceneGraph(Vocabulary(("cup",), ()), "world")
     graph.add_node(np.zeros(3), np.eye(3), np.ones(1), 1)
-    again = graph_io.graph_from_arrays(arrays_of(graph), "saved")
+    again = graph_files.graph_from_arrays(arrays_of(graph), "saved")
     assert len(again) == 1 and equal(graph, again)
 
 
@@ -366,9 +367,9 @@ def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, se
     graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
     edit_at_random(graph, rng, int(rng.integers(0, 60)))
     path = tmp_path_factory.mktemp("graph") / "graph.npz"
-    graph_io.save(graph, path)
+    graph_files.save(graph, path)
     assert [item.name for item in path.parent.iterdir()] == ["graph.npz"]
-    loaded = graph_io.load(path)
+    loaded = graph_files.load(path)
     assert equal(loaded, graph)
     assert node_states(loaded, 4, with_points=True) == node_states(graph, 4, with_points=True)
     for name in ("log_determinants", "eigenvalue_bounds"):
@@ -386,16 +387,16 @@ def test_a_state_does_not_change_with_its_graph(seed: int) -> None:
     graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
     edit_at_random(graph, rng, 30)
     state = graph.state()
-    before = graph_io.to_arrays(state)
+    before = graph_files.to_arrays(state)
     again = SceneGraph.from_state(state)
     edit_at_random(graph, rng, 30)
     edit_at_random(again, rng, 30)
-    after = graph_io.to_arrays(state)
+    after = graph_files.to_arrays(state)
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    graph_io.save(graph_of(3), tmp_path / "good.npz")
+    graph_files.save(graph_of(3), tmp_path / "good.npz")
     whole = (tmp_path / "good.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "text.npz").write_text("hello")
@@ -405,16 +406,16 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     names = ("cut.npz", "text.npz", "empty.npz", "other.npz", "array.npy", "absent.npz")
     for name in names:
         with pytest.raises(RefusedInput, match=name) as refused:
-            graph_io.load(tmp_path / name)
+            graph_files.load(tmp_path / name)
         assert refused.value.reason == "invalid_graph_file"
 
 
 def test_a_file_of_a_later_version_is_refused(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("deworldsg_ros.scene.graph_io.FORMAT_VERSION", 2)
-    graph_io.save(graph_of(1), tmp_path / "later.npz")
+    monkeypatch.setattr("deworldsg_ros.graph.graph_files.FORMAT_VERSION", 2)
+    graph_files.save(graph_of(1), tmp_path / "later.npz")
     monkeypatch.undo()
     with pytest.raises(RefusedInput, match="version 2: expected 1 or older"):
-        graph_io.load(tmp_path / "later.npz")
+        graph_files.load(tmp_path / "later.npz")
 
 
 @pytest.mark.parametrize(

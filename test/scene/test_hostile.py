@@ -22,7 +22,7 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import MAX_LOGIT
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire.follow import GraphReplica
 
 PAPER = Config(
     merging=MergingConfig(association="paper"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.scene.node_ids import PRUNE_ABOVE, NodeIds
+from deworldsg_ros.graph.nodes import PRUNE_ABOVE, NodeIds
 
 FRAMES = 20
 

@@ -8,10 +8,10 @@ from support.merging import VOCABULARY
 from support.node_states import node_states
 from support.room_nodes import room, table, thing
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.extent import surface_points
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import NodeStates
+from deworldsg_ros.graph.extent import surface_points
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.messages import NodeStates
+from deworldsg_ros.wire import messages as wire
 
 
 def graph_of_one(points: np.ndarray) -> SceneGraph:

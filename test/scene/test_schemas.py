@@ -10,8 +10,9 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from deworldsg_ros.scene import codec, wire
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.wire import codec
+from deworldsg_ros.wire import messages as wire
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "msg_schemas"

@@ -9,22 +9,23 @@ from support.surfaces import CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.client import SceneGraph as AskedGraph
 from deworldsg_ros.config import Config, OutputConfig
-from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.map_file import copy_state, read_map, write_map
-from deworldsg_ros.scene import graph_io, wire
-from deworldsg_ros.scene.edits import MergeNodes
-from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.frame_graph import LocalGraph
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.graph_file import write_graph
-from deworldsg_ros.scene.seen_frames import (
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.edits import MergeNodes
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph_files import write_graph
+from deworldsg_ros.graph.pairs import frame_votes
+from deworldsg_ros.graph.provenance import (
     CLEAREST,
     PRUNE_FRAMES,
     FrameMemory,
     path_beside,
     write_seen,
 )
-from deworldsg_ros.scene.votes import frame_votes
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import copy_state, read_map, write_map
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.wire import messages as wire
 
 CONFIG = Config(output=OutputConfig(min_existence=0.0))
 FLOOR = slab((0, 0, 0.95), (1.2, 0.8, 0.01))
@@ -105,8 +106,8 @@ def test_a_map_keeps_them_byte_for_byte(tmp_path) -> None:
     assert len(again.frames.all(again.graph)) > len(again.graph)
     one, other = copy_state(builder)["seen_frames"], copy_state(again)["seen_frames"]
     assert one.tobytes() == other.tobytes()
-    damaged = {**graph_io.read(tmp_path / "room.map"), "seen_frames": np.zeros(3, np.uint8)}
-    graph_io.write(tmp_path / "room.map", damaged)
+    damaged = {**graph_files.read(tmp_path / "room.map"), "seen_frames": np.zeros(3, np.uint8)}
+    graph_files.write(tmp_path / "room.map", damaged)
     with pytest.raises(ConfigurationError, match="JSON"):
         read_map(CONFIG, tmp_path / "room.map")
 

@@ -13,14 +13,14 @@ from support.surfaces import CAMERA, CUP, HERE, view
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config, InputsConfig, OutputConfig
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph_files import write_graph
+from deworldsg_ros.graph.provenance import MAX_VIEWS, SeenSpace, space_path, write_space
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
-from deworldsg_ros.scene import graph_io
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
-from deworldsg_ros.scene.graph_file import write_graph
-from deworldsg_ros.scene.seen_space import MAX_VIEWS, SeenSpace, space_path, write_space
 
 # The camera looks along world x, at a height of 1 m; its image has x to the right and y down.
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]])
@@ -130,12 +130,12 @@ def test_it_is_in_the_map_and_beside_a_saved_graph(tmp_path: Path) -> None:
     assert SceneGraph.load(tmp_path).goal_near("cup").seen_free > 0.0
     space_path(path).write_bytes(b"no archive")
     assert SceneGraph.load(tmp_path).space is None
-    arrays = graph_io.read(tmp_path / "room.map")
+    arrays = graph_files.read(tmp_path / "room.map")
     for name, wrong in (
         ("view_poses", np.zeros((2, 4, 4))),
         ("view_depths_mm", np.zeros((MAX_VIEWS + 1, 2, 2), np.uint16)),
         ("view_cameras", np.full((len(builder.space), 4), np.nan)),
     ):
-        graph_io.write(tmp_path / "bad.map", {**arrays, name: wrong})
+        graph_files.write(tmp_path / "bad.map", {**arrays, name: wrong})
         with pytest.raises(ConfigurationError, match=name):
             read_map(Config(), tmp_path / "bad.map")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from deworldsg_ros.scene.softmax import softmax
+from deworldsg_ros.scene.arrays import softmax
 
 
 @pytest.mark.parametrize("shape", [(0, 4), (1,), (50,), (7, 1), (300, 80), (2, 3, 5)])

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import seeds
 
-from deworldsg_ros.scene.extent import even_moments
+from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.scene.surface import _hash, add_points, drop_points
 
 

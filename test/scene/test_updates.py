@@ -9,12 +9,11 @@ from support.merging import VOCABULARY, edit_at_random, seeds
 from support.node_states import node_states
 from support.reference_updates import diff
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import empty_scene_graph
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.scene.wire import SceneGraphMessage, SceneGraphUpdateMessage
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica, empty_scene_graph
+from deworldsg_ros.wire.messages import SceneGraphMessage, SceneGraphUpdateMessage
 
 
 def snapshot_of(graph: SceneGraph, sequence: int):

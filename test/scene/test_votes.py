@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY
 
-from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.edges import Pair, ends_of
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.votes import VoteMap, frame_votes
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.pairs import Pair, VoteMap, ends_of, frame_votes
 
 WIDTH = 3
 seeds = st.integers(0, 10_000)
@@ -191,8 +190,8 @@ def test_a_file_keeps_the_votes(tmp_path: Path) -> None:
     graph.add_votes(1, 2, None)
     graph.add_votes(4, 2, np.ones((2, 3)))
     graph.add_votes(1, 3, None)
-    graph_io.save(graph, tmp_path / "graph.npz")
-    loaded = graph_io.load(tmp_path / "graph.npz")
+    graph_files.save(graph, tmp_path / "graph.npz")
+    loaded = graph_files.load(tmp_path / "graph.npz")
     assert plain(loaded) == plain(graph) and len(plain(graph)) == 3
     assert loaded.seen_together(2) == {1, 4}
     assert changed(loaded) == {(1, 2), (1, 3), (2, 4)}
@@ -201,11 +200,11 @@ def test_a_file_keeps_the_votes(tmp_path: Path) -> None:
 def test_a_file_of_an_older_release_has_no_votes(tmp_path: Path) -> None:
     graph = graph_of(2)
     graph.add_votes(1, 2, None)
-    arrays = graph_io.to_arrays(graph.state())
+    arrays = graph_files.to_arrays(graph.state())
     old = {name: values for name, values in arrays.items() if not name.startswith("vote_")}
     assert len(old) == len(arrays) - 3
-    graph_io.write(tmp_path / "old.npz", old)
-    loaded = graph_io.load(tmp_path / "old.npz")
+    graph_files.write(tmp_path / "old.npz", old)
+    loaded = graph_files.load(tmp_path / "old.npz")
     assert len(loaded) == 2 and not loaded.votes and loaded.seen_together(1) == set()
 
 

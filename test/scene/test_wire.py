@@ -22,16 +22,7 @@ from support.merging import (
     seeds,
 )
 
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.codec import (
-    evidence_from_message,
-    evidence_to_message,
-    frame_graph_from_message,
-    frame_graph_to_message,
-    local_graph_from_message,
-    local_graph_to_message,
-)
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import (
     DepthGrid,
@@ -41,6 +32,15 @@ from deworldsg_ros.scene.frame_graph import (
     Relations,
 )
 from deworldsg_ros.scene.limits import MAX_OBJECTS, MAX_POINTS
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import (
+    evidence_from_message,
+    evidence_to_message,
+    frame_graph_from_message,
+    frame_graph_to_message,
+    local_graph_from_message,
+    local_graph_to_message,
+)
 
 
 def random_relations(rng: np.random.Generator, count: int) -> Relations:

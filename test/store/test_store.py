@@ -19,13 +19,11 @@ from support.reference_updates import diff
 from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.store import add_joined
 from deworldsg_ros.client.changes import MOVED_M
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.delta import empty_scene_graph, join
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.store import Store, StoreError
-from deworldsg_ros.store.store import DATABASE_FILE, MESSAGES_FILE, StoreWriter
-from deworldsg_ros.store.times import time_ns_from_text
+from deworldsg_ros.store.store import DATABASE_FILE, MESSAGES_FILE, StoreWriter, time_ns_from_text
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica, empty_scene_graph, join
 
 SECOND = 10**9
 HOSTILE = [

@@ -25,11 +25,7 @@ from support.streams import (
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
-from deworldsg_ros.streams.frame_assemblers import (
-    FrameAssembler,
-    LiftingAssembler,
-    RelationAssembler,
-)
+from deworldsg_ros.streams.frames import FrameAssembler, LiftingAssembler, RelationAssembler
 
 INPUTS = InputsConfig()
 PERIOD = 100 * MS

@@ -13,15 +13,16 @@ from support.streams import MS, T0, header, odometry, pose, tf, transform
 
 from deworldsg_ros.scene.camera import invert_pose, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.streams.jump_gate import JumpGate
-from deworldsg_ros.streams.pose_stream import PoseStream
 from deworldsg_ros.streams.poses import (
+    MAX_FRAMES,
+    JumpGate,
     PoseBuffer,
+    PoseStream,
+    TransformTree,
     pose_from_message,
     set_stamp,
     stamp_ns_of,
 )
-from deworldsg_ros.streams.transforms import MAX_FRAMES, TransformTree
 
 SLOP = 100 * MS
 

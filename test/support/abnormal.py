@@ -24,7 +24,7 @@ from support.nodes_bench import (
     rgb,
 )
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 HOUR_NS = 3600 * 10**9
 Make = Callable[[int], Any] | None

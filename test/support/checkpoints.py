@@ -10,12 +10,8 @@ transformers = pytest.importorskip("transformers")
 
 from support.relations import VOCABULARY  # noqa: E402  after the guards
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard  # noqa: E402
-from deworldsg_ros.checkpoints.probe_network import (  # noqa: E402
-    Probe,
-    build_network,
-    save_probe,
-)
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard  # noqa: E402
+from deworldsg_ros.checkpoints.probe_network import Probe, build_network, save_probe  # noqa: E402
 from deworldsg_ros.config import RelationsConfig  # noqa: E402
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext  # noqa: E402
 

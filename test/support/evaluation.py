@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from deworldsg_ros.evaluation.protocol.predictions import ScanPrediction
+from deworldsg_ros.evaluation.predictions import ScanPrediction
 
 CLASSES = ("book", "chair", "table")
 PREDICATES = ("near", "on", "under")

@@ -18,11 +18,11 @@ import numpy as np
 from deworldsg_ros.config import Config
 from deworldsg_ros.fleet.zenoh_link import Feed, Follower, open_session, part_key, robot_key
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.change_log import ChangeLog
-from deworldsg_ros.scene.codec import local_graph_from_message
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import transform
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_from_message
+from deworldsg_ros.wire.follow import ChangeLog
 
 ASK_S = 0.5
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.scene import limits, wire
+from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import (
     DepthGrid,
@@ -19,7 +19,8 @@ from deworldsg_ros.scene.frame_graph import (
     Relations,
     Vocabulary,
 )
-from deworldsg_ros.scene.replica import GraphReplica
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 PLACES_M = [0.0, 1e-9, 0.01, 0.5, 1.0, 31.0, 1e3, limits.MAX_COORDINATE_M]

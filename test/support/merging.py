@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
-from deworldsg_ros.scene.graph import SceneGraph
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 

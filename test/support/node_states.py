@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from weakref import WeakKeyDictionary
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.graph import SceneGraph
-from deworldsg_ros.scene.node_states import NodeStates
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.messages import NodeStates
+from deworldsg_ros.wire import messages as wire
 
 _made: WeakKeyDictionary[SceneGraph, dict[int, NodeStates]] = WeakKeyDictionary()
 

@@ -19,8 +19,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import String
 
-from deworldsg_ros.recordings.messages import Role
-from deworldsg_ros.recordings.source import RawRoleMessage
+from deworldsg_ros.recordings.source import RawRoleMessage, Role
 from deworldsg_ros.ros.qos import reliable
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -18,9 +18,9 @@ from support.nodes import Peer
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.scene import wire
 from deworldsg_ros.streams.images import fill_image
 from deworldsg_ros.streams.poses import set_stamp
+from deworldsg_ros.wire import messages as wire
 
 WIDTH, HEIGHT = 64, 48
 STEP_NS = 100 * 10**6

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from deworldsg_ros.recordings import messages as ros
-from deworldsg_ros.recordings.messages import RoleMessage, typestore
+from deworldsg_ros.recordings import source as ros
+from deworldsg_ros.recordings.source import RoleMessage, typestore
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
 
 WIDTH, HEIGHT = 64, 48

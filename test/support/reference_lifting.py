@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting.constants import LiftingConstants
+from deworldsg_ros.lifting.stage import LiftingConstants
 from deworldsg_ros.scene.camera import Intrinsics
 
 

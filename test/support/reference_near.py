@@ -1,4 +1,4 @@
-"""What is near, for all pairs at once: the reference of `relations.settling`."""
+"""What is near, for all pairs at once: the reference of `relations.rules`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.special import expit
 
-from deworldsg_ros.relations.exclusions import (
+from deworldsg_ros.relations.rules import (
     CENTRE_FRACTION,
+    MIN_NEIGHBOUR,
     NEAR_CERTAINTY,
     NEAR_FLOOR_M,
     NEAR_FLOOR_SPREAD_M,
@@ -18,7 +19,6 @@ from deworldsg_ros.relations.exclusions import (
     NEAREST,
     SEAT_GAP_M,
 )
-from deworldsg_ros.relations.settling import MIN_NEIGHBOUR
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 
 def diff(

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.relations.evidence import PROVENANCES, FusedEdges, fuse_edges
-from deworldsg_ros.relations.prior import ClassPairPrior
-from deworldsg_ros.relations.world_models.fake import FakeWorldModel
+from deworldsg_ros.relations.paper import PROVENANCES, ClassPairPrior, FusedEdges, fuse_edges
+from deworldsg_ros.relations.world_model import FakeWorldModel
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 
 WIDTH, HEIGHT = 64, 48

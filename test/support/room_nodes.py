@@ -13,7 +13,7 @@ import numpy as np
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.frame_graph import Vocabulary
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES, REPLICA_SSG_PREDICATES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES, REPLICA_SSG_PREDICATES
 
 VOCABULARY = Vocabulary(COCO_CLASSES, REPLICA_SSG_PREDICATES)
 # Depth noise of a surface that was seen many times.

@@ -12,11 +12,7 @@ transformers = pytest.importorskip("transformers")
 
 from safetensors.torch import save_file  # noqa: E402  after the guards
 
-from deworldsg_ros.checkpoints.card import (  # noqa: E402
-    CARD_FILE,
-    CheckpointCard,
-    write_card,
-)
+from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard, write_detector_card  # noqa: E402
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork  # noqa: E402
 from deworldsg_ros.config import PerceptionConfig  # noqa: E402
 from deworldsg_ros.perception import SegmentedObjects  # noqa: E402
@@ -89,7 +85,7 @@ def save_rtdetr(folder, version=1, card=None, normalise=False, **changes):
     preprocessing = {"size": {"height": 64, "width": 64}, "do_normalize": normalise, **IMAGENET}
     (folder / "preprocessor_config.json").write_text(json.dumps(preprocessing))
     if card is not None:
-        write_card(folder / CARD_FILE, card)
+        write_detector_card(folder / DETECTOR_CARD, card)
     return folder
 
 

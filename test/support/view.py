@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 STAMP = wire.Stamp(sec=3, nanosec=5)
 

@@ -9,10 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deworldsg_ros.perception.upright import turned
-from deworldsg_ros.recordings import messages as ros
-from deworldsg_ros.recordings.messages import RoleMessage
-from deworldsg_ros.recordings.source import serialize
+from deworldsg_ros.perception.stage import turned
+from deworldsg_ros.recordings import source as ros
+from deworldsg_ros.recordings.source import RoleMessage, serialize
 from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.camera import RgbdFrame, invert_pose
 

@@ -19,7 +19,7 @@ from support.sequences import (
 )
 
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.training.dataset_clips import ClipChoice, read_clips
+from deworldsg_ros.training.clips import ClipChoice, read_clips
 
 CHOICE = ClipChoice(clip_length=4, clips_per_pair=2)
 

@@ -15,26 +15,30 @@ pytestmark = pytest.mark.models
 from support.checkpoints import config_of, save_vjepa2  # noqa: E402  after the guards
 from support.pair_rooms import PREDICATES, render_room  # noqa: E402
 
-from deworldsg_ros.checkpoints.probe_card import BackboneIdentity, ProbeCard  # noqa: E402
+from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard  # noqa: E402
 from deworldsg_ros.checkpoints.probe_network import load_probe  # noqa: E402
-from deworldsg_ros.relations import union_box  # noqa: E402
-from deworldsg_ros.relations.world_models import vjepa2  # noqa: E402
+from deworldsg_ros.relations import clip_models, union_box  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput  # noqa: E402
-from deworldsg_ros.training.confusion import INCHES_PER_PREDICATE, MARGIN_INCHES, write_confusion  # noqa: E402
-from deworldsg_ros.training.features import (  # noqa: E402
-    FeatureCache,
-    extract_features,
-)
-from deworldsg_ros.training.fit import class_weights, fit_probe, score  # noqa: E402
-from deworldsg_ros.training.labelled_clips import (  # noqa: E402
+from deworldsg_ros.training.clips import (  # noqa: E402
+    cut_clips,
     of_length,
+    read_boxes,
     read_clip_folder,
     read_frames,
 )
 from deworldsg_ros.training.options import FitOptions, TrainingOptions  # noqa: E402
-from deworldsg_ros.training.scan_clips import cut_clips, read_boxes  # noqa: E402
-from deworldsg_ros.training.split import split_by_group  # noqa: E402
-from deworldsg_ros.training.train import train_probe  # noqa: E402
+from deworldsg_ros.training.train import (  # noqa: E402  # noqa: E402
+    INCHES_PER_PREDICATE,
+    MARGIN_INCHES,
+    FeatureCache,
+    class_weights,
+    extract_features,
+    fit_probe,
+    score,
+    split_by_group,
+    train_probe,
+    write_confusion,
+)
 
 LENGTH = 4
 ROOMS, PAIRS = 8, 20
@@ -57,7 +61,7 @@ def clip_folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def backbone(tmp_path_factory):
     folder = save_vjepa2(tmp_path_factory.mktemp("backbone"), crop_size=48)
-    return vjepa2.load_backbone(config_of("vjepa2", folder))
+    return clip_models.load_vjepa2(config_of("vjepa2", folder))
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.scene.boxes import shared_areas
-from deworldsg_ros.view.colours import PALETTE, class_colours, predicate_colours, shade, to_rgb
-from deworldsg_ros.view.geometry import drawable_edges, principal_axes, view_axes
-from deworldsg_ros.view.labelling import place, place_if_free
+from deworldsg_ros.scene.arrays import shared_areas
+from deworldsg_ros.view.colours import (
+    PALETTE,
+    class_colours,
+    drawable_edges,
+    predicate_colours,
+    principal_axes,
+    shade,
+    to_rgb,
+    view_axes,
+)
+from deworldsg_ros.view.picture import place, place_if_free
 
 
 def random_covariance(seed):

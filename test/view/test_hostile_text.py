@@ -11,10 +11,9 @@ from rich.console import Console
 from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.cli import outputs
-from deworldsg_ros.cli.model_folder import inspect_file
-from deworldsg_ros.evaluation.protocol.scoring import Count, ProtocolResult
-from deworldsg_ros.evaluation.reports.plots import plot_classes
-from deworldsg_ros.evaluation.reports.terminal import print_protocol
+from deworldsg_ros.cli.models import inspect_file
+from deworldsg_ros.evaluation.reports import plot_classes, print_protocol
+from deworldsg_ros.evaluation.scoring import Count, ProtocolResult
 from deworldsg_ros.view import page, picture, table
 
 LABELS = [

@@ -15,8 +15,8 @@ from support.browser import browser, opened_page
 from support.view import make_edge, make_graph, make_node, make_room
 
 from deworldsg_ros.client import SceneGraph
-from deworldsg_ros.scene import wire
 from deworldsg_ros.view import page
+from deworldsg_ros.wire import messages as wire
 
 pytestmark = pytest.mark.slow
 SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"

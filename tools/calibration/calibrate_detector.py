@@ -20,10 +20,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from deworldsg_ros.perception.backends.nanodet import CALIBRATION, NanoDetDetector, combine
-from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.scene.boxes import pairwise_iou
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES
+from deworldsg_ros.perception.backends.nanodet import (
+    CALIBRATION,
+    NanoDetDetector,
+    SoftmaxCalibration,
+    combine,
+)
+from deworldsg_ros.scene.arrays import pairwise_iou
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
 # COCO class of each Replica class that COCO contains.
 COCO_OF_REPLICA = {

@@ -23,15 +23,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, Kind, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, Kind, build_front_end
 from deworldsg_ros.evaluation.pose_sources import PoseSource, repose
 from deworldsg_ros.evaluation.recorded_room import RecordedRoom, open_annotations
-from deworldsg_ros.evaluation.tables.rows import HARD, Condition
+from deworldsg_ros.evaluation.rows import HARD, Condition
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.registry import build_perception
 from deworldsg_ros.pipeline import Perceiver
 from deworldsg_ros.recordings.folders.annotations import Annotations
-from deworldsg_ros.recordings.folders.instances import read_instances
+from deworldsg_ros.recordings.folders.sequence import read_instances
 from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.recordings.source import Source
 from deworldsg_ros.scene.arrays import Int64, UInt16

@@ -26,12 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.measures.calibration import (
-    Calibrated,
-    calibration_error,
-    reliability,
-)
-from deworldsg_ros.evaluation.measures.graph_measures import (
+from deworldsg_ros.evaluation.edge_measures import Calibrated, calibration_error, reliability
+from deworldsg_ros.evaluation.graph_measures import (
     BOX_MARGIN_M,
     Measures,
     NodeView,
@@ -40,22 +36,16 @@ from deworldsg_ros.evaluation.measures.graph_measures import (
     measure_views,
     read_reference,
 )
-from deworldsg_ros.evaluation.measures.graph_measures import pool as pool_measures
-from deworldsg_ros.evaluation.protocol.labels import translate, translation
-from deworldsg_ros.evaluation.protocol.scene_graphs import to_prediction
-from deworldsg_ros.evaluation.protocol.scoring import (
-    ProtocolOptions,
-    ScanResult,
-    pool,
-    score_scan,
-)
+from deworldsg_ros.evaluation.graph_measures import pool as pool_measures
 from deworldsg_ros.evaluation.recorded_room import open_annotations
+from deworldsg_ros.evaluation.runner import to_prediction, translate, translation
+from deworldsg_ros.evaluation.scoring import ProtocolOptions, ScanResult, pool, score_scan
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.recordings.folders.annotations import Annotations, ScanPoints
-from deworldsg_ros.relations.graph_view import LiveGraph
+from deworldsg_ros.relations.clips import LiveGraph
 from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
-from deworldsg_ros.scene import wire
+from deworldsg_ros.wire import messages as wire
 
 NO_IMAGE = np.zeros((0, 0, 3), np.uint8)
 HEADER = (

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.front_ends.choice import FrontEndChoice, build_front_end
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.map_file import write_map
 from deworldsg_ros.pipeline import Pipeline

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deworldsg_ros.relations.pair_geometry import NodeShapes, pair_features
-from deworldsg_ros.relations.pair_table import floor_height
-from deworldsg_ros.relations.physical_states import DIRECTED, RELATIONS, relation_of_predicates
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.relations.geometry import NodeShapes, pair_features
+from deworldsg_ros.relations.pairs import floor_height
+from deworldsg_ros.relations.physics import relation_counts
 from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, pairs_in_reach
-from deworldsg_ros.relations.vote_model import relation_counts
-from deworldsg_ros.scene import graph_io
-from deworldsg_ros.scene.graph import SceneGraph
+from deworldsg_ros.relations.states import DIRECTED, RELATIONS, relation_of_predicates
 
 # A node is in the box of an object if its mean is; the box is this much larger on every side.
 BOX_MARGIN_M = 0.05
@@ -59,7 +59,7 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
     content = json.loads(truth_path.read_text())
     objects = [item for item in content["objects"] if item.get("detectable") and item.get("vg")]
     truth = {(s, o): name for s, o, _, name in content["relationships"]}
-    graph = graph_io.load(map_path)
+    graph = graph_files.load(map_path)
     for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
         graph.remove_node(node_id)
     nodes = graph.nodes

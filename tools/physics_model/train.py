@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import softmax
 
-from deworldsg_ros.relations.exclusions import CARRIED_FIRST, CARRIED_SECOND, one_support
-from deworldsg_ros.relations.physical_states import DIRECTED, STATE_COUNT
-from deworldsg_ros.relations.physics_model import (
+from deworldsg_ros.relations.physics import (
     INPUT_COUNT,
     MAX_INPUT,
     PairInputs,
     PhysicsModel,
     believed_logits,
+    vote_logits,
 )
-from deworldsg_ros.relations.vote_model import vote_logits
+from deworldsg_ros.relations.rules import CARRIED_FIRST, CARRIED_SECOND, one_support
+from deworldsg_ros.relations.states import DIRECTED, STATE_COUNT
 
 # Networks, whose mean counts.
 MEMBERS = 4

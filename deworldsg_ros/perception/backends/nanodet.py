@@ -1,11 +1,9 @@
-"""NanoDet-g 416 with integers of 8 bits on ONNX Runtime: the embedded detector, 80 classes of COCO.
-
-`tools/calibration/quantize_detector.py` makes the weights.
-"""
+"""NanoDet-g 416 in 8 bits on ONNX Runtime: the embedded detector, 80 classes of COCO."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,13 +11,86 @@ import cv2
 import numpy as np
 import onnxruntime
 
-from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.perception.networks.nms import cluster_boxes
 from deworldsg_ros.perception.protocols import Detections
-from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
-from deworldsg_ros.scene.boxes import pairwise_iou
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64, UInt8, pairwise_iou, softmax
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES
+
+# --- Non-maximum suppression that keeps track of the suppressed boxes.
+
+
+def cluster_boxes(
+    boxes_xyxy: Float64,
+    scores: Float64,
+    classes: Int64,
+    *,
+    same_class_iou: float,
+    any_class_iou: float,
+) -> Int64:
+    """Greedy non-maximum suppression, with the suppressing box of each box.
+
+    The best remaining box suppresses the remaining boxes of its class whose IoU exceeds
+    `same_class_iou`, and those of any class whose IoU exceeds `any_class_iou`.
+
+    Args:
+        boxes_xyxy: (n, 4) pixels.
+        scores: (n,).
+        classes: (n,) most likely class.
+        same_class_iou: IoU above which boxes of one class show one object.
+        any_class_iou: IoU above which any boxes show one object.
+
+    Returns:
+        (n,) int64: row of the box that suppressed each; its own row if it was kept.
+    """
+    order = np.argsort(-scores, kind="stable")
+    iou = pairwise_iou(boxes_xyxy[order], boxes_xyxy[order])
+    same_class = classes[order][:, None] == classes[order][None, :]
+    covers = (iou > any_class_iou) | (same_class & (iou > same_class_iou))
+    keeper = np.full(len(order), -1, dtype=np.int64)
+    for rank in range(len(order)):
+        if keeper[rank] < 0:
+            keeper[(keeper < 0) & covers[rank]] = rank
+            keeper[rank] = rank
+    result = np.empty(len(order), dtype=np.int64)
+    result[order] = order[keeper]
+    return result
+
+
+# --- Independent sigmoid scores → one calibrated class distribution.
+
+# Keeps the logit finite. The network's scores of absent classes are far higher.
+SCORE_FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class SoftmaxCalibration:
+    """p = softmax(logit(scores) / temperature).
+
+    Sigmoid scores are independent. If they were normalised, 80 classes at 0.01 would outweigh one
+    at 0.5. The softmax of their logits keeps their order. The temperature is fitted by likelihood
+    (temperature scaling, Guo et al. 2017) with tools/calibration/calibrate_detector.py.
+
+    Attributes:
+        temperature: above 0; below 1 sharpens.
+    """
+
+    temperature: float
+
+    def __post_init__(self) -> None:
+        if not self.temperature > 0:
+            raise ValueError(f"calibration temperature is {self.temperature}, expected > 0")
+
+    def __call__(self, scores: Float64) -> Float64:
+        """Distributions (n, C), rows sum to one, of sigmoid scores (n, C)."""
+        clipped = np.clip(np.asarray(scores, dtype=np.float64), SCORE_FLOOR, 1 - SCORE_FLOOR)
+        logits = np.log(clipped / (1 - clipped)) / self.temperature
+        return np.asarray(softmax(logits))
+
+
+# --- NanoDet-g 416 with integers of 8 bits on ONNX Runtime: the embedded detector, 80 classes of
+# COCO.
+#
+# `tools/calibration/quantize_detector.py` makes the weights.
 
 WEIGHTS = Path(__file__).parents[1] / "weights" / "nanodet_g_416_coco_int8.onnx"
 # Side of the network's input and strides of its outputs, pixels.

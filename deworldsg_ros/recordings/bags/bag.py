@@ -11,26 +11,26 @@ from typing import Any, ClassVar
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, Topic
 from deworldsg_ros.recordings.bags.topics import TopicChoice, find_topics
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import (
+from deworldsg_ros.recordings.source import (
     CAMERA_INFO,
     ODOMETRY,
     POSE_STAMPED,
     TF_MESSAGE,
+    RawRoleMessage,
     Role,
     RoleMessage,
+    UsedTopic,
     camera_info,
     decode,
     pose_stamped_from_matrix,
+    serialize,
     stamp_ns_of_cdr,
 )
-from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 from deworldsg_ros.streams.images import depth_from_message, rgb_from_message
-from deworldsg_ros.streams.poses import pose_from_message
-from deworldsg_ros.streams.transforms import TransformTree
+from deworldsg_ros.streams.poses import TransformTree, pose_from_message
 
 # Static transforms: also /robot/tf_static.
 STATIC_SUFFIX = "tf_static"

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings.bags.storage import Topic
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.messages import (
+from deworldsg_ros.recordings.source import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
@@ -17,6 +16,7 @@ from deworldsg_ros.recordings.messages import (
     TF_MESSAGE,
     Role,
 )
+from deworldsg_ros.scene.errors import RecordingError
 
 Types = tuple[str, ...]
 # The topic with the highest score has the role; None = the topic cannot have it.

@@ -5,6 +5,6 @@ files per frame: `seven_scenes`, and via `sequence` the layout of 3RScan: `rio`,
 `tum` reads TUM RGB-D. `annotations`, `instances` and `ply` read the ground truth.
 """
 
-from deworldsg_ros.recordings.folders.registry import detect_dataset, open_dataset
+from deworldsg_ros.recordings.folders.dataset import detect_dataset, open_dataset
 
 __all__ = ["detect_dataset", "open_dataset"]

@@ -13,11 +13,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from deworldsg_ros.recordings import messages as ros
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.base.words import MAX_STAMP_S
+from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.folders.dataset import CAMERA_FRAME, WORLD_FRAME, Dataset, read_text
-from deworldsg_ros.recordings.messages import Role, RoleMessage
-from deworldsg_ros.recordings.source import RawRoleMessage, UsedTopic, serialize
+from deworldsg_ros.recordings.source import RawRoleMessage, Role, RoleMessage, UsedTopic, serialize
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import (
     Intrinsics,
@@ -25,8 +24,7 @@ from deworldsg_ros.scene.camera import (
     pose_from_quaternion,
     quaternion_from_rotation,
 )
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.stamps import MAX_STAMP_S
+from deworldsg_ros.scene.errors import RecordingError, RefusedInput
 
 # Stamp of frame 0: many programs read a ROS time of zero as "unset".
 FIRST_STAMP_NS = 10**9

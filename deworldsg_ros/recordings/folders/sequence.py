@@ -1,15 +1,14 @@
-"""Common layout of 3RScan, ReplicaSSG and the rendered rooms: a scan with sequence/_info.txt."""
+"""Scans with sequence/_info.txt: 3RScan, ReplicaSSG and the rendered rooms."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import (
     DatasetOptions,
     decode_image,
@@ -17,11 +16,14 @@ from deworldsg_ros.recordings.folders.dataset import (
     image_format,
     image_size,
     read_file,
+    read_json,
 )
 from deworldsg_ros.recordings.folders.frame_files import FIRST_STAMP_NS, FrameFiles, color_files
 from deworldsg_ros.scene.arrays import Float64, UInt16
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.errors import RecordingError, RefusedInput
+
+# --- Common layout of 3RScan, ReplicaSSG and the rendered rooms: a scan with sequence/_info.txt.
 
 INFO_NAME = "_info.txt"
 RENDERED_DEPTH = ".rendered.depth.png"
@@ -241,3 +243,120 @@ def _camera(values: dict[str, str], which: str) -> Intrinsics:
     lower = which.lower()
     size = int(values[f"m_{lower}Width"]), int(values[f"m_{lower}Height"])
     return Intrinsics(numbers[0], numbers[5], numbers[2], numbers[6], *size)
+
+
+# --- Rendered rooms: the layout of ReplicaSSG with instance images, recorded detections, gt.json.
+
+GROUND_TRUTH_NAME = "gt.json"
+
+
+def belongs_to_rooms(path: Path) -> bool:
+    """Whether a scan has instance images and recorded detections."""
+    return has_frames(path, ".instance.png") and has_frames(path, ".frontend.json")
+
+
+class RoomsScan(SequenceDataset):
+    """One rendered room."""
+
+    kind = "rooms"
+    expects = (
+        "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt,instance.png,"
+        "frontend.json}"
+    )
+    default_rate_hz = 10.0
+    how_to_get = "run unpack.py of the rendered rooms, which writes all files"
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether it is a scan with instance images and recorded detections."""
+        return looks_like_scan(path) and belongs_to_rooms(path)
+
+
+def read_ground_truth(scan_folder: Path) -> dict[str, Any] | None:
+    """Content of a room's gt.json; None if there is none. Raises RecordingError."""
+    path = sequence_folder(scan_folder).parent / GROUND_TRUTH_NAME
+    if not path.exists():
+        return None
+    content = read_json(path)
+    if not isinstance(content, dict) or "objects" not in content:
+        raise RecordingError(f"{path}: there is no key objects; expected one")
+    return content
+
+
+# --- ReplicaSSG over Replica: data/SCAN/sequence, 960x540, no rotation.
+
+
+def belongs_to_replica(path: Path) -> bool:
+    """Whether the data set of a scan has the annotations of ReplicaSSG."""
+    return (dataset_root(path) / "ReplicaSSG").is_dir()
+
+
+class ReplicaScan(SequenceDataset):
+    """One scene of ReplicaSSG."""
+
+    kind = "replica"
+    expects = (
+        "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt}, with "
+        "ReplicaSSG/ beside data/"
+    )
+    default_rate_hz = 30.0
+    how_to_get = (
+        "download Replica (https://github.com/facebookresearch/Replica-Dataset) and run the "
+        "scripts of https://github.com/Howardkhh/ReplicaSSG, which render the frames"
+    )
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether it is a scan of a data set with ReplicaSSG/, but no rendered room."""
+        return looks_like_scan(path) and belongs_to_replica(path) and not belongs_to_rooms(path)
+
+
+# --- 3RScan with annotations of 3DSSG: data/SCAN/sequence, images rotated upright by 90 degrees.
+#
+# The phone was held upright but its images are stored in landscape format: they are rotated
+# clockwise, with the intrinsics and the poses (`rotated_intrinsics`, `rotated_pose`). Depth is
+# rendered from the mesh if such files exist (``frame-*.rendered.depth.png``, as in published
+# results), else it is of the sensor; `DatasetOptions.depth_source` selects it.
+
+
+class RioScan(SequenceDataset):
+    """One scan of 3RScan."""
+
+    kind = "3rscan"
+    expects = "sequence/_info.txt and sequence/frame-NNNNNN.{color.jpg,depth.pgm,pose.txt}"
+    default_rate_hz = 10.0
+    rotated = True
+    how_to_get = (
+        "agree to the terms at https://github.com/WaldJohannaU/3RScan, download the scan and "
+        "unpack its sequence.zip into sequence/"
+    )
+
+    @staticmethod
+    def looks_like(path: Path) -> bool:
+        """Whether it is a scan that is neither of ReplicaSSG nor a rendered room."""
+        return looks_like_scan(path) and not belongs_to_replica(path) and not belongs_to_rooms(path)
+
+    def _choose_depth(self, first: int) -> str:
+        if self.options.depth_source == "auto" and self.file(first, RENDERED_DEPTH).exists():
+            return RENDERED_DEPTH
+        return super()._choose_depth(first)
+
+
+# --- Instance images of the data sets that have them: the object id of each pixel.
+
+
+def read_instances(source: object, stamp_ns: int) -> UInt16 | None:
+    """Object ids of a frame's pixels, (H, W) uint16, 0 = none; None without an instance image.
+
+    Raises:
+        RecordingError: for an image that cannot be decoded.
+    """
+    # Instance images are not rotated: they do not fit rotated images.
+    if not isinstance(source, SequenceDataset) or source.rotated:
+        return None
+    if stamp_ns not in source.frame_numbers:
+        return None
+    path = source.file(source.frame_numbers[stamp_ns], ".instance.png")
+    if not path.exists():
+        return None
+    return np.asarray(decode_image(read_file(path), cv2.IMREAD_UNCHANGED, path), np.uint16)

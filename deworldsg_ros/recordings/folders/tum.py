@@ -15,8 +15,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from deworldsg_ros.recordings import messages as ros
-from deworldsg_ros.recordings.errors import RecordingError
+from deworldsg_ros.base.words import stamp_ns_from_text
+from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.folders.dataset import (
     CAMERA_FRAME,
     WORLD_FRAME,
@@ -28,10 +28,9 @@ from deworldsg_ros.recordings.folders.dataset import (
     image_size,
     read_file,
 )
-from deworldsg_ros.recordings.messages import Role, RoleMessage
-from deworldsg_ros.recordings.source import UsedTopic
+from deworldsg_ros.recordings.source import Role, RoleMessage, UsedTopic
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.stamps import stamp_ns_from_text
+from deworldsg_ros.scene.errors import RecordingError
 
 # Factory-calibrated colour cameras, from the data set's documentation.
 INTRINSICS = {

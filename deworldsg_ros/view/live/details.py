@@ -7,9 +7,9 @@ import math
 from collections.abc import Sequence
 from html import escape
 
+from deworldsg_ros.base.words import counted
 from deworldsg_ros.client.explain import explain_relation
 from deworldsg_ros.client.objects import Relation, SceneObject, odds_of
-from deworldsg_ros.words import counted
 
 # A second class is worth a word from this share of the first one's probability on, and as likely
 # as the first from the other.

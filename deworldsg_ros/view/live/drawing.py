@@ -1,4 +1,4 @@
-"""What the scene shows, as arrays: boxes or ellipsoids, outlines, relations, labels."""
+"""The content of the scene as arrays: boxes or ellipsoids, outlines, relations, labels."""
 
 from __future__ import annotations
 
@@ -6,18 +6,137 @@ import math
 from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from deworldsg_ros.client.objects import SURE
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.arrays import Float64, Int64, UInt8
-from deworldsg_ros.scene.edges import Pair
-from deworldsg_ros.view.colours import GREY, class_colours, predicate_colours, to_rgb
-from deworldsg_ros.view.geometry import MUTUAL
-from deworldsg_ros.view.live.filters import Filter
-from deworldsg_ros.view.live.tables import Label, ObjectTable
+from deworldsg_ros.client.objects import SURE, Point, SceneObject, scene_object
+from deworldsg_ros.graph.pairs import Pair
+from deworldsg_ros.scene.arrays import Columns, Float64, Int64, UInt8
+from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.view.colours import (
+    GREY,
+    MUTUAL,
+    QUIET,
+    SIGMAS,
+    class_colours,
+    predicate_colours,
+    principal_axes,
+    to_rgb,
+)
+from deworldsg_ros.wire import messages as wire
+
+# --- Which objects and relations are shown.
+
+
+@dataclass(frozen=True)
+class Filter:
+    """The user's choice; the default hides the relations that hide everything else.
+
+    Attributes:
+        hidden_classes, hidden_predicates: names that are not shown.
+        min_probability: of an object, that it exists and is of its class.
+        min_relation: of a relation.
+    """
+
+    hidden_classes: frozenset[str] = frozenset()
+    hidden_predicates: frozenset[str] = QUIET
+    min_probability: float = 0.0
+    min_relation: float = 0.0
+
+
+# --- The objects of the graph as arrays. Only objects whose message changed are computed again.
+
+# Thinner ellipsoids are invisible from the side.
+LEAST_DIAMETER_M = 0.012
+
+
+class Label(NamedTuple):
+    """A text in the scene.
+
+    Attributes:
+        key: stable identity.
+        text: what it says.
+        position: (3,) world, metres.
+        weight: labels of more weight are placed first.
+    """
+
+    key: str
+    text: str
+    position: Float64
+    weight: float
+
+
+class ObjectTable(Columns):
+    """The boxes and ellipsoids of n objects.
+
+    Attributes:
+        centres: (n, 3) of the boxes, metres, world.
+        wxyzs: (n, 4) axes of the boxes to world.
+        sizes: (n, 3) of the boxes along their axes, metres.
+        means, ellipsoid_wxyzs, diameters: the same of the ellipsoids (2σ).
+        probabilities: (n,) that it exists and is of its class.
+        objects: each object by its id.
+        texts: the label of each object by its id.
+    """
+
+    centres: Float64
+    wxyzs: Float64
+    sizes: Float64
+    means: Float64
+    ellipsoid_wxyzs: Float64
+    diameters: Float64
+    probabilities: Float64
+
+    def __init__(self) -> None:
+        super().__init__(
+            {
+                **dict.fromkeys(("centres", "sizes", "means", "diameters"), (np.float64, (3,))),
+                **dict.fromkeys(("wxyzs", "ellipsoid_wxyzs"), (np.float64, (4,))),
+                "probabilities": (np.float64, ()),
+            }
+        )
+        self.objects: dict[int, SceneObject] = {}
+        self.texts: dict[int, Label] = {}
+
+    @property
+    def labels(self) -> list[str]:
+        """Class of each row."""
+        return [self.objects[node_id].label for node_id in self.ids.tolist()]
+
+    def sync(self, nodes: Mapping[int, wire.NodeState], frame_id: str, up: Point) -> bool:
+        """Make the rows equal to these nodes; returns whether anything changed."""
+        gone = [node_id for node_id in self.objects if node_id not in nodes]
+        for node_id in gone:
+            self.remove(node_id)
+            del self.objects[node_id], self.texts[node_id]
+        changed = [
+            node
+            for node_id, node in nodes.items()
+            if node_id not in self.objects or self.objects[node_id].state is not node
+        ]
+        self.extend([node.id for node in changed if node.id not in self.objects])
+        for node in changed:
+            self._put(scene_object(node, frame_id, up))
+        return bool(gone or changed)
+
+    def _put(self, item: SceneObject) -> None:
+        row = self.row(item.id)
+        self.objects[item.id] = item
+        self.centres[row], self.sizes[row] = item.position_m, item.size_m
+        x, y, z, w = item.orientation_xyzw
+        self.wxyzs[row] = w, x, y, z
+        deviations, axes = principal_axes(np.array(item.covariance_m2))
+        self.means[row] = item.mean_m
+        self.ellipsoid_wxyzs[row] = np.roll(quaternion_from_rotation(axes), 1)
+        self.diameters[row] = np.maximum(2 * SIGMAS * deviations, LEAST_DIAMETER_M)
+        self.probabilities[row] = probability = item.probability
+        top = np.array(item.position_m) + item.size_m[2] / 2 * np.array(item.up)
+        text = f"{item.label}{'' if probability >= SURE else '?'} {item.id}"
+        self.texts[item.id] = Label(f"object {item.id}", text, top, math.prod(item.size_m))
+
+
+# --- What the scene shows, as arrays: boxes or ellipsoids, outlines, relations, labels.
 
 Shape = Literal["boxes", "ellipsoids"]
 

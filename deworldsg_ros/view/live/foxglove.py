@@ -10,16 +10,16 @@ import numpy as np
 from foxglove import channels, messages
 
 from deworldsg_ros.client.objects import SceneObject, scene_object
-from deworldsg_ros.scene import wire
+from deworldsg_ros.graph.extent import horizontal_axes
+from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.scene.arrays import Float64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
-from deworldsg_ros.scene.edges import Pair
-from deworldsg_ros.scene.extent import horizontal_axes
-from deworldsg_ros.scene.replica import GraphReplica
 from deworldsg_ros.view.colours import QUIET, class_colours, to_rgb
 from deworldsg_ros.view.live.camera import CameraView, jpeg, with_masks
 from deworldsg_ros.view.live.details import in_words
 from deworldsg_ros.view.live.state import up_of
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
 
 # One topic each, so that Foxglove can switch them.
 OBJECTS, RELATIONS, NEAR = "/scene_graph/objects", "/scene_graph/relations", "/scene_graph/near"

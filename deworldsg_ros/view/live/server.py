@@ -14,16 +14,20 @@ from typing import Any
 import numpy as np
 import viser
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.scene.extent import horizontal_axes
+from deworldsg_ros.graph.extent import horizontal_axes
 from deworldsg_ros.view.live.camera import CameraView
-from deworldsg_ros.view.live.client_labels import ClientLabels, has_area, overview
 from deworldsg_ros.view.live.details import object_html
-from deworldsg_ros.view.live.errors import LogOnce, OnError
-from deworldsg_ros.view.live.panel import Panel, set_theme
-from deworldsg_ros.view.live.scene import ViserScene
-from deworldsg_ros.view.live.state import LiveState, up_of
-from deworldsg_ros.view.live.tables import Label
+from deworldsg_ros.view.live.drawing import Label
+from deworldsg_ros.view.live.scene import (
+    ClientLabels,
+    Panel,
+    ViserScene,
+    has_area,
+    overview,
+    set_theme,
+)
+from deworldsg_ros.view.live.state import LiveState, LogOnce, OnError, up_of
+from deworldsg_ros.wire import messages as wire
 
 # Updates come at up to 30 Hz; a browser shows them at this rate, and surface points more seldom.
 PERIOD_S = 0.1

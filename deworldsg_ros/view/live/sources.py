@@ -9,13 +9,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Protocol
 
+from deworldsg_ros.graph.graph_files import GRAPH_FILE
 from deworldsg_ros.pipeline import Pipeline
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.following import Copy
-from deworldsg_ros.scene.graph_file import GRAPH_FILE
 from deworldsg_ros.view.live.camera import CameraView, view_of
-from deworldsg_ros.view.live.errors import OnError
+from deworldsg_ros.view.live.state import OnError
+from deworldsg_ros.wire.follow import Copy
 
 
 class Sink(Copy, Protocol):

@@ -2,23 +2,140 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from deworldsg_ros.client.objects import Point, Relation, relation
-from deworldsg_ros.scene import wire
+from deworldsg_ros.base.words import counted
+from deworldsg_ros.client.objects import Point, Relation, relation_of
+from deworldsg_ros.graph.extent import DEFAULT_UP
+from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.scene.arrays import Float32, Float64, UInt8
-from deworldsg_ros.scene.edges import Pair
-from deworldsg_ros.scene.extent import DEFAULT_UP
-from deworldsg_ros.scene.replica import GraphReplica
-from deworldsg_ros.view.live.camera import CameraView, Shot, Shots, jpeg, with_masks
-from deworldsg_ros.view.live.crops import BestViews
-from deworldsg_ros.view.live.drawing import Drawing, Shape, draw, node_colours, rgb_of, rotations
-from deworldsg_ros.view.live.filters import Filter
-from deworldsg_ros.view.live.history import History
-from deworldsg_ros.view.live.tables import ObjectTable
-from deworldsg_ros.words import counted
+from deworldsg_ros.view.live.camera import BestViews, CameraView, Shot, Shots, jpeg, with_masks
+from deworldsg_ros.view.live.drawing import (
+    Drawing,
+    Filter,
+    ObjectTable,
+    Shape,
+    draw,
+    node_colours,
+    rgb_of,
+    rotations,
+)
+from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.follow import GraphReplica
+
+# --- What becomes of an exception in the thread of the page, which goes on.
+
+OnError = Callable[[Exception], None]
+
+
+class LogOnce:
+    """Logs the first exception of each type: a step of the page may fail ten times a second."""
+
+    def __init__(self) -> None:
+        self._types: set[type[Exception]] = set()
+
+    def __call__(self, error: Exception) -> None:
+        """Log an exception with its traceback."""
+        if type(error) not in self._types:
+            self._types.add(type(error))
+            logging.getLogger(__name__).error("the page goes on after an error", exc_info=error)
+
+
+# --- What was recorded: the graph after each numbered update, for the time slider.
+
+# A moment is found by applying at most so many updates to a snapshot.
+BLOCK = 100
+# The oldest updates are forgotten beyond this number: ten minutes at 30 Hz.
+MOST_UPDATES = 18_000
+
+
+@dataclass
+class _Block:
+    """A snapshot, the first moment of the block, and the updates after it."""
+
+    start: wire.SceneGraphMessage
+    updates: list[wire.SceneGraphUpdateMessage] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return 1 + len(self.updates)
+
+
+class History:
+    """The graph after each update. Moments are numbered from 0; the oldest are forgotten.
+
+    Args:
+        most_updates: number of moments that are kept, about.
+
+    Attributes:
+        newest: the graph now.
+        first: number of the oldest moment that is kept.
+    """
+
+    def __init__(self, most_updates: int = MOST_UPDATES) -> None:
+        self.newest = GraphReplica()
+        self.first = 0
+        self._most_blocks = max(most_updates // BLOCK, 1)
+        self._blocks: list[_Block] = []
+
+    @property
+    def session(self) -> str | None:
+        """The session of the graph."""
+        return self.newest.session
+
+    @property
+    def sequence(self) -> int:
+        """Number of the newest update."""
+        return self.newest.sequence
+
+    @property
+    def last(self) -> int:
+        """Number of the newest moment; `first` - 1 if there is none."""
+        return self.first + sum(map(len, self._blocks)) - 1
+
+    def reset(self, snapshot: wire.SceneGraphMessage) -> None:
+        """Continue with a snapshot: of a file, or after lost updates."""
+        self.newest.reset(snapshot)
+        self._begin(snapshot)
+
+    def apply(self, update: wire.SceneGraphUpdateMessage) -> bool:
+        """Apply the next update; False for one that is known.
+
+        Raises:
+            RefusedInput: ``lost_updates`` or ``other_session``, as `GraphReplica.apply`.
+        """
+        if not self.newest.apply(update):
+            return False
+        # The first update of a session replaces the graph, so it begins a block too.
+        if not self._blocks or update.sequence == 1 or len(self._blocks[-1]) >= BLOCK:
+            self._begin(self.newest.message())
+        else:
+            self._blocks[-1].updates.append(update)
+        return True
+
+    def at(self, moment: int) -> GraphReplica:
+        """The graph at a moment; the nearest one that is kept."""
+        left = min(max(moment, self.first), self.last) - self.first
+        replica = GraphReplica()
+        for block in self._blocks:
+            if left < len(block):
+                replica.reset(block.start)
+                for update in block.updates[:left]:
+                    replica.apply(update)
+                break
+            left -= len(block)
+        return replica
+
+    def _begin(self, snapshot: wire.SceneGraphMessage) -> None:
+        self._blocks.append(_Block(snapshot))
+        if len(self._blocks) > self._most_blocks:
+            self.first += len(self._blocks.pop(0))
+
+
+# --- The state of a viewer, without a browser: what was recorded, and what of it is shown.
 
 # Points of an object that are collected from the frames, if the messages of the graph have none.
 POINTS_OF_OBJECT = 256
@@ -124,7 +241,7 @@ class LiveState:
         """Relations of an object that is drawn, the most probable first."""
         objects = self.table.objects
         found = [
-            relation(edge, objects[edge.subject], objects[edge.object], None)
+            relation_of(edge, objects[edge.subject], objects[edge.object], None)
             for pair, edge in self.edges.items()
             if node_id in pair and pair[0] in objects and pair[1] in objects
         ]

@@ -21,11 +21,15 @@ from support.torch_models import (
     torch,
 )
 
-from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, read_card, write_card
+from deworldsg_ros.checkpoints.cards import (
+    DETECTOR_CARD,
+    CheckpointCard,
+    read_detector_card,
+    write_detector_card,
+)
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
-from deworldsg_ros.perception.backends.egtr import EgtrRelationHead, best_pairs
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector, best_pairs
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -199,8 +203,8 @@ def test_another_decoder_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="has 5 layers of 32 .* reads 4 layers of 32"):
         build(deeper, predicate_set="checkpoint")
     # The head accepts a detector with fewer layers.
-    card = read_card(deeper / CARD_FILE)
-    write_card(deeper / CARD_FILE, msgspec.structs.replace(card, decoder_layers=3))
+    card = read_detector_card(deeper / DETECTOR_CARD)
+    write_detector_card(deeper / DETECTOR_CARD, msgspec.structs.replace(card, decoder_layers=3))
     build(deeper, predicate_set="checkpoint")
 
 

@@ -16,16 +16,16 @@ from deworldsg_ros.perception.backends.nanodet import (
     INPUT_SIZE,
     STRIDES,
     NanoDetDetector,
+    SoftmaxCalibration,
     Tables,
+    cluster_boxes,
     combine,
     decode,
     letterbox,
 )
-from deworldsg_ros.perception.networks.calibration import SoftmaxCalibration
-from deworldsg_ros.perception.networks.nms import cluster_boxes
-from deworldsg_ros.scene.boxes import pairwise_iou
+from deworldsg_ros.scene.arrays import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.vocabularies import COCO_CLASSES
+from deworldsg_ros.scene.vocabulary import COCO_CLASSES
 
 CHAIR, CUP, VASE = (COCO_CLASSES.index(name) for name in ("chair", "cup", "vase"))
 

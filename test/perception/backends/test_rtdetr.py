@@ -21,7 +21,12 @@ from support.torch_models import (
     torch,
 )
 
-from deworldsg_ros.checkpoints.card import CARD_FILE, CheckpointCard, read_card, write_card
+from deworldsg_ros.checkpoints.cards import (
+    DETECTOR_CARD,
+    CheckpointCard,
+    read_detector_card,
+    write_detector_card,
+)
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -47,7 +52,7 @@ def detector(folder, **changes):
 def with_card(folder, tmp_path, **fields):
     """A copy of a checkpoint with another card."""
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    write_card(copy / CARD_FILE, CheckpointCard(**fields))
+    write_detector_card(copy / DETECTOR_CARD, CheckpointCard(**fields))
     return copy
 
 
@@ -250,8 +255,8 @@ def test_damaged_cards_and_preprocessing_are_refused(folders, tmp_path):
     card = tmp_path / "deworldsg.json"
     card.write_text('{"class_scores": "argmax"}')
     with pytest.raises(ConfigurationError, match="deworldsg.json: .*argmax"):
-        read_card(card)
-    assert read_card(None) == CheckpointCard()
+        read_detector_card(card)
+    assert read_detector_card(None) == CheckpointCard()
     for name in ("config.json", "model.safetensors"):
         (tmp_path / name).write_bytes((folders["v1"] / name).read_bytes())
     card.unlink()

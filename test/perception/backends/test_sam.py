@@ -16,11 +16,13 @@ from support.torch_models import (
     transformers,
 )
 
-from deworldsg_ros.perception.backends.sam import SamSegmenter
-from deworldsg_ros.perception.backends.sam2 import Sam2Segmenter
-from deworldsg_ros.perception.backends.sam3 import Sam3Segmenter
-from deworldsg_ros.perception.instance_image import instance_image
-from deworldsg_ros.perception.networks.box_prompts import as_patch
+from deworldsg_ros.perception.backends.sam import (
+    Sam2Segmenter,
+    Sam3Segmenter,
+    SamSegmenter,
+    as_patch,
+)
+from deworldsg_ros.perception.stage import instance_image
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError
 

@@ -7,8 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from deworldsg_ros.recordings.errors import RecordingError
-from deworldsg_ros.recordings.folders.ply import read_vertices
+from deworldsg_ros.recordings.folders.annotations import read_vertices
+from deworldsg_ros.scene.errors import RecordingError
 
 NAMES = ("x", "id")
 FORMS = ("ascii", "binary_little_endian", "binary_big_endian")

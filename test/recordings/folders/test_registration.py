@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.recordings.folders.registration import register_depth
+from deworldsg_ros.recordings.folders.seven_scenes import register_depth
 from deworldsg_ros.scene.camera import Intrinsics
 
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)

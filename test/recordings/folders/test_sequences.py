@@ -21,17 +21,13 @@ from support.sequences import (
     write_sequence,
 )
 
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders import detect_dataset
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.folders.sequence import (
-    resample,
-    rotated_intrinsics,
-    rotated_pose,
-)
+from deworldsg_ros.recordings.folders.sequence import resample, rotated_intrinsics, rotated_pose
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion
+from deworldsg_ros.scene.errors import RecordingError
 
 
 def test_each_folder_is_recognised(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from support.recordings import (
     write_seven_scenes,
 )
 
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.folders.seven_scenes import (
     BASELINE_M,
@@ -27,6 +26,7 @@ from deworldsg_ros.recordings.folders.seven_scenes import (
 from deworldsg_ros.recordings.recording import detect_kind, open_recording, open_source
 from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.camera import Intrinsics
+from deworldsg_ros.scene.errors import RecordingError
 
 COUNT = 5
 

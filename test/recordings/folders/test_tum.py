@@ -7,17 +7,12 @@ import pytest
 from support.recordings import HEIGHT, WIDTH, encoded, pose, rgb_pixels
 
 from deworldsg_ros.config import Config, InputsConfig
-from deworldsg_ros.recordings.errors import RecordingError
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions
-from deworldsg_ros.recordings.messages import Role
 from deworldsg_ros.recordings.posing import PoseChoice, choose_poses
-from deworldsg_ros.recordings.recording import (
-    Recording,
-    detect_kind,
-    open_recording,
-    open_source,
-)
+from deworldsg_ros.recordings.recording import Recording, detect_kind, open_recording, open_source
+from deworldsg_ros.recordings.source import Role
 from deworldsg_ros.scene.camera import interpolate_pose, quaternion_from_rotation
+from deworldsg_ros.scene.errors import RecordingError
 
 COUNT = 4
 T0_NS = 1305031102175304000

@@ -24,13 +24,16 @@ from support.checkpoints import (  # noqa: E402  after the guards
 from support.relations import VOCABULARY, pair_graph, picture  # noqa: E402
 
 from deworldsg_ros.checkpoints.loading import choose_device, choose_dtype  # noqa: E402
-from deworldsg_ros.relations import RelationReasoner, build_world_model  # noqa: E402
-from deworldsg_ros.relations.probing.preprocessing import normalise, stretch  # noqa: E402
-from deworldsg_ros.relations.world_models import dinov2, vjepa2  # noqa: E402
+from deworldsg_ros.relations import (  # noqa: E402
+    RelationReasoner,
+    build_world_model,
+    clip_models,
+)
+from deworldsg_ros.relations.clip_models import normalise, stretch  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
 
 SAVERS = {"vjepa2": save_vjepa2, "dinov2": save_dinov2}
-LOADERS = {"vjepa2": vjepa2.load_backbone, "dinov2": dinov2.load_backbone}
+LOADERS = {"vjepa2": clip_models.load_vjepa2, "dinov2": clip_models.load_dinov2}
 # The published 224 pixels of DINOv2 are the default; the tests use a smaller input.
 SMALL = {"vjepa2": {}, "dinov2": {"image_size": 56}}
 IMAGE_SIZES = {"vjepa2": 32, "dinov2": 56}
@@ -118,7 +121,7 @@ def test_backbone_and_probe_are_a_world_model(checkpoints, family, inputs, tmp_p
 
 def test_the_stage_publishes_the_predictions_of_backbone_and_probe(checkpoints, tmp_path):
     config = config_of("vjepa2", checkpoints["vjepa2"], probe_path=str(tmp_path))
-    save_random_probe(tmp_path, vjepa2.load_backbone(config).identity)
+    save_random_probe(tmp_path, clip_models.load_vjepa2(config).identity)
     stage = RelationReasoner(config, build_world_model(config))
     for stamp in range(1, 4):
         stage.observe(pair_graph(stamp), picture(stamp))
@@ -138,13 +141,13 @@ def test_the_stage_publishes_the_predictions_of_backbone_and_probe(checkpoints, 
 )
 def test_missing_checkpoint_is_one_sentence(path, message):
     with pytest.raises(ConfigurationError, match=message) as refusal:
-        vjepa2.load_backbone(config_of("vjepa2", path))
+        clip_models.load_vjepa2(config_of("vjepa2", path))
     assert "\n" not in str(refusal.value)
 
 
 def test_folder_without_a_model_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+        clip_models.load_vjepa2(config_of("vjepa2", tmp_path))
 
 
 @pytest.mark.parametrize("family, other", [("vjepa2", "dinov2"), ("dinov2", "vjepa2")])
@@ -161,13 +164,13 @@ def test_damaged_or_incomplete_weights_are_refused(checkpoints, tmp_path):
     del state[key]
     save_file(state, weights, metadata={"format": "pt"})
     with pytest.raises(ConfigurationError, match=f"lacks 1 parameters of VJEPA2Model.*{key}"):
-        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+        clip_models.load_vjepa2(config_of("vjepa2", tmp_path))
     weights.write_bytes(b"not a checkpoint")
     with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+        clip_models.load_vjepa2(config_of("vjepa2", tmp_path))
     (tmp_path / "config.json").write_text(json.dumps({"model_type": "no_such_model"}))
     with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        vjepa2.load_backbone(config_of("vjepa2", tmp_path))
+        clip_models.load_vjepa2(config_of("vjepa2", tmp_path))
 
 
 def test_a_checkpoint_without_the_unused_predictor_is_accepted(checkpoints, tmp_path):
@@ -178,7 +181,7 @@ def test_a_checkpoint_without_the_unused_predictor_is_accepted(checkpoints, tmp_
     assert len(kept) < len(state)
     save_file(kept, weights, metadata={"format": "pt"})
     identity = load("vjepa2", checkpoints["vjepa2"]).identity
-    assert vjepa2.load_backbone(config_of("vjepa2", tmp_path)).identity == identity
+    assert clip_models.load_vjepa2(config_of("vjepa2", tmp_path)).identity == identity
 
 
 def test_a_clip_length_that_the_encoder_cannot_split_is_refused(checkpoints):
@@ -191,7 +194,7 @@ def test_cuda_without_a_device_is_refused(checkpoints, monkeypatch):
     chosen = {choose_device("perception.device", choice) for choice in ("auto", "cpu")}
     assert chosen == {torch.device("cpu")}
     with pytest.raises(ConfigurationError, match="finds no CUDA device: set it to 'auto' or 'cpu'"):
-        vjepa2.load_backbone(config_of("vjepa2", checkpoints["vjepa2"]), device="cuda")
+        clip_models.load_vjepa2(config_of("vjepa2", checkpoints["vjepa2"]), device="cuda")
 
 
 def test_half_precision_only_on_cuda():

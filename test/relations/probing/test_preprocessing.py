@@ -9,13 +9,9 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")
 pytestmark = pytest.mark.models
 
-from deworldsg_ros.checkpoints.card import IMAGENET_MEAN, IMAGENET_STD  # noqa: E402
-from deworldsg_ros.relations.probing.preprocessing import (  # noqa: E402  after the guards
-    ClipGeometry,
-    normalise,
-    stretch,
-)
-from deworldsg_ros.relations.world_models import dinov2, vjepa2  # noqa: E402
+from deworldsg_ros.checkpoints.cards import IMAGENET_MEAN, IMAGENET_STD  # noqa: E402
+from deworldsg_ros.relations import clip_models  # noqa: E402
+from deworldsg_ros.relations.clip_models import ClipGeometry, normalise, stretch  # noqa: E402
 
 
 def triangle(x):
@@ -71,13 +67,13 @@ def test_both_ends_of_a_long_crop_are_in_view(size):
 @pytest.mark.parametrize("size", [(1, 1), (1, 640), (480, 1)])
 def test_any_crop_gives_a_whole_square(size):
     clip = np.full((2, *size, 3), 77, np.uint8)
-    stretched = stretch(clip, vjepa2.clip_geometry(256))
+    stretched = stretch(clip, clip_models.vjepa2_geometry(256))
     assert stretched.shape == (2, 3, 256, 256) and (stretched == 77).all()
 
 
 def test_interpolation_is_that_of_the_published_processors():
-    assert vjepa2.clip_geometry(384) == ClipGeometry(384, "bilinear")
-    assert dinov2.clip_geometry(224) == ClipGeometry(224, "bicubic")
+    assert clip_models.vjepa2_geometry(384) == ClipGeometry(384, "bilinear")
+    assert clip_models.dinov2_geometry(224) == ClipGeometry(224, "bicubic")
 
 
 def test_normalisation_is_per_channel():

@@ -6,12 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 from deworldsg_ros.view.live import camera as camera_module
-from deworldsg_ros.view.live.camera import CameraView, Shot, Shots, view_of, with_masks
-from deworldsg_ros.view.live.crops import BestViews
+from deworldsg_ros.view.live.camera import BestViews, CameraView, Shot, Shots, view_of, with_masks
 from deworldsg_ros.view.live.state import LiveState
+from deworldsg_ros.wire import messages as wire
 
 WIDTH, HEIGHT = 640, 480
 

@@ -7,9 +7,9 @@ import math
 import pytest
 from support.view import make_edge, make_node
 
-from deworldsg_ros.client.objects import relation, scene_object
-from deworldsg_ros.scene import wire
+from deworldsg_ros.client.objects import relation_of, scene_object
 from deworldsg_ros.view.live.details import in_words, note_html, object_html, uncertainty
+from deworldsg_ros.wire import messages as wire
 
 UP = (0.0, 0.0, 1.0)
 
@@ -48,7 +48,7 @@ def test_entropy_is_a_number_of_classes():
 def test_all_that_is_known_is_there():
     cup = item(("cup", 0.7), ("bowl", 0.2), remainder=0.1, entropy=0.8)
     table = scene_object(make_node(5, "table"), "map", UP)
-    html = object_html(cup, [relation(make_edge(13, 5), cup, table, None)], b"\xff\xd8jpeg")
+    html = object_html(cup, [relation_of(make_edge(13, 5), cup, table, None)], b"\xff\xd8jpeg")
     for text in (
         "cup #13", "bowl", "all other classes", "10%", "5 frames", "on table #5", "80%",
         "seen in 4 frames", "data:image/jpeg;base64,/9hqcGVn",
@@ -59,7 +59,7 @@ def test_all_that_is_known_is_there():
 @pytest.mark.parametrize("name", ["<script>alert(1)</script>", '"><img src=x onerror=1>', "&lt;"])
 def test_names_are_text(name):
     evil = item((name, 0.5), (name + "2", 0.4), remainder=0.1)
-    html = object_html(evil, [relation(make_edge(13, 13, name), evil, evil, None)], None)
+    html = object_html(evil, [relation_of(make_edge(13, 13, name), evil, evil, None)], None)
     html += note_html([name, name])
     assert name not in html
     assert "<script" not in html and "<img" not in html

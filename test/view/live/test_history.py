@@ -7,9 +7,9 @@ import pytest
 from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.scene import wire
 from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.view.live.history import BLOCK, History
+from deworldsg_ros.view.live.state import BLOCK, History
+from deworldsg_ros.wire import messages as wire
 
 
 def graph(step):

@@ -23,7 +23,7 @@ from support.view import make_edge, make_graph, make_node, make_room
 from deworldsg_ros.view.colours import class_colours, to_rgb
 
 pytest.importorskip("viser", reason="needs viser")
-from deworldsg_ros.view.live.client_labels import camera_of
+from deworldsg_ros.view.live.scene import camera_of
 from deworldsg_ros.view.live.server import Viewer
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]

@@ -6,13 +6,13 @@ from itertools import permutations
 
 import pytest
 
-from deworldsg_ros.view.live import joining
-from deworldsg_ros.view.live.joining import MOST_WAITING, PARTS, FrameJoiner
+from deworldsg_ros.view.live import camera
+from deworldsg_ros.view.live.camera import MOST_WAITING, PARTS, FrameJoiner
 
 
 @pytest.fixture(autouse=True)
 def plain_views(monkeypatch):
-    monkeypatch.setattr(joining, "view_of", lambda *parts: parts)
+    monkeypatch.setattr(camera, "view_of", lambda *parts: parts)
 
 
 def send(joiner, stamp_ns, parts=PARTS, now_s=0.0, decoded=None):

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deworldsg_ros.scene.boxes import shared_areas
-from deworldsg_ros.view.live.client_labels import overview
-from deworldsg_ros.view.live.labels import (
+from deworldsg_ros.scene.arrays import shared_areas
+from deworldsg_ros.view.live.drawing import Label
+from deworldsg_ros.view.live.scene import (
     ANCHORS,
     FRAME_PX,
     HEIGHT_PX,
     LETTER_PX,
     Camera,
+    overview,
     place,
 )
-from deworldsg_ros.view.live.tables import Label
 
 # Looks along +y, z is up: x right, y down is -z.
 AHEAD = Camera(np.zeros(3), np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]), np.pi / 2, 800.0, 600.0)

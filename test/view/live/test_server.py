@@ -15,10 +15,9 @@ pytest.importorskip("viser", reason="needs the extra view: viser")
 
 import viser
 
-from deworldsg_ros.view.live.client_labels import ClientLabels
-from deworldsg_ros.view.live.errors import LogOnce
-from deworldsg_ros.view.live.server import Viewer
-from deworldsg_ros.view.live.tables import Label
+from deworldsg_ros.view.live.drawing import Label
+from deworldsg_ros.view.live.scene import ClientLabels
+from deworldsg_ros.view.live.server import LogOnce, Viewer
 
 LIMIT_S = 30.0
 PORT = 8580

@@ -8,10 +8,9 @@ import pytest
 from support.reference_updates import diff
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.scene import wire
-from deworldsg_ros.view.live.filters import Filter
+from deworldsg_ros.view.live.drawing import Filter, ObjectTable
 from deworldsg_ros.view.live.state import LiveState
-from deworldsg_ros.view.live.tables import ObjectTable
+from deworldsg_ros.wire import messages as wire
 
 
 def box(center, size=(0.2, 0.4, 0.6), turned=0.0):

@@ -1,0 +1,1 @@
+"""What every part of the package may use: files, text, kernels, times. It knows no scene."""

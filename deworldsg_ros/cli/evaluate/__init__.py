@@ -1,1 +1,0 @@
-"""`deworldsg evaluate`: scene graphs measured against annotations."""

@@ -1,0 +1,405 @@
+"""Questions in words ("cup on dining table", "chair within 1 m of table"), and their answers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from deworldsg_ros.base.words import counted
+from deworldsg_ros.client.graph import SceneGraph, distance_m
+from deworldsg_ros.client.objects import (
+    SURE,
+    HiddenObject,
+    Point,
+    Relation,
+    SceneObject,
+    is_class,
+    odds_of,
+)
+from deworldsg_ros.scene.errors import ClientError
+from deworldsg_ros.scene.vocabulary import PREDICATES, plain
+
+# --- Questions in words: "cup on dining table", "chair within 1 m of table", "what changed since
+# …".
+#
+#     question  = "what changed" [ "since" time ] | pattern
+#     pattern   = thing { [ "and" ] condition }
+#     thing     = class | "anything"
+#     condition = predicate thing | "near" point | "within" length [ "of" ( thing | point ) ]
+#     point     = "(" x "," y "," z ")"        length = number [ "m" | "cm" ]
+#     time      = number [ "s" ] [ "ago" ]     a stamp in seconds, or seconds before the graph's
+#     stamp
+#
+# Articles and words such as "which", "where", "is" are skipped.
+
+SKIPPED = frozenset(
+    {"a", "an", "the", "is", "are", "was", "which", "where", "find", "show", "all", "that", "there"}
+)
+ANYTHING = frozenset({"anything", "something", "everything", "what", "*", "?"})
+# Answers that are less probable are left out.
+MIN_PROBABILITY = 0.05
+
+_TOKEN = re.compile(r"\([^)]*\)|[^\s,()]+")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_LENGTH = re.compile(rf"({_NUMBER})(cm|m)?")
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What an object has to fulfil.
+
+    Attributes:
+        predicate: of a relation; None = a distance only.
+        thing: class of the other object; None = anything.
+        point: a place instead of an object.
+        within_m: largest distance, metres.
+    """
+
+    predicate: str | None = None
+    thing: str | None = None
+    point: Point | None = None
+    within_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A question for objects.
+
+    Attributes:
+        thing: class; None = anything.
+        conditions: all of them have to hold.
+    """
+
+    thing: str | None
+    conditions: tuple[Condition, ...]
+
+
+@dataclass(frozen=True)
+class Since:
+    """A question for changes.
+
+    Attributes:
+        time_s: a stamp in seconds, or seconds before the graph's stamp; None = the first graph.
+        ago: whether `time_s` counts back from the graph's stamp.
+    """
+
+    time_s: float | None
+    ago: bool
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An object that fulfils a pattern.
+
+    Attributes:
+        item: the object.
+        probability: that it exists, is of the class, and fulfils all conditions; the factors count
+            as independent.
+        relations: the relations that were used.
+        evidence: in words.
+    """
+
+    item: SceneObject
+    probability: float
+    relations: tuple[Relation, ...]
+    evidence: str
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether `probability` is at least `SURE`."""
+        return self.probability >= SURE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "object": self.item.to_dict(),
+            "probability": round(self.probability, 3),
+            "odds": odds_of(self.probability),
+            "sure": self.is_sure,
+            "evidence": self.evidence,
+            "relations": [relation.to_dict() for relation in self.relations],
+        }
+
+
+@dataclass(frozen=True)
+class Answers:
+    """The answers to a pattern.
+
+    Attributes:
+        question: as asked.
+        found: the most probable first.
+        notes: what else is worth knowing, e.g. why there is no answer.
+    """
+
+    question: str
+    found: tuple[Answer, ...]
+    notes: tuple[str, ...] = field(default=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "question": self.question,
+            "answers": [answer.to_dict() for answer in self.found],
+            "notes": list(self.notes),
+        }
+
+
+def parse(question: str, predicates: Collection[str] = ()) -> Pattern | Since:
+    """Read a question.
+
+    Args:
+        question: see the top of this file.
+        predicates: further predicates, e.g. those of the graph.
+
+    Raises:
+        ClientError: if it cannot be read.
+    """
+    tokens = [token for token in _TOKEN.findall(question.rstrip(" ?.!").lower())]
+    if tokens[:2] == ["what", "changed"]:
+        return _since(question, tokens[2:])
+    tokens = [token for token in tokens if token not in SKIPPED]
+    reader = _Reader(question, tokens, _longest_first(predicates))
+    thing = reader.thing()
+    conditions = []
+    while reader.tokens:
+        conditions.append(reader.condition())
+    if thing is None and not conditions:
+        raise ClientError(f"question '{question}': expected a class, as in 'cup on table'")
+    return Pattern(thing, tuple(conditions))
+
+
+class _Reader:
+    """Takes the tokens of a pattern from the left."""
+
+    def __init__(self, question: str, tokens: list[str], names: list[list[str]]) -> None:
+        self.question = question
+        self.tokens = tokens
+        self.names = names
+
+    def thing(self) -> str | None:
+        words = []
+        while self.tokens and not self._at_condition():
+            words.append(self.tokens.pop(0))
+        name = " ".join(word for word in words if word not in ANYTHING)
+        if words:
+            return name or None
+        raise ClientError(
+            f"question '{self.question}': expected a class or 'anything' "
+            + (f"before '{' '.join(self.tokens)}'" if self.tokens else "at the end")
+        )
+
+    def condition(self) -> Condition:
+        if self.tokens[0] == "and":
+            self.tokens.pop(0)
+        if self.tokens[:1] == ["within"]:
+            return self._within(None, None)
+        predicate = self._predicate()
+        if predicate is None:
+            raise ClientError(
+                f"question '{self.question}': '{' '.join(self.tokens) or 'the end'}' is no "
+                "condition; expected a predicate such as on, near or within"
+            )
+        if self.tokens and self.tokens[0].startswith("("):
+            if predicate != "near":
+                raise ClientError(f"question '{self.question}': a point needs near or within")
+            return self._within(None, self._point())
+        thing = self.thing()
+        if predicate == "near" and self.tokens[:1] == ["within"]:
+            return self._within(thing, None)
+        return Condition(predicate, thing)
+
+    def _within(self, thing: str | None, point: Point | None) -> Condition:
+        """The rest of a distance; without a length, near a point means 1 m."""
+        length_m = 1.0
+        if self.tokens[:1] == ["within"]:
+            self.tokens.pop(0)
+            length_m = self._length()
+            if self.tokens[:1] == ["of"]:
+                self.tokens.pop(0)
+                if self.tokens and self.tokens[0].startswith("("):
+                    point = self._point()
+                else:
+                    thing = self.thing()
+        if thing is None and point is None:
+            raise ClientError(f"question '{self.question}': within what? expected 'of' and a thing")
+        return Condition(None, thing, point, length_m)
+
+    def _length(self) -> float:
+        text = self.tokens.pop(0) if self.tokens else ""
+        match = _LENGTH.fullmatch(text)
+        if match is None:
+            raise ClientError(f"question '{self.question}': '{text}' is no length such as 0.5 m")
+        unit = match[2] or (self.tokens.pop(0) if self.tokens[:1] in (["m"], ["cm"]) else "m")
+        return float(match[1]) * (0.01 if unit == "cm" else 1.0)
+
+    def _point(self) -> Point:
+        text = self.tokens.pop(0)
+        numbers = re.findall(_NUMBER, text)
+        if len(numbers) != 3:
+            raise ClientError(f"question '{self.question}': '{text}' is no point (x, y, z)")
+        x, y, z = map(float, numbers)
+        return x, y, z
+
+    def _at_condition(self) -> bool:
+        return self.tokens[0] in ("and", "within") or self._match() is not None
+
+    def _match(self) -> list[str] | None:
+        return next((n for n in self.names if self.tokens[: len(n)] == n), None)
+
+    def _predicate(self) -> str | None:
+        name = self._match()
+        if name is None:
+            return None
+        del self.tokens[: len(name)]
+        return " ".join(name)
+
+
+def _longest_first(predicates: Iterable[str]) -> list[list[str]]:
+    names = {plain(name) for group in PREDICATES for name in group} | set(map(plain, predicates))
+    return sorted((name.split() for name in names if name), key=lambda n: (-len(n), n))
+
+
+def _since(question: str, tokens: list[str]) -> Since:
+    match = re.fullmatch(rf"(?:since ({_NUMBER}) ?s?( ago)?)?", " ".join(tokens))
+    if match is None:
+        raise ClientError(
+            f"question '{question}': expected 'what changed since 10 s ago' or a stamp in seconds"
+        )
+    return Since(None if match[1] is None else float(match[1]), match[2] is not None)
+
+
+def absence_notes(
+    thing: str, hidden: Sequence[HiddenObject] | None, labels: Sequence[str]
+) -> list[str]:
+    """Why there is no object of a class: hidden ones, or the classes that there are."""
+    found = [item for item in hidden or () if is_class(thing, item.label)]
+    notes = [
+        f"a {item.label} was detected in {counted(item.observations, 'frame')} and is hidden: "
+        f"{item.reason}"
+        for item in found
+    ]
+    if not any(is_class(thing, label) for label in labels):
+        notes.append(f"no object of class '{thing}'; classes of the graph: {', '.join(labels)}")
+    return notes
+
+
+# --- Answers questions in words from a graph.
+
+# Part of an answer: probability, relation or None, words.
+_Part = tuple[float, Relation | None, str]
+
+
+def ask(graph: SceneGraph, question: str) -> Answers:
+    """Answer a pattern such as "cup on dining table", or "what changed since 10 s ago".
+
+    A single graph knows of changes only when each object was first and last seen.
+
+    Raises:
+        ClientError: if the question cannot be read.
+    """
+    pattern = parse(question, {edge.predicate for edge in graph.message.edges})
+    if isinstance(pattern, Since):
+        return _seen_since(graph, question, pattern)
+    items = graph.objects(pattern.thing, min_probability=MIN_PROBABILITY)
+    answers = [answer for item in items if (answer := _answer(graph, pattern, item)) is not None]
+    answers.sort(key=lambda answer: (-answer.probability, answer.item.id))
+    things = [pattern.thing, *(condition.thing for condition in pattern.conditions)]
+    notes = [
+        note
+        for thing in dict.fromkeys(thing for thing in things if thing is not None)
+        for note in absence_notes(thing, graph.hidden, graph.labels)
+    ]
+    if not answers:
+        notes.insert(0, f"nothing fulfils this with {MIN_PROBABILITY:.0%} or more")
+    return Answers(question, tuple(answers), tuple(notes))
+
+
+def since_ns(graph: SceneGraph, since: Since) -> int:
+    """The stamp that is meant; 0 = the start.
+
+    Raises:
+        ClientError: for a time that is not finite.
+    """
+    if since.time_s is None:
+        return 0
+    if not math.isfinite(since.time_s):
+        raise ClientError(f"time {since.time_s}: expected a finite number of seconds")
+    time_ns = round(since.time_s * 1e9)
+    return graph.stamp_ns - time_ns if since.ago else time_ns
+
+
+def _seen_since(graph: SceneGraph, question: str, since: Since) -> Answers:
+    """The objects that were first seen since a time."""
+    start_ns = since_ns(graph, since)
+    new = [item for item in graph if item.first_seen_ns >= start_ns]
+    answers = [
+        Answer(
+            item,
+            item.probability,
+            (),
+            f"first seen {(graph.stamp_ns - item.first_seen_ns) / 1e9:.1f} s before the newest "
+            f"frame, in {counted(item.observations, 'frame')} so far",
+        )
+        for item in sorted(new, key=lambda item: (item.first_seen_ns, item.id))
+    ]
+    quiet = sum(item.last_seen_ns < start_ns for item in graph)
+    notes = [
+        "from one graph: new objects only; objects that moved or went need two graphs "
+        "(deworldsg diff) or the live client",
+        f"{quiet} of {len(graph)} objects were not seen since",
+    ]
+    return Answers(question, tuple(answers), tuple(notes))
+
+
+def _answer(graph: SceneGraph, pattern: Pattern, item: SceneObject) -> Answer | None:
+    chance = item.probability if pattern.thing is None else item.probability_of(pattern.thing)
+    if chance < MIN_PROBABILITY:
+        return None
+    what = item.label if pattern.thing is None else pattern.thing
+    words = [f"{what} {chance:.0%} in {counted(item.observations, 'frame')}"]
+    relations = []
+    for condition in pattern.conditions:
+        part = _best_part(graph, item, condition)
+        if part is None:
+            return None
+        chance *= part[0]
+        relations += [part[1]] if part[1] is not None else []
+        words.append(part[2])
+    if chance < MIN_PROBABILITY:
+        return None
+    return Answer(item, chance, tuple(relations), "; ".join(words))
+
+
+def _best_part(graph: SceneGraph, item: SceneObject, condition: Condition) -> _Part | None:
+    """The most probable way to fulfil a condition."""
+    if condition.point is not None:
+        is_close = distance_m(item, condition.point) <= (condition.within_m or 0.0)
+        return (1.0, None, f"within {condition.within_m:g} m") if is_close else None
+    if condition.predicate is None:
+        around = graph.objects(near=item, within=condition.within_m or 0.0)
+    else:
+        around = [found.object for found in graph.relations(item, condition.predicate)]
+    others: list[tuple[SceneObject, float]] = []
+    for other in sorted(dict.fromkeys(around), key=lambda other: other.id):
+        chance = 1.0 if condition.thing is None else other.probability_of(condition.thing)
+        if other.id != item.id and chance >= MIN_PROBABILITY:
+            others.append((other, chance))
+    parts = [part for other in others if (part := _part(graph, item, condition, *other))]
+    return max(parts, key=lambda part: part[0], default=None)
+
+
+def _part(
+    graph: SceneGraph, item: SceneObject, condition: Condition, other: SceneObject, chance: float
+) -> _Part | None:
+    of = f"{other.name} ({chance:.0%})" if condition.thing is not None else other.name
+    if condition.predicate is None:
+        return chance, None, f"{distance_m(item, other):.2f} m from {of}"
+    found = graph.relations(item, condition.predicate, other)
+    if not found:
+        return None
+    relation = found[0]
+    text = f"{relation.predicate} {of}: {relation.probability:.0%}, {relation.evidence}"
+    return chance * relation.probability, relation, text

@@ -1,1 +1,0 @@
-"""Measures beside the protocol: precision, duplicates, positions, steadiness."""

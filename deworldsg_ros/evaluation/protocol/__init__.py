@@ -1,1 +1,0 @@
-"""The official protocol and its input formats."""

@@ -1,1 +1,0 @@
-"""Reports of an evaluation: JSON values, CSV and LaTeX files, plots, terminal tables."""

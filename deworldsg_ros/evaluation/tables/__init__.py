@@ -1,1 +1,0 @@
-"""Tables that compare methods: rows, jobs, parallel runs, results."""

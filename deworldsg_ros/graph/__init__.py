@@ -1,0 +1,1 @@
+"""The global graph: its nodes and pairs, edits, messages, publication and files."""

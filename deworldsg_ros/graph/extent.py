@@ -1,0 +1,479 @@
+"""The extent of a surface: even moments, a gravity-aligned box, and its points as compact bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from deworldsg_ros.base.kernels import kernel
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+from deworldsg_ros.scene.camera import quaternion_from_rotation
+from deworldsg_ros.scene.checks import check_array
+from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
+from deworldsg_ros.wire import messages as wire
+
+# Radius in which the density of points is counted: half a cell of the surface map.
+EVEN_RADIUS_M = 0.015
+# A point is an outlier if its third neighbour is farther away than this many times the
+# median of that distance. Mixed pixels at depth edges lie apart from the surface. Chosen on the two
+# rendered rooms: 1.5 cuts corners off, 3 keeps mixed pixels.
+OUTLIER_FACTOR = 2.0
+# Weights of points with these many points around.
+_EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
+# Heading of a box: the smallest rectangle of this many directions over 90 degrees.
+DIRECTIONS = 45
+# Points of a box, the first ones: surfaces are stored in random order. 256 of 512 take a quarter of
+# the time and cost 0.2 cm of the median extent.
+MOST_POINTS = 256
+# The up of the world frame if nothing tells it (REP 103).
+DEFAULT_UP = (0.0, 0.0, 1.0)
+# Points that spread less are at one place: the number of buckets for each metre stays finite.
+LEAST_SPREAD_M = 1e-12
+# Decimals of numbers in messages: positions to 0.1 mm, variances to (0.3 mm)², so that a thin
+# object keeps its thickness.
+POSITION_DECIMALS, VARIANCE_DECIMALS = 4, 7
+BOX_DECIMALS, QUATERNION_DECIMALS = 3, 4
+# Points in messages are int16 millimetres.
+_MOST_MM = 32767
+
+
+class Extent(NamedTuple):
+    """The extent of one surface, as messages have it.
+
+    Attributes:
+        mean_m: (3,) and
+        covariance_m2: (9,); see `even_moments`.
+        box: without outliers.
+    """
+
+    mean_m: list[float]
+    covariance_m2: list[float]
+    box: wire.GravityBox
+
+
+def extents_of(
+    points_world: Float32, counts: Int64, rows: Int64, up: Sequence[float]
+) -> list[Extent]:
+    """Extents of the surfaces of some rows.
+
+    Args:
+        points_world: (S, K, 3) metres; the first `counts` of each row are used.
+        counts: (S,) 1 or more in the rows.
+        rows: (n,).
+        up: unit vector against gravity.
+    """
+    measured = _measure(points_world, counts, rows, *_frame_of(tuple(up)))
+    return [
+        Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
+        for row in measured.tolist()
+    ]
+
+
+def rounded_gaussians(means: Float64, covariances: Float64, rows: Int64) -> list[list[float]]:
+    """Mean and covariance (12,) of some rows of (N, 3) and (N, 3, 3), as messages have them."""
+    found: list[list[float]] = _gaussians(means, covariances, rows).tolist()
+    return found
+
+
+def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
+    """Mean (3,) and covariance (3, 3) of a surface with uneven point density.
+
+    Points (n, 3), n >= 1, are dense on parts that were seen longer or from nearby. The weight of a
+    point is the inverse square root of the number of points within `EVEN_RADIUS_M`. The inverse
+    itself would give a stray point the weight of a whole patch. The covariance of a ball of that
+    radius is added.
+
+    Raises:
+        ValueError: without points, or for one that is not finite or out of reach.
+    """
+    _check_points(points_world)
+    means, covariances = np.empty(3), np.empty((3, 3))
+    _even_moments(np.ascontiguousarray(points_world.T, np.float64), means, covariances)
+    return means, covariances
+
+
+def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.GravityBox:
+    """The box around points (n, 3), n >= 1, without outliers.
+
+    Args:
+        points_world: metres.
+        up: unit vector against gravity.
+
+    Raises:
+        ValueError: without points, or for one that is not finite or out of reach.
+    """
+    _check_points(points_world)
+    box = np.empty(3), np.empty(3), np.empty(4)
+    columns = np.ascontiguousarray(points_world[:MOST_POINTS].T, np.float64)
+    _box(columns, *_frame_of(tuple(up)), *box)
+    center, size, quat_xyzw = box
+    return wire.GravityBox(
+        rounded(center, BOX_DECIMALS),
+        rounded(size, BOX_DECIMALS),
+        rounded(quat_xyzw, QUATERNION_DECIMALS),
+    )
+
+
+def _check_points(points_world: Float32 | Float64) -> None:
+    """The kernels take their indices from the points."""
+    if not len(points_world):
+        raise ValueError("a surface without points: expected at least one")
+    # Corners of a box around a Gaussian may lie outside of the limit of its mean.
+    check_array("points", points_world, (len(points_world), 3), 4 * MAX_GRAPH_COORDINATE_M)
+
+
+def horizontal_axes(up: Sequence[float]) -> Float64:
+    """Rows (3, 3): two horizontal unit vectors and up, right-handed; the identity for +z."""
+    third = np.asarray(up, np.float64) / np.linalg.norm(up)
+    first = np.eye(3)[0 if abs(third[0]) < 0.9 else 1]
+    first = first - third * (first @ third)
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(third, first), third])
+
+
+@lru_cache(maxsize=4)
+def _frame_of(up: tuple[float, ...]) -> tuple[Float64, Float64]:
+    """`horizontal_axes`, and their quaternion: every box needs them, and up changes seldom."""
+    axes = horizontal_axes(up)
+    # A column of eigenvectors has another layout than its opposite: one kernel is enough.
+    return axes, np.ascontiguousarray(quaternion_from_rotation(axes.T))
+
+
+def rounded(values: Float64, decimals: int) -> list[float]:
+    """Flat list of rounded values, without negative zeros."""
+    flat: list[float] = (np.round(values, decimals) + 0.0).ravel().tolist()
+    return flat
+
+
+def surface_bytes(points_world: Float32, mean_m: Sequence[float]) -> bytes:
+    """Points (n, 3) for `NodeState.surface_mm`; points farther than 32 m are left out."""
+    offsets = np.rint((points_world.astype(np.float64) - mean_m) * 1e3)
+    offsets = offsets[(np.abs(offsets) <= _MOST_MM).all(axis=1)]
+    return offsets.astype("<i2").tobytes()
+
+
+def surface_points(node: wire.NodeState) -> Float64:
+    """The surface points (n, 3) of a message of any version, metres; (0, 3) without them."""
+    if isinstance(node.surface_mm, bytes):
+        whole = len(node.surface_mm) // 6 * 6
+        offsets = np.frombuffer(node.surface_mm[:whole], "<i2").reshape(-1, 3)
+        return np.asarray(offsets * 1e-3 + np.array(node.mean_m))
+    points = node.surface_points_m if isinstance(node.surface_points_m, list) else []
+    return np.array(points, np.float64).reshape(-1, 3)
+
+
+@kernel
+def _measure(
+    points_world: Float32, counts: Int64, rows: Int64, axes: Float64, quat_axes: Float64
+) -> Float64:
+    """Mean, covariance, and centre, size and quaternion of the box of each row; rounded."""
+    result = np.empty((len(rows), 22), np.float64)
+    covariance = np.empty((3, 3), np.float64)
+    for index in range(len(rows)):
+        count = counts[rows[index]]
+        columns = np.empty((3, count), np.float64)
+        first = np.empty((3, min(count, MOST_POINTS)), np.float64)
+        for place in range(count):
+            for axis in range(3):
+                columns[axis, place] = points_world[rows[index], place, axis]
+                if place < MOST_POINTS:
+                    first[axis, place] = columns[axis, place]
+        row = result[index]
+        _even_moments(columns, row[:3], covariance)
+        _write_gaussian(row, row, covariance)
+        _box(first, axes, quat_axes, row[12:15], row[15:18], row[18:])
+        _round(row, 12, 18, BOX_DECIMALS)
+        _round(row, 18, 22, QUATERNION_DECIMALS)
+    return result
+
+
+@kernel
+def _gaussians(means: Float64, covariances: Float64, rows: Int64) -> Float64:
+    result = np.empty((len(rows), 12), np.float64)
+    for index in range(len(rows)):
+        _write_gaussian(result[index], means[rows[index]], covariances[rows[index]])
+    return result
+
+
+@kernel
+def _write_gaussian(row: Float64, mean: Float64, covariance: Float64) -> None:
+    for i in range(3):
+        row[i] = mean[i]
+        for j in range(3):
+            row[3 + 3 * i + j] = covariance[i, j]
+    _round(row, 0, 3, POSITION_DECIMALS)
+    _round(row, 3, 12, VARIANCE_DECIMALS)
+
+
+@kernel
+def _round(values: Float64, start: int, end: int, decimals: int) -> None:
+    """As `rounded`, in place."""
+    scale = 10.0**decimals
+    for index in range(start, end):
+        values[index] = np.rint(values[index] * scale) / scale + 0.0
+
+
+@kernel
+def _along_widest(columns: Float64) -> tuple[Float64, int]:
+    """Points, columns (3, n), in the order of the coordinate that spreads most; and its axis."""
+    count = columns.shape[1]
+    widest, low, spread = 0, 0.0, -1.0
+    for axis in range(3):
+        least, most = columns[axis, 0], columns[axis, 0]
+        for place in range(1, count):
+            least, most = min(least, columns[axis, place]), max(most, columns[axis, place])
+        if most - least > spread:
+            widest, low, spread = axis, least, most - least
+    # As many buckets as points; then each point is near its place.
+    per_m = (count - 1) / spread if spread > LEAST_SPREAD_M else 0.0
+    starts = np.zeros(count + 1, np.int64)
+    for place in range(count):
+        starts[int((columns[widest, place] - low) * per_m) + 1] += 1
+    for bucket in range(count):
+        starts[bucket + 1] += starts[bucket]
+    order = np.empty(count, np.int64)
+    for place in range(count):
+        bucket = int((columns[widest, place] - low) * per_m)
+        order[starts[bucket]] = place
+        starts[bucket] += 1
+    for index in range(1, count):
+        place, at = order[index], index
+        while at > 0 and columns[widest, order[at - 1]] > columns[widest, place]:
+            order[at] = order[at - 1]
+            at -= 1
+        order[at] = place
+    ordered = np.empty((3, count), np.float64)
+    for axis in range(3):
+        for index in range(count):
+            ordered[axis, index] = columns[axis, order[index]]
+    return ordered, widest
+
+
+@kernel
+def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
+    """See `even_moments`; columns (3, n), and the results are written."""
+    ordered, widest = _along_widest(columns)
+    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
+    count = len(along)
+    weights = np.empty(count, np.float64)
+    first, last, total = 0, 0, 0.0
+    for a in range(count):
+        while along[a] - along[first] > EVEN_RADIUS_M:
+            first += 1
+        while last < count and along[last] - along[a] <= EVEN_RADIUS_M:
+            last += 1
+        near = _count_near(x[first:last], y[first:last], z[first:last], x[a], y[a], z[a])
+        weights[a] = _EVEN_WEIGHTS[min(near, len(_EVEN_WEIGHTS) - 1)]
+        total += weights[a]
+    # One pass for all sums: the processor adds to them at the same time.
+    mean_x = mean_y = mean_z = 0.0
+    for a in range(count):
+        weights[a] = weights[a] / total
+        mean_x += weights[a] * x[a]
+        mean_y += weights[a] * y[a]
+        mean_z += weights[a] * z[a]
+    mean[0], mean[1], mean[2] = mean_x, mean_y, mean_z
+    xx = yy = zz = EVEN_RADIUS_M**2 / 5
+    xy = xz = yz = 0.0
+    for a in range(count):
+        step_x, step_y, step_z = x[a] - mean_x, y[a] - mean_y, z[a] - mean_z
+        by_x, by_y = weights[a] * step_x, weights[a] * step_y
+        xx += by_x * step_x
+        xy += by_x * step_y
+        xz += by_x * step_z
+        yy += by_y * step_y
+        yz += by_y * step_z
+        zz += weights[a] * step_z * step_z
+    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx, yy, zz
+    covariance[0, 1] = covariance[1, 0] = xy
+    covariance[0, 2] = covariance[2, 0] = xz
+    covariance[1, 2] = covariance[2, 1] = yz
+
+
+@kernel
+def _count_near(xs: Float64, ys: Float64, zs: Float64, x: float, y: float, z: float) -> int:
+    """Number of points within `EVEN_RADIUS_M` of a point. The compiler makes vectors of this."""
+    near = 0
+    for b in range(len(xs)):
+        step_x, step_y, step_z = x - xs[b], y - ys[b], z - zs[b]
+        squared = step_x * step_x + step_y * step_y + step_z * step_z
+        near += int(squared <= EVEN_RADIUS_M * EVEN_RADIUS_M)
+    return near
+
+
+@kernel
+def _box(
+    columns: Float64,
+    axes: Float64,
+    quat_axes: Float64,
+    center: Float64,
+    size: Float64,
+    quat_xyzw: Float64,
+) -> None:
+    """See `box_of`; points are columns (3, n) of the world frame, and the results are written."""
+    upright = np.zeros(columns.shape, np.float64)
+    for axis in range(3):
+        for k in range(3):
+            if axes[axis, k] != 0.0:
+                for place in range(columns.shape[1]):
+                    upright[axis, place] += axes[axis, k] * columns[k, place]
+    corners = _outer(_without_outliers(upright))
+    best, heading = np.inf, 0.0
+    for step in range(DIRECTIONS):
+        angle = 0.5 * math.pi * step / DIRECTIONS
+        left, right, back, front = _bounds(corners, math.cos(angle), math.sin(angle))
+        area = (right - left) * (front - back)
+        # Ties go to the axes of the world.
+        if area < best - 1e-12:
+            best, heading = area, angle
+    cos, sin = math.cos(heading), math.sin(heading)
+    left, right, back, front = _bounds(corners, cos, sin)
+    low, high = corners[2, 0], corners[2, 0]
+    for place in range(1, corners.shape[1]):
+        low, high = min(low, corners[2, place]), max(high, corners[2, place])
+    size[0], size[1], size[2] = right - left, front - back, high - low
+    u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2
+    for axis in range(3):
+        center[axis] = (
+            (cos * u - sin * v) * axes[0, axis]
+            + (sin * u + cos * v) * axes[1, axis]
+            + w * axes[2, axis]
+        )
+    # The turn about the third axis, after the axes.
+    qx, qy, qz, qw = quat_axes[0], quat_axes[1], quat_axes[2], quat_axes[3]
+    cos, sin = math.cos(heading / 2), math.sin(heading / 2)
+    sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
+    quat_xyzw[0], quat_xyzw[1] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
+    quat_xyzw[2], quat_xyzw[3] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)
+
+
+@kernel
+def _bounds(points: Float64, cos: float, sin: float) -> tuple[float, float, float, float]:
+    """Horizontal bounds of columns (3, n) along turned axes."""
+    left, right, back, front = np.inf, -np.inf, np.inf, -np.inf
+    for place in range(points.shape[1]):
+        x, y = points[0, place], points[1, place]
+        u, v = cos * x + sin * y, cos * y - sin * x
+        left, right = min(left, u), max(right, u)
+        back, front = min(back, v), max(front, v)
+    return left, right, back, front
+
+
+@kernel
+def _outer(points: Float64) -> Float64:
+    """The points, columns (3, n), that may be corners of the hull seen from above, or its ends.
+
+    Those inside the octagon of the outermost points in eight directions are left out.
+    """
+    count = points.shape[1]
+    x, y, z = points[0], points[1], points[2]
+    outermost = np.zeros(8, np.int64)
+    lowest = highest = 0
+    for place in range(count):
+        if z[place] < z[lowest]:
+            lowest = place
+        if z[place] > z[highest]:
+            highest = place
+        for side in range(8):
+            other = outermost[side]
+            if _reach(side, x[place], y[place]) > _reach(side, x[other], y[other]):
+                outermost[side] = place
+    kept = np.empty((3, count), np.float64)
+    size = 0
+    for place in range(count):
+        inside = True
+        for side in range(8):
+            a, b = outermost[side], outermost[(side + 1) % 8]
+            if a == b or not inside:
+                continue
+            cross = (x[b] - x[a]) * (y[place] - y[a]) - (y[b] - y[a]) * (x[place] - x[a])
+            inside = cross > 0.0
+        if not inside or place in (lowest, highest):
+            for axis in range(3):
+                kept[axis, size] = points[axis, place]
+            size += 1
+    return kept[:, :size]
+
+
+@kernel
+def _reach(side: int, x: float, y: float) -> float:
+    """How far a point lies in one of eight directions, counterclockwise from x."""
+    if side % 4 == 0:
+        reach = x
+    elif side % 4 == 1:
+        reach = x + y
+    elif side % 4 == 2:
+        reach = y
+    else:
+        reach = y - x
+    return reach if side < 4 else -reach
+
+
+@kernel
+def _without_outliers(columns: Float64) -> Float64:
+    """The points, columns (3, n), that have neighbours as close as the others have."""
+    count = columns.shape[1]
+    if count <= 6:
+        return columns
+    ordered, widest = _along_widest(columns)
+    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
+    last, sorted_partly = np.empty(count, np.float64), np.empty(count, np.float64)
+    for row in range(count):
+        # Squared distances of the three nearest points so far. Without branches: on new points, no
+        # processor predicts them.
+        near_1 = near_2 = near_3 = np.inf
+        for step in (1, -1):
+            other = row + step
+            while 0 <= other < count:
+                apart = along[other] - along[row]
+                if apart * apart >= near_3:
+                    break
+                step_x, step_y, step_z = x[other] - x[row], y[other] - y[row], z[other] - z[row]
+                squared = step_x * step_x + step_y * step_y + step_z * step_z
+                near_3 = min(near_3, max(near_2, squared))
+                near_2 = min(near_2, max(near_1, squared))
+                near_1 = min(near_1, squared)
+                other += step
+        last[row] = sorted_partly[row] = near_3
+    most = OUTLIER_FACTOR**2 * _median(sorted_partly)
+    kept = np.empty((3, count), np.float64)
+    size = 0
+    for row in range(count):
+        if last[row] <= most:
+            for axis in range(3):
+                kept[axis, size] = ordered[axis, row]
+            size += 1
+    return kept[:, :size]
+
+
+@kernel
+def _median(values: Float64) -> float:
+    """Median; the values are moved (Hoare's selection)."""
+    low, high, middle = 0, len(values) - 1, len(values) // 2
+    while low < high:
+        pivot, left, right = values[(low + high) // 2], low, high
+        while left <= right:
+            while values[left] < pivot:
+                left += 1
+            while values[right] > pivot:
+                right -= 1
+            if left <= right:
+                values[left], values[right] = values[right], values[left]
+                left, right = left + 1, right - 1
+        if middle <= right:
+            high = right
+        elif middle >= left:
+            low = left
+        else:
+            high = low
+    median: float = values[middle]
+    if len(values) % 2 == 0:
+        before = values[0]
+        for place in range(1, middle):
+            before = max(before, values[place])
+        median = (before + median) / 2.0
+    return median

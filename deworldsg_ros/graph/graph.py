@@ -1,0 +1,497 @@
+"""The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deworldsg_ros.graph.edits import Edit, EditLog
+from deworldsg_ros.graph.extent import even_moments
+from deworldsg_ros.graph.nodes import SAVED_COLUMNS, IdState, NodeIds, NodeTable, Observations
+from deworldsg_ros.graph.pairs import (
+    EdgeArrays,
+    EdgeEvidence,
+    EdgeMap,
+    Pair,
+    PairVotes,
+    VoteMap,
+    VotesByPair,
+)
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
+from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.surface import NO_POINTS
+
+# --- The nodes of a graph with their ids over time.
+
+
+class NodeStore:
+    """Nodes that are added, observed and changed; ids and frames are remembered.
+
+    Ids start at 1 and are never reused; `resolve` follows merges. `revision` increases with every
+    change. Nodes and edges carry the revision of their last change, so that derived data is rebuilt
+    for them only.
+
+    Attributes:
+        vocabulary: names of classes and predicates.
+        frame_id: world frame.
+        surface_point_capacity: maximum number of surface points of a node.
+        remembered_frames: number of newest frames that `nodes_of_frame` knows.
+        nodes: the nodes as parallel arrays; read only.
+        edits: what an operator has said about nodes; read only.
+        revision: number of changes so far.
+    """
+
+    def __init__(
+        self,
+        vocabulary: Vocabulary,
+        frame_id: str,
+        surface_point_capacity: int,
+        remembered_frames: int,
+    ) -> None:
+        self.vocabulary = vocabulary
+        self.frame_id = frame_id
+        self.surface_point_capacity = surface_point_capacity
+        self.remembered_frames = remembered_frames
+        self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
+        self.edits = EditLog()
+        self.revision = 0
+        self._ids = NodeIds(self.nodes, remembered_frames)
+        self._watchers: list[set[int]] = []
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __contains__(self, node_id: object) -> bool:
+        return node_id in self.nodes
+
+    def add_node(
+        self,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surface_points_world: Float32 = NO_POINTS,
+        weight: float = 1.0,
+        confirmed: bool = True,
+    ) -> int:
+        """Add a node for a first observation and return its id.
+
+        Args:
+            mean_world: (3,) metres.
+            covariance_world: (3, 3) square metres, positive definite.
+            class_probabilities: (C,), scaled to sum to one.
+            stamp_ns: time of the observation.
+            surface_points_world: (k, 3) float32 points of its surface, metres.
+            weight: w of Eq. 7.
+            confirmed: false for a hidden node.
+
+        Raises:
+            ValueError: if the covariance is not positive definite.
+        """
+        nodes, node_id = self.nodes, self._ids.next_id
+        row = nodes.append(node_id)
+        try:
+            classes = class_probabilities / class_probabilities.sum()
+            nodes.put(row, mean_world, covariance_world, classes, weight, observations=1)
+        except ValueError:
+            nodes.remove(node_id)
+            raise
+        nodes.confirmed[row], nodes.existence[row] = confirmed, -1.0
+        nodes.set_surface(row, surface_points_world)
+        nodes.first_seen_ns[row] = nodes.last_seen_ns[row] = stamp_ns
+        self._changed([row])
+        return self._ids.take()
+
+    def observe(
+        self,
+        node_id: int,
+        mean_world: Float64,
+        covariance_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surface_points_world: Float32 = NO_POINTS,
+        weight: float = 1.0,
+    ) -> None:
+        """Fuse one more observation into a live node (Eq. 7); arguments as in `add_node`."""
+        self.observe_each(
+            [node_id],
+            mean_world[None],
+            covariance_world[None],
+            class_probabilities[None],
+            stamp_ns,
+            [surface_points_world],
+            np.array([weight]),
+        )
+
+    def observe_each(
+        self,
+        node_ids: Sequence[int],
+        means_world: Float64,
+        covariances_world: Float64,
+        class_probabilities: Float64,
+        stamp_ns: int,
+        surfaces: Sequence[Float32],
+        weights: Float64,
+        classes_after: Float64 | None = None,
+    ) -> None:
+        """Fuse one more observation into each of n different live nodes, as `observe` does.
+
+        With `classes_after` (n, C), as `set_classes` with these afterwards.
+        """
+        rows = self.nodes.rows_at(node_ids)
+        classes = class_probabilities / class_probabilities.sum(axis=1, keepdims=True)
+        gaussians, counts = (means_world, covariances_world), np.ones(len(rows), np.int64)
+        seen = Observations(*gaussians, classes, weights, counts, surfaces, stamp_ns, stamp_ns)
+        self.nodes.fuse(rows, seen)
+        if classes_after is not None:
+            self.nodes.class_probabilities[rows] = classes_after
+            self.revision += len(rows)  # each counts as two changes
+        self._changed(rows)
+
+    def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
+        """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
+        self._changed(self.nodes.drop_points(self.nodes.rows_at(node_ids), dropped))
+
+    def set_classes(self, node_ids: Sequence[int], class_probabilities: Float64) -> None:
+        """Replace the class distributions of n live nodes, (n, C)."""
+        rows = self.nodes.rows_at(node_ids)
+        self.nodes.class_probabilities[rows] = class_probabilities
+        self._changed(rows)
+
+    def set_existence(
+        self, node_ids: Sequence[int], existence: Float64, minimum: float
+    ) -> list[int]:
+        """Set the probabilities (n,) that n live nodes are objects, to two decimals.
+
+        A node is confirmed if it has at least the minimum, and no edit hides it.
+
+        Returns:
+            The ids of the nodes that were not confirmed before, and are now.
+        """
+        nodes = self.nodes
+        rows = nodes.rows_at(node_ids)
+        existence = existence.round(2)
+        confirmed = existence >= minimum
+        if self.edits:
+            shown = (not self.edits.hides(node_id) for node_id in node_ids)
+            confirmed &= np.fromiter(shown, np.bool_, len(node_ids))
+        known = nodes.confirmed[rows]
+        differs = (nodes.existence[rows] != existence) | (known != confirmed)
+        nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed
+        self._changed(rows[differs])
+        return list(itertools.compress(node_ids, (confirmed & ~known).tolist()))
+
+    def move_node(self, node_id: int, T_correction: Float64) -> None:
+        """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
+        row = self.nodes.row(node_id)
+        self.nodes.move(row, T_correction)
+        self._changed([row])
+
+    def resolve(self, node_id: int) -> int:
+        """The live node that an id stands for, following merges; 0 = none."""
+        return self._ids.resolve(node_id)
+
+    def take_removals(self) -> dict[int, int | None]:
+        """Ids removed since the last call, each with the live node that it was merged into."""
+        return self._ids.take_removals()
+
+    def remember_frame(self, stamp_ns: int, node_ids: Iterable[int]) -> None:
+        """Remember which node each row of a frame's local graph became."""
+        self._ids.remember_frame(stamp_ns, node_ids)
+
+    def nodes_of_frame(self, stamp_ns: int) -> list[int] | None:
+        """The live node of each row of a frame (0 = removed); None = the frame is forgotten."""
+        return self._ids.nodes_of_frame(stamp_ns)
+
+    def watch_nodes(self) -> set[int]:
+        """A set that gets the ids of all nodes that change, come or go from now on.
+
+        It starts with all ids. The caller empties it.
+        """
+        watcher: set[int] = set(self.nodes.ids.tolist())
+        self._watchers.append(watcher)
+        return watcher
+
+    def _changed(self, rows: Sequence[int] | Int64) -> None:
+        """Count one change for each row."""
+        first = self.revision + 1
+        self.revision += len(rows)
+        self.nodes.revisions[rows] = np.arange(first, self.revision + 1)
+        ids = self.nodes.ids[rows].tolist()
+        for watcher in self._watchers:
+            watcher.update(ids)
+
+
+# --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
+
+
+@dataclass(frozen=True)
+class GraphState:
+    """Everything from which an equal graph can be made.
+
+    Attributes:
+        vocabulary, frame_id: of the graph, and
+        surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
+        revision: number of changes so far.
+        nodes: arrays of n rows, by their names in `NodeTable`.
+        surface_points: (m, 3) float32, metres, those of one node after those of another.
+        surface_counts: (n,) int64, number of points of each node.
+        edges: evidence of the directed pairs of ids.
+        votes: votes of frames on each unordered pair of ids.
+        ids: the id memory.
+        edits: of an operator, oldest first.
+    """
+
+    vocabulary: Vocabulary
+    frame_id: str
+    nodes: Mapping[str, NDArray[Any]]
+    surface_points: Float32
+    surface_counts: Int64
+    edges: EdgeArrays
+    votes: Mapping[Pair, PairVotes]
+    ids: IdState
+    revision: int
+    surface_point_capacity: int
+    remembered_frames: int
+    even_gaussians: bool
+    edits: Sequence[Edit] = ()
+
+
+class SceneGraph(NodeStore):
+    """The state of the map: nodes (see `NodeStore`) and directed edges between them.
+
+    Stages change it only through its methods. When two nodes merge, the older id stays.
+
+    Attributes:
+        even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
+            Gaussian.
+    """
+
+    def __init__(
+        self,
+        vocabulary: Vocabulary,
+        frame_id: str,
+        surface_point_capacity: int = 512,
+        remembered_frames: int = 1024,
+        even_gaussians: bool = False,
+    ) -> None:
+        super().__init__(vocabulary, frame_id, surface_point_capacity, remembered_frames)
+        self.even_gaussians = even_gaussians
+        self._edges = EdgeMap(len(vocabulary.predicates))
+        self._votes = VoteMap(len(vocabulary.predicates))
+
+    @classmethod
+    def from_state(cls, state: GraphState) -> SceneGraph:
+        """The graph of a state; ValueError or KeyError if its parts do not fit together."""
+        graph = cls(
+            state.vocabulary,
+            state.frame_id,
+            state.surface_point_capacity,
+            state.remembered_frames,
+            state.even_gaussians,
+        )
+        graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
+        graph._edges.restore(state.edges)
+        graph._votes.restore(state.votes)
+        graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
+        graph.edits = EditLog(state.edits)
+        graph.revision = state.revision
+        return graph
+
+    def state(self) -> GraphState:
+        """A copy of everything from which `from_state` makes an equal graph."""
+        nodes = self.nodes
+        return GraphState(
+            vocabulary=self.vocabulary,
+            frame_id=self.frame_id,
+            nodes={name: getattr(nodes, name).copy() for name in SAVED_COLUMNS},
+            surface_points=nodes.surface_points(),
+            surface_counts=nodes.surface_counts.copy(),
+            edges=self._edges.arrays(),
+            votes=dict(self.votes),
+            ids=self._ids.state(),
+            revision=self.revision,
+            surface_point_capacity=self.surface_point_capacity,
+            remembered_frames=self.remembered_frames,
+            even_gaussians=self.even_gaussians,
+            edits=list(self.edits.edits),
+        )
+
+    def copy_relations(self, node_id: int, new_id: int, without: Collection[int]) -> None:
+        """Give a node the edges and votes of another one, except those with some nodes."""
+        self._edges.copy(node_id, new_id, without, self.revision)
+        self._votes.copy(node_id, new_id, without, self.revision)
+
+    def add_edit(self, edit: Edit) -> Edit:
+        """Note an operator's edit, with a new number; the nodes that it replaces are hidden."""
+        edit, lost = self.edits.add(edit)
+        rows = [self.nodes.row(node_id) for node_id in (*edit.nodes, *edit.replaced)]
+        self.nodes.confirmed[rows] &= [not self.edits.hides(i) for i in self.nodes.ids[rows]]
+        self._changed(rows)
+        self._drop(lost)
+        return edit
+
+    def merge_nodes(self, a_id: int, b_id: int) -> int:
+        """Merge two live nodes (Eq. 7) and return the id that stays, the older one.
+
+        The edges of the other node are re-pointed and their evidence is summed. An edge between the
+        two is dropped.
+        """
+        if a_id == b_id:
+            raise ValueError(f"node {a_id} cannot be merged with itself")
+        kept_id, removed_id = min(a_id, b_id), max(a_id, b_id)
+        row = self.nodes.row(kept_id)
+        self.nodes.merge(row, self.nodes.row(removed_id))
+        self._changed([row])
+        self._edges.repoint(removed_id, kept_id, self.revision)
+        self._votes.repoint(removed_id, kept_id, self.revision)
+        self._remove(removed_id, kept_id)
+        return kept_id
+
+    def take_over(self, old_id: int, new_id: int) -> None:
+        """Give a newer node an older node's id: the object was moved and detected again.
+
+        Gaussian, surface and edges are the newer node's. Class distributions average with the
+        numbers of observations.
+        """
+        row = self.nodes.row(old_id)
+        self.nodes.take_over(row, self.nodes.row(new_id))
+        self._changed([row])
+        self._edges.drop(old_id)
+        self._votes.drop(old_id)
+        self._edges.repoint(new_id, old_id, self.revision)
+        self._votes.repoint(new_id, old_id, self.revision)
+        self._remove(new_id, old_id)
+
+    def remove_node(self, node_id: int) -> None:
+        """Remove a live node and its edges."""
+        self.nodes.row(node_id)
+        self.revision += 1
+        self._edges.drop(node_id)
+        self._votes.drop(node_id)
+        self._remove(node_id, 0)
+
+    @property
+    def edges(self) -> Mapping[Pair, EdgeEvidence]:
+        """Evidence of each directed pair (subject id, object id); read only."""
+        return self._edges.evidence
+
+    @property
+    def votes(self) -> VotesByPair:
+        """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
+        return self._votes.pairs
+
+    def take_changed_votes(self) -> set[int]:
+        """Keys of the pairs whose votes changed since the last call; some may be removed."""
+        return self._votes.take_changed()
+
+    def seen_together(self, node_id: int) -> set[int]:
+        """Ids of the nodes that frames showed together with a node."""
+        return self._votes.partners(node_id)
+
+    def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
+        """Count a frame that showed two live nodes; votes (2, R) or None, first row: a to b."""
+        self.revision += 1
+        self._votes.add((a_id, b_id), 1, counts, self.revision)
+
+    def add_frame_votes(self, seen: Int64, voted: Int64, votes: Float64) -> None:
+        """Count a frame that showed pairs of live nodes; see `VoteMap.add_frame`."""
+        self._votes.add_frame(seen, voted, votes, self.revision + 1)
+        self.revision += len(seen)
+
+    def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
+        """Sum a frame's visual logits (R,) into an edge (Eq. 9); False if it has no two nodes."""
+        pair = (self.resolve(subject_id), self.resolve(object_id))
+        if 0 in pair or pair[0] == pair[1]:
+            return False
+        self.add_frame_visual({pair: logits}, stamp_ns)
+        return True
+
+    def add_frame_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int) -> None:
+        """As `add_visual`, by pairs of different live nodes."""
+        self._edges.add_visual(logits, stamp_ns, self.revision)
+        self.revision += len(logits)
+
+    def add_neighbours(self, pairs: Iterable[Pair], stamp_ns: int) -> None:
+        """Count a frame in which pairs of nodes (0 = removed) were geometric neighbours (Eq. 8).
+
+        Pairs without two different nodes are left out.
+        """
+        live = [pair for pair in pairs if pair[0] and pair[1] and pair[0] != pair[1]]
+        self._edges.add_neighbours(live, stamp_ns, self.revision)
+        self.revision += len(live)
+
+    def partners(self, node_id: int) -> Collection[int]:
+        """Ids of the nodes that share an edge with a node; do not change it."""
+        return self._edges.partners(node_id)
+
+    def take_changed_edges(self) -> set[Pair]:
+        """Pairs whose evidence changed since the last call; some may have been removed."""
+        return self._edges.take_changed()
+
+    def _remove(self, node_id: int, successor: int) -> None:
+        self.nodes.remove(node_id)
+        for watcher in self._watchers:
+            watcher.add(node_id)
+        self._ids.retire(node_id, successor)
+        if self.edits:
+            self._drop(self.edits.removed(node_id, successor))
+
+    def _drop(self, successors: Mapping[int, int]) -> None:
+        for node_id, successor in successors.items():
+            self._edges.drop(node_id)
+            self._votes.drop(node_id)
+            self._remove(node_id, successor)
+
+
+# --- Copies of nodes, for edits that an operator may undo.
+
+
+def copy_node(
+    graph: SceneGraph,
+    node_id: int,
+    without: Collection[int] = (),
+    points_world: Float32 | None = None,
+) -> int:
+    """Add a copy of a live node, with its edges and votes; returns its id.
+
+    Args:
+        graph: changed.
+        node_id: of the node.
+        without: nodes to which the copy has no edges.
+        points_world: (k, 3) float32, the part of the node's surface points that the copy gets, with
+            the Gaussian of these points; None = everything.
+    """
+    nodes, row = graph.nodes, graph.nodes.row(node_id)
+    mean, covariance = nodes.means[row].copy(), nodes.covariances[row].copy()
+    surface, weight = nodes.surface(row).copy(), float(nodes.weights[row])
+    if points_world is not None:
+        mean, covariance = even_moments(points_world)
+        surface, weight = points_world, weight * len(points_world) / len(surface)
+    classes, first_ns = nodes.class_probabilities[row].copy(), int(nodes.first_seen_ns[row])
+    confirmed = bool(nodes.confirmed[row])
+    new_id = graph.add_node(mean, covariance, classes, first_ns, surface, weight, confirmed)
+    new = nodes.row(new_id)
+    for name in ("class_probabilities", "observations", "existence", "last_seen_ns"):
+        getattr(nodes, name)[new] = getattr(nodes, name)[row]
+    graph.copy_relations(node_id, new_id, without)
+    return new_id
+
+
+# --- Pose corrections: which nodes move with corrected poses.
+#
+# When a SLAM system closes a loop, it corrects the poses of a part of the trajectory. Nodes first
+# seen in that part have the error of its poses and are moved by the correction. A node that was
+# seen before and again in that part averages both. Its earlier observations had correct poses, so
+# it stays.
+
+
+def nodes_since(graph: SceneGraph, since_ns: int) -> list[int]:
+    """Ids of the nodes first seen at a stamp or later, ascending."""
+    nodes = graph.nodes
+    return sorted(nodes.ids[nodes.first_seen_ns >= since_ns].tolist())

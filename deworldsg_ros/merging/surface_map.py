@@ -1,0 +1,382 @@
+"""Surface map: the cells of space that the surface of each node passes through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+
+from deworldsg_ros.base.kernels import kernel
+from deworldsg_ros.graph.nodes import NodeTable
+from deworldsg_ros.merging import cell_kernels
+from deworldsg_ros.merging.cell_kernels import (
+    INDEX_BIAS,
+    INDEX_MASK,
+    CellSets,
+    SumArrays,
+    TableArrays,
+)
+from deworldsg_ros.merging.common import Memory
+from deworldsg_ros.merging.views import NEAR_M, FrameArrays
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt64
+
+# --- Evidence that a cell of an owner is its surface: how many of the frames that saw it say so.
+#
+# A mask may include a part of another object, or of the floor. Its cells are then cells of the
+# owner. So each cell has a score. A frame that shows the owner and the cell raises the score if the
+# pixel of the cell is in the owner's mask, and lowers it if not. Cells with a negative score are
+# rejected.
+
+# A cell is rejected if less than 60 % of the frames that saw it say that it is the owner's. With
+# 50 %, more of a bleeding mask stays; with 67 %, more of the true surface is lost if masks are cut
+# (docs/dev/notebook.md).
+HIT = 2
+MISS = 3
+# Bounds of a score, so that a cell can be rejected or accepted again: 60 hits, 40 misses.
+MAX_SCORE = 120
+# A frame shows a cell if the measured depth differs from that of its centre by at most SHOWN_M and
+# SHOWN_FRACTION of it: the distance of a cell's corner from its centre, and the noise of cameras.
+SHOWN_M = 0.03
+SHOWN_FRACTION = 0.01
+
+
+@kernel
+def judge(
+    table: TableArrays,
+    firsts: Int64,
+    owners: Int64,
+    values: Int64,
+    frame: FrameArrays,
+    cell_m: float,
+) -> tuple[Int64, UInt64, Int64]:
+    """Update the scores of all cells of some owners by one frame.
+
+    Args:
+        table: marked cells are hit, whatever the images say; the marks are removed.
+        firsts: first row of each owner.
+        owners: (n,) owners that the frame shows.
+        values: (n,) value of each in the instance image.
+        frame: the frame.
+        cell_m: edge of a cell, metres.
+
+    Returns:
+        Arrays of the `CellSets` of each owner's cells that this frame has rejected, and of its
+        rejected cells that were marked.
+    """
+    _, row_blocks, masks, _, marks, rejected, scores, nexts = table
+    offsets = _offsets(frame[0], cell_m)
+    blocks, cells = np.empty(64, np.int64), np.empty(64, np.uint64)
+    starts = np.zeros(len(owners) + 1, np.int64)
+    count = 0
+    for index in range(len(owners)):
+        row = firsts[owners[index]]
+        while row >= 0:
+            marked = masks[row] & marks[row]
+            marks[row] = 0
+            changed, lost = _judge_block(
+                row_blocks[row],
+                masks[row],
+                marked,
+                scores[row],
+                values[index],
+                frame,
+                offsets,
+                cell_m,
+            )
+            dropped = (lost & ~rejected[row]) | (lost & marked)
+            rejected[row] = (rejected[row] & ~changed) | lost
+            if dropped != 0:
+                if count == len(blocks):
+                    blocks = np.concatenate((blocks, blocks))
+                    cells = np.concatenate((cells, cells))
+                blocks[count], cells[count] = row_blocks[row], dropped
+                count += 1
+            row = nexts[row]
+        starts[index + 1] = count
+    return blocks[:count].copy(), cells[:count].copy(), starts
+
+
+@kernel
+def _offsets(T_camera_world: Float64, cell_m: float) -> Float64:
+    """Position of each cell of a block from its first one, in camera axes (64, 3), metres."""
+    offsets = np.empty((64, 3))
+    for cell in range(64):
+        for axis in range(3):
+            row = T_camera_world[axis]
+            steps = row[0] * (cell >> 4) + row[1] * ((cell >> 2) & 3) + row[2] * (cell & 3)
+            offsets[cell, axis] = cell_m * steps
+    return offsets
+
+
+@kernel
+def _index(bit: np.uint64) -> int:
+    """Index of a single bit: the number of bits below it.
+
+    As `_bit_count` of `cell_kernels`: a kernel calls kernels of its own module only.
+    """
+    mask = bit - np.uint64(1)
+    mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
+    pairs = np.uint64(0x3333333333333333)
+    mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
+    mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
+
+
+@kernel
+def _judge_block(
+    block: np.int64,
+    cells: np.uint64,
+    marked: np.uint64,
+    scores: Int8,
+    value: int,
+    frame: FrameArrays,
+    offsets: Float64,
+    cell_m: float,
+) -> tuple[np.uint64, np.uint64]:
+    """Update the scores (64,) of the cells of a block that a frame shows.
+
+    A marked cell is hit, and one in a pixel with this value; another one is missed.
+
+    Returns:
+        The cells whose score was updated, and those of them with a negative one.
+    """
+    T, depth_mm, instances, (fx, fy, cx, cy) = frame
+    rows, columns = depth_mm.shape
+    changed = lost = np.uint64(0)
+    # Centre of the block's first cell.
+    x = cell_m * (4 * (block >> 42) - INDEX_BIAS + 0.5)
+    y = cell_m * (4 * ((block >> 21) & INDEX_MASK) - INDEX_BIAS + 0.5)
+    z = cell_m * (4 * (block & INDEX_MASK) - INDEX_BIAS + 0.5)
+    right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    while cells != 0:
+        bit = cells & (~cells + np.uint64(1))
+        cells ^= bit
+        cell = _index(bit)
+        step = HIT
+        if marked & bit == 0:
+            depth_m = ahead + offsets[cell, 2]
+            if depth_m < NEAR_M:
+                continue
+            u = fx * (right + offsets[cell, 0]) / depth_m + cx
+            v = fy * (down + offsets[cell, 1]) / depth_m + cy
+            if u < 0.0 or v < 0.0 or u >= columns or v >= rows:
+                continue
+            row, column = int(v), int(u)
+            measured_mm = depth_mm[row, column]
+            apart_m = abs(0.001 * measured_mm - depth_m)
+            if measured_mm == 0 or apart_m > SHOWN_M + SHOWN_FRACTION * depth_m:
+                continue
+            if instances[row, column] != value:
+                step = -MISS
+        score = scores[cell] + step
+        scores[cell] = min(max(score, -MAX_SCORE), MAX_SCORE)
+        changed |= bit
+        if score < 0:
+            lost |= bit
+    return changed, lost
+
+
+# --- Surface map: the cells of space that the surface of each node passes through.
+#
+# The map is a sparse hash of small cubes. A cell keeps up to four nodes ("owners"). The cost of
+# each operation is linear in the number of its points, and independent of the size of the map. Each
+# cell of an owner has a score, the evidence that it is the owner's surface (`cell_beliefs`).
+
+# Edge of a cell. In the rendered rooms, cells of 2 cm lose objects and cells of 5 cm lose relations
+# (docs/dev/notebook.md).
+CELL_M = 0.03
+# At 3 cm, a surface of about 7 m²; larger surfaces are not stored in full.
+CELLS_PER_OWNER = 8192
+
+
+class VoxelMap:
+    """Cells of the surfaces of nodes. Nodes are numbered by small owner indices.
+
+    Args:
+        cell_m: edge of a cell, metres.
+        cells_per_owner: maximum number of cells of an owner; more cells are not stored.
+    """
+
+    def __init__(self, cell_m: float = CELL_M, cells_per_owner: int = CELLS_PER_OWNER) -> None:
+        self.cell_m = cell_m
+        self._cells_per_owner = cells_per_owner
+        self._table = cell_kernels.new_table(1 << 12)
+        # Rows of the table, also removed ones.
+        self._used = 0
+        # Number of cells of each owner, and its first row.
+        self._counts = np.zeros(64, np.int64)
+        self._firsts = np.full(64, -1, np.int64)
+        self._sums = _new_sums(64)
+
+    @property
+    def capacity(self) -> int:
+        """Number of slots, used or not."""
+        return len(self._table.slots)
+
+    def cells_of(self, point_sets: Sequence[Float32]) -> CellSets:
+        """Cells of each set of points (k, 3), metres."""
+        points = np.concatenate([np.zeros((0, 3), np.float32), *point_sets])
+        starts = np.array([0, *accumulate(map(len, point_sets))])
+        return CellSets(*cell_kernels.cells_of(points, starts, self.cell_m))
+
+    def cells(self, owner: int) -> CellSets:
+        """An owner's cells, as one set."""
+        rows = self._rows_of(owner)
+        blocks, masks = self._table.blocks[rows], self._table.masks[rows]
+        return CellSets(blocks, masks, np.array([0, len(rows)]))
+
+    def scores(self, owner: int) -> Int8:
+        """Score of each cell in each block of `cells` (m, 64)."""
+        return self._table.scores[self._rows_of(owner)]
+
+    def memory(self, owners: Sequence[int]) -> Memory:
+        """The cells and scores of all owners as arrays by name; the blocks of each ascend.
+
+        Args:
+            owners: all owners, in the order of the arrays.
+        """
+        table, places = self._table, np.zeros(max(owners, default=0) + 1, np.int64)
+        places[owners] = np.arange(len(owners))
+        rows = np.flatnonzero(table.owners[: self._used] >= 0)
+        of = places[table.owners[rows]]
+        rows = rows[np.lexsort((table.blocks[rows], of))]
+        return {
+            "cell_m": np.array(self.cell_m),
+            "blocks": table.blocks[rows],
+            "masks": table.masks[rows],
+            "block_counts": np.bincount(of, minlength=len(owners)),
+            "scores": table.scores[rows],
+        }
+
+    def centres(self, owner: int) -> Float32:
+        """Centres of an owner's cells, (n, 3) float32, metres."""
+        blocks, masks, _ = self.cells(owner)
+        rows, cells = np.nonzero(cell_bits(masks))
+        corners = np.stack([blocks >> 42, (blocks >> 21) & INDEX_MASK, blocks & INDEX_MASK], axis=1)
+        within = np.stack([cells >> 4, (cells >> 2) & 3, cells & 3], axis=1)
+        indices = 4 * corners[rows] + within - INDEX_BIAS
+        return ((indices + 0.5) * self.cell_m).astype(np.float32)
+
+    def add(self, owners: Sequence[int], sets: CellSets) -> None:
+        """Add the cells of each set to its owner."""
+        if not len(owners):
+            return
+        self._make_room(max(owners) + 1)
+        if 2 * (self._used + len(sets.blocks)) > self.capacity:
+            self._grow(len(sets.blocks))
+        self._used = cell_kernels.add(
+            self._table[:],
+            self._counts,
+            self._firsts,
+            self._cells_per_owner,
+            self._used,
+            np.array(owners, np.int64),
+            sets[:],
+        )
+
+    def add_scores(self, owners: Sequence[int], sets: CellSets, scores: Int8) -> None:
+        """Add to the scores of owners' cells, (m, 64): those of each block of their sets.
+
+        Blocks without a cell of the owner are left out.
+        """
+        owner_array, limit = np.array(owners, np.int64), MAX_SCORE
+        cell_kernels.add_scores(self._table[:], owner_array, sets[:], scores, limit)
+
+    def judge(
+        self,
+        owners: Sequence[int],
+        sets: CellSets,
+        values: Int64,
+        frame: FrameArrays,
+    ) -> CellSets:
+        """Update the scores of the cells of owners that a frame shows.
+
+        Args:
+            owners: n owners.
+            sets: cells in which the frame shows each owner, and which it has (`add`).
+            values: (n,) value of each owner in the instances of the frame.
+            frame: with instances.
+
+        Returns:
+            For each owner, the cells that became rejected, and the rejected ones of its set.
+        """
+        owner_array = np.array(owners, np.int64)
+        cell_kernels.mark(self._table[:], owner_array, sets[:])
+        changed = judge(self._table[:], self._firsts, owner_array, values, frame, self.cell_m)
+        return CellSets(*changed)
+
+    def points_in(self, sets: CellSets, nodes: NodeTable, rows: Sequence[int]) -> Bool:
+        """Which surface points of nodes lie in a cell of a set: (n, K), by row and by set."""
+        return cell_kernels.points_in(
+            nodes.surface_points_world,
+            nodes.surface_counts,
+            np.array(rows, np.int64),
+            sets[:],
+            self.cell_m,
+        )
+
+    def overlaps(self, sets: CellSets) -> tuple[list[int], Float64, Float64]:
+        """How much of each set lies on each owner, and of each owner on each set.
+
+        A cell lies on a surface if it is a cell of it or shares a face with one.
+
+        Returns:
+            The k owners that any set meets, ascending; and two fractions (n, k) float64 in [0, 1]:
+            of the set's cells that lie on the owner, and of the owner's cells that lie on the set.
+        """
+        owners, on, of = cell_kernels.overlaps(
+            self._table[:], self._counts, self._sums, self._used, sets[:]
+        )
+        return owners.tolist(), on, of
+
+    def remove(self, owner: int) -> CellSets:
+        """Remove an owner; returns its cells, as one set."""
+        cells = self.cells(owner)
+        rows = self._rows_of(owner)
+        self._table.masks[rows] = self._table.rejected[rows] = 0
+        self._table.scores[rows] = 0
+        self._table.owners[rows] = -1
+        if len(rows):
+            self._counts[owner], self._firsts[owner] = 0, -1
+        return cells
+
+    def warm_up(self) -> None:
+        """Compile the kernels that the first frames do not need."""
+        self._grow(0)
+        self.add_scores([0], self.cells(0), self.scores(0))
+
+    def _rows_of(self, owner: int) -> Int64:
+        """Rows of an owner."""
+        first = int(self._firsts[owner]) if owner < len(self._firsts) else -1
+        return cell_kernels.rows_of(self._table[:], first)
+
+    def _make_room(self, owner_count: int) -> None:
+        if owner_count > len(self._counts):
+            more = (0, 2 * owner_count - len(self._counts))
+            self._counts = np.pad(self._counts, more)
+            self._firsts = np.pad(self._firsts, more, constant_values=-1)
+            self._sums = _new_sums(len(self._counts))
+
+    def _grow(self, more_rows: int) -> None:
+        # Rows of removed owners are not copied.
+        rows = np.count_nonzero(self._table.owners[: self._used] >= 0) + more_rows
+        capacity = self.capacity
+        while capacity < 3 * rows:
+            capacity *= 2
+        larger = cell_kernels.new_table(capacity)
+        self._used = cell_kernels.rehash(self._table[:], self._used, larger[:], self._firsts)
+        self._table = larger
+
+
+def cell_bits(masks: UInt64) -> UInt64:
+    """Which cells of blocks are in their masks (m,): (m, 64), 1 or 0."""
+    bits: UInt64 = (masks[:, None] >> np.arange(64, dtype=np.uint64)) & np.uint64(1)
+    return bits
+
+
+def _new_sums(owner_count: int) -> SumArrays:
+    counts = np.zeros(owner_count, np.int64)
+    return np.zeros(owner_count, np.uint64), counts, counts.copy()

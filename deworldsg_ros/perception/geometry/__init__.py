@@ -1,1 +1,0 @@
-"""Relations from geometry: `layout` measures the objects of a frame, `predicates` judges pairs."""

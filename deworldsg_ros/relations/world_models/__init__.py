@@ -1,1 +1,0 @@
-"""World models of clips, one per file; `world_model.WORLD_MODELS` has their names."""

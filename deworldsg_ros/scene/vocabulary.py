@@ -1,0 +1,173 @@
+"""Names of classes and predicates: the sets in use, kinds of classes, and predicates that agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from deworldsg_ros.scene.arrays import Bool, Float64
+
+# --- Kinds of classes by name, for the classes of COCO, Visual Genome and ScanNet.
+#
+# A kind says how objects of a class usually rest, contain or hang.
+
+TABLES = frozenset({"table", "dining table", "desk", "counter", "bench"})
+SEATS = frozenset({"chair", "couch", "seat", "sofa", "stool"})
+STORAGE = frozenset(
+    [
+        "bookshelf", "cabinet", "drawer", "oven", "refridgerator", "refrigerator", "shelf",
+        "stand", "microwave", "toaster",
+    ]
+)  # fmt: skip
+CONTAINERS = frozenset(
+    [
+        "vase", "pot", "basket", "bowl", "cup", "sink", "bag", "box", "drawer", "backpack",
+        "handbag", "suitcase", "bathtub", "glass", "wine glass",
+    ]
+)  # fmt: skip
+PLANTS = frozenset({"plant", "potted plant", "flower", "tree", "leaf", "branch"})
+ON_WALLS = frozenset(
+    [
+        "picture", "clock", "window", "curtain", "shower curtain", "door", "sign", "board",
+        "poster", "logo", "flag", "railing",
+    ]
+)  # fmt: skip
+SCREENS = frozenset({"screen", "tv", "laptop"})
+SOFT = frozenset(
+    [
+        "pillow", "towel", "jacket", "coat", "shirt", "blanket", "bag", "handbag", "backpack",
+        "teddy bear", "hat", "cap", "glove", "sock", "pant", "jean",
+    ]
+)  # fmt: skip
+FLAT = frozenset({"book", "plate", "paper", "letter", "keyboard", "remote", "tile", "fork"})
+BEDS = frozenset({"bed", "bathtub", "toilet"})
+KINDS: tuple[frozenset[str], ...] = (
+    TABLES, SEATS, STORAGE, CONTAINERS, PLANTS, ON_WALLS, SCREENS, SOFT, FLAT, BEDS,
+)  # fmt: skip
+
+# Classes of the objects that a class is fixed to.
+FIXED_TO = {
+    "sink": frozenset({"counter", "cabinet", "table"}),
+    "curtain": frozenset({"window", "wall"}),
+    "shower curtain": frozenset({"wall", "bathtub"}),
+    "picture": frozenset({"wall"}),
+    "window": frozenset({"wall"}),
+    "door": frozenset({"wall"}),
+    "handle": frozenset({"door", "cabinet", "drawer"}),
+}
+
+
+def kind_table(classes: Sequence[str]) -> Float64:
+    """(C, len(KINDS)) float64: 1 for each kind of a class."""
+    table = [[float(name in kind) for kind in KINDS] for name in classes]
+    return np.array(table, np.float64).reshape(-1, len(KINDS))
+
+
+def fixed_table(classes: Sequence[str]) -> Bool:
+    """(C, C) bool: the class of the row is usually fixed to the class of the column."""
+    table = [[name in FIXED_TO.get(subject, ()) for name in classes] for subject in classes]
+    return np.array(table, np.bool_).reshape(len(classes), len(classes))
+
+
+# --- Predicates with the same meaning, and what a predicate says in the opposite direction.
+
+# Names of each physical relation. The first one in a vocabulary names it if no frame named another.
+PREDICATES: tuple[tuple[str, ...], ...] = (
+    (
+        "on", "standing on", "supported by", "sitting on", "lying on", "laying on", "parked on",
+        "on back of",
+    ),
+    ("in", "inside", "standing in", "lying in", "hanging in"),
+    ("attached to", "hanging on", "hanging from", "mounted on", "build in", "built in"),
+    ("against", "leaning against", "connected to"),
+    ("above", "over"),
+    ("under", "below"),
+    ("near", "next to", "beside", "close by", "with"),
+)  # fmt: skip
+
+# If A is near B, B is near A.
+SYMMETRIC = frozenset({"near", "next to", "beside", "close by"})
+
+
+def plain(name: str) -> str:
+    """A name in lower case, with spaces."""
+    return name.lower().replace("_", " ")
+
+
+# --- Names of classes and predicates, in the order of the distributions.
+
+# COCO's 80 detection classes, by their official names.
+# fmt: off
+COCO_CLASSES: tuple[str, ...] = (
+    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
+    "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat",
+    "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe", "backpack",
+    "umbrella", "handbag", "tie", "suitcase", "frisbee", "skis", "snowboard", "sports ball",
+    "kite", "baseball bat", "baseball glove", "skateboard", "surfboard", "tennis racket",
+    "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple",
+    "sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair",
+    "couch", "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse",
+    "remote", "keyboard", "cell phone", "microwave", "oven", "toaster", "sink",
+    "refrigerator", "book", "clock", "vase", "scissors", "teddy bear", "hair drier",
+    "toothbrush",
+)
+# fmt: on
+
+# ReplicaSSG's 150 Visual Genome classes (34 occur in its scenes).
+# fmt: off
+VISUAL_GENOME_CLASSES: tuple[str, ...] = (
+    "airplane", "animal", "arm", "bag", "banana", "basket", "beach", "bear", "bed", "bench",
+    "bike", "bird", "board", "boat", "book", "boot", "bottle", "bowl", "box", "boy", "branch",
+    "building", "bus", "cabinet", "cap", "car", "cat", "chair", "child", "clock", "coat",
+    "counter", "cow", "cup", "curtain", "desk", "dog", "door", "drawer", "ear", "elephant",
+    "engine", "eye", "face", "fence", "finger", "flag", "flower", "food", "fork", "fruit",
+    "giraffe", "girl", "glass", "glove", "guy", "hair", "hand", "handle", "hat", "head",
+    "helmet", "hill", "horse", "house", "jacket", "jean", "kid", "kite", "lady", "lamp",
+    "laptop", "leaf", "leg", "letter", "light", "logo", "man", "men", "motorcycle",
+    "mountain", "mouth", "neck", "nose", "number", "orange", "pant", "paper", "paw", "people",
+    "person", "phone", "pillow", "pizza", "plane", "plant", "plate", "player", "pole", "post",
+    "pot", "racket", "railing", "rock", "roof", "room", "screen", "seat", "sheep", "shelf",
+    "shirt", "shoe", "short", "sidewalk", "sign", "sink", "skateboard", "ski", "skier",
+    "sneaker", "snow", "sock", "stand", "street", "surfboard", "table", "tail", "tie", "tile",
+    "tire", "toilet", "towel", "tower", "track", "train", "tree", "truck", "trunk",
+    "umbrella", "vase", "vegetable", "vehicle", "wave", "wheel", "window", "windshield",
+    "wing", "wire", "woman", "zebra",
+)
+# fmt: on
+
+# 3DSSG's 20 ScanNet classes.
+# fmt: off
+SCANNET_CLASSES: tuple[str, ...] = (
+    "bathtub", "bed", "bookshelf", "cabinet", "chair", "counter", "curtain", "desk", "door",
+    "floor", "otherfurniture", "picture", "refridgerator", "shower curtain", "sink", "sofa",
+    "table", "toilet", "wall", "window",
+)
+# fmt: on
+
+# ReplicaSSG's 50 Visual Genome predicates (nine occur).
+# fmt: off
+REPLICA_SSG_PREDICATES: tuple[str, ...] = (
+    "above", "across", "against", "along", "and", "at", "attached to", "behind",
+    "belonging to", "between", "carrying", "covered in", "covering", "eating", "flying in",
+    "for", "from", "growing on", "hanging from", "has", "holding", "in", "in front of",
+    "laying on", "looking at", "lying on", "made of", "mounted on", "near", "of", "on",
+    "on back of", "over", "painted on", "parked on", "part of", "playing", "riding", "says",
+    "sitting on", "standing on", "to", "under", "using", "walking in", "walking on",
+    "watching", "wearing", "wears", "with",
+)
+# fmt: on
+
+# 3DSSG's seven predicates.
+# fmt: off
+SCANNET_PREDICATES: tuple[str, ...] = (
+    "attached to", "build in", "connected to", "hanging on", "part of", "standing on",
+    "supported by",
+)
+# fmt: on
+
+# By the value of `perception.predicate_set`.
+PREDICATE_SETS: dict[str, tuple[str, ...]] = {
+    "replica_ssg": REPLICA_SSG_PREDICATES,
+    "3dssg": SCANNET_PREDICATES,
+}
