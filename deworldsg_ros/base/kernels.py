@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import sys
 import threading
 from collections.abc import Callable
-from types import ModuleType
+from contextlib import suppress
+from types import CodeType, ModuleType
 from typing import Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -21,29 +23,27 @@ COMPILING = "compiling the kernels, for the first run on this machine …"
 def kernel(function: F) -> F:
     """Compile with numba: strict IEEE arithmetic, without the GIL, cached on disk if possible.
 
-    Numba is imported at the first call of a kernel: a program that calls none starts earlier.
-
-    A kernel may call kernels of its own module only. Numba invalidates a cached kernel when the
-    kernel's own file changes, but ignores changes in the files of the kernels that it calls.
+    Numba is imported at the first call of a kernel: a program that calls none starts earlier. A
+    kernel may call kernels of any module. Take many arrays as one named tuple, or as one structured
+    array.
     """
     return cast(F, _Kernel(function))
 
 
 class _Kernel:
-    """Stands for a kernel until one of its module is called; then numba's dispatchers do.
+    """Stands for a kernel until any kernel is called; then numba's dispatchers do.
 
     Modules that imported it before get the dispatcher, too: a call of this object takes longer.
     """
 
-    _waiting: ClassVar[dict[ModuleType, list[_Kernel]]] = {}
+    _waiting: ClassVar[list[_Kernel]] = []
     _lock = threading.Lock()
 
     def __init__(self, function: Callable[..., Any]) -> None:
         functools.update_wrapper(self, function)
         self._function = function
         self._dispatcher: Any = None
-        self._module = sys.modules[function.__module__]
-        self._waiting.setdefault(self._module, []).append(self)
+        self._waiting.append(self)
 
     def __call__(self, *args: Any) -> Any:
         # Some keep this object: under another name, or in a container.
@@ -54,12 +54,13 @@ class _Kernel:
         """Numba's."""
         if self._dispatcher is None:
             with self._lock:
-                # None if another thread has made them meanwhile.
-                items = self._waiting.pop(self._module, [])
-                dispatchers = [_jit(item._function) for item in items]
-                # Kernels are compiled when all of their module are in place: they call one another.
-                _replace(self._module, items, dispatchers)
-                for item, dispatcher in zip(items, dispatchers):
+                # Empty if another thread has made them meanwhile.
+                items = self._waiting.copy()
+                self._waiting.clear()
+                made = {item: _jit(item) for item in items}
+                # Kernels are compiled when all of them are in place: they call one another.
+                _replace(made)
+                for item, dispatcher in made.items():
                     item._dispatcher = dispatcher
         return self._dispatcher
 
@@ -68,17 +69,53 @@ class _Kernel:
         """The types of arguments for which it is compiled."""
         return self.dispatcher.signatures
 
+    @functools.cached_property
+    def content(self) -> bytes:
+        """Hash of all that its machine code is made from: its own code, constants, and kernels.
 
-def _replace(own: ModuleType, items: list[_Kernel], dispatchers: list[Any]) -> None:
-    """Put numba's dispatchers in place of a module's kernels, in all modules of the package."""
+        Numba freezes the values of global names. By itself it looks at the kernel's own file only.
+        """
+        known = _code_parts(self._function.__code__, self._function.__doc__)
+        for name in self._function.__code__.co_names:
+            known.append(_global_part(self._function.__globals__.get(name)))
+        return hashlib.sha256(b"\0".join(known)).digest()
+
+
+def _code_parts(code: CodeType, documentation: str | None = None) -> list[bytes]:
+    parts = [code.co_code, " ".join(code.co_names).encode()]
+    for value in code.co_consts:
+        if isinstance(value, CodeType):  # a comprehension
+            parts += _code_parts(value)
+        elif value != documentation:
+            parts.append(repr(value).encode())
+    return parts
+
+
+def _global_part(value: Any) -> bytes:
+    value = _kernels.get(id(value), value)
+    if isinstance(value, _Kernel):
+        return value.content
+    if isinstance(value, np.ndarray):
+        return b"%r %r " % (value.dtype.str.encode(), value.shape) + value.tobytes()
+    if isinstance(value, ModuleType):
+        return value.__name__.encode()
+    return repr((value, getattr(value, "_fields", ()))).encode()
+
+
+# The kernel of each dispatcher, by its identity.
+_kernels: dict[int, _Kernel] = {}
+
+
+def _replace(made: dict[_Kernel, Any]) -> None:
+    """Put numba's dispatchers in place of kernels, in their own modules and in the package."""
     package = __name__.partition(".")[0]
-    for module_name, module in list(sys.modules.items()):
-        if module_name.partition(".")[0] == package or module is own:
+    own = {item._function.__module__ for item in made}
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] == package or name in own:
             content = vars(module)
-            for item, dispatcher in zip(items, dispatchers):
-                name = item._function.__name__
-                if content.get(name) is item:
-                    content[name] = dispatcher
+            for known, value in list(content.items()):
+                if isinstance(value, _Kernel) and value in made:
+                    content[known] = made[value]
 
 
 # Functions to call when the first kernel is compiled.
@@ -111,13 +148,51 @@ def _numba() -> ModuleType:
     return numba
 
 
-def _jit(function: Callable[..., Any]) -> Any:
+def _jit(item: _Kernel) -> Any:
     # No C code calls a kernel.
-    options = {"nogil": True, "no_cfunc_wrapper": True}
-    try:
-        return _numba().njit(cache=True, **options)(function)
-    except RuntimeError:  # the cache folder is not writable: compile in every process
-        return _numba().njit(**options)(function)
+    dispatcher: Any = _numba().njit(nogil=True, no_cfunc_wrapper=True)(item._function)
+    # It compiles in every process if no folder is writable.
+    with suppress(RuntimeError):
+        dispatcher._cache = _cache_class()(item)
+    _kernels[id(dispatcher)] = item
+    return dispatcher
+
+
+@functools.cache
+def _cache_class() -> Any:
+    """Numba's cache on disk, which asks for a kernel's `content` in place of its file."""
+    from numba.core import caching
+
+    class Files(caching.CompileResultCacheImpl):
+        """Finds the files of a kernel."""
+
+        def __init__(self, item: _Kernel) -> None:
+            self._content = item.content
+            begin: Any = super().__init__
+            begin(item._function)
+
+        @property
+        def locator(self) -> Any:
+            return self
+
+        def get_source_stamp(self) -> bytes:
+            return self._content
+
+        def get_disambiguator(self) -> str:
+            return "kernel"
+
+        def __getattr__(self, name: str) -> Any:  # the place of the files
+            return getattr(self._locator, name)
+
+    class Cache(caching.FunctionCache):
+        _impl_class = Files
+
+        def __init__(self, item: _Kernel) -> None:
+            begin: Any = super().__init__
+            begin(item)
+            self._py_func = item._function
+
+    return Cache
 
 
 def read_only(array: NDArray[Any], dtype: DTypeLike | None = None) -> NDArray[Any]:

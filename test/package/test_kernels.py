@@ -88,3 +88,45 @@ def test_a_start_imports_nothing_slow_that_it_may_not_need(modules: str) -> None
     code = f"import sys, {modules}; print(*({slow} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
+
+
+CALLED = '''
+from deworldsg_ros.base.kernels import kernel
+STEP = {step}
+@kernel
+def called(x):
+    """{documentation}"""
+    return x + STEP
+'''
+CALLING = """
+from called import called
+from deworldsg_ros.base.kernels import kernel
+@kernel
+def calling(x):
+    return 2 * called(x)
+"""
+CALL = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from deworldsg_ros.base.kernels import on_compilation
+compiled = []
+on_compilation(lambda: compiled.append(True))
+from calling import calling
+print(calling(1), compiled != [])
+"""
+
+
+def test_a_kernel_is_compiled_again_if_one_that_it_calls_in_another_file_changed(
+    tmp_path: Path,
+) -> None:
+    def call(step: int, documentation: str) -> list[str]:
+        text = CALLED.format(step=step, documentation=documentation)
+        (tmp_path / "called.py").write_text(text, encoding="utf-8")
+        command = [sys.executable, "-B", "-c", CALL, str(tmp_path)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
+
+    (tmp_path / "calling.py").write_text(CALLING, encoding="utf-8")
+    assert call(1, "One.") == ["4", "True"]
+    assert call(1, "One.") == ["4", "False"]
+    assert call(1, "Another text, and\n    another line.") == ["4", "False"]
+    assert call(5, "One.") == ["12", "True"]
