@@ -43,7 +43,8 @@ PACKAGES = (
     "lifting",
     "merging",
     "relations",
-    "wire",
+    "wire/codec.py",
+    "wire/messages.py",
     "graph_builder.py",
     "scene/camera.py",
 )

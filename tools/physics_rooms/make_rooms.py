@@ -55,7 +55,7 @@ def name_of(index: int) -> str:
 
 def vocabulary() -> dict[str, list[str]]:
     """The lists of ReplicaSSG's mapping file, from the package's source."""
-    path = REPOSITORY / "deworldsg_ros" / "scene" / "scene/vocabulary.py"
+    path = REPOSITORY / "deworldsg_ros" / "scene" / "vocabulary.py"
     spec = importlib.util.spec_from_file_location("vocabularies", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
