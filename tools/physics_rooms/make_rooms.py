@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[2])]
 
 from physics_room.files import (
     PLY_NAME,
@@ -42,7 +42,8 @@ from physics_room.simulate import Outcome, simulate
 from physics_room.truth import Judge, relation_rows
 from physics_room.walk import plan
 
-REPOSITORY = Path(__file__).resolve().parents[2]
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES, VISUAL_GENOME_CLASSES
+
 RATE_HZ = 10
 # Of 24 rooms: 16 to train, 4 to validate, 4 to test; more rooms go on in the same way.
 SPLITS = ("train",) * 16 + ("validation",) * 4 + ("test",) * 4
@@ -54,15 +55,10 @@ def name_of(index: int) -> str:
 
 
 def vocabulary() -> dict[str, list[str]]:
-    """The lists of ReplicaSSG's mapping file, from the package's source."""
-    path = REPOSITORY / "deworldsg_ros" / "scene" / "vocabulary.py"
-    spec = importlib.util.spec_from_file_location("vocabularies", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    """The lists of ReplicaSSG's mapping file."""
     return {
-        "VisualGenome_list": list(module.VISUAL_GENOME_CLASSES),
-        "VisualGenome_rel": list(module.REPLICA_SSG_PREDICATES),
+        "VisualGenome_list": list(VISUAL_GENOME_CLASSES),
+        "VisualGenome_rel": list(REPLICA_SSG_PREDICATES),
     }
 
 
