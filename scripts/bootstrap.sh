@@ -7,10 +7,11 @@
 # Each slow step stores the hash of its input in .venv/.bootstrap. A second call without changes
 # does no work. A call after an interruption continues where the first one stopped.
 #
+# With DEWORLDSG_TEST_MODELS set, `bootstrap test` adds torch, and the environment is .venv-models.
 # With DEWORLDSG_LOCKED=1 it installs the versions of locks/ instead, and checks their hashes.
 
 root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
-venv="$root/.venv"
+venv="$root/.venv${DEWORLDSG_TEST_MODELS:+-models}"
 stamps="$venv/.bootstrap"
 log="$stamps/log.txt"
 

@@ -29,6 +29,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
@@ -168,17 +169,15 @@ def _edit(builder: GraphBuilder, step: int) -> None:
 
 def surface() -> dict[str, str]:
     """Hashes of what users see of the options: help, defaults and parameters."""
-    runner = CliRunner()
-    texts = {"help": runner.invoke(app, ["--help"]).output}
-    for command in app.registered_commands:
-        name = str(command.name or command.callback.__name__.replace("_", "-"))  # type: ignore[union-attr]
-        texts[f"help {name}"] = runner.invoke(app, [name, "--help"]).output
-    for group in app.registered_groups:
-        texts[f"help {group.name}"] = runner.invoke(app, [str(group.name), "--help"]).output
-        for command in group.typer_instance.registered_commands:  # type: ignore[union-attr]
-            name = str(command.name or command.callback.__name__.replace("_", "-"))  # type: ignore[union-attr]
-            arguments = [str(group.name), name, "--help"]
-            texts[" ".join(("help", *arguments[:2]))] = runner.invoke(app, arguments).output
+    texts: dict[str, str] = {}
+    waiting: list[tuple[str, ...]] = [()]
+    while waiting:
+        words = waiting.pop()
+        texts[" ".join(("help", *words))] = CliRunner().invoke(app, [*words, "--help"]).output
+        command: Any = get_command(app)
+        for word in words:
+            command = command.commands[word]
+        waiting += [(*words, word) for word in getattr(command, "commands", ())]
     texts["configuration"] = described_yaml(Config())
     for kind in (Parameters, ReplayParameters):
         texts[kind.__name__] = msgspec.json.encode(msgspec.json.schema(kind)).decode()

@@ -33,8 +33,8 @@ from rclpy.parameter import Parameter  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from deworldsg_ros.lifting.stage import Lifting  # noqa: E402
-from deworldsg_ros.nodes import odometry_node, viewer_node  # noqa: E402
-from deworldsg_ros.ros import graph_keeper, graph_output, inputs  # noqa: E402
+from deworldsg_ros.nodes import viewer_node  # noqa: E402
+from deworldsg_ros.ros import graph_keeper, graph_output, inputs, transforms  # noqa: E402
 
 # fleet_link_node asks for fleet_node at its start.
 NODES = sorted(
@@ -71,7 +71,7 @@ Uses = dict[str, dict[str, set[str]]]
 def used() -> Uses:
     """What the nodes use, whatever their options are."""
     # The wheels of ROS 2 lack these two packages. The names of topics do not depend on the types.
-    inputs.TFMessage = odometry_node.TFMessage = TransformStamped
+    inputs.TFMessage = transforms.TFMessage = TransformStamped
     graph_output.VISION_MSGS = SimpleNamespace(Detection3DArray=MarkerArray)
     viewer_node.make_viewer = MagicMock()  # its page is no part of ROS
     # No frame is processed, so no kernel has to be compiled.

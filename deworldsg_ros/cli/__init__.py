@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
+import signal
 import sys
-
-from deworldsg_ros.cli.configuration import EXIT_INTERRUPTED
 
 
 def main() -> None:
@@ -15,9 +14,9 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
-        # The import takes a second: Ctrl-C may come during it, too.
+        # The import takes a second: Ctrl-C may come during it, too. So nothing is imported above.
         from deworldsg_ros.cli.app import app
 
         app(prog_name="deworldsg")
     except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(128 + signal.SIGINT)  # EXIT_INTERRUPTED

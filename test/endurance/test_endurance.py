@@ -65,13 +65,15 @@ def test_many_rooms_cost_memory_and_no_more_calls(calls):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_killed_nodes_come_back_with_their_graph(tmp_path):
-    recoveries = crash(5, tmp_path)
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.nightly)])
+def test_killed_nodes_come_back_with_their_graph(kills, tmp_path):
+    recoveries = crash(kills, tmp_path)
     assert not [item for item in recoveries if item.problem]
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.timeout(1500)
 def test_ten_minutes_of_replay_take_no_more_memory(tmp_path):
     memory, _ = replay(10.0, tmp_path)

@@ -14,8 +14,9 @@ from support.corner_room import INTRINSICS, LEVEL, corner_frame, walk
 from support.nodes_bench import Bench, bench, camera_info, image, works
 from support.streams import tf, transform
 
-from deworldsg_ros.nodes.odometry_node import OdometryNode, camera_transform
+from deworldsg_ros.nodes.odometry_node import OdometryNode
 from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.ros.transforms import camera_transform
 from deworldsg_ros.scene.camera import invert_pose, rigid_motion
 from deworldsg_ros.streams.poses import (
     TransformTree,
