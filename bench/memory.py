@@ -51,7 +51,7 @@ def grow(builder: GraphBuilder, count: int, rng: np.random.Generator) -> None:
         points = (centre + rng.uniform(-0.2, 0.2, (POINTS, 3))).astype(np.float32)
         classes = rng.dirichlet(np.full(len(COCO_CLASSES), 0.05))
         node = graph.add_node(points.mean(0).astype(float), np.eye(3) * 0.01, classes, 1, points)
-        graph.nodes.confirmed[graph.nodes.row(node)] = True
+        graph.nodes.confirmed[graph.nodes.slot(node)] = True
         for other in range(max(1, node - PARTNERS), node):
             graph.add_votes(other, node, votes)
     publish(builder)

@@ -28,7 +28,7 @@ from bench.figures import Figure, Paired, Setup, in_turn
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import build_merging
-from deworldsg_ros.merging.paper_rule import bhattacharyya_bound, nearest_row, observed, warm_up
+from deworldsg_ros.merging.paper_rule import bhattacharyya_bound, nearest_slot, observed, warm_up
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations, Vocabulary
 from deworldsg_ros.scene.gaussian import hellinger_distance
@@ -179,7 +179,7 @@ def depth_grid(surfaces: tuple[np.ndarray, ...], camera_world: np.ndarray) -> De
 def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
     bound = bhattacharyya_bound(0.7)
     return [
-        nearest_row(observed(mean, covariance, probabilities), graph.nodes, bound, 0.8)
+        nearest_slot(observed(mean, covariance, probabilities), graph.nodes, bound, 0.8)
         for mean, covariance, probabilities in zip(
             local.means_world, local.covariances_world, local.class_probabilities
         )

@@ -153,7 +153,7 @@ def belief_costs(objects: int, nodes: int, turns: int) -> None:
         first = int(generator.integers(nodes - objects))
         seen = list(range(first + 1, first + objects + 1))
         for node in seen:
-            row = graph.nodes.row(node)
+            row = graph.nodes.slot(node)
             mean, known = graph.nodes.means[row].copy(), graph.nodes.class_probabilities[row]
             graph.observe(node, mean, np.eye(3) * 0.01, known, turn + 2, cloud(node - 1, 64))
         pair_votes = np.zeros((2, len(REPLICA_SSG_PREDICATES)))

@@ -168,8 +168,9 @@ def _read(config: Config, path: Path) -> GraphBuilder:
     for name in ("surface_points", "class_probabilities"):  # the largest that the graph has copied
         del arrays[name]
     prior = _prior(arrays, graph.vocabulary)
-    for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
-        if not graph.edits.hides(node_id):
+    for node_id in list(graph.nodes.slot_of):
+        confirmed = graph.nodes.confirmed[graph.nodes.slot(node_id)]
+        if not confirmed and not graph.edits.hides(node_id):
             graph.remove_node(node_id)
     graph.take_removals()
     builder = GraphBuilder(config, graph.vocabulary, graph.frame_id, graph, prior)

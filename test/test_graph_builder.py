@@ -94,7 +94,7 @@ def test_an_unchanged_edge_is_the_same_object() -> None:
 def change(builder: GraphBuilder, generator: np.random.Generator) -> None:
     """Anything that may change an edge, at random."""
     graph = builder.graph
-    one, other = generator.choice(graph.nodes.ids, 2, replace=False).tolist()
+    one, other = generator.choice(list(graph.nodes.slot_of), 2, replace=False).tolist()
     kind = generator.choice(
         ["see", "near", "predict", "observe", "confirm", "merge", "remove", "move", "add"],
         p=[0.2, 0.2, 0.3, 0.1, 0.04, 0.04, 0.04, 0.04, 0.04],

@@ -143,7 +143,7 @@ def test_hidden_nodes_are_dropped_and_ids_continue(tmp_path):
         builder.integrate(frame(stamp, (WHOLE, TABLE)))
     assert builder.integrate(frame(5, (WHOLE, TABLE), (MUG, CUP))) == [1, 2]
     again = read_map(Config(), saved(builder, tmp_path))
-    assert again.graph.nodes.ids.tolist() == [1]
+    assert list(again.graph.nodes.slot_of) == [1]
     # Older than the map: another recording of the place.
     assert again.integrate(frame(2, (WHOLE, TABLE), (MUG, CUP))) == [1, 3]
 
@@ -374,12 +374,12 @@ def test_a_killed_node_has_its_last_checkpoint(tmp_path):
         works(at, lambda: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
         at.expect(path.exists, "a checkpoint")
         config = msgspec.convert({"merging": {"association": "paper"}}, Config)
-        assert read_map(config, path).graph.nodes.ids.tolist() == [1]
+        assert list(read_map(config, path).graph.nodes.slot_of) == [1]
         # What cannot be written is counted and named, and the node works on.
         with full_disk(100):
             works(at, lambda: at.send(deworldsg__local_graph=message_of(at.next_stamp())))
             at.expect(lambda: at.node.health.drops.get("map_not_written"), "the refusal")
-        assert read_map(config, path).graph.nodes.ids.tolist() == [1]
+        assert list(read_map(config, path).graph.nodes.slot_of) == [1]
     finally:
         at.close()
 
@@ -407,7 +407,7 @@ def test_the_node_continues_its_map_and_writes_it_at_the_end(tmp_path):
         at.close()
     config = msgspec.convert({"merging": {"association": "paper"}}, Config)
     graph = read_map(config, tmp_path / "maps" / "room.map").graph
-    assert graph.nodes.ids.tolist() == [1]
+    assert list(graph.nodes.slot_of) == [1]
     assert graph.nodes.observations.tolist() >= [2]
     for path in (tmp_path / "maps").iterdir():
         path.write_text("no map")

@@ -61,7 +61,7 @@ def sent(local: LocalGraph) -> LocalGraph:
 
 
 def hostile_edit(rng: np.random.Generator, builder: GraphBuilder) -> EditRequest:
-    ids = builder.graph.nodes.ids.tolist() or [1]
+    ids = list(builder.graph.nodes.slot_of) or [1]
     a, b = (int(rng.choice(ids)) for _ in range(2))
     edits = [SetLabel(a, "é" * 256), DeleteNode(a), MergeNodes([a, b]), SplitNode(a), Undo()]
     return edits[int(rng.integers(len(edits)))]

@@ -38,6 +38,7 @@ from deworldsg_ros.config import Config
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end
 from deworldsg_ros.evaluation.recorded_room import open_annotations
 from deworldsg_ros.graph.edits import DeleteNode, MergeNodes, SetLabel, SplitNode, Undo
+from deworldsg_ros.graph.nodes import SAVED
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
 from deworldsg_ros.pipeline import Pipeline
@@ -45,6 +46,7 @@ from deworldsg_ros.recordings.recording import Recording, open_source
 from deworldsg_ros.ros.options import Parameters, ReplayParameters
 from deworldsg_ros.scene.errors import RefusedInput
 
+Arrays = dict[str, "np.ndarray[Any, Any]"]
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "bags" / "demo_room"
 CONFIGS: dict[str, tuple[str, ...]] = {
@@ -118,7 +120,7 @@ def run(case: Case, rooms: Path | None, max_frames: int) -> dict[str, Any]:
         "drops": dict(sorted((recording.drops + pipeline.drops + refused).items())),
         "updates": updates.hexdigest()[:16],
         "graph": _hash(_json(graph)),
-        "map": {name: _array_hash(values) for name, values in sorted(state.items())},
+        "map": {name: _array_hash(values) for name, values in sorted(_ordered(state).items())},
     }
 
 
@@ -147,20 +149,21 @@ def _go_on_from_map(pipeline: Pipeline, config: Config) -> None:
 def _edit(builder: GraphBuilder, step: int) -> None:
     """The edit of a frame, if it has one; the steps are frames after the map was read."""
     if step == 10:
-        stamps = builder.graph.nodes.first_seen_ns
+        nodes = builder.graph.nodes
+        stamps = nodes.first_seen_ns[nodes.ids > 0]
         builder.apply_correction(CORRECTION, int(np.median(stamps)))
-    nodes = sorted(node.id for node in builder.full().nodes) if step in range(12, 60, 4) else []
-    if len(nodes) < 6:
+    ids = sorted(node.id for node in builder.full().nodes) if step in range(12, 60, 4) else []
+    if len(ids) < 6:
         return
     requests = {
-        12: SetLabel(nodes[0], "thing of mine"),
-        16: MergeNodes([nodes[1], nodes[2]]),
-        20: SplitNode(nodes[3]),
-        24: DeleteNode(nodes[-1]),
+        12: SetLabel(ids[0], "thing of mine"),
+        16: MergeNodes([ids[1], ids[2]]),
+        20: SplitNode(ids[3]),
+        24: DeleteNode(ids[-1]),
         28: Undo(),
-        32: DeleteNode(nodes[4]),
-        36: SplitNode(nodes[-2]),
-        40: MergeNodes([nodes[0], nodes[-1]]),
+        32: DeleteNode(ids[4]),
+        36: SplitNode(ids[-2]),
+        40: MergeNodes([ids[0], ids[-1]]),
         44: Undo(),
     }
     if step in requests:
@@ -184,6 +187,30 @@ def surface() -> dict[str, str]:
     for path in sorted((ROOT / "msg_schemas").rglob("*.json")):
         texts[path.name] = path.read_text(encoding="utf-8")
     return {name: _hash(text.encode()) for name, text in texts.items()}
+
+
+def _ordered(state: Arrays) -> Arrays:
+    """The arrays of a map with nodes, edges and votes by their ids."""
+    found = dict(state)
+    order = state["ids"].argsort()
+    for name in SAVED:
+        found[name] = state[name][order]
+    counts = state["surface_point_counts"]
+    surfaces = np.split(state["surface_points"], np.cumsum(counts)[:-1])
+    found["surface_point_counts"] = counts[order]
+    found["surface_points"] = np.concatenate([surfaces[index] for index in order])
+    order = np.lexsort(state["edge_pairs"].T[::-1])
+    for name in ("edge_pairs", "edge_visual_logits", "edge_counts"):
+        found[name] = state[name][order]
+    found["edge_counts"] = found["edge_counts"][:, :3]
+    order, voted = np.lexsort(state["vote_pairs"].T[::-1]), state["vote_known"][:, -1] == 1
+    found["vote_pairs"] = state["vote_pairs"][order]
+    found["vote_known"] = state["vote_known"][order][:, [0, -1]]
+    places = np.cumsum(voted) - 1
+    found["vote_counts"] = state["vote_counts"][places[order][voted[order]]]
+    for name in ("header", "revisions"):
+        found.pop(name, None)
+    return found
 
 
 def _json(value: Any) -> bytes:

@@ -121,11 +121,11 @@ class EditLog:
         return found
 
     def believed_classes(
-        self, nodes: NodeTable, vocabulary: Vocabulary, rows: Int64 | Sequence[int]
+        self, nodes: NodeTable, vocabulary: Vocabulary, slots: Int64 | Sequence[int]
     ) -> Float64:
-        """Class distributions (n, C) of n rows: those of the frames, or the operator's labels."""
-        classes: Float64 = nodes.class_probabilities[rows]
-        for index, node_id in enumerate(nodes.ids[rows].tolist() if self.labels else ()):
+        """Class distributions (n, C) of n slots: those of the frames, or the operator's labels."""
+        classes: Float64 = nodes.class_probabilities[slots]
+        for index, node_id in enumerate(nodes.ids[slots].tolist() if self.labels else ()):
             label = self.labels.get(node_id)
             if label in vocabulary.classes:
                 classes[index] = 0.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.graph.edits import Edit, EditLog
 from deworldsg_ros.graph.extent import even_moments
-from deworldsg_ros.graph.nodes import SAVED_COLUMNS, IdState, NodeIds, NodeTable, Observations
+from deworldsg_ros.graph.nodes import SAVED, IdState, NodeIds, NodeTable, Observations
 from deworldsg_ros.graph.pairs import (
     EdgeArrays,
     EdgeEvidence,
@@ -26,15 +26,46 @@ from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.scene.surface import NO_POINTS
 
-# --- The nodes of a graph with their ids over time.
+# --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
 
 
-class NodeStore:
-    """Nodes that are added, observed and changed; ids and frames are remembered.
+@dataclass(frozen=True)
+class GraphState:
+    """Everything from which an equal graph can be made.
 
-    Ids start at 1 and are never reused; `resolve` follows merges. `revision` increases with every
-    change. Nodes and edges carry the revision of their last change, so that derived data is rebuilt
-    for them only.
+    Attributes:
+        vocabulary, frame_id: of the graph, and
+        surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
+        revision: number of changes so far.
+        nodes: arrays of n rows, by ascending ids, by their names in `NodeTable`.
+        surface_points: (m, 3) float32, metres, those of one node after those of another.
+        surface_counts: (n,) int64, number of points of each node.
+        edges: evidence of the directed pairs of ids.
+        votes: votes of frames on each unordered pair of ids.
+        ids: the id memory.
+        edits: of an operator, oldest first.
+    """
+
+    vocabulary: Vocabulary
+    frame_id: str
+    nodes: Mapping[str, NDArray[Any]]
+    surface_points: Float32
+    surface_counts: Int64
+    edges: EdgeArrays
+    votes: Mapping[Pair, PairVotes]
+    ids: IdState
+    revision: int
+    surface_point_capacity: int
+    remembered_frames: int
+    even_gaussians: bool
+    edits: Sequence[Edit] = ()
+
+
+class SceneGraph:
+    """The state of the map: nodes and directed edges between them.
+
+    Stages change it only through its methods. Ids start at 1 and are never reused. When two nodes
+    merge, the older id stays; `resolve` follows merges.
 
     Attributes:
         vocabulary: names of classes and predicates.
@@ -43,25 +74,68 @@ class NodeStore:
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
         nodes: the nodes as parallel arrays; read only.
         edits: what an operator has said about nodes; read only.
-        revision: number of changes so far.
+        even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
+            Gaussian.
     """
 
     def __init__(
         self,
         vocabulary: Vocabulary,
         frame_id: str,
-        surface_point_capacity: int,
-        remembered_frames: int,
+        surface_point_capacity: int = 512,
+        remembered_frames: int = 1024,
+        even_gaussians: bool = False,
     ) -> None:
         self.vocabulary = vocabulary
         self.frame_id = frame_id
         self.surface_point_capacity = surface_point_capacity
         self.remembered_frames = remembered_frames
+        self.even_gaussians = even_gaussians
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.edits = EditLog()
         self.revision = 0
         self._ids = NodeIds(self.nodes, remembered_frames)
-        self._watchers: list[set[int]] = []
+        self._watchers: list[dict[int, int]] = []
+        self._edges = EdgeMap(len(vocabulary.predicates))
+        self._votes = VoteMap(len(vocabulary.predicates))
+
+    @classmethod
+    def from_state(cls, state: GraphState) -> SceneGraph:
+        """The graph of a state; ValueError or KeyError if its parts do not fit together."""
+        graph = cls(
+            state.vocabulary,
+            state.frame_id,
+            state.surface_point_capacity,
+            state.remembered_frames,
+            state.even_gaussians,
+        )
+        graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
+        graph._edges.restore(state.edges)
+        graph._votes.restore(state.votes)
+        graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
+        graph.edits = EditLog(state.edits)
+        graph.revision = state.revision
+        return graph
+
+    def state(self) -> GraphState:
+        """A copy of everything from which `from_state` makes an equal graph."""
+        nodes = self.nodes
+        slots = nodes.slots_of(sorted(nodes.slot_of))
+        return GraphState(
+            vocabulary=self.vocabulary,
+            frame_id=self.frame_id,
+            nodes={name: getattr(nodes, name)[slots] for name in SAVED},
+            surface_points=np.concatenate([NO_POINTS, *map(nodes.surface, slots.tolist())]),
+            surface_counts=nodes.surface_counts[slots],
+            edges=self._edges.arrays().by_ids(),
+            votes=dict(sorted(self.votes.items())),
+            ids=self._ids.state(),
+            revision=self.revision,
+            surface_point_capacity=self.surface_point_capacity,
+            remembered_frames=self.remembered_frames,
+            even_gaussians=self.even_gaussians,
+            edits=list(self.edits.edits),
+        )
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -94,17 +168,17 @@ class NodeStore:
             ValueError: if the covariance is not positive definite.
         """
         nodes, node_id = self.nodes, self._ids.next_id
-        row = nodes.append(node_id)
+        slot = nodes.add(node_id)
         try:
             classes = class_probabilities / class_probabilities.sum()
-            nodes.put(row, mean_world, covariance_world, classes, weight, observations=1)
+            nodes.put(slot, mean_world, covariance_world, classes, weight, observations=1)
         except ValueError:
             nodes.remove(node_id)
             raise
-        nodes.confirmed[row], nodes.existence[row] = confirmed, -1.0
-        nodes.set_surface(row, surface_points_world)
-        nodes.first_seen_ns[row] = nodes.last_seen_ns[row] = stamp_ns
-        self._changed([row])
+        nodes.confirmed[slot], nodes.existence[slot] = confirmed, -1.0
+        nodes.set_surface(slot, surface_points_world)
+        nodes.first_seen_ns[slot] = nodes.last_seen_ns[slot] = stamp_ns
+        self._changed([slot])
         return self._ids.take()
 
     def observe(
@@ -143,25 +217,25 @@ class NodeStore:
 
         With `classes_after` (n, C), as `set_classes` with these afterwards.
         """
-        rows = self.nodes.rows_at(node_ids)
+        slots = self.nodes.slots_of(node_ids)
         classes = class_probabilities / class_probabilities.sum(axis=1, keepdims=True)
-        gaussians, counts = (means_world, covariances_world), np.ones(len(rows), np.int64)
+        gaussians, counts = (means_world, covariances_world), np.ones(len(slots), np.int64)
         seen = Observations(*gaussians, classes, weights, counts, surfaces, stamp_ns, stamp_ns)
-        self.nodes.fuse(rows, seen)
+        self.nodes.fuse(slots, seen)
         if classes_after is not None:
-            self.nodes.class_probabilities[rows] = classes_after
-            self.revision += len(rows)  # each counts as two changes
-        self._changed(rows)
+            self.nodes.class_probabilities[slots] = classes_after
+            self.revision += len(slots)  # each counts as two changes
+        self._changed(slots)
 
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
         """Remove some of the surface points of n live nodes; see `NodeTable.drop_points`."""
-        self._changed(self.nodes.drop_points(self.nodes.rows_at(node_ids), dropped))
+        self._changed(self.nodes.drop_points(self.nodes.slots_of(node_ids), dropped))
 
     def set_classes(self, node_ids: Sequence[int], class_probabilities: Float64) -> None:
         """Replace the class distributions of n live nodes, (n, C)."""
-        rows = self.nodes.rows_at(node_ids)
-        self.nodes.class_probabilities[rows] = class_probabilities
-        self._changed(rows)
+        slots = self.nodes.slots_of(node_ids)
+        self.nodes.class_probabilities[slots] = class_probabilities
+        self._changed(slots)
 
     def set_existence(
         self, node_ids: Sequence[int], existence: Float64, minimum: float
@@ -174,23 +248,23 @@ class NodeStore:
             The ids of the nodes that were not confirmed before, and are now.
         """
         nodes = self.nodes
-        rows = nodes.rows_at(node_ids)
+        slots = nodes.slots_of(node_ids)
         existence = existence.round(2)
         confirmed = existence >= minimum
         if self.edits:
             shown = (not self.edits.hides(node_id) for node_id in node_ids)
             confirmed &= np.fromiter(shown, np.bool_, len(node_ids))
-        known = nodes.confirmed[rows]
-        differs = (nodes.existence[rows] != existence) | (known != confirmed)
-        nodes.existence[rows], nodes.confirmed[rows] = existence, confirmed
-        self._changed(rows[differs])
+        known = nodes.confirmed[slots]
+        differs = (nodes.existence[slots] != existence) | (known != confirmed)
+        nodes.existence[slots], nodes.confirmed[slots] = existence, confirmed
+        self._changed(slots[differs])
         return list(itertools.compress(node_ids, (confirmed & ~known).tolist()))
 
     def move_node(self, node_id: int, T_correction: Float64) -> None:
         """Apply a pose correction (4, 4), from the old world frame to the new, to a live node."""
-        row = self.nodes.row(node_id)
-        self.nodes.move(row, T_correction)
-        self._changed([row])
+        slot = self.nodes.slot(node_id)
+        self.nodes.move(slot, T_correction)
+        self._changed([slot])
 
     def resolve(self, node_id: int) -> int:
         """The live node that an id stands for, following merges; 0 = none."""
@@ -208,119 +282,21 @@ class NodeStore:
         """The live node of each row of a frame (0 = removed); None = the frame is forgotten."""
         return self._ids.nodes_of_frame(stamp_ns)
 
-    def watch_nodes(self) -> set[int]:
-        """A set that gets the ids of all nodes that change, come or go from now on.
+    def watch_nodes(self) -> dict[int, int]:
+        """All nodes that change, come or go from now on: the slot of each id.
 
-        It starts with all ids. The caller empties it.
+        It starts with all nodes. The caller empties it.
         """
-        watcher: set[int] = set(self.nodes.ids.tolist())
+        watcher = dict(self.nodes.slot_of)
         self._watchers.append(watcher)
         return watcher
 
-    def _changed(self, rows: Sequence[int] | Int64) -> None:
-        """Count one change for each row."""
-        first = self.revision + 1
-        self.revision += len(rows)
-        self.nodes.revisions[rows] = np.arange(first, self.revision + 1)
-        ids = self.nodes.ids[rows].tolist()
+    def _changed(self, slots: Sequence[int] | Int64) -> None:
+        """Count one change for each slot."""
+        self.revision += len(slots)
+        ids, known = self.nodes.ids[slots].tolist(), self.nodes.slot_of
         for watcher in self._watchers:
-            watcher.update(ids)
-
-
-# --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
-
-
-@dataclass(frozen=True)
-class GraphState:
-    """Everything from which an equal graph can be made.
-
-    Attributes:
-        vocabulary, frame_id: of the graph, and
-        surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
-        revision: number of changes so far.
-        nodes: arrays of n rows, by their names in `NodeTable`.
-        surface_points: (m, 3) float32, metres, those of one node after those of another.
-        surface_counts: (n,) int64, number of points of each node.
-        edges: evidence of the directed pairs of ids.
-        votes: votes of frames on each unordered pair of ids.
-        ids: the id memory.
-        edits: of an operator, oldest first.
-    """
-
-    vocabulary: Vocabulary
-    frame_id: str
-    nodes: Mapping[str, NDArray[Any]]
-    surface_points: Float32
-    surface_counts: Int64
-    edges: EdgeArrays
-    votes: Mapping[Pair, PairVotes]
-    ids: IdState
-    revision: int
-    surface_point_capacity: int
-    remembered_frames: int
-    even_gaussians: bool
-    edits: Sequence[Edit] = ()
-
-
-class SceneGraph(NodeStore):
-    """The state of the map: nodes (see `NodeStore`) and directed edges between them.
-
-    Stages change it only through its methods. When two nodes merge, the older id stays.
-
-    Attributes:
-        even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
-            Gaussian.
-    """
-
-    def __init__(
-        self,
-        vocabulary: Vocabulary,
-        frame_id: str,
-        surface_point_capacity: int = 512,
-        remembered_frames: int = 1024,
-        even_gaussians: bool = False,
-    ) -> None:
-        super().__init__(vocabulary, frame_id, surface_point_capacity, remembered_frames)
-        self.even_gaussians = even_gaussians
-        self._edges = EdgeMap(len(vocabulary.predicates))
-        self._votes = VoteMap(len(vocabulary.predicates))
-
-    @classmethod
-    def from_state(cls, state: GraphState) -> SceneGraph:
-        """The graph of a state; ValueError or KeyError if its parts do not fit together."""
-        graph = cls(
-            state.vocabulary,
-            state.frame_id,
-            state.surface_point_capacity,
-            state.remembered_frames,
-            state.even_gaussians,
-        )
-        graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
-        graph._edges.restore(state.edges)
-        graph._votes.restore(state.votes)
-        graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
-        graph.edits = EditLog(state.edits)
-        graph.revision = state.revision
-        return graph
-
-    def state(self) -> GraphState:
-        """A copy of everything from which `from_state` makes an equal graph."""
-        nodes = self.nodes
-        return GraphState(
-            vocabulary=self.vocabulary,
-            frame_id=self.frame_id,
-            nodes={name: getattr(nodes, name).copy() for name in SAVED_COLUMNS},
-            surface_points=nodes.surface_points(),
-            surface_counts=nodes.surface_counts.copy(),
-            edges=self._edges.arrays(),
-            votes=dict(self.votes),
-            ids=self._ids.state(),
-            revision=self.revision,
-            surface_point_capacity=self.surface_point_capacity,
-            remembered_frames=self.remembered_frames,
-            even_gaussians=self.even_gaussians,
-            edits=list(self.edits.edits),
-        )
+            watcher.update((node_id, known[node_id]) for node_id in ids)
 
     def copy_relations(self, node_id: int, new_id: int, without: Collection[int]) -> None:
         """Give a node the edges and votes of another one, except those with some nodes."""
@@ -330,9 +306,9 @@ class SceneGraph(NodeStore):
     def add_edit(self, edit: Edit) -> Edit:
         """Note an operator's edit, with a new number; the nodes that it replaces are hidden."""
         edit, lost = self.edits.add(edit)
-        rows = [self.nodes.row(node_id) for node_id in (*edit.nodes, *edit.replaced)]
-        self.nodes.confirmed[rows] &= [not self.edits.hides(i) for i in self.nodes.ids[rows]]
-        self._changed(rows)
+        slots = self.nodes.slots_of([*edit.nodes, *edit.replaced])
+        self.nodes.confirmed[slots] &= [not self.edits.hides(i) for i in self.nodes.ids[slots]]
+        self._changed(slots)
         self._drop(lost)
         return edit
 
@@ -345,9 +321,9 @@ class SceneGraph(NodeStore):
         if a_id == b_id:
             raise ValueError(f"node {a_id} cannot be merged with itself")
         kept_id, removed_id = min(a_id, b_id), max(a_id, b_id)
-        row = self.nodes.row(kept_id)
-        self.nodes.merge(row, self.nodes.row(removed_id))
-        self._changed([row])
+        slot = self.nodes.slot(kept_id)
+        self.nodes.merge(slot, self.nodes.slot(removed_id))
+        self._changed([slot])
         self._edges.repoint(removed_id, kept_id, self.revision)
         self._votes.repoint(removed_id, kept_id, self.revision)
         self._remove(removed_id, kept_id)
@@ -359,9 +335,9 @@ class SceneGraph(NodeStore):
         Gaussian, surface and edges are the newer node's. Class distributions average with the
         numbers of observations.
         """
-        row = self.nodes.row(old_id)
-        self.nodes.take_over(row, self.nodes.row(new_id))
-        self._changed([row])
+        slot = self.nodes.slot(old_id)
+        self.nodes.take_over(slot, self.nodes.slot(new_id))
+        self._changed([slot])
         self._edges.drop(old_id)
         self._votes.drop(old_id)
         self._edges.repoint(new_id, old_id, self.revision)
@@ -370,7 +346,7 @@ class SceneGraph(NodeStore):
 
     def remove_node(self, node_id: int) -> None:
         """Remove a live node and its edges."""
-        self.nodes.row(node_id)
+        self.nodes.slot(node_id)
         self.revision += 1
         self._edges.drop(node_id)
         self._votes.drop(node_id)
@@ -435,9 +411,9 @@ class SceneGraph(NodeStore):
         return self._edges.take_changed()
 
     def _remove(self, node_id: int, successor: int) -> None:
-        self.nodes.remove(node_id)
         for watcher in self._watchers:
-            watcher.add(node_id)
+            watcher[node_id] = self.nodes.slot(node_id)
+        self.nodes.remove(node_id)
         self._ids.retire(node_id, successor)
         if self.edits:
             self._drop(self.edits.removed(node_id, successor))
@@ -467,18 +443,18 @@ def copy_node(
         points_world: (k, 3) float32, the part of the node's surface points that the copy gets, with
             the Gaussian of these points; None = everything.
     """
-    nodes, row = graph.nodes, graph.nodes.row(node_id)
-    mean, covariance = nodes.means[row].copy(), nodes.covariances[row].copy()
-    surface, weight = nodes.surface(row).copy(), float(nodes.weights[row])
+    nodes, slot = graph.nodes, graph.nodes.slot(node_id)
+    mean, covariance = nodes.means[slot].copy(), nodes.covariances[slot].copy()
+    surface, weight = nodes.surface(slot).copy(), float(nodes.weights[slot])
     if points_world is not None:
         mean, covariance = even_moments(points_world)
         surface, weight = points_world, weight * len(points_world) / len(surface)
-    classes, first_ns = nodes.class_probabilities[row].copy(), int(nodes.first_seen_ns[row])
-    confirmed = bool(nodes.confirmed[row])
+    classes, first_ns = nodes.class_probabilities[slot].copy(), int(nodes.first_seen_ns[slot])
+    confirmed = bool(nodes.confirmed[slot])
     new_id = graph.add_node(mean, covariance, classes, first_ns, surface, weight, confirmed)
-    new = nodes.row(new_id)
+    new = nodes.slot(new_id)
     for name in ("class_probabilities", "observations", "existence", "last_seen_ns"):
-        getattr(nodes, name)[new] = getattr(nodes, name)[row]
+        getattr(nodes, name)[new] = getattr(nodes, name)[slot]
     graph.copy_relations(node_id, new_id, without)
     return new_id
 
@@ -494,4 +470,5 @@ def copy_node(
 def nodes_since(graph: SceneGraph, since_ns: int) -> list[int]:
     """Ids of the nodes first seen at a stamp or later, ascending."""
     nodes = graph.nodes
-    return sorted(nodes.ids[nodes.first_seen_ns >= since_ns].tolist())
+    slots = nodes.slots
+    return sorted(nodes.ids[slots[nodes.first_seen_ns[slots] >= since_ns]].tolist())

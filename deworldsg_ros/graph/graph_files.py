@@ -16,7 +16,7 @@ from deworldsg_ros.base.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, paused_collector, read_regular, write_atomically
 from deworldsg_ros.graph.edits import MAX_EDITS, Edit
 from deworldsg_ros.graph.graph import GraphState, SceneGraph
-from deworldsg_ros.graph.nodes import SAVED_COLUMNS, IdState
+from deworldsg_ros.graph.nodes import SAVED, IdState
 from deworldsg_ros.graph.pairs import MAX_ID, EdgeArrays, Pair, PairVotes
 from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.arrays import Int64
@@ -134,7 +134,6 @@ def _check_nodes(arrays: ArraysByName, header: Header) -> None:
     _check_stamps("first_seen_ns", first)
     _check_stamps("last_seen_ns", last)
     holds("first_seen_ns", (first <= last).all(), "no later than last_seen_ns")
-    within("revisions", checked(arrays, "revisions", np.int64, count), 0, header.revision)
     points = checked(arrays, "surface_points", np.float32, None, 3)
     within("surface_points", points, *_sym(MAX_POSITION_M))
     counts = checked(arrays, "surface_point_counts", np.int64, count)
@@ -347,7 +346,7 @@ def _state(arrays: Arrays) -> GraphState:
     return GraphState(
         vocabulary=Vocabulary(tuple(header.classes), tuple(header.predicates)),
         frame_id=header.frame_id,
-        nodes={name: _column(arrays, name) for name in SAVED_COLUMNS},
+        nodes={name: _column(arrays, name) for name in SAVED},
         surface_points=arrays["surface_points"],
         surface_counts=arrays["surface_point_counts"],
         edges=EdgeArrays(arrays["edge_pairs"], arrays["edge_visual_logits"], arrays["edge_counts"]),

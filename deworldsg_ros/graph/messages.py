@@ -21,7 +21,7 @@ from deworldsg_ros.graph.extent import (
     rounded_gaussians,
     surface_bytes,
 )
-from deworldsg_ros.graph.graph import NodeStore
+from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.wire import messages as wire
 
@@ -144,7 +144,7 @@ class NodeStates:
     always the newest.
 
     Args:
-        store: the nodes.
+        graph: of the nodes.
         top_k: number of labels of each node.
         even_gaussians: show the `even_moments` of a node's surface instead of the pooled Gaussian.
 
@@ -153,12 +153,12 @@ class NodeStates:
         states: messages by id. Those of nodes that did not change are the same objects as before.
     """
 
-    def __init__(self, store: NodeStore, top_k: int, even_gaussians: bool) -> None:
+    def __init__(self, graph: SceneGraph, top_k: int, even_gaussians: bool) -> None:
         self.states: dict[int, wire.NodeState] = {}
-        self._store = store
+        self._graph = graph
         self._top_k = top_k
         self._even_gaussians = even_gaussians
-        self._touched = store.watch_nodes()
+        self._touched = graph.watch_nodes()
         # Confirmed nodes without a message.
         self._new: dict[int, None] = {}
         # Which surface the extent of a message is of, and the nodes whose extent is an older one.
@@ -193,13 +193,13 @@ class NodeStates:
             at_most: number of extents to measure again, those that wait longest first; None = all.
             new_at_most: number of first messages; None = all.
         """
-        places, confirmed = self._store.nodes.places, self._store.nodes.confirmed
+        slot_of, confirmed = self._graph.nodes.slot_of, self._graph.nodes.confirmed
         gone, present = [], {}
         for node_id in sorted(self._touched):
-            row = places.get(node_id)
-            if row is not None and confirmed[row]:
+            slot = slot_of.get(node_id)
+            if slot is not None and confirmed[slot]:
                 if node_id in self.states:
-                    present[node_id] = row
+                    present[node_id] = slot
                 else:
                     self._new[node_id] = None
                 continue
@@ -210,18 +210,18 @@ class NodeStates:
                 self._stale.pop(node_id, None)
         self._touched.clear()
         for node_id in take_first(self._new, new_at_most):
-            present[node_id] = places[node_id]
+            present[node_id] = slot_of[node_id]
         extents = self._measure(present, at_most)
         for node_id in extents.keys() - present.keys():
-            present[node_id] = places[node_id]
+            present[node_id] = slot_of[node_id]
         if present:
             self._make(present, extents)
         return [*gone, *present]
 
     def with_points(self, state: wire.NodeState) -> wire.NodeState:
         """A message with the surface points of its node."""
-        nodes = self._store.nodes
-        points = nodes.surface(nodes.row(state.id))
+        nodes = self._graph.nodes
+        points = nodes.surface(nodes.slot(state.id))
         return msgspec.structs.replace(state, surface_mm=surface_bytes(points, state.mean_m))
 
     def _measure(self, changed: Mapping[int, int], at_most: int | None) -> dict[int, Extent | None]:
@@ -229,37 +229,37 @@ class NodeStates:
 
         None = without points.
         """
-        nodes, due = self._store.nodes, []
+        nodes, due = self._graph.nodes, []
         revisions = nodes.surface_revisions
-        for node_id, row in changed.items():
+        for node_id, slot in changed.items():
             known = self._measured.get(node_id)
             if known is None:
                 due.append(node_id)
-            elif known != revisions[row]:
+            elif known != revisions[slot]:
                 self._stale[node_id] = None
         due += take_first(self._stale, at_most)
         if not due:
             return {}
-        rows = np.array([nodes.places[node_id] for node_id in due], np.int64)
-        self._measured.update(zip(due, revisions[rows].tolist()))
-        solid = nodes.surface_counts[rows] > 0
+        slots = nodes.slots_of(due)
+        self._measured.update(zip(due, revisions[slots].tolist()))
+        solid = nodes.surface_counts[slots] > 0
         surfaces = nodes.surface_points_world, nodes.surface_counts
-        found = iter(extents_of(*surfaces, rows[solid], self.up))
+        found = iter(extents_of(*surfaces, slots[solid], self.up))
         return {
             node_id: next(found) if has_points else None
             for node_id, has_points in zip(due, solid.tolist())
         }
 
     def _make(self, present: Mapping[int, int], extents: Mapping[int, Extent | None]) -> None:
-        """Write the messages of nodes, given by id and row, with a new or the known extent."""
-        nodes, rows = self._store.nodes, np.array(list(present.values()), np.int64)
-        vocabulary, labels = self._store.vocabulary, self._store.edits.labels
+        """Write the messages of nodes, given by id and slot, with a new or the known extent."""
+        nodes, slots = self._graph.nodes, np.array(list(present.values()), np.int64)
+        vocabulary, labels = self._graph.vocabulary, self._graph.edits.labels
         columns = (nodes.observations, nodes.existence, nodes.first_seen_ns, nodes.last_seen_ns)
         for node_id, classes, pooled, observations, existence, first_ns, last_ns in zip(
             present,
-            listed(nodes.class_probabilities[rows], vocabulary.classes, self._top_k),
-            rounded_gaussians(nodes.means, nodes.covariances, rows),
-            *(column[rows].tolist() for column in columns),
+            listed(nodes.class_probabilities[slots], vocabulary.classes, self._top_k),
+            rounded_gaussians(nodes.means, nodes.covariances, slots),
+            *(column[slots].tolist() for column in columns),
         ):
             label = labels.get(node_id)
             if label is not None:
@@ -292,14 +292,14 @@ class NodeStates:
         return Extent(state.mean_m, state.covariance_m2, state.box)
 
 
-def hidden_node(store: NodeStore, node_id: int, reason: str) -> wire.HiddenNode:
+def hidden_node(graph: SceneGraph, node_id: int, reason: str) -> wire.HiddenNode:
     """The message of a node that is not published."""
-    nodes, row = store.nodes, store.nodes.row(node_id)
-    best = int(nodes.class_probabilities[row].argmax())
+    nodes, slot = graph.nodes, graph.nodes.slot(node_id)
+    best = int(nodes.class_probabilities[slot].argmax())
     return wire.HiddenNode(
-        label=store.vocabulary.classes[best],
-        mean_m=rounded(nodes.means[row], POSITION_DECIMALS),
-        existence=max(0.0, float(nodes.existence[row])),
-        observations=int(nodes.observations[row]),
+        label=graph.vocabulary.classes[best],
+        mean_m=rounded(nodes.means[slot], POSITION_DECIMALS),
+        existence=max(0.0, float(nodes.existence[slot])),
+        observations=int(nodes.observations[slot]),
         reason=reason,
     )

@@ -7,13 +7,13 @@ import math
 import operator
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Bool, Columns, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.gaussian import (
     eigenvalue_bound,
     eigenvalue_bounds,
@@ -138,14 +138,15 @@ class NodeIds:
         return None if node_ids is None else [self.resolve(node_id) for node_id in node_ids]
 
 
-# --- The nodes of the global graph as parallel, contiguous arrays.
+# --- The nodes of the global graph as parallel arrays.
 
-# Surface points for which a table has room at first.
+# Slots for which a table has room at first, and surface points of each.
+FIRST_SLOTS = 64
 FIRST_POINTS = 64
 # A covariance with a pivot below this fraction of its trace is singular up to rounding.
 SINGULAR = 1e-13
-# Saved columns of a node, beside its surface points; the other columns follow from these.
-SAVED_COLUMNS = (
+# Saved arrays of the nodes, beside their surface points; the other arrays follow from these.
+SAVED = (
     "ids",
     "means",
     "covariances",
@@ -156,7 +157,6 @@ SAVED_COLUMNS = (
     "existence",
     "first_seen_ns",
     "last_seen_ns",
-    "revisions",
 )
 
 
@@ -184,11 +184,29 @@ class Observations:
     last_seen_ns: int
 
 
-class NodeTable(Columns):
-    """n nodes with distributions over C classes; see `Columns` for rows and ids.
+class _Gaussians(NamedTuple):
+    """What Eq. 7 fuses: means, covariances, classes, weights, and numbers of observations."""
+
+    means: Float64
+    covariances: Float64
+    classes: Float64
+    weights: Float64
+    observations: Int64
+
+
+class NodeTable:
+    """The nodes, each in a slot of parallel arrays.
+
+    A node keeps its slot as long as it lives. Other modules have arrays by slot, too. The slot of a
+    removed node is used again. All values in a free slot are 0, also the id. A new node may replace
+    the arrays by larger ones, so do not keep them.
+
+    Args:
+        class_count: C.
+        surface_point_capacity: maximum number of surface points of a node.
 
     Attributes:
-        ids: (n,) int64, stable, from 1.
+        ids: (n,) int64, from 1; 0 = a free slot.
         means: (n, 3) float64, metres, world frame.
         covariances: (n, 3, 3) float64, square metres, positive definite.
         class_probabilities: (n, C) float64, rows sum to one.
@@ -199,13 +217,14 @@ class NodeTable(Columns):
         log_determinants: (n,) float64, of the covariances.
         eigenvalue_bounds: (n,) float64, no smaller than the covariance's largest eigenvalue.
         first_seen_ns, last_seen_ns: (n,) int64.
-        revisions: (n,) int64, graph revision at which the node last changed.
         existence: (n,) float64, probability that it is an object; -1 = not estimated.
         surface_points_world: (n, K, 3) float32, metres: a sample of each node's surface points, of
         surface_counts: (n,) int64 points; see `surface`. K grows up to the capacity.
         surface_revisions: (n,) int64, number of changes of the surface so far.
+        slot_of: the slot of each id; read only.
     """
 
+    ids: Int64
     means: Float64
     covariances: Float64
     class_probabilities: Float64
@@ -217,184 +236,242 @@ class NodeTable(Columns):
     eigenvalue_bounds: Float64
     first_seen_ns: Int64
     last_seen_ns: Int64
-    revisions: Int64
     surface_points_world: Float32
     surface_counts: Int64
     surface_revisions: Int64
 
     def __init__(self, class_count: int, surface_point_capacity: int = 0) -> None:
-        first_points = min(FIRST_POINTS, surface_point_capacity)
-        super().__init__(
-            {
-                "means": (np.float64, (3,)),
-                "covariances": (np.float64, (3, 3)),
-                "class_probabilities": (np.float64, (class_count,)),
-                "weights": (np.float64, ()),
-                "observations": (np.int64, ()),
-                "confirmed": (np.bool_, ()),
-                "existence": (np.float64, ()),
-                "log_determinants": (np.float64, ()),
-                "eigenvalue_bounds": (np.float64, ()),
-                "first_seen_ns": (np.int64, ()),
-                "last_seen_ns": (np.int64, ()),
-                "revisions": (np.int64, ()),
-                "surface_points_world": (np.float32, (first_points, 3)),
-                "surface_counts": (np.int64, ()),
-                "surface_revisions": (np.int64, ()),
-            }
-        )
+        points = min(FIRST_POINTS, surface_point_capacity)
+        layout: dict[str, tuple[DTypeLike, tuple[int, ...]]] = {
+            "ids": (np.int64, ()),
+            "means": (np.float64, (3,)),
+            "covariances": (np.float64, (3, 3)),
+            "class_probabilities": (np.float64, (class_count,)),
+            "weights": (np.float64, ()),
+            "observations": (np.int64, ()),
+            "confirmed": (np.bool_, ()),
+            "existence": (np.float64, ()),
+            "log_determinants": (np.float64, ()),
+            "eigenvalue_bounds": (np.float64, ()),
+            "first_seen_ns": (np.int64, ()),
+            "last_seen_ns": (np.int64, ()),
+            "surface_points_world": (np.float32, (points, 3)),
+            "surface_counts": (np.int64, ()),
+            "surface_revisions": (np.int64, ()),
+        }
+        # With room for more; the attributes are views of the slots that were ever used.
+        self._storage: dict[str, NDArray[Any]] = {
+            name: np.zeros((FIRST_SLOTS, *shape), dtype) for name, (dtype, shape) in layout.items()
+        }
+        self.slot_of: dict[int, int] = {}
         self._surface_point_capacity = surface_point_capacity
+        self._free: list[int] = []
+        self._show(0)
+
+    def __len__(self) -> int:
+        return len(self.slot_of)
+
+    def __contains__(self, node_id: object) -> bool:
+        return node_id in self.slot_of
+
+    @property
+    def slots(self) -> Int64:
+        """The slots of all nodes, ascending."""
+        return np.flatnonzero(self.ids)
+
+    def slot(self, node_id: int) -> int:
+        """The slot of a node; KeyError if there is no such node."""
+        try:
+            return self.slot_of[node_id]
+        except KeyError:
+            raise KeyError(f"node {node_id} is not in the graph") from None
+
+    def slots_of(self, ids: Sequence[int]) -> Int64:
+        """The slot (n,) of each node; KeyError if there is no such node."""
+        try:
+            return np.fromiter(map(self.slot_of.__getitem__, ids), np.int64, len(ids))
+        except KeyError as missing:
+            raise KeyError(f"node {missing} is not in the graph") from None
+
+    def add(self, node_id: int) -> int:
+        """Give a new node a slot, of zeros."""
+        slot = self._free.pop() if self._free else len(self.ids)
+        if slot == len(self.ids):
+            self._make_slots(slot + 1)
+        self.slot_of[node_id] = slot
+        self.ids[slot] = node_id
+        return slot
+
+    def remove(self, node_id: int) -> None:
+        """Free the slot of a node."""
+        slot = self.slot(node_id)
+        for values in self._storage.values():
+            values[slot] = 0
+        del self.slot_of[node_id]
+        self._free.append(slot)
 
     def put(
         self,
-        row: int,
+        slot: int,
         mean_world: Float64,
         covariance_world: Float64,
         class_probabilities: Float64,
         weight: float,
         observations: int,
     ) -> None:
-        """Replace a row's Gaussian, classes and counts, and the cached values of its covariance.
+        """Replace a node's Gaussian, classes and counts, and the cached values of its covariance.
 
         Raises:
-            ValueError: if the covariance is not positive definite; the row is unchanged.
+            ValueError: if the covariance is not positive definite; the node is unchanged.
         """
-        self.log_determinants[row] = log_determinant(covariance_world)
-        self.eigenvalue_bounds[row] = eigenvalue_bound(covariance_world)
-        self.means[row] = mean_world
-        self.covariances[row] = covariance_world
-        self.class_probabilities[row] = class_probabilities
-        self.weights[row] = weight
-        self.observations[row] = observations
+        self.log_determinants[slot] = log_determinant(covariance_world)
+        self.eigenvalue_bounds[slot] = eigenvalue_bound(covariance_world)
+        self.means[slot] = mean_world
+        self.covariances[slot] = covariance_world
+        self.class_probabilities[slot] = class_probabilities
+        self.weights[slot] = weight
+        self.observations[slot] = observations
 
-    def fuse(self, rows: Int64, seen: Observations) -> None:
-        """Fuse one observation into each of n different rows (Eq. 7).
+    def fuse(self, slots: Int64, seen: Observations) -> None:
+        """Fuse one observation into each of n different nodes (Eq. 7).
 
         Raises:
-            ValueError: if a covariance is not positive definite; rows before it were fused.
+            ValueError: if a covariance is not positive definite; nodes before it were fused.
         """
-        refused = _fuse(
-            rows,
+        known = _Gaussians(
             self.means,
             self.covariances,
             self.class_probabilities,
             self.weights,
             self.observations,
-            self.log_determinants,
-            self.eigenvalue_bounds,
+        )
+        new = _Gaussians(
             seen.means_world,
             seen.covariances_world,
             seen.class_probabilities,
             seen.weights,
             seen.counts,
         )
+        refused = _fuse(slots, known, self.log_determinants, self.eigenvalue_bounds, new)
         if refused >= 0:
             raise ValueError(
                 f"covariance {seen.covariances_world[refused].tolist()}, fused into node "
-                f"{self.ids[rows[refused]]}, gives one that is not positive definite"
+                f"{self.ids[slots[refused]]}, gives one that is not positive definite"
             )
-        self._add_surfaces(rows, seen.surfaces)
-        self.first_seen_ns[rows] = np.minimum(self.first_seen_ns[rows], seen.first_seen_ns)
-        self.last_seen_ns[rows] = np.maximum(self.last_seen_ns[rows], seen.last_seen_ns)
+        self._add_surfaces(slots, seen.surfaces)
+        self.first_seen_ns[slots] = np.minimum(self.first_seen_ns[slots], seen.first_seen_ns)
+        self.last_seen_ns[slots] = np.maximum(self.last_seen_ns[slots], seen.last_seen_ns)
 
-    def merge(self, row: int, other: int) -> None:
-        """Fuse everything that was observed of another row into a row."""
-        self.fuse(np.array([row]), _observed(self, other))
-        self.confirmed[row] |= self.confirmed[other]
-        self.existence[row] = max(self.existence[row], self.existence[other])
+    def merge(self, slot: int, other: int) -> None:
+        """Fuse everything that was observed of another node into a node."""
+        self.fuse(np.array([slot]), self._observed(other))
+        self.confirmed[slot] |= self.confirmed[other]
+        self.existence[slot] = max(self.existence[slot], self.existence[other])
 
-    def take_over(self, row: int, other: int) -> None:
-        """Give a row the Gaussian, surface and state of another one.
+    def take_over(self, slot: int, other: int) -> None:
+        """Give a node the Gaussian, surface and state of another one.
 
         Class distributions average with the numbers of observations, which add up.
         """
-        counts = self.observations[[row, other]]
-        classes = counts @ self.class_probabilities[[row, other]] / counts.sum()
+        counts = self.observations[[slot, other]]
+        classes = counts @ self.class_probabilities[[slot, other]] / counts.sum()
         gaussian = self.means[other].copy(), self.covariances[other].copy()
-        self.put(row, *gaussian, classes, float(self.weights[other]), int(counts.sum()))
-        self.set_surface(row, self.surface(other))
-        self.confirmed[row], self.existence[row] = self.confirmed[other], self.existence[other]
-        self.last_seen_ns[row] = self.last_seen_ns[other]
+        self.put(slot, *gaussian, classes, float(self.weights[other]), int(counts.sum()))
+        self.set_surface(slot, self.surface(other))
+        self.confirmed[slot], self.existence[slot] = self.confirmed[other], self.existence[other]
+        self.last_seen_ns[slot] = self.last_seen_ns[other]
 
-    def move(self, row: int, T: Float64) -> None:
-        """Apply a rigid transform (4, 4) to the Gaussian and the surface points of a row."""
-        gaussian = transform(self.means[row], self.covariances[row], T)
-        classes, weight = self.class_probabilities[row].copy(), float(self.weights[row])
-        self.put(row, *gaussian, classes, weight, int(self.observations[row]))
-        points = self.surface(row).astype(np.float64) @ T[:3, :3].T
+    def move(self, slot: int, T: Float64) -> None:
+        """Apply a rigid transform (4, 4) to the Gaussian and the surface points of a node."""
+        gaussian = transform(self.means[slot], self.covariances[slot], T)
+        classes, weight = self.class_probabilities[slot].copy(), float(self.weights[slot])
+        self.put(slot, *gaussian, classes, weight, int(self.observations[slot]))
+        points = self.surface(slot).astype(np.float64) @ T[:3, :3].T
         points += T[:3, 3]
-        self.set_surface(row, points.astype(np.float32))
+        self.set_surface(slot, points.astype(np.float32))
 
-    def surface(self, row: int) -> Float32:
-        """The surface points (k, 3) of a row, metres; a view."""
-        return self.surface_points_world[row, : self.surface_counts[row]]
+    def surface(self, slot: int) -> Float32:
+        """The surface points (k, 3) of a node, metres; a view."""
+        return self.surface_points_world[slot, : self.surface_counts[slot]]
 
-    def set_surface(self, row: int, points_world: Float32) -> None:
-        """Replace the surface points of a row by a sample of these (k, 3)."""
-        self.surface_counts[row] = 0
-        self.surface_revisions[row] += 1
-        self._add_surfaces(np.array([row]), [points_world])
+    def set_surface(self, slot: int, points_world: Float32) -> None:
+        """Replace the surface points of a node by a sample of these (k, 3)."""
+        self.surface_counts[slot] = 0
+        self.surface_revisions[slot] += 1
+        self._add_surfaces(np.array([slot]), [points_world])
 
-    def drop_points(self, rows: Int64, dropped: Bool) -> Int64:
-        """Remove some of the surface points of n rows, (n, K); but never all points of a row.
+    def drop_points(self, slots: Int64, dropped: Bool) -> Int64:
+        """Remove some of the surface points of n nodes, (n, K); but never all points of a node.
 
         Returns:
-            The rows of which some were to be removed.
+            The slots of those of which some were to be removed.
         """
-        drop_points(self.surface_points_world, self.surface_counts, rows, dropped)
-        changed = rows[dropped.any(axis=1)]
+        drop_points(self.surface_points_world, self.surface_counts, slots, dropped)
+        changed = slots[dropped.any(axis=1)]
         self.surface_revisions[changed] += 1
         return changed
 
-    def surface_points(self) -> Float32:
-        """The surface points (m, 3) of all rows, one row after the other, metres."""
-        known = np.arange(self.surface_points_world.shape[1]) < self.surface_counts[:, None]
-        return self.surface_points_world[known]
-
-    def restore(self, columns: Mapping[str, NDArray[Any]], points: Float32, counts: Int64) -> None:
-        """Fill an empty table with saved columns and `surface_points`, some for each row."""
-        self.extend(columns["ids"].tolist())
-        for name in SAVED_COLUMNS:
-            getattr(self, name)[:] = columns[name]
+    def restore(self, saved: Mapping[str, NDArray[Any]], points: Float32, counts: Int64) -> None:
+        """Fill an empty table with `SAVED` arrays, and some of the points for each node."""
+        ids = saved["ids"].tolist()
+        self._make_slots(len(ids))
+        self.slot_of = dict(zip(ids, range(len(ids))))
+        for name in SAVED:
+            getattr(self, name)[:] = saved[name]
         self.log_determinants[:] = log_determinants(self.covariances)
         self.eigenvalue_bounds[:] = eigenvalue_bounds(self.covariances)
-        self._make_room(int(counts.max(initial=0)))
+        self._make_point_room(int(counts.max(initial=0)))
         add_flat(self.surface_points_world, self.surface_counts, points, counts)
 
-    def _make_room(self, count: int) -> None:
-        """Make room for this many surface points in each row, or for as many as a row may have."""
-        known = self._storage["surface_points_world"]
+    def _make_slots(self, used: int) -> None:
+        """Use this many slots; the new ones are zeros."""
+        known = capacity = len(self._storage["ids"])
+        while capacity < used:
+            capacity *= 2
+        for name, values in self._storage.items() if capacity > known else ():
+            # Zeros that were never written take no memory; a copy of zeros would.
+            larger = np.zeros((capacity, *values.shape[1:]), values.dtype)
+            larger[: len(self.ids)] = values[: len(self.ids)]
+            self._storage[name] = larger
+        self._show(used)
+
+    def _show(self, used: int) -> None:
+        for name, values in self._storage.items():
+            setattr(self, name, values[:used])
+
+    def _make_point_room(self, count: int) -> None:
+        """Make room for this many surface points of a node, or for as many as one may have."""
+        known, used = self._storage["surface_points_world"], len(self.ids)
         if known.shape[1] < min(count, self._surface_point_capacity):
             larger = _widened(known, count, self._surface_point_capacity)
-            larger[: len(self), : known.shape[1]] = known[: len(self)]
+            larger[:used, : known.shape[1]] = known[:used]
             self._storage["surface_points_world"] = larger
-            self._show(len(self))
+            self._show(used)
 
-    def _add_surfaces(self, rows: Int64, point_sets: Sequence[Float32]) -> None:
+    def _add_surfaces(self, slots: Int64, point_sets: Sequence[Float32]) -> None:
         if self.surface_points_world.shape[1] < self._surface_point_capacity:
-            counts = self.surface_counts[rows].tolist()
-            self._make_room(max(map(operator.add, counts, map(len, point_sets)), default=0))
+            counts = self.surface_counts[slots].tolist()
+            self._make_point_room(max(map(operator.add, counts, map(len, point_sets)), default=0))
         surfaces = self.surface_points_world, self.surface_counts
-        self.surface_revisions[rows] += add_points(*surfaces, rows, point_sets)
+        self.surface_revisions[slots] += add_points(*surfaces, slots, point_sets)
 
-
-def _observed(table: NodeTable, row: int) -> Observations:
-    """Everything that was observed of a row, as one observation."""
-    one = [row]
-    return Observations(
-        table.means[one],
-        table.covariances[one],
-        table.class_probabilities[one],
-        table.weights[one],
-        table.observations[one],
-        [table.surface(row)],
-        int(table.first_seen_ns[row]),
-        int(table.last_seen_ns[row]),
-    )
+    def _observed(self, slot: int) -> Observations:
+        """Everything that was observed of a node, as one observation."""
+        one = [slot]
+        return Observations(
+            self.means[one],
+            self.covariances[one],
+            self.class_probabilities[one],
+            self.weights[one],
+            self.observations[one],
+            [self.surface(slot)],
+            int(self.first_seen_ns[slot]),
+            int(self.last_seen_ns[slot]),
+        )
 
 
 def _widened(known: Float32, count: int, most: int) -> Float32:
-    """Zeros for rows of at least this many points, or of `most`. Unwritten, they take no memory."""
+    """Zeros for slots of at least this many points, or of `most`; unwritten, without memory."""
     width = known.shape[1]
     while width < count:
         width *= 2
@@ -415,37 +492,30 @@ def _pivots(c: Float64) -> tuple[float, float]:
 
 @kernel
 def _fuse(
-    rows: Int64,
-    means: Float64,
-    covariances: Float64,
-    classes: Float64,
-    weights: Float64,
-    observations: Int64,
+    slots: Int64,
+    nodes: _Gaussians,
     log_determinants: Float64,
     eigenvalue_bounds: Float64,
-    new_means: Float64,
-    new_covariances: Float64,
-    new_classes: Float64,
-    new_weights: Float64,
-    new_observations: Int64,
+    new: _Gaussians,
 ) -> int:
-    """`scene.gaussian.fuse` for each row, with cached values; the index refused, -1 = none.
+    """`scene.gaussian.fuse` for each slot, with cached values; the index refused, -1 = none.
 
     The operations are those of `fuse`, `log_determinant` and `eigenvalue_bound`, in the same order.
     """
+    means, covariances = nodes.means, nodes.covariances
     c = np.empty((3, 3))
-    for index in range(len(rows)):
-        row = rows[index]
-        known, weight = weights[row], new_weights[index]
+    for index in range(len(slots)):
+        slot = slots[index]
+        known, weight = nodes.weights[slot], new.weights[index]
         total = known + weight
         cross = known * weight / (total * total)
         squares = 0.0
         for i in range(3):
             for j in range(3):
-                apart = (means[row, i] - new_means[index, i]) * (
-                    means[row, j] - new_means[index, j]
+                apart = (means[slot, i] - new.means[index, i]) * (
+                    means[slot, j] - new.means[index, j]
                 )
-                mixed = known * covariances[row, i, j] + weight * new_covariances[index, i, j]
+                mixed = known * covariances[slot, i, j] + weight * new.covariances[index, i, j]
                 c[i, j] = mixed / total + cross * apart
                 squares += c[i, j] * c[i, j]
         pivot_1, pivot_2 = _pivots(c)
@@ -457,17 +527,17 @@ def _fuse(
             pivot_1, pivot_2 = _pivots(c)
         if not (c[0, 0] > 0.0 and pivot_1 > 0.0 and pivot_2 > 0.0):
             return index
-        log_determinants[row] = math.log(c[0, 0] * pivot_1 * pivot_2)
-        eigenvalue_bounds[row] = math.sqrt(squares)
-        seen, seen_now = observations[row], new_observations[index]
+        log_determinants[slot] = math.log(c[0, 0] * pivot_1 * pivot_2)
+        eigenvalue_bounds[slot] = math.sqrt(squares)
         for i in range(3):
-            means[row, i] = (known * means[row, i] + weight * new_means[index, i]) / total
+            means[slot, i] = (known * means[slot, i] + weight * new.means[index, i]) / total
             for j in range(3):
-                covariances[row, i, j] = c[i, j]
-        for label in range(classes.shape[1]):
-            classes[row, label] = (
-                seen * classes[row, label] + seen_now * new_classes[index, label]
+                covariances[slot, i, j] = c[i, j]
+        seen, seen_now = nodes.observations[slot], new.observations[index]
+        for label in range(nodes.classes.shape[1]):
+            nodes.classes[slot, label] = (
+                seen * nodes.classes[slot, label] + seen_now * new.classes[index, label]
             ) / (seen + seen_now)
-        weights[row] = total
-        observations[row] = seen + seen_now
+        nodes.weights[slot] = total
+        nodes.observations[slot] = seen + seen_now
     return -1

@@ -85,6 +85,11 @@ class EdgeArrays:
     def __len__(self) -> int:
         return len(self.pairs)
 
+    def by_ids(self) -> EdgeArrays:
+        """The same, by ascending ids."""
+        order = np.lexsort(self.pairs.T[::-1])
+        return EdgeArrays(self.pairs[order], self.visual_logits[order], self.counts[order])
+
     def at(self, row: int) -> EdgeEvidence:
         """The evidence of a row."""
         return EdgeEvidence(self.visual_logits[row], *self.counts[row].tolist())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,19 +53,19 @@ def start(record: Any, probabilities: Float64, stamp_ns: int) -> None:
 
 @kernel
 def observe_names(
-    records: NDArray[Any], owners: Int64, seen: Float64, stamp_ns: int, classes: Float64
+    records: NDArray[Any], slots: Int64, seen: Float64, stamp_ns: int, classes: Float64
 ) -> None:
     """Add class distributions (n, C) of a frame to n known nodes.
 
     Args:
-        records: with `NAME_FIELDS`; those of the owners are updated.
-        owners: (n,) index of each node's record.
+        records: with `NAME_FIELDS`; those of the slots are updated.
+        slots: (n,) index of each node's record.
         seen: (n, C) distributions of the detections.
         stamp_ns: of the frame.
         classes: (n, C), filled with the distributions of the nodes' classes.
     """
-    for index in range(len(owners)):
-        record = records[owners[index]]
+    for index in range(len(slots)):
+        record = records[slots[index]]
         _consider(record, int(np.argmax(seen[index])))
         known = 0
         for label in record.labels:
@@ -202,13 +202,13 @@ def prior(fates: Int64) -> float:
 
 
 @kernel
-def settle(records: NDArray[Any], fates: Int64, owners: Int64, known: Float64) -> None:
+def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) -> None:
     """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
 
     A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
     """
-    for index in range(len(owners)):
-        record, probability = records[owners[index]], known[index]
+    for index in range(len(slots)):
+        record, probability = records[slots[index]], known[index]
         is_error = probability < 1.0 - SETTLED and record.missed_since > CLEAR_MISS
         if not record.is_settled and (probability > SETTLED or is_error):
             record.is_settled = True
@@ -223,33 +223,44 @@ def frame_weight(step_ns: int | None) -> float:
     return MAX_WEIGHT if step_ns is None else min(MAX_WEIGHT, max(step_ns, 1) / LOOK_NS)
 
 
+class Frame(NamedTuple):
+    """A frame as its looks need it.
+
+    Attributes:
+        camera_world: (3,) position of the camera, metres.
+        stamp_ns: of the frame.
+        weight: see `frame_weight`.
+    """
+
+    camera_world: Float64
+    stamp_ns: int
+    weight: float
+
+
 @kernel
 def observe_existence(
     records: NDArray[Any],
     counts: Float64,
-    owners: Int64,
+    slots: Int64,
     scores: Float64,
     visibilities: Int64,
     means_world: Float64,
-    camera_world: Float64,
-    stamp_ns: int,
-    weight: float,
+    frame: Frame,
 ) -> None:
     """Add a frame to the looks at n nodes that it shows.
 
     Args:
-        records: of all nodes, with `EXISTENCE_FIELDS`; those of the owners are updated.
+        records: of all nodes, with `EXISTENCE_FIELDS`; those of the slots are updated.
         counts: see `first_counts`; updated.
-        owners: (n,) index of each node's record.
+        slots: (n,) index of each node's record.
         scores: (n,) score of its detection; 0 = it was not detected.
         visibilities: (n,) how much of it is visible.
         means_world: (n, 3) means, metres.
-        camera_world: (3,) position of the camera, metres.
-        stamp_ns: of the frame.
-        weight: of the frame, see `frame_weight`.
+        frame: that shows them.
     """
-    for index in range(len(owners)):
-        record = records[owners[index]]
+    camera_world, stamp_ns, weight = frame
+    for index in range(len(slots)):
+        record = records[slots[index]]
         if record.best_score == 0.0:
             record.first_ns = record.last_ns = record.look_ns = stamp_ns
             record.look_weight = 1.0
@@ -320,22 +331,22 @@ def _look(record: Any, counts: Float64) -> tuple[float, float]:
 
 
 @kernel
-def probabilities(records: NDArray[Any], counts: Float64, owners: Int64, prior: float) -> Float64:
+def probabilities(records: NDArray[Any], counts: Float64, slots: Int64, prior: float) -> Float64:
     """Probability (n,) that each of n nodes is an object; the prior is that of `prior`."""
-    result = np.empty(len(owners))
-    for index in range(len(owners)):
-        result[index] = _probability(records[owners[index]], counts, prior, True)
+    result = np.empty(len(slots))
+    for index in range(len(slots)):
+        result[index] = _probability(records[slots[index]], counts, prior, True)
     return result
 
 
 @kernel
 def are_missed(
-    records: NDArray[Any], counts: Float64, owners: Int64, prior: float, minimum: float
+    records: NDArray[Any], counts: Float64, slots: Int64, prior: float, minimum: float
 ) -> Bool:
     """Whether (n,) only the misses make the probability of each of n nodes less than a minimum."""
-    result = np.empty(len(owners), np.bool_)
-    for index in range(len(owners)):
-        result[index] = _probability(records[owners[index]], counts, prior, False) >= minimum
+    result = np.empty(len(slots), np.bool_)
+    for index in range(len(slots)):
+        result[index] = _probability(records[slots[index]], counts, prior, False) >= minimum
     return result
 
 

@@ -70,8 +70,8 @@ def as_edited(
     """
     if not len(local):
         return local, []
-    owners, on_nodes, _ = records.map.overlaps(records.map.cells_of(local.surface_points_world))
-    ids = [records.node(owner) for owner in owners]
+    slots, on_nodes, _ = records.map.overlaps(records.map.cells_of(local.surface_points_world))
+    ids = records.nodes_of(slots)
     on_nodes = (
         on_nodes * np.array([_agrees(graph, local, i) for i in ids]).reshape(-1, len(local)).T
     )
@@ -113,7 +113,7 @@ def reject_deleted(
     """
     for column, node_id in enumerate(node_ids):
         if node_id in graph.edits.deleted:
-            classes = graph.nodes.class_probabilities[graph.nodes.row(node_id)]
+            classes = graph.nodes.class_probabilities[graph.nodes.slot(node_id)]
             on_nodes[local.class_probabilities @ classes <= CLASS_AGREEMENT, column] = 0.0
 
 
@@ -124,14 +124,14 @@ def may_merge(graph: SceneGraph, a_id: int, b_id: int) -> bool:
         return False
     # A fragment of a deleted object becomes a part of it. A published object is something else.
     others = [node_id for node_id in (a_id, b_id) if node_id not in edits.deleted]
-    return len(others) != 1 or not nodes.confirmed[nodes.row(others[0])]
+    return len(others) != 1 or not nodes.confirmed[nodes.slot(others[0])]
 
 
 def _agrees(graph: SceneGraph, local: LocalGraph, node_id: int) -> Bool:
     """Whether (n,) the class of each object is that of a node, or of one that it was made of."""
     nodes = graph.nodes
-    rows = [nodes.row(known) for known in (node_id, *graph.edits.origins(node_id))]
-    agreement = local.class_probabilities @ nodes.class_probabilities[rows].T
+    slots = nodes.slots_of([node_id, *graph.edits.origins(node_id)])
+    agreement = local.class_probabilities @ nodes.class_probabilities[slots].T
     return np.asarray((agreement > CLASS_AGREEMENT).any(axis=1))
 
 
@@ -153,7 +153,7 @@ def _parts_of_object(graph: SceneGraph, points: Float32, on_nodes: dict[int, flo
     sides = [best, *(i for i in touched if (min(i, best), max(i, best)) in graph.edits.separate)]
     if len(sides) == 1:
         return whole
-    surfaces = [graph.nodes.surface(graph.nodes.row(node_id)) for node_id in sides]
+    surfaces = [graph.nodes.surface(graph.nodes.slot(node_id)) for node_id in sides]
     side_of = np.repeat(np.arange(len(sides)), [len(surface) for surface in surfaces])
     from scipy.spatial import cKDTree  # slow to import, and only for edits
 
@@ -336,8 +336,8 @@ class Editor:
         if edit.kind == "delete":
             self._publish(graph, edit.nodes)
         # Their messages say another label now.
-        rows = [graph.nodes.row(node_id) for node_id in edit.nodes]
-        graph.set_classes(edit.nodes, graph.nodes.class_probabilities[rows])
+        slots = graph.nodes.slots_of(edit.nodes)
+        graph.set_classes(edit.nodes, graph.nodes.class_probabilities[slots])
         if edit.kind in ("merge", "split"):
             said += " does not hold any more, but the objects before it are forgotten"
         return EditReply("undo", edit.nodes, said)
@@ -347,8 +347,8 @@ class Editor:
 
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish nodes that an edit has hidden: all, with a rule that hides none."""
-        rows = [graph.nodes.row(node_id) for node_id in node_ids]
-        graph.set_existence(node_ids, graph.nodes.existence[rows], minimum=-1.0)
+        existence = graph.nodes.existence[graph.nodes.slots_of(node_ids)]
+        graph.set_existence(node_ids, existence, minimum=-1.0)
 
 
 class SurfaceEditor(Editor):
@@ -370,9 +370,9 @@ class SurfaceEditor(Editor):
     def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Editor.apply`."""
         reply = super().apply(graph, request, stamp_ns)
-        for node_id in list(self.aside.owner_of):
+        for slot, node_id in zip(self.aside.slots.tolist(), self.aside.ids):
             if node_id not in graph.edits.replaced:
-                self.aside.remove(node_id)
+                self.aside.remove(slot)
         return reply
 
     def _merge(self, graph: SceneGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
@@ -383,14 +383,15 @@ class SurfaceEditor(Editor):
         new_ids = [copy_node(graph, node_id, without=old_ids) for node_id in old_ids]
         for old_id, new_id in zip(old_ids, new_ids):
             self._replace(graph, old_id, {new_id: None})
+        kept, removed = graph.nodes.slots_of(new_ids).tolist()
         kept_id = graph.merge_nodes(*new_ids)
-        self._records.merge(graph, kept_id, new_ids[1])
+        self._records.merge(graph, kept, removed)
         graph.add_edit(Edit(0, "merge", stamp_ns, [kept_id], old_ids, labels[0] or labels[1]))
         return EditReply("merge", [kept_id], f"objects {_names(old_ids)} are object {kept_id} now")
 
     def _split(self, graph: SceneGraph, request: SplitNode, stamp_ns: int) -> EditReply:
         old_id = request.node
-        points = graph.nodes.surface(graph.nodes.row(old_id)).copy()
+        points = graph.nodes.surface(graph.nodes.slot(old_id)).copy()
         parts = _parts(points, request.near_m)
         if len(parts) < 2:
             raise refused(
@@ -415,21 +416,22 @@ class SurfaceEditor(Editor):
 
     def _replace(self, graph: SceneGraph, old_id: int, new: dict[int, Belongs | None]) -> None:
         """Put the record of a node aside, and give copies of it, or of parts, to new nodes."""
-        balances = self._balances([old_id])
-        _transfer(graph, self._records, self.aside, old_id, old_id)
-        self._records.remove(old_id)
+        balances, old = self._balances(graph, [old_id]), graph.nodes.slot(old_id)
+        _transfer(graph, self._records, self.aside, old, old)
+        self._records.remove(old)
         for new_id, belongs in new.items():
-            _transfer(graph, self.aside, self._records, old_id, new_id, belongs)
-            self._add_balances(new_id, balances)
+            slot = graph.nodes.slot(new_id)
+            _transfer(graph, self.aside, self._records, old, slot, belongs)
+            self._add_balances(graph, slot, balances)
 
     def _bring_back(self, graph: SceneGraph, edit: Edit) -> None:
-        balances = self._balances(edit.nodes)
+        balances = self._balances(graph, edit.nodes)
         for node_id in edit.nodes:
             self._life_cycle.remove(graph, node_id)
-        for old_id in edit.replaced:
-            _transfer(graph, self.aside, self._records, old_id, old_id)
-            self.aside.remove(old_id)
-            self._add_balances(old_id, balances)
+        for slot in graph.nodes.slots_of(edit.replaced).tolist():
+            _transfer(graph, self.aside, self._records, slot, slot)
+            self.aside.remove(slot)
+            self._add_balances(graph, slot, balances)
         self._publish(graph, edit.replaced)
 
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
@@ -437,7 +439,7 @@ class SurfaceEditor(Editor):
 
     def memory(self) -> Memory:
         """The records of replaced nodes, for `restore`; empty without any."""
-        memory = self.aside.memory() if self.aside.owner_of else {}
+        memory = self.aside.memory() if len(self.aside.slots) else {}
         return {_ASIDE + name: values for name, values in memory.items()}
 
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
@@ -449,21 +451,21 @@ class SurfaceEditor(Editor):
         }
         self.aside.restore(graph, own, sorted(graph.edits.replaced))
 
-    def _balances(self, node_ids: Sequence[int]) -> dict[int, int]:
+    def _balances(self, graph: SceneGraph, node_ids: Sequence[int]) -> dict[int, int]:
         """Evidence that other nodes are one object with one of these, by the id of the other."""
         records = self._records
-        owners = {records.owner(node_id) for node_id in node_ids if node_id in records}
+        slots = set(graph.nodes.slots_of(node_ids).tolist())
         return {
             records.node(other): balance
             for pair, balance in records.joint.balances.items()
-            for owner, other in (pair, pair[::-1])
-            if owner in owners and other not in owners
+            for slot, other in (pair, pair[::-1])
+            if slot in slots and other not in slots
         }
 
-    def _add_balances(self, node_id: int, balances: dict[int, int]) -> None:
-        records, owner = self._records, self._records.owner(node_id)
-        known = {records.owner(other): n for other, n in balances.items() if other in records}
-        records.joint.restore({(owner, other): balance for other, balance in known.items()})
+    def _add_balances(self, graph: SceneGraph, slot: int, balances: dict[int, int]) -> None:
+        records, slot_of = self._records, graph.nodes.slot_of
+        known = {slot_of[other]: n for other, n in balances.items() if other in slot_of}
+        records.joint.restore({(slot, at): n for at, n in known.items() if records.has(at)})
 
 
 def refused(message: str) -> RefusedInput:
@@ -476,7 +478,7 @@ def _check_published(graph: SceneGraph, node_id: int) -> None:
         new_id = graph.resolve(node_id)
         now = f"it is object {new_id} now" if new_id else "it is gone, or never was"
         raise refused(f"object {node_id} is not in the graph: {now}")
-    if not graph.nodes.confirmed[graph.nodes.row(node_id)]:
+    if not graph.nodes.confirmed[graph.nodes.slot(node_id)]:
         replaced = graph.edits.replaced.get(node_id)
         reason = f"it was merged into object {replaced}" if replaced else "it is hidden"
         raise refused(f"object {node_id} is not in the graph: {reason}")
@@ -514,23 +516,25 @@ def _transfer(
     graph: SceneGraph,
     source: NodeRecords,
     target: NodeRecords,
-    node_id: int,
-    as_id: int,
+    slot: int,
+    to: int,
     belongs: Belongs | None = None,
 ) -> None:
-    """Copy the record and the cells of a node to another table, or those that belong to a part."""
-    owner = source.owner(node_id)
-    cells, scores = source.map.cells(owner), source.map.scores(owner)
+    """Copy the record and the cells of a node to another table, or those that belong to a part.
+
+    They become those of the node in the slot `to`.
+    """
+    cells, scores = source.map.cells(slot), source.map.scores(slot)
     if belongs is not None:
-        centres, rows = source.map.centres(owner), {}
+        centres, rows = source.map.centres(slot), {}
         rows = {block: row for row, block in enumerate(cells.blocks.tolist())}
         cells = target.map.cells_of([centres[belongs(centres)]])
         scores = scores[[rows[block] for block in cells.blocks.tolist()]]
         scores *= cell_bits(cells.masks).astype(np.int8)
-    row = graph.nodes.row(as_id)
-    new = target.add(as_id, graph.nodes.class_probabilities[row], 0)
-    target.rows[new] = source.rows[owner]
-    target.rows["node_id"][new] = as_id
-    target.map.add([new], cells)
-    target.map.add_scores([new], cells, scores)
-    target.place(graph, [new])
+    node_id = int(graph.nodes.ids[to])
+    target.add(to, node_id, graph.nodes.class_probabilities[to], 0)
+    target.rows[to] = source.rows[slot]
+    target.rows["node_id"][to] = node_id
+    target.map.add([to], cells)
+    target.map.add_scores([to], cells, scores)
+    target.place(graph, [to])

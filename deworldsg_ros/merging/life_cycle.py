@@ -45,8 +45,8 @@ class LostNodes:
     def match(self, graph: SceneGraph, node_id: int) -> int | None:
         """The lost node that is the same object as a new node; None if there is not exactly one."""
         nodes = graph.nodes
-        rows = np.array([nodes.row(lost_id) for lost_id in self._lost_ns], np.int64)
-        earlier = rows[nodes.last_seen_ns[rows] < nodes.first_seen_ns[nodes.row(node_id)]]
+        slots = nodes.slots_of(list(self._lost_ns))
+        earlier = slots[nodes.last_seen_ns[slots] < nodes.first_seen_ns[nodes.slot(node_id)]]
         similar = earlier[_are_similar(graph, node_id, earlier)]
         return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
@@ -75,22 +75,22 @@ def moved_object(graph: SceneGraph, lost_id: int) -> int | None:
     None if there is not exactly one.
     """
     nodes = graph.nodes
-    last_ns = nodes.last_seen_ns[nodes.row(lost_id)]
+    last_ns = nodes.last_seen_ns[nodes.slot(lost_id)]
     later = np.flatnonzero(nodes.confirmed & (nodes.first_seen_ns > last_ns))
     similar = later[_are_similar(graph, lost_id, later)]
     return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
 
-def _are_similar(graph: SceneGraph, node_id: int, rows: Int64) -> Bool:
-    """Whether a node and each of some rows (n,) have the same class and similar shapes."""
+def _are_similar(graph: SceneGraph, node_id: int, slots: Int64) -> Bool:
+    """Whether a node and those of some slots (n,) have the same class and similar shapes."""
     nodes = graph.nodes
-    row = nodes.row(node_id)
-    label = nodes.class_probabilities[row].argmax()
-    similar: Bool = nodes.class_probabilities[rows].argmax(axis=1) == label
+    slot = nodes.slot(node_id)
+    label = nodes.class_probabilities[slot].argmax()
+    similar: Bool = nodes.class_probabilities[slots].argmax(axis=1) == label
     if similar.any():
-        origin, alike = np.zeros(3), rows[similar]
+        origin, alike = np.zeros(3), slots[similar]
         similar[similar] = (
-            hellinger_distance(origin, nodes.covariances[row], origin, nodes.covariances[alike])
+            hellinger_distance(origin, nodes.covariances[slot], origin, nodes.covariances[alike])
             < SHAPE_THRESHOLD
         )
     return similar
@@ -129,8 +129,8 @@ class LifeCycle:
     def restore(self, graph: SceneGraph) -> None:
         """Continue with a graph of an earlier run; call it before the first frame."""
         nodes = graph.nodes
-        improbable = _are_improbable(graph, np.arange(len(nodes)))
-        self._improbable = set(nodes.ids[improbable].tolist())
+        slots = nodes.slots
+        self._improbable = set(nodes.ids[slots[_are_improbable(graph, slots)]].tolist())
 
     def observe(
         self, graph: SceneGraph, local: LocalGraph, view: View, node_ids: list[int]
@@ -143,7 +143,7 @@ class LifeCycle:
             view: what the frame shows of the nodes before it was merged.
             node_ids: node of each row of the frame.
         """
-        records = self._records
+        records, slot_of = self._records, graph.nodes.slot_of
         self._forget(graph, local.stamp_ns)
         scores: dict[int, float] = {}
         for node_id, score in zip(node_ids, local.scores.tolist()):
@@ -151,37 +151,39 @@ class LifeCycle:
         shown = {
             node_id: visibility
             for node_id, visibility in zip(view.ids.tolist(), view.visibilities.tolist())
-            if visibility > NOT_VISIBLE and node_id in records.owner_of
+            if visibility > NOT_VISIBLE and records.has(slot_of.get(node_id))
         }
         ids = sorted(scores.keys() | shown.keys())
-        owners = np.array(records.owners_of(ids), np.int64)
-        rows = graph.nodes.rows_at(ids)
+        slots = graph.nodes.slots_of(ids)
         records.look(
-            owners,
+            slots,
             np.array([scores.get(node_id, 0.0) for node_id in ids]),
             np.array([shown.get(node_id, NOT_VISIBLE) for node_id in ids], np.int64),
-            graph.nodes.means[rows],
+            graph.nodes.means[slots],
             local.T_world_camera[:3, 3],
             local.stamp_ns,
         )
-        self._publish(graph, ids, rows, owners)
-        for node_id in self._absent(view, scores.keys()):
+        self._publish(graph, ids, slots)
+        for node_id in self._absent(graph, view, scores.keys()):
             # It may be gone: another absent node of this frame has taken its place.
-            if node_id in records and node_id not in graph.edits.deleted:
+            if records.has(slot_of.get(node_id)) and node_id not in graph.edits.deleted:
                 self._lose(graph, node_id, local.stamp_ns)
 
-    def _absent(self, view: View, detected: Collection[int]) -> list[int]:
+    def _absent(self, graph: SceneGraph, view: View, detected: Collection[int]) -> list[int]:
         """Nodes that enough consecutive frames have seen through."""
-        records, absent = self._records, []
+        records, slot_of, absent = self._records, graph.nodes.slot_of, []
         present = {*detected, *view.ids[view.visibilities >= HALF].tolist()}
         frames = records.rows["through_frames"]
-        frames[records.owners_of([node_id for node_id in present if node_id in records])] = 0
+        for node_id in present:
+            slot = slot_of.get(node_id)
+            if slot is not None and records.has(slot):
+                frames[slot] = 0
         for node_id in view.ids[view.through].tolist():
-            if node_id in present or node_id not in records:
+            slot = slot_of.get(node_id)
+            if slot is None or node_id in present or not records.has(slot):
                 continue
-            owner = records.owner(node_id)
-            frames[owner] += 1
-            if frames[owner] >= ABSENT_FRAMES:
+            frames[slot] += 1
+            if frames[slot] >= ABSENT_FRAMES:
                 absent.append(node_id)
         return absent
 
@@ -189,9 +191,11 @@ class LifeCycle:
         """The nodes that are not published, each with its reason, in words."""
         nodes, records = graph.nodes, self._records
         edits = graph.edits
-        hidden = [i for i in nodes.ids[~nodes.confirmed].tolist() if i not in edits.replaced]
-        ids = [node_id for node_id in hidden if node_id in records]
-        missed = records.are_missed(records.owners_of(ids), self._min_existence)
+        slots = nodes.slots
+        hidden = nodes.ids[slots[~nodes.confirmed[slots]]].tolist()
+        hidden = [node_id for node_id in hidden if node_id not in edits.replaced]
+        ids = [node_id for node_id in hidden if records.has(nodes.slot(node_id))]
+        missed = records.are_missed(nodes.slots_of(ids), self._min_existence)
         reasons = {
             i: "absent from its position" if i in self._lost else "seen too little" for i in hidden
         }
@@ -201,24 +205,24 @@ class LifeCycle:
 
     def publish_again(self, graph: SceneGraph, node_ids: list[int]) -> None:
         """Publish nodes that an edit has hidden, if they are likely to be objects."""
-        owners = self._records.owners_of(node_ids)
-        graph.set_existence(node_ids, self._records.existence(owners), self._min_existence)
+        existence = self._records.existence(graph.nodes.slots_of(node_ids))
+        graph.set_existence(node_ids, existence, self._min_existence)
 
     def remove(self, graph: SceneGraph, node_id: int) -> None:
         """Remove a node, wherever its object is."""
         if node_id in self._lost:
             self._lost.remove(node_id)
         else:
-            self._records.remove(node_id)
+            self._records.remove(graph.nodes.slot(node_id))
         graph.remove_node(node_id)
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int], rows: Int64, owners: Int64) -> None:
+    def _publish(self, graph: SceneGraph, node_ids: list[int], slots: Int64) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
         records = self._records
-        probabilities = records.existence(owners)
-        beliefs.settle(records.rows, records.fates, owners, probabilities)
+        probabilities = records.existence(slots)
+        beliefs.settle(records.rows, records.fates, slots, probabilities)
         new_ids = graph.set_existence(node_ids, probabilities, self._min_existence)
-        improbable = _are_improbable(graph, rows).tolist()
+        improbable = _are_improbable(graph, slots).tolist()
         self._improbable.difference_update(node_ids)
         self._improbable.update(itertools.compress(node_ids, improbable))
         for node_id in new_ids:
@@ -232,28 +236,28 @@ class LifeCycle:
         """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
         nodes = graph.nodes
         if self._improbable:
-            # In the order of the rows, which depends on nothing but the frames.
-            ids = sorted((i for i in self._improbable if i in nodes), key=nodes.row)
+            # In the order of the slots, which depends on nothing but the frames.
+            ids = sorted((i for i in self._improbable if i in nodes), key=nodes.slot)
             self._improbable.intersection_update(ids)
-            rows = nodes.rows_at(ids)
-            old = _are_improbable(graph, rows)
-            old &= nodes.last_seen_ns[rows] < stamp_ns - FORGOTTEN_NS
+            slots = nodes.slots_of(ids)
+            old = _are_improbable(graph, slots)
+            old &= nodes.last_seen_ns[slots] < stamp_ns - FORGOTTEN_NS
             for node_id in itertools.compress(ids, old.tolist()):
                 if node_id not in self._lost and not graph.edits.hides(node_id):
                     self._improbable.discard(node_id)
+                    self._records.remove(nodes.slot(node_id))
                     graph.remove_node(node_id)
-                    self._records.remove(node_id)
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
 
     def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
         """Remove an absent node from its position; its id may continue elsewhere, now or later."""
-        self._records.remove(node_id)
-        row = graph.nodes.row(node_id)
-        if not graph.nodes.confirmed[row]:
+        slot = graph.nodes.slot(node_id)
+        self._records.remove(slot)
+        if not graph.nodes.confirmed[slot]:
             graph.remove_node(node_id)
             return
-        graph.set_existence([node_id], graph.nodes.existence[[row]], np.inf)
+        graph.set_existence([node_id], graph.nodes.existence[[slot]], np.inf)
         moved_id = moved_object(graph, node_id)
         if moved_id is None:
             self._lost.add(node_id, stamp_ns)
@@ -262,12 +266,13 @@ class LifeCycle:
 
     def _move(self, graph: SceneGraph, old_id: int, new_id: int) -> None:
         """Continue the id of a lost node at the node that its object has become."""
+        old, new = graph.nodes.slot(old_id), graph.nodes.slot(new_id)
         graph.take_over(old_id, new_id)
-        self._records.rename(new_id, old_id)
+        self._records.move(graph, new, old)
 
 
-def _are_improbable(graph: SceneGraph, rows: Int64) -> Bool:
-    """Whether (n,) the nodes of rows are hidden and too improbable to be kept."""
+def _are_improbable(graph: SceneGraph, slots: Int64) -> Bool:
+    """Whether (n,) the nodes of slots are hidden and too improbable to be kept."""
     nodes = graph.nodes
-    improbable: Bool = ~nodes.confirmed[rows] & (nodes.existence[rows] < FORGOTTEN)
+    improbable: Bool = ~nodes.confirmed[slots] & (nodes.existence[slots] < FORGOTTEN)
     return improbable

@@ -125,14 +125,14 @@ class Matches(NamedTuple):
     """How n objects of a frame match k nodes.
 
     Attributes:
-        owners: the k owners of the nodes.
+        slots: (k,) int64, of the nodes.
         on_nodes: (n, k) float64, fraction of each object's cells that lie on each node.
         scores: (n, k) float64, 0 = no match possible.
         touching: (n, k) bool, whether the surfaces touch and the classes agree.
         columns: column of the node that each object matched, one to one; -1 = none.
     """
 
-    owners: list[int]
+    slots: Int64
     on_nodes: Float64
     scores: Float64
     touching: Bool
@@ -142,8 +142,7 @@ class Matches(NamedTuple):
 def match(
     local: LocalGraph,
     nodes: NodeTable,
-    rows: Int64,
-    owners: list[int],
+    slots: Int64,
     on_nodes: Float64,
     covered: Float64,
     overlap_threshold: float,
@@ -160,8 +159,7 @@ def match(
     Args:
         local: n objects.
         nodes: the nodes of the graph.
-        rows: (k,) rows of the nodes to compare with.
-        owners: the owner of each.
+        slots: (k,) of the nodes to compare with.
         on_nodes: (n, k) fraction of each object's cells that lie on each node.
         covered: (n, k) fraction of each node's surface that lies in each object.
         overlap_threshold: minimum overlap of a match whose classes agree.
@@ -170,14 +168,14 @@ def match(
     scores, touching = _match_scores(
         (local.means_world, local.covariances_world, local.class_probabilities),
         (nodes.means, nodes.covariances, nodes.class_probabilities),
-        rows,
+        slots,
         on_nodes,
         covered,
         overlap_threshold,
         # Variance of a point in a cell along each axis, if only the cell is known.
         cell_m**2 / 12,
     )
-    return Matches(owners, on_nodes, scores, touching, one_to_one(scores))
+    return Matches(slots, on_nodes, scores, touching, one_to_one(scores))
 
 
 def one_to_one(scores: Float64) -> list[int]:
@@ -284,23 +282,23 @@ WIDE_STEP_FACTOR = 3
 
 
 class JointEvidence:
-    """Sums, for pairs of owners, the frames for and against one object.
+    """Sums, for the slots of two nodes, the frames for and against one object.
 
     A frame that shows two objects counts wherever they are in it. If later a mask covers both, or a
     pose is wrong, they are known to be two.
     """
 
     def __init__(self) -> None:
-        # Evidence for one object minus evidence for two: by the smaller owner, then the greater.
+        # Evidence for one object minus evidence for two: by the smaller slot, then the greater.
         self._balances: defaultdict[int, dict[int, int]] = defaultdict(dict)
-        # The smaller owners that have evidence about a greater one.
+        # The smaller slots that have evidence about a greater one.
         self._smaller: defaultdict[int, set[int]] = defaultdict(set)
         self._due: list[Pair] = []
         self._camera_world = np.full(3, np.nan)
 
     @property
     def balances(self) -> dict[Pair, int]:
-        """Evidence for one object minus evidence for two, of each pair (smaller owner first)."""
+        """Evidence for one object minus evidence for two, of each pair (smaller slot first)."""
         return {(a, b): row[b] for a, row in sorted(self._balances.items()) for b in sorted(row)}
 
     def restore(self, balances: dict[Pair, int]) -> None:
@@ -311,20 +309,21 @@ class JointEvidence:
 
     def add_frame(
         self,
-        object_owners: list[int],
+        object_slots: list[int],
         matches: Matches,
         detection_scores: Float64,
         camera_world: Float64,
     ) -> None:
-        """Add one frame of n objects that met k owners.
+        """Add one frame of n objects that met k nodes.
 
         Args:
-            object_owners: owner of each object, matched or new.
-            matches: of the objects and the k owners.
+            object_slots: slot of the node of each object, matched or new.
+            matches: of the objects and the k nodes.
             detection_scores: (n,) scores of the objects.
             camera_world: (3,) camera position, metres.
         """
-        sure = dict(zip(object_owners, (detection_scores >= SURE_SCORE).tolist()))
+        slots = matches.slots.tolist()
+        sure = dict(zip(object_slots, (detection_scores >= SURE_SCORE).tolist()))
         evidence: dict[Pair, int] = {}
         taken = set(matches.columns)
         met = (matches.touching | (matches.scores > 0)).nonzero()
@@ -332,7 +331,7 @@ class JointEvidence:
         for row, column, score, is_nested in zip(
             *(places.tolist() for places in met), matches.scores[met].tolist(), nested.tolist()
         ):
-            a, b = object_owners[row], matches.owners[column]
+            a, b = object_slots[row], slots[column]
             pair = (a, b) if a < b else (b, a)
             if column not in taken:
                 if matches.columns[row] >= 0:
@@ -360,7 +359,7 @@ class JointEvidence:
         return None
 
     def merge(self, kept: int, removed: int) -> None:
-        """Combine the evidence against one object of two owners that are one."""
+        """Combine the evidence against one object of two nodes that are one."""
         against = {b: balance for b, balance in self._balances[removed].items() if balance < 0}
         for a in self._smaller[removed]:
             balance = self._balances[a].get(removed, 0)
@@ -371,12 +370,20 @@ class JointEvidence:
             if other != kept:
                 self._add(min(kept, other), max(kept, other), balance)
 
-    def forget(self, owner: int) -> None:
-        """Drop the evidence of a removed owner."""
-        for b in self._balances.pop(owner, ()):
-            self._smaller[b].discard(owner)
-        for a in self._smaller.pop(owner, ()):
-            self._balances[a].pop(owner, None)
+    def move(self, slot: int, to: int) -> None:
+        """A node has another slot, which has no evidence."""
+        known = dict(self._balances[slot])
+        known.update((a, self._balances[a][slot]) for a in self._smaller[slot])
+        self.forget(slot)
+        for other, balance in known.items():
+            self._add(min(to, other), max(to, other), balance)
+
+    def forget(self, slot: int) -> None:
+        """Drop the evidence of a removed node."""
+        for b in self._balances.pop(slot, ()):
+            self._smaller[b].discard(slot)
+        for a in self._smaller.pop(slot, ()):
+            self._balances[a].pop(slot, None)
 
     def _add(self, a: int, b: int, balance: int) -> None:
         row = self._balances[a]

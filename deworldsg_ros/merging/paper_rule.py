@@ -74,24 +74,24 @@ def observed(mean: Float64, covariance: Float64, class_probabilities: Float64) -
     )
 
 
-def nearest_row(
+def nearest_slot(
     item: Observed,
     nodes: NodeTable,
     bhattacharyya_bound: float,
     class_distance_threshold: float,
-    skipped_row: int = -1,
+    skipped: int = -1,
 ) -> int:
-    """Row of the node with the smallest Hellinger distance among those that pass Eq. 6.
+    """Slot of the node with the smallest Hellinger distance among those that pass Eq. 6.
 
     Args:
         item: the object or node.
         nodes: the nodes to compare with.
         bhattacharyya_bound: of the threshold δ_g.
         class_distance_threshold: δ_c.
-        skipped_row: row that is not compared; -1 = none.
+        skipped: slot that is not compared; -1 = none.
 
     Returns:
-        The row; among equal distances that of the smallest id; -1 if no node passes.
+        The slot; among equal distances that of the smallest id; -1 if no node passes.
     """
     table = (
         nodes.ids,
@@ -101,22 +101,21 @@ def nearest_row(
         nodes.eigenvalue_bounds,
         nodes.class_probabilities,
     )
-    return int(_nearest(item[:], table, skipped_row, bhattacharyya_bound, class_distance_threshold))
+    return int(_nearest(item[:], table, skipped, bhattacharyya_bound, class_distance_threshold))
 
 
 def warm_up() -> None:
     """Compile the kernel, or load it from the cache."""
     nodes = NodeTable(1)
-    row = nodes.append(1)
-    nodes.put(row, np.zeros(3), np.eye(3), np.ones(1), 1.0, 1)
-    nearest_row(observed(np.zeros(3), np.eye(3), np.ones(1)), nodes, 1.0, 1.0)
+    nodes.put(nodes.add(1), np.zeros(3), np.eye(3), np.ones(1), 1.0, 1)
+    nearest_slot(observed(np.zeros(3), np.eye(3), np.ones(1)), nodes, 1.0, 1.0)
 
 
 @kernel
 def _nearest(  # pragma: no cover - compiled
     item: _ItemArrays,
     nodes: _NodeArrays,
-    skipped_row: int,
+    skipped: int,
     bhattacharyya_bound: float,
     class_distance_threshold: float,
 ) -> int:
@@ -124,25 +123,25 @@ def _nearest(  # pragma: no cover - compiled
     ids, means, covariances, log_determinants, eigenvalue_bounds, node_classes = nodes
     a00, a10, a11 = covariance[0, 0], covariance[1, 0], covariance[1, 1]
     a20, a21, a22 = covariance[2, 0], covariance[2, 1], covariance[2, 2]
-    best_row = -1
+    best_slot = -1
     best = bhattacharyya_bound
     best_slack = best * _SLACK
-    for row in range(len(ids)):
-        d0 = mean[0] - means[row, 0]
-        d1 = mean[1] - means[row, 1]
-        d2 = mean[2] - means[row, 2]
+    for slot in range(len(ids)):
+        d0 = mean[0] - means[slot, 0]
+        d1 = mean[1] - means[slot, 1]
+        d2 = mean[2] - means[slot, 2]
         squared = d0 * d0 + d1 * d1 + d2 * d2
-        if squared > 4.0 * best_slack * (eigenvalue_bound + eigenvalue_bounds[row]):
+        if squared > 4.0 * best_slack * (eigenvalue_bound + eigenvalue_bounds[slot]):
             continue
-        if row == skipped_row:
+        if slot == skipped or ids[slot] == 0:
             continue
         # LDLᵀ of S; the operations are those of scene.gaussian.log_determinant.
-        s00 = (a00 + covariances[row, 0, 0]) / 2
-        s10 = (a10 + covariances[row, 1, 0]) / 2
-        s11 = (a11 + covariances[row, 1, 1]) / 2
-        s20 = (a20 + covariances[row, 2, 0]) / 2
-        s21 = (a21 + covariances[row, 2, 1]) / 2
-        s22 = (a22 + covariances[row, 2, 2]) / 2
+        s00 = (a00 + covariances[slot, 0, 0]) / 2
+        s10 = (a10 + covariances[slot, 1, 0]) / 2
+        s11 = (a11 + covariances[slot, 1, 1]) / 2
+        s20 = (a20 + covariances[slot, 2, 0]) / 2
+        s21 = (a21 + covariances[slot, 2, 1]) / 2
+        s22 = (a22 + covariances[slot, 2, 2]) / 2
         l10 = s10 / s00
         l20 = s20 / s00
         pivot_1 = s11 - l10 * s10
@@ -155,19 +154,19 @@ def _nearest(  # pragma: no cover - compiled
         if mahalanobis > 8.0 * best_slack:
             continue
         log_mixed = math.log(s00 * pivot_1 * pivot_2)
-        log_ratio = log_mixed - (log_determinant + log_determinants[row]) / 2
+        log_ratio = log_mixed - (log_determinant + log_determinants[slot]) / 2
         distance = max(mahalanobis / 8 + log_ratio / 2, 0.0)
-        # Among equal distances the smallest id wins; rows are in no order.
-        if distance > best or (distance == best and (best_row < 0 or ids[row] > ids[best_row])):
+        # Among equal distances the smallest id wins; slots are in no order.
+        if distance > best or (distance == best and (best_slot < 0 or ids[slot] > ids[best_slot])):
             continue
         inner = 0.0
         for index in range(len(classes)):
-            inner += classes[index] * node_classes[row, index]
+            inner += classes[index] * node_classes[slot, index]
         if 1.0 - inner < class_distance_threshold:
-            best_row = row
+            best_slot = slot
             best = distance
             best_slack = best * _SLACK
-    return best_row
+    return best_slot
 
 
 # --- The paper's rule: an object matches the nearest node that passes Eq. 5-6, or creates a node.
@@ -238,20 +237,20 @@ class PaperMerging:
         """Merge a changed node with its nearest match until no node matches (Eq. 6)."""
         nodes = graph.nodes
         while True:
-            row = nodes.row(node_id)
+            slot = nodes.slot(node_id)
             node = Observed(
-                nodes.means[row],
-                nodes.covariances[row],
-                float(nodes.log_determinants[row]),
-                float(nodes.eigenvalue_bounds[row]),
-                nodes.class_probabilities[row],
+                nodes.means[slot],
+                nodes.covariances[slot],
+                float(nodes.log_determinants[slot]),
+                float(nodes.eigenvalue_bounds[slot]),
+                nodes.class_probabilities[slot],
             )
-            other_id = self._nearest(graph, node, skipped_row=row)
+            other_id = self._nearest(graph, node, skipped=slot)
             if other_id is None or (graph.edits and not may_merge(graph, node_id, other_id)):
                 return node_id
             node_id = graph.merge_nodes(node_id, other_id)
 
-    def _nearest(self, graph: SceneGraph, item: Observed, skipped_row: int = -1) -> int | None:
+    def _nearest(self, graph: SceneGraph, item: Observed, skipped: int = -1) -> int | None:
         """Id of the nearest node that passes Eq. 6; None if there is none."""
-        row = nearest_row(item, graph.nodes, self._bound, self._class_threshold, skipped_row)
-        return None if row < 0 else int(graph.nodes.ids[row])
+        slot = nearest_slot(item, graph.nodes, self._bound, self._class_threshold, skipped)
+        return None if slot < 0 else int(graph.nodes.ids[slot])

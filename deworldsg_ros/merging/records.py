@@ -15,7 +15,7 @@ from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.matching import JointEvidence
 from deworldsg_ros.merging.surface_map import CELLS_PER_OWNER, VoxelMap
 from deworldsg_ros.merging.views import VISIBILITIES, NodeGrid
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float64, Int8, Int64
 from deworldsg_ros.scene.checks import (
     MAX_SUM_ERROR,
     checked,
@@ -129,7 +129,7 @@ def _check_stamps(name: str, stamps_ns: Int64) -> None:
     within(name, stamps_ns, -MAX_STAMP_NS, MAX_STAMP_NS)
 
 
-# --- What the surface rule remembers of each node besides the graph: one table, one row for each.
+# --- What the surface rule remembers of each node besides the graph.
 
 RECORD = np.dtype(
     [
@@ -144,17 +144,16 @@ RECORD = np.dtype(
 
 
 class NodeRecords:
-    """Records of nodes, found by id. The row of a record, its "owner", stays while the node lives.
+    """The records of nodes, by the slot of the node in the graph.
 
     Attributes:
-        rows: (capacity,) of `RECORD`; ``node_id`` is 0 in rows that are free.
-        looks: looks at objects and those that detected them (`existence.first_counts`).
-        fates: errors and objects among the nodes so far (`existence.first_fates`).
+        rows: (n,) of `RECORD`, by slot; ``node_id`` is 0 where there is no record.
+        looks: looks at objects and those that detected them (`beliefs.first_counts`).
+        fates: errors and objects among the nodes so far (`beliefs.first_fates`).
         last_ns: stamp of the newest frame; 0 = none.
-        map: cells of the surfaces, by owner.
-        grid: owners by the position of their node.
-        joint: evidence that two owners are one object.
-        owner_of: the owner of each node; read only.
+        map: cells of the surfaces, by slot.
+        grid: slots by the position of their node.
+        joint: evidence that two slots are one object.
     """
 
     def __init__(self) -> None:
@@ -165,169 +164,174 @@ class NodeRecords:
         self.map = VoxelMap()
         self.grid = NodeGrid()
         self.joint = JointEvidence()
-        self.owner_of: dict[int, int] = {}
-        self._free: list[int] = []
 
-    def __contains__(self, node_id: object) -> bool:
-        return node_id in self.owner_of
+    @property
+    def slots(self) -> Int64:
+        """The slots with a record, ascending."""
+        return np.flatnonzero(self.rows["node_id"])
 
-    def owner(self, node_id: int) -> int:
-        """Owner of a node that has a record."""
-        return self.owner_of[node_id]
-
-    def node(self, owner: int) -> int:
-        """The node of an owner; 0 if the record is free."""
-        return int(self.rows["node_id"][owner])
-
-    def nodes_of(self, owners: Sequence[int] | Int64) -> list[int]:
-        """The node of each owner."""
-        node_ids: list[int] = self.rows["node_id"][owners].tolist()
+    @property
+    def ids(self) -> list[int]:
+        """The nodes with a record."""
+        node_ids: list[int] = self.rows["node_id"][self.slots].tolist()
         return node_ids
 
-    def owners_of(self, node_ids: Sequence[int]) -> list[int]:
-        """Owners of nodes that have a record."""
-        return [self.owner_of[node_id] for node_id in node_ids]
+    def has(self, slot: int | None) -> bool:
+        """Whether a slot has a record; None = no slot."""
+        return slot is not None and slot < len(self.rows) and bool(self.rows["node_id"][slot])
 
-    def graph_rows(self, graph: SceneGraph, owners: Sequence[int] | Int64) -> Int64:
-        """Row in the graph of each owner."""
-        return graph.nodes.rows_at(self.nodes_of(owners))
+    def node(self, slot: int) -> int:
+        """The node of a slot; 0 if there is no record."""
+        return int(self.rows["node_id"][slot])
 
-    def add(self, node_id: int, class_probabilities: Float64, stamp_ns: int) -> int:
-        """Add the record of a new node; returns its owner."""
-        if not self._free:
-            count = len(self.owner_of)
-            if count == len(self.rows):
-                self.rows = np.concatenate((self.rows, np.zeros_like(self.rows)))
-            self._free.append(count)
-        owner = self.owner_of[node_id] = self._free.pop()
-        self.rows[owner] = np.zeros((), RECORD)
-        self.rows["node_id"][owner] = node_id
-        beliefs.start(self.rows[owner], np.ascontiguousarray(class_probabilities), stamp_ns)
-        return owner
+    def nodes_of(self, slots: Sequence[int] | Int64) -> list[int]:
+        """The node of each slot."""
+        node_ids: list[int] = self.rows["node_id"][slots].tolist()
+        return node_ids
 
-    def place(self, graph: SceneGraph, owners: list[int]) -> None:
-        """Note where the nodes of owners are, after a change of their Gaussians."""
-        nodes, rows = graph.nodes, self.graph_rows(graph, owners)
-        self.grid.put(owners, rows, nodes.means, nodes.eigenvalue_bounds)
+    def add(self, slot: int, node_id: int, class_probabilities: Float64, stamp_ns: int) -> None:
+        """Add the record of a new node."""
+        self._make_room(slot + 1)
+        if self.has(slot):  # of a node that has left the graph
+            self.remove(slot)
+        self.rows[slot] = np.zeros((), RECORD)
+        self.rows["node_id"][slot] = node_id
+        beliefs.start(self.rows[slot], np.ascontiguousarray(class_probabilities), stamp_ns)
+
+    def place(self, graph: SceneGraph, slots: Sequence[int] | Int64) -> None:
+        """Note where the nodes of slots are, after a change of their Gaussians."""
+        nodes = graph.nodes
+        self.grid.put(np.asarray(slots, np.int64), nodes.means, nodes.eigenvalue_bounds)
 
     def look(
         self,
-        owners: Sequence[int] | Int64,
+        slots: Int64,
         scores: Float64,
         visibilities: Int64,
         means_world: Float64,
         camera_world: Float64,
         stamp_ns: int,
     ) -> None:
-        """Add a frame to the looks at n owners; see `existence.observe`. Once for each frame."""
+        """Add a frame to the looks at n nodes; see `beliefs.observe_existence`. Once a frame."""
         step_ns = stamp_ns - self.last_ns if self.last_ns else None
         self.last_ns = stamp_ns
         beliefs.observe_existence(
             self.rows,
             self.looks,
-            np.asarray(owners, np.int64),
+            slots,
             scores,
             visibilities,
             means_world,
-            np.ascontiguousarray(camera_world),
-            stamp_ns,
-            beliefs.frame_weight(step_ns),
+            beliefs.Frame(
+                np.ascontiguousarray(camera_world), stamp_ns, beliefs.frame_weight(step_ns)
+            ),
         )
 
-    def name(self, owners: list[int], seen: Float64, stamp_ns: int) -> Float64:
-        """Class distributions (n, C) of n owners after a frame; see `names.observe`."""
+    def name(self, slots: Int64, seen: Float64, stamp_ns: int) -> Float64:
+        """Class distributions (n, C) of n nodes after a frame; see `beliefs.observe_names`."""
         classes = np.empty_like(seen)
-        beliefs.observe_names(self.rows, np.array(owners, np.int64), seen, stamp_ns, classes)
+        beliefs.observe_names(self.rows, slots, seen, stamp_ns, classes)
         return classes
 
-    def existence(self, owners: Sequence[int] | Int64) -> Float64:
-        """Probability (n,) that each of n owners is an object."""
+    def existence(self, slots: Int64) -> Float64:
+        """Probability (n,) that each of n nodes is an object."""
+        return beliefs.probabilities(self.rows, self.looks, slots, beliefs.prior(self.fates))
+
+    def are_missed(self, slots: Int64, minimum: float) -> Bool:
+        """Whether (n,) only misses make the existence of each of n nodes less than a minimum."""
         prior = beliefs.prior(self.fates)
-        return beliefs.probabilities(self.rows, self.looks, np.asarray(owners, np.int64), prior)
+        return beliefs.are_missed(self.rows, self.looks, slots, prior, minimum)
 
-    def are_missed(self, owners: list[int], minimum: float) -> Bool:
-        """Whether (n,) only misses make the existence of each of n owners less than a minimum."""
-        prior, indices = beliefs.prior(self.fates), np.array(owners, np.int64)
-        return beliefs.are_missed(self.rows, self.looks, indices, prior, minimum)
-
-    def remove(self, node_id: int) -> CellSets:
+    def remove(self, slot: int) -> CellSets:
         """Drop everything of a node; returns its cells, as one set."""
-        owner = self.owner_of.pop(node_id)
-        self.rows["node_id"][owner] = 0
-        self._free.append(owner)
-        self.joint.forget(owner)
-        self.grid.remove(owner)
-        return self.map.remove(owner)
+        self.rows["node_id"][slot] = 0
+        self.joint.forget(slot)
+        self.grid.remove(slot)
+        return self.map.remove(slot)
 
-    def rename(self, old_id: int, new_id: int) -> None:
-        """Continue the record of a node under another id."""
-        owner = self.owner_of[new_id] = self.owner_of.pop(old_id)
-        self.rows["node_id"][owner] = new_id
+    def move(self, graph: SceneGraph, slot: int, to: int) -> None:
+        """Continue the record of a node as that of another node, which has none."""
+        node_id = int(graph.nodes.ids[to])
+        self._make_room(to + 1)
+        self.rows[to] = self.rows[slot]
+        self.rows["node_id"][to] = node_id
+        self.joint.move(slot, to)
+        scores = self.map.scores(slot)
+        cells = self.remove(slot)
+        self._add_cells(to, cells, scores)
+        self.place(graph, [to])
 
-    def merge(self, graph: SceneGraph, kept_id: int, removed_id: int) -> None:
-        """Combine the records of two nodes that the graph has merged."""
-        kept, removed = self.owner_of[kept_id], self.owner_of[removed_id]
+    def merge(self, graph: SceneGraph, kept: int, removed: int) -> None:
+        """Combine the records of the nodes of two slots that the graph has merged."""
         record = self.rows[kept]
         beliefs.merge(record, self.rows[removed])
-        classes = graph.nodes.class_probabilities[graph.nodes.row(kept_id)]
+        classes = graph.nodes.class_probabilities[kept]
         beliefs.start(record, classes.copy(), int(record["named_ns"]))
         self.joint.merge(kept, removed)
         scores = self.map.scores(removed)
-        cells = self.remove(removed_id)
-        self.map.add([kept], cells)
-        self.map.add_scores([kept], cells, scores)
+        cells = self.remove(removed)
+        self._add_cells(kept, cells, scores)
         self.place(graph, [kept])
 
     def memory(self) -> Memory:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
         from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
 
-        owners = [self.owner_of[node_id] for node_id in sorted(self.owner_of)]
+        slots = self.slots
+        slots = slots[self.rows["node_id"][slots].argsort()]
         pairs = [[*sorted(map(self.node, pair)), n] for pair, n in self.joint.balances.items()]
         return {
             # Without the padding between fields, which is memory of the process.
-            "records": repack_fields(self.rows[owners]),
+            "records": repack_fields(self.rows[slots]),
             "looks": self.looks,
             "fates": self.fates,
             "last_ns": np.array(self.last_ns),
-            **self.map.memory(owners),
+            **self.map.memory(slots),
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
     def restore(self, graph: SceneGraph, memory: Memory, node_ids: Sequence[int]) -> None:
         """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
-        owners = list(range(len(node_ids)))
-        self.owner_of = owner_of = dict(zip(node_ids, owners))
-        self.rows = np.zeros(max(len(self.rows), len(owners)), RECORD)
-        self.rows["node_id"][owners] = node_ids
-        self.place(graph, owners)
+        slots = graph.nodes.slots_of(node_ids)
+        self._make_room(int(slots.max(initial=-1)) + 1)
+        self.rows["node_id"][slots] = node_ids
+        self.place(graph, slots)
         # The paper's rule and older releases have no records; cells of another size are useless.
         if "records" not in memory or checked(memory, "cell_m", np.float64) != self.map.cell_m:
-            _rebuild(self, graph, owners)
+            _rebuild(self, graph, slots)
             return
         check_memory(memory, RECORD, len(graph.vocabulary.classes))
         records, counts = memory["records"], memory["block_counts"]
         kept = np.isin(records["node_id"], node_ids)
-        owners = [owner_of[node_id] for node_id in records["node_id"][kept].tolist()]
-        _name(self, graph, sorted(set(owner_of.values()) - set(owners)))
+        known = graph.nodes.slots_of(records["node_id"][kept].tolist())
+        _name(self, graph, np.setdiff1d(slots, known))
         # A slice takes no memory.
         everything, every = slice(None), bool(kept.all())
-        self.rows[owners] = records[everything if every else kept]
+        self.rows[known] = records[everything if every else kept]
         self.looks[:] = memory["looks"]
         self.fates[:] = memory["fates"]
         self.last_ns = int(memory["last_ns"])
         own = everything if every else np.repeat(kept, counts)
         starts = np.append(0, np.cumsum(counts[kept]))
         cells = CellSets(memory["blocks"][own], memory["masks"][own], starts)
-        self.map.add(owners, cells)
-        self.map.add_scores(owners, cells, memory["scores"][own])
+        self.map.add(known, cells)
+        self.map.add_scores(known, cells, memory["scores"][own])
+        slot_of = dict(zip(node_ids, slots.tolist()))
         self.joint.restore(
             {
-                (owner_of[a], owner_of[b]): balance
+                (slot_of[a], slot_of[b]): balance
                 for a, b, balance in memory["joint"].tolist()
-                if a in owner_of and b in owner_of
+                if a in slot_of and b in slot_of
             }
         )
+
+    def _add_cells(self, slot: int, cells: CellSets, scores: Int8) -> None:
+        self.map.add([slot], cells)
+        self.map.add_scores([slot], cells, scores)
+
+    def _make_room(self, count: int) -> None:
+        while len(self.rows) < count:
+            self.rows = np.concatenate((self.rows, np.zeros_like(self.rows)))
 
 
 def apply_correction(
@@ -338,32 +342,31 @@ def apply_correction(
     Their scores start again at 0: rotated cells do not lie on cells.
     """
     for node_id in node_ids:
-        owner = records.owner_of.get(node_id)
-        if owner is None:  # a lost node has no cells
+        slot = graph.nodes.slot(node_id)
+        # A lost node has no cells.
+        if not records.has(slot) or records.node(slot) != node_id:
             continue
-        centres = records.map.centres(owner).astype(np.float64)
+        centres = records.map.centres(slot).astype(np.float64)
         centres = centres @ T_correction[:3, :3].T + T_correction[:3, 3]
-        row = graph.nodes.row(node_id)
-        points = graph.nodes.surface(row)
+        points = graph.nodes.surface(slot)
         cells = records.map.cells_of([np.concatenate((centres.astype(np.float32), points))])
-        records.map.remove(owner)
-        records.map.add([owner], cells)
-        records.place(graph, [owner])
+        records.map.remove(slot)
+        records.map.add([slot], cells)
+        records.place(graph, [slot])
 
 
-def _rebuild(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
+def _rebuild(records: NodeRecords, graph: SceneGraph, slots: Int64) -> None:
     """Make records from the surfaces and observations in the graph."""
-    nodes, rows = graph.nodes, records.graph_rows(graph, owners)
-    _name(records, graph, owners)
-    surfaces = [nodes.surface(row) for row in rows]
-    records.map.add(owners, records.map.cells_of(surfaces))
-    for owner, observations in zip(owners, nodes.observations[rows].tolist()):
-        beliefs.assume(records.rows[owner], observations)
-
-
-def _name(records: NodeRecords, graph: SceneGraph, owners: list[int]) -> None:
-    """Begin the names of owners that have none."""
     nodes = graph.nodes
-    for owner, row in zip(owners, records.graph_rows(graph, owners)):
-        stamp_ns = int(nodes.last_seen_ns[row])
-        beliefs.start(records.rows[owner], nodes.class_probabilities[row], stamp_ns)
+    _name(records, graph, slots)
+    records.map.add(slots, records.map.cells_of([nodes.surface(slot) for slot in slots]))
+    for slot, observations in zip(slots, nodes.observations[slots].tolist()):
+        beliefs.assume(records.rows[slot], observations)
+
+
+def _name(records: NodeRecords, graph: SceneGraph, slots: Int64) -> None:
+    """Begin the names of nodes that have none."""
+    nodes = graph.nodes
+    for slot in slots.tolist():
+        stamp_ns = int(nodes.last_seen_ns[slot])
+        beliefs.start(records.rows[slot], nodes.class_probabilities[slot], stamp_ns)

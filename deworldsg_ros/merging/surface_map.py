@@ -193,7 +193,7 @@ CELLS_PER_OWNER = 8192
 
 
 class VoxelMap:
-    """Cells of the surfaces of nodes. Nodes are numbered by small owner indices.
+    """Cells of the surfaces of nodes. The owner of a cell is the slot of a node.
 
     Args:
         cell_m: edge of a cell, metres.
@@ -232,13 +232,13 @@ class VoxelMap:
         """Score of each cell in each block of `cells` (m, 64)."""
         return self._table.scores[self._rows_of(owner)]
 
-    def memory(self, owners: Sequence[int]) -> Memory:
+    def memory(self, owners: Int64) -> Memory:
         """The cells and scores of all owners as arrays by name; the blocks of each ascend.
 
         Args:
             owners: all owners, in the order of the arrays.
         """
-        table, places = self._table, np.zeros(max(owners, default=0) + 1, np.int64)
+        table, places = self._table, np.zeros(int(owners.max(initial=0)) + 1, np.int64)
         places[owners] = np.arange(len(owners))
         rows = np.flatnonzero(table.owners[: self._used] >= 0)
         of = places[table.owners[rows]]
@@ -260,7 +260,7 @@ class VoxelMap:
         indices = 4 * corners[rows] + within - INDEX_BIAS
         return ((indices + 0.5) * self.cell_m).astype(np.float32)
 
-    def add(self, owners: Sequence[int], sets: CellSets) -> None:
+    def add(self, owners: Sequence[int] | Int64, sets: CellSets) -> None:
         """Add the cells of each set to its owner."""
         if not len(owners):
             return
@@ -277,7 +277,7 @@ class VoxelMap:
             sets[:],
         )
 
-    def add_scores(self, owners: Sequence[int], sets: CellSets, scores: Int8) -> None:
+    def add_scores(self, owners: Sequence[int] | Int64, sets: CellSets, scores: Int8) -> None:
         """Add to the scores of owners' cells, (m, 64): those of each block of their sets.
 
         Blocks without a cell of the owner are left out.
@@ -287,7 +287,7 @@ class VoxelMap:
 
     def judge(
         self,
-        owners: Sequence[int],
+        owners: Int64,
         sets: CellSets,
         values: Int64,
         frame: FrameArrays,
@@ -303,22 +303,21 @@ class VoxelMap:
         Returns:
             For each owner, the cells that became rejected, and the rejected ones of its set.
         """
-        owner_array = np.array(owners, np.int64)
-        cell_kernels.mark(self._table[:], owner_array, sets[:])
-        changed = judge(self._table[:], self._firsts, owner_array, values, frame, self.cell_m)
+        cell_kernels.mark(self._table[:], owners, sets[:])
+        changed = judge(self._table[:], self._firsts, owners, values, frame, self.cell_m)
         return CellSets(*changed)
 
-    def points_in(self, sets: CellSets, nodes: NodeTable, rows: Sequence[int]) -> Bool:
-        """Which surface points of nodes lie in a cell of a set: (n, K), by row and by set."""
+    def points_in(self, sets: CellSets, nodes: NodeTable, slots: Int64) -> Bool:
+        """Which surface points of nodes lie in a cell of a set: (n, K), by slot and by set."""
         return cell_kernels.points_in(
             nodes.surface_points_world,
             nodes.surface_counts,
-            np.array(rows, np.int64),
+            slots,
             sets[:],
             self.cell_m,
         )
 
-    def overlaps(self, sets: CellSets) -> tuple[list[int], Float64, Float64]:
+    def overlaps(self, sets: CellSets) -> tuple[Int64, Float64, Float64]:
         """How much of each set lies on each owner, and of each owner on each set.
 
         A cell lies on a surface if it is a cell of it or shares a face with one.
@@ -327,10 +326,8 @@ class VoxelMap:
             The k owners that any set meets, ascending; and two fractions (n, k) float64 in [0, 1]:
             of the set's cells that lie on the owner, and of the owner's cells that lie on the set.
         """
-        owners, on, of = cell_kernels.overlaps(
-            self._table[:], self._counts, self._sums, self._used, sets[:]
-        )
-        return owners.tolist(), on, of
+        known = self._table[:], self._counts, self._sums, self._used
+        return cell_kernels.overlaps(*known, sets[:])
 
     def remove(self, owner: int) -> CellSets:
         """Remove an owner; returns its cells, as one set."""

@@ -60,13 +60,13 @@ class SurfaceMerging:
             spare.merge(graph, _spare_frame(stamp_ns))
         NodeStates(graph, 1, graph.even_gaussians).refresh()
         spare.hidden(graph)
-        spare._records.remove(1)
+        spare._records.remove(graph.nodes.slot(1))
         graph.merge_nodes(1, 2)
         # Points are dropped only from nodes whose parts belong to others.
-        node_ids = graph.nodes.ids.tolist()
-        rows = [graph.nodes.row(node_id) for node_id in node_ids]
-        cells = spare._records.map.cells_of([graph.nodes.surface(row) for row in rows])
-        graph.drop_points(node_ids, spare._records.map.points_in(cells, graph.nodes, rows))
+        slots = graph.nodes.slots
+        cells = spare._records.map.cells_of([graph.nodes.surface(slot) for slot in slots])
+        inside = spare._records.map.points_in(cells, graph.nodes, slots)
+        graph.drop_points(list(graph.nodes.slot_of), inside)
         spare._records.map.warm_up()
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
@@ -78,7 +78,7 @@ class SurfaceMerging:
         frame, rows = local, list(range(len(local)))
         if graph.edits.merged or graph.edits.separate:
             frame, rows = as_edited(graph, local, self._records)
-        live = graph.nodes.places
+        live = graph.nodes.slot_of
         merged = [
             node_id if node_id in live else graph.resolve(node_id)
             for node_id in self._merge_frame(graph, frame)
@@ -112,7 +112,7 @@ class SurfaceMerging:
     def restore(self, graph: SceneGraph, memory: Memory) -> None:
         """See `Merging.restore`."""
         replaced = graph.edits.replaced
-        node_ids = [node_id for node_id in graph.nodes.ids.tolist() if node_id not in replaced]
+        node_ids = [node_id for node_id in graph.nodes.slot_of if node_id not in replaced]
         self._records.restore(graph, memory, node_ids)
         self._editor.restore(graph, memory)
         self._life_cycle.restore(graph)
@@ -130,26 +130,24 @@ class SurfaceMerging:
         """What the frame shows of the nodes that may be in view."""
         if frame is None:
             return see_nothing(local)
-        rows = self._records.graph_rows(graph, self._records.grid.in_view(frame))
-        rows.sort()
-        return see(graph.nodes, rows, local, frame)
+        slots = self._records.grid.in_view(frame)
+        slots.sort()
+        return see(graph.nodes, slots, local, frame)
 
     def _associate(
         self, graph: SceneGraph, local: LocalGraph, cells: CellSets, view: View
     ) -> Matches:
         """Match the objects with the nodes whose surfaces they meet."""
         records = self._records
-        owners, on_nodes, covered = records.map.overlaps(cells)
-        rows = records.graph_rows(graph, owners)
+        slots, on_nodes, covered = records.map.overlaps(cells)
         # If the frame shows enough of a node, its visible part counts, and not the whole node.
-        covered = with_seen(covered, rows, view.covered, view.rows)
+        covered = with_seen(covered, slots, view.covered, view.slots)
         if graph.edits.deleted:
-            reject_deleted(graph, local, graph.nodes.ids[rows].tolist(), on_nodes)
+            reject_deleted(graph, local, graph.nodes.ids[slots].tolist(), on_nodes)
         return match(
             local,
             graph.nodes,
-            rows,
-            owners,
+            slots,
             on_nodes,
             covered,
             self._config.overlap_threshold,
@@ -161,22 +159,22 @@ class SurfaceMerging:
     ) -> list[int]:
         """Fuse each object into the node that it matched, or add a node; returns the node ids."""
         records, weights = self._records, local.pixel_counts / PIXELS_PER_WEIGHT
-        owners = [matches.owners[column] if column >= 0 else -1 for column in matches.columns]
-        known = [row for row, owner in enumerate(owners) if owner >= 0]
-        known_owners = [owners[row] for row in known]
+        slots = [int(matches.slots[column]) if column >= 0 else -1 for column in matches.columns]
+        known = [row for row, slot in enumerate(slots) if slot >= 0]
+        matched = np.array([slots[row] for row in known], np.int64)
         at, seen = np.array(known, np.int64), local.class_probabilities[known]
         graph.observe_each(
-            records.nodes_of(known_owners),
+            records.nodes_of(matched),
             local.means_world[at],
             local.covariances_world[at],
             seen,
             local.stamp_ns,
             [local.surface_points_world[row] for row in known],
             weights[at],
-            records.name(known_owners, seen, local.stamp_ns),
+            records.name(matched, seen, local.stamp_ns),
         )
-        for row, owner in enumerate(owners):
-            if owner < 0:
+        for row, slot in enumerate(slots):
+            if slot < 0:
                 classes = local.class_probabilities[row]
                 node_id = graph.add_node(
                     local.means_world[row],
@@ -187,10 +185,11 @@ class SurfaceMerging:
                     float(weights[row]),
                     confirmed=False,
                 )
-                owners[row] = records.add(node_id, classes, local.stamp_ns)
-        records.map.add(owners, cells)
-        records.place(graph, owners)
-        return records.nodes_of(owners)
+                slots[row] = graph.nodes.slot(node_id)
+                records.add(slots[row], node_id, classes, local.stamp_ns)
+        records.map.add(slots, cells)
+        records.place(graph, slots)
+        return records.nodes_of(slots)
 
     def _judge_cells(
         self,
@@ -203,26 +202,26 @@ class SurfaceMerging:
         """Drop surface points in cells that the frames so far show as something else."""
         if frame is None or local.depth_grid is None or local.depth_grid.instances is None:
             return
-        owners = self._records.owners_of(node_ids)
-        rejected = self._records.map.judge(owners, cells, local.instance_ids, frame)
+        slots = graph.nodes.slots_of(node_ids)
+        rejected = self._records.map.judge(slots, cells, local.instance_ids, frame)
         if len(rejected.blocks):
-            rows = [graph.nodes.row(node_id) for node_id in node_ids]
-            graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, rows))
+            graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, slots))
 
     def _merge_parts(
         self, graph: SceneGraph, local: LocalGraph, matches: Matches, node_ids: list[int]
     ) -> list[int]:
         """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records
-        owners = records.owners_of(node_ids)
-        records.joint.add_frame(owners, matches, local.scores, local.T_world_camera[:3, 3])
+        slots = graph.nodes.slots_of(node_ids).tolist()
+        records.joint.add_frame(slots, matches, local.scores, local.T_world_camera[:3, 3])
         merged = False
         while (pair := records.joint.next_merge()) is not None:
-            a_id, b_id = (records.node(owner) for owner in pair)
+            a_id, b_id = map(records.node, pair)
             if graph.edits and not may_merge(graph, a_id, b_id):
                 continue
-            kept_id = graph.merge_nodes(a_id, b_id)
-            records.merge(graph, kept_id, b_id if kept_id == a_id else a_id)
+            kept, removed = pair if a_id < b_id else pair[::-1]
+            graph.merge_nodes(a_id, b_id)
+            records.merge(graph, kept, removed)
             merged = True
         return [graph.resolve(node_id) for node_id in node_ids] if merged else node_ids
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +50,7 @@ class View:
     """The m nodes that a frame with n objects may show.
 
     Attributes:
-        rows: (m,) int64, rows of the nodes before the frame is merged, ascending.
+        slots: (m,) int64, slots of the nodes before the frame is merged, ascending.
         ids: (m,) int64, ids of the nodes.
         visibilities: (m,) int64, how much of each is visible and present, of `VISIBILITIES`.
         through: (m,) bool, whether the frame sees through most of it.
@@ -59,28 +58,28 @@ class View:
             if too few are present, or without instances.
     """
 
-    rows: Int64
+    slots: Int64
     ids: Int64
     visibilities: Int64
     through: Bool
     covered: Float64
 
 
-def see(nodes: NodeTable, rows: Int64, local: LocalGraph, frame: FrameArrays) -> View:
+def see(nodes: NodeTable, slots: Int64, local: LocalGraph, frame: FrameArrays) -> View:
     """What a frame shows of some nodes.
 
     Args:
         nodes: of the graph.
-        rows: (m,) rows of the nodes to compare with it.
+        slots: (m,) of the nodes to compare with it.
         local: the frame.
         frame: its arrays, with those of its depth grid.
     """
     visibilities, through, covered = _see(
-        nodes.surface_points_world, nodes.surface_counts, rows, local.instance_ids, frame
+        nodes.surface_points_world, nodes.surface_counts, slots, local.instance_ids, frame
     )
     if local.depth_grid is None or local.depth_grid.instances is None:
         covered[:] = np.nan
-    return View(rows, nodes.ids[rows], visibilities, through, covered)
+    return View(slots, nodes.ids[slots], visibilities, through, covered)
 
 
 def see_nothing(local: LocalGraph) -> View:
@@ -100,14 +99,14 @@ def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
 
 
 @kernel
-def with_seen(covered: Float64, rows: Int64, seen: Float64, seen_rows: Int64) -> Float64:
-    """Fractions (n, k) of some rows, from those (n, m) of a view where the view has a row (k,)."""
+def with_seen(covered: Float64, slots: Int64, seen: Float64, seen_slots: Int64) -> Float64:
+    """Fractions (n, k) of some nodes, from those (n, m) of a view where the view has the node."""
     result = covered.copy()
-    for column in range(len(rows)):
+    for column in range(len(slots)):
         place = 0
-        while place < len(seen_rows) and seen_rows[place] != rows[column]:
+        while place < len(seen_slots) and seen_slots[place] != slots[column]:
             place += 1
-        for index in range(len(seen) if place < len(seen_rows) else 0):
+        for index in range(len(seen) if place < len(seen_slots) else 0):
             if not np.isnan(seen[index, place]):
                 result[index, column] = seen[index, place]
     return result
@@ -124,11 +123,11 @@ def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, 
 
 @kernel
 def _see(
-    points: Float32, counts: Int64, rows: Int64, values: Int64, frame: FrameArrays
+    points: Float32, counts: Int64, slots: Int64, values: Int64, frame: FrameArrays
 ) -> tuple[Int64, Bool, Float64]:
-    """The arrays of a `View` of some rows; values (n,) are those of the objects in the image."""
-    visibilities, through = np.empty(len(rows), np.int64), np.zeros(len(rows), np.bool_)
-    covered = np.empty((len(values), len(rows)), np.float64)
+    """The arrays of a `View` of some nodes; values (n,) are those of the objects in the image."""
+    visibilities, through = np.empty(len(slots), np.int64), np.zeros(len(slots), np.bool_)
+    covered = np.empty((len(values), len(slots)), np.float64)
     most = 0
     for index in range(len(values)):
         most = max(most, int(values[index]))
@@ -138,12 +137,12 @@ def _see(
     for index in range(len(values)):
         object_of[values[index]] = index
     hits = np.empty(len(values), np.int64)
-    for column in range(len(rows)):
-        count = min(counts[rows[column]], SAMPLED_POINTS)
+    for column in range(len(slots)):
+        count = min(counts[slots[column]], SAMPLED_POINTS)
         visibilities[column] = NOT_VISIBLE
         for index in range(len(values)):
             hits[index], covered[index, column] = 0, np.nan
-        behind, present, inside = _compare(points[rows[column]], count, object_of, hits, frame)
+        behind, present, inside = _compare(points[slots[column]], count, object_of, hits, frame)
         if present >= MIN_VISIBLE_POINTS:
             for index in range(len(values)):
                 covered[index, column] = hits[index] / present
@@ -207,45 +206,35 @@ _Sides = tuple[float, float, float, float, float, float]
 
 
 class NodeGrid:
-    """Owners by the cube that contains the mean of their node."""
+    """The slots of nodes by the cube that contains their mean."""
 
     def __init__(self) -> None:
         self._cube_of: dict[tuple[int, ...], int] = {}
         # Of each cube: its place in cubes, a ball around the balls of all nodes ever in it, and its
-        # first owner.
+        # first slot.
         self._keys, self._cubes = np.zeros((16, 3)), np.zeros((16, 4))
         self._firsts = np.full(16, -1)
-        # Of each owner: the ball of its node, its cube, and the owners before and after it there.
+        # Of each slot: the ball of its node, its cube, and the slots before and after it there.
         self._balls = np.zeros((64, 4))
         self._links = np.full((64, 3), -1)
 
-    def put(
-        self,
-        owners: Sequence[int],
-        rows: Int64,
-        means_world: Float64,
-        eigenvalue_bounds: Float64,
-    ) -> None:
-        """Set the Gaussians of n owners, new or known.
+    def put(self, slots: Int64, means_world: Float64, eigenvalue_bounds: Float64) -> None:
+        """Set the Gaussians of n nodes, new or known.
 
         Args:
-            owners: n owners.
-            rows: (n,) row of each in
+            slots: (n,) of the nodes in
             means_world: (N, 3) metres, and
             eigenvalue_bounds: (N,) square metres, see `NodeTable`.
         """
-        if not len(owners):
+        if not len(slots):
             return
-        while max(owners) >= len(self._balls):
+        while slots.max() >= len(self._balls):
             self._balls = np.concatenate((self._balls, np.zeros_like(self._balls)))
             self._links = np.concatenate((self._links, np.full_like(self._links, -1)))
-        moved = np.zeros(len(owners), np.int64)
-        at = np.array(owners, np.int64)
         known = self._keys, self._cubes, self._balls, self._links
-        count = _stay(*known, at, rows, means_world, eigenvalue_bounds, moved)
-        if count:
-            moved = moved[:count]
-            keys = np.floor(means_world[rows[moved]] / CUBE_M).astype(np.int64)
+        moved = _stay(*known, slots, means_world, eigenvalue_bounds)
+        if len(moved):
+            keys = np.floor(means_world[moved] / CUBE_M).astype(np.int64)
             cube_of = self._cube_of
             cubes = np.array(
                 [
@@ -253,15 +242,15 @@ class NodeGrid:
                     for key in map(tuple, keys.tolist())
                 ]
             )
-            _put(self._cubes, self._firsts, self._balls, self._links, at[moved], cubes)
+            _put(self._cubes, self._firsts, self._balls, self._links, moved, cubes)
 
-    def remove(self, owner: int) -> None:
-        """Remove an owner, if it is in the grid."""
-        if owner < len(self._links):
-            _remove(self._firsts, self._links, owner)
+    def remove(self, slot: int) -> None:
+        """Remove a slot, if it is in the grid."""
+        if slot < len(self._links):
+            _remove(self._firsts, self._links, slot)
 
     def in_view(self, frame: FrameArrays) -> Int64:
-        """Owners whose nodes a frame may show, in any order.
+        """Slots whose nodes a frame may show, in any order.
 
         Their balls are not wholly behind the camera, beyond one side of the image, or farther than
         all measured depth.
@@ -283,8 +272,8 @@ class NodeGrid:
 
 
 @kernel
-def _remove(firsts: Int64, links: Int64, owner: int) -> None:
-    cube, before, after = links[owner]
+def _remove(firsts: Int64, links: Int64, slot: int) -> None:
+    cube, before, after = links[slot]
     if cube < 0:
         return
     if before >= 0:
@@ -293,7 +282,7 @@ def _remove(firsts: Int64, links: Int64, owner: int) -> None:
         firsts[cube] = after
     if after >= 0:
         links[after, 1] = before
-    links[owner] = -1
+    links[slot] = -1
 
 
 @kernel
@@ -302,28 +291,25 @@ def _stay(
     cubes: Float64,
     balls: Float64,
     links: Int64,
-    owners: Int64,
-    rows: Int64,
+    slots: Int64,
     means: Float64,
     eigenvalue_bounds: Float64,
-    moved: Int64,
-) -> int:
-    """Set the balls of owners. The number of those in another cube; their places are written."""
-    count = 0
-    for index in range(len(owners)):
-        owner, row, is_same = owners[index], rows[index], True
-        cube = links[owner, 0]
+) -> Int64:
+    """Set the balls of nodes; returns the slots of those that are in another cube now."""
+    moved, count = np.empty(len(slots), np.int64), 0
+    for slot in slots:
+        is_same, cube = True, links[slot, 0]
         for axis in range(3):
-            balls[owner, axis] = means[row, axis]
-            is_same &= cube >= 0 and math.floor(means[row, axis] / CUBE_M) == keys[cube, axis]
-        balls[owner, 3] = BALL_DEVIATIONS * math.sqrt(eigenvalue_bounds[row])
+            balls[slot, axis] = means[slot, axis]
+            is_same &= cube >= 0 and math.floor(means[slot, axis] / CUBE_M) == keys[cube, axis]
+        balls[slot, 3] = BALL_DEVIATIONS * math.sqrt(eigenvalue_bounds[slot])
         if is_same:
-            reach = math.sqrt(0.75) * CUBE_M + balls[owner, 3]
+            reach = math.sqrt(0.75) * CUBE_M + balls[slot, 3]
             cubes[cube, 3] = max(cubes[cube, 3], reach)
         else:
-            moved[count] = index
+            moved[count] = slot
             count += 1
-    return count
+    return moved[:count].copy()
 
 
 @kernel
@@ -332,21 +318,21 @@ def _put(
     firsts: Int64,
     balls: Float64,
     links: Int64,
-    owners: Int64,
+    slots: Int64,
     new_cubes: Int64,
 ) -> None:
-    """Put owners, whose balls are known, into other cubes."""
-    for index in range(len(owners)):
-        owner, cube = owners[index], new_cubes[index]
-        reach = math.sqrt(0.75) * CUBE_M + balls[owner, 3]
+    """Put nodes, whose balls are known, into other cubes."""
+    for index in range(len(slots)):
+        slot, cube = slots[index], new_cubes[index]
+        reach = math.sqrt(0.75) * CUBE_M + balls[slot, 3]
         cubes[cube, 3] = max(cubes[cube, 3], reach)
-        if links[owner, 0] == cube:
+        if links[slot, 0] == cube:
             continue
-        _remove(firsts, links, owner)
-        links[owner, 0], links[owner, 2] = cube, firsts[cube]
+        _remove(firsts, links, slot)
+        links[slot, 0], links[slot, 2] = cube, firsts[cube]
         if firsts[cube] >= 0:
-            links[firsts[cube], 1] = owner
-        firsts[cube] = owner
+            links[firsts[cube], 1] = slot
+        firsts[cube] = slot
 
 
 @kernel
@@ -383,15 +369,15 @@ def _in_view(
     sides = right, below, *lengths
     # Beyond this, no measured depth is within the tolerance of a point.
     far_m = (0.001 * farthest + THROUGH_M) / (1.0 - THROUGH_FRACTION)
-    owners, count = np.empty(64, np.int64), 0
+    slots, count = np.empty(64, np.int64), 0
     for cube in range(len(cubes)):
-        owner = firsts[cube]
-        if owner < 0 or not _may_show(cubes[cube], frame, sides, far_m):
+        slot = firsts[cube]
+        if slot < 0 or not _may_show(cubes[cube], frame, sides, far_m):
             continue
-        while owner >= 0:
-            if count == len(owners):
-                owners = np.concatenate((owners, owners))
-            owners[count] = owner
-            count += int(_may_show(balls[owner], frame, sides, far_m))
-            owner = links[owner, 2]
-    return owners[:count].copy()
+        while slot >= 0:
+            if count == len(slots):
+                slots = np.concatenate((slots, slots))
+            slots[count] = slot
+            count += int(_may_show(balls[slot], frame, sides, far_m))
+            slot = links[slot, 2]
+    return slots[:count].copy()

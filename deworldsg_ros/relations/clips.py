@@ -259,7 +259,7 @@ class LiveGraph:
     def node(self, node_id: int) -> NodeView | None:
         """See `GraphView`."""
         nodes = self._graph.nodes
-        row = nodes.row(node_id)
+        row = nodes.slot(node_id)
         if not nodes.confirmed[row]:
             return None
         names = self._graph.vocabulary

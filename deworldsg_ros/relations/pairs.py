@@ -361,7 +361,7 @@ class GeometryJudge:
         used = joined(ends, [])
         first, second = np.searchsorted(used, ends.T)
         low, high = shapes.low[used], shapes.high[used]
-        node_rows = nodes.rows_at(shapes.ids[used].tolist())
+        node_rows = nodes.slots_of(shapes.ids[used].tolist())
         features = pair_features(
             first,
             second,
@@ -465,7 +465,7 @@ class PairTable(PairRows):
 
     def _follow_nodes(self, up_world: Float64, at_most: int | None) -> list[int]:
         """Measure nodes that changed, and forget those that went; returns ids."""
-        places, confirmed = self._graph.nodes.places, self._graph.nodes.confirmed
+        places, confirmed = self._graph.nodes.slot_of, self._graph.nodes.confirmed
         for node_id in sorted(self._touched):
             row = places.get(node_id)
             if row is not None and confirmed[row]:
@@ -503,7 +503,7 @@ class PairTable(PairRows):
         if not node_ids:
             return
         shapes, nodes = self.shapes, self._graph.nodes
-        rows = nodes.rows_at(node_ids)
+        rows = nodes.slots_of(node_ids)
         new = [node_id for node_id in node_ids if node_id not in shapes]
         shapes.extend(new)
         at = shapes.rows_at(node_ids)

@@ -425,7 +425,7 @@ class PaperBeliefs:
         pairs = set()
         for node_id in self._touched:
             best = -1
-            if node_id in nodes and nodes.confirmed[row := nodes.row(node_id)]:
+            if node_id in nodes and nodes.confirmed[row := nodes.slot(node_id)]:
                 best = int(edits.believed_classes(nodes, names, [row]).argmax())
             if self._class_of.get(node_id, -1) == best:
                 continue

@@ -87,7 +87,7 @@ def kept_nodes(rig: Rig) -> dict[int, int]:
     except ConfigurationError:
         # A kill never breaks it: the test fails by what follows.
         graph = read_map(Config(), previous_of(rig.map_path)).graph
-    return dict(zip(graph.nodes.ids.tolist(), graph.nodes.observations.tolist()))
+    return dict(zip(list(graph.nodes.slot_of), graph.nodes.observations.tolist()))
 
 
 def crash(kills: int, folder: Path, seed: int = 0, only: str | None = None) -> list[Recovery]:

@@ -98,7 +98,7 @@ def test_a_moved_object_keeps_its_id(scene) -> None:
         ids = scene.see((WHOLE, TABLE), (THERE, CUP))
     assert ids == [1, 2]
     assert scene.published() == {1: "table", 2: "cup"}
-    row = scene.graph.nodes.row(2)
+    row = scene.graph.nodes.slot(2)
     assert scene.graph.nodes.means[row] == pytest.approx(THERE.mean(axis=0), abs=1e-3)
     assert scene.graph.nodes.observations[row] == 12
     assert scene.see((THERE, CUP)) == [2]
@@ -134,4 +134,4 @@ def test_a_tentative_node_that_is_seen_through_is_removed() -> None:
     scene.see((WHOLE, TABLE), (HERE, CUP))
     for _ in range(6):
         scene.see((WHOLE, TABLE))
-    assert scene.graph.nodes.ids.tolist() == [1]
+    assert list(scene.graph.nodes.slot_of) == [1]

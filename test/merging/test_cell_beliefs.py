@@ -68,7 +68,7 @@ def widths_after(*frames: LocalGraph) -> list[float]:
     widths = []
     for local in frames:
         merging.merge(graph, local)
-        assert graph.nodes.ids.tolist() == list(range(1, len(local) + 1))
+        assert list(graph.nodes.slot_of) == list(range(1, len(local) + 1))
         widths.append(float(np.quantile(np.abs(graph.nodes.surface(0)[:, 0]), 0.95)))
     return widths
 

@@ -186,7 +186,7 @@ def test_a_split_takes_the_places_that_are_named():
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 40])
 def test_an_object_of_few_places_is_not_split(count):
     room = Room((BESIDE, CUP))
-    row = room.builder.graph.nodes.row(1)
+    row = room.builder.graph.nodes.slot(1)
     room.builder.graph.nodes.set_surface(row, np.tile(BESIDE[:1], (count, 1)))
     for places in (None, [[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [0, 0, 0]]):
         with pytest.raises(RefusedInput, match="has no two parts of at least 8 there"):

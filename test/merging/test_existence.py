@@ -133,7 +133,7 @@ def test_a_node_missed_from_most_positions_is_hidden_until_it_is_detected_again(
     assert walk.published == [1]
     for _ in range(600):
         walk.see(detected=False)
-    assert walk.published == [] and walk.graph.nodes.ids.tolist() == [1]
+    assert walk.published == [] and list(walk.graph.nodes.slot_of) == [1]
     assert walk.merging.hidden(walk.graph) == {1: "missed by the detector"}
     for _ in range(100):
         walk.see(detected=True, score=0.4)
@@ -211,19 +211,19 @@ def test_a_loaded_node_is_published(tmp_path: Path) -> None:
     walk.see(detected=False)
     assert walk.published == [1]
     walk.see(detected=True)
-    assert walk.published == [1] and walk.graph.nodes.ids.tolist() == [1]
+    assert walk.published == [1] and list(walk.graph.nodes.slot_of) == [1]
 
 
 def records_of(count: int) -> NodeRecords:
     records = NodeRecords()
     for node_id in range(1, count + 1):
-        records.add(node_id, np.ones(2) / 2, 0)
+        records.add(node_id - 1, node_id, np.ones(2) / 2, 0)
     return records
 
 
 def look(
     records: NodeRecords,
-    owner: int,
+    slot: int,
     camera_world: np.ndarray,
     stamp_ns: int,
     score: float,
@@ -232,7 +232,7 @@ def look(
 ) -> None:
     arrays = np.array([score]), np.array([visibility]), np.zeros((1, 3))
     records.last_ns = stamp_ns - round(weight * beliefs.LOOK_NS)
-    records.look([owner], *arrays, camera_world, stamp_ns)
+    records.look(np.array([slot]), *arrays, camera_world, stamp_ns)
 
 
 def around(index: int) -> np.ndarray:
@@ -251,7 +251,7 @@ def test_at_a_high_detection_rate_a_miss_counts_for_more() -> None:
             look(records, 1, around(index), index * 10**9, 0.9)
         for index in range(103, 106):
             look(records, 1, around(index), index * 10**9, 0.0)
-        beliefs.append(records.existence([1])[0])
+        beliefs.append(records.existence(np.array([1]))[0])
     assert beliefs[0] < beliefs[1] - 0.03
 
 
@@ -261,7 +261,7 @@ def test_where_new_nodes_turn_out_to_be_errors_a_new_one_is_less_probable() -> N
         records = records_of(1)
         records.fates[:] = fates
         look(records, 0, around(0), 0, 0.5)
-        beliefs.append(records.existence([0])[0])
+        beliefs.append(records.existence(np.array([0]))[0])
     assert beliefs[0] > beliefs[1] + 0.2
 
 
@@ -278,9 +278,9 @@ def test_restored_records_continue_if_the_clock_is_behind(behind_s: int) -> None
     records = records_of(1)
     for index in range(20):
         look(records, 0, around(index), (10**7 + index) * 10**9, 0.9)
-    before = records.existence([0])[0]
+    before = records.existence(np.array([0]))[0]
     look(records, 0, around(20), (10**7 + 20 - behind_s) * 10**9, 0.9)
-    assert records.existence([0])[0] >= before > 0.9
+    assert records.existence(np.array([0]))[0] >= before > 0.9
 
 
 def reference(looks: list[list[tuple[float, int, float]]], rates: dict[int, float]) -> float:
@@ -328,7 +328,9 @@ def test_the_log_odds_are_those_of_the_definition(seed: int) -> None:
             look(records, 0, around(index), stamp_ns, score, visibility, weight)
         looks.append(frames)
     odds = reference(looks, dict.fromkeys((QUARTER, HALF, FULL), 0.5))
-    assert math.isclose(records.existence([0])[0], 1 / (1 + math.exp(-odds)), rel_tol=1e-9)
+    assert math.isclose(
+        records.existence(np.array([0]))[0], 1 / (1 + math.exp(-odds)), rel_tol=1e-9
+    )
 
 
 def test_a_lost_node_of_an_open_graph_is_kept_until_its_time_is_over() -> None:

@@ -52,11 +52,10 @@ def test_match_scores_equal_the_formulas(seed: int) -> None:
     nodes = NodeTable(4)
     for index in range(5):
         covariance, classes = random_covariances(rng, 1, 0.01)[0], random_classes(rng, 1)[0]
-        nodes.put(nodes.append(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
+        nodes.put(nodes.add(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
     rows = rng.permutation(5)[:3]
     on_nodes, covered = rng.uniform(0, 1, (2, 4, 3))
-    owners = [5, 2, 7]
-    matches = match(local, nodes, rows, owners, on_nodes, covered, OVERLAP_THRESHOLD, CELL_M)
+    matches = match(local, nodes, rows, on_nodes, covered, OVERLAP_THRESHOLD, CELL_M)
     blur = CELL_M**2 / 12 * np.eye(3)
     for index, column in np.ndindex(4, 3):
         row = rows[column]
@@ -74,14 +73,14 @@ def test_match_scores_equal_the_formulas(seed: int) -> None:
         assert matches.scores[index, column] == pytest.approx(score if possible else 0.0, abs=1e-9)
         assert matches.touching[index, column] == same
     assert matches.columns == one_to_one(matches.scores)
-    assert matches.owners == owners and matches.on_nodes is on_nodes
+    assert matches.slots is rows and matches.on_nodes is on_nodes
 
 
 def test_a_frame_without_objects_has_no_matches() -> None:
     empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
     nothing = np.zeros((0, 0))
     matches = match(
-        empty, NodeTable(4), np.zeros(0, np.int64), [], nothing, nothing, OVERLAP_THRESHOLD, CELL_M
+        empty, NodeTable(4), np.zeros(0, np.int64), nothing, nothing, OVERLAP_THRESHOLD, CELL_M
     )
     assert matches.scores.shape == matches.touching.shape == (0, 0)
     assert matches.columns == []
@@ -128,12 +127,12 @@ def add_frame(
     on_nodes: ArrayLike = 0.0,
     camera_m: float = 0.0,
 ) -> None:
-    """One frame of objects; unless told, each touches the owners with which it has a score."""
+    """One frame of objects; unless told, each touches the slots with which it has a score."""
     shape = len(seen), len(known)
     scores = np.array(match_scores, float).reshape(shape)
     touching = scores > 0 if touching is None else np.array(touching, bool).reshape(shape)
-    matched = [known.index(owner) if owner in known else -1 for owner in seen]
-    matches = Matches(known, np.broadcast_to(on_nodes, shape), scores, touching, matched)
+    matched = [known.index(slot) if slot in known else -1 for slot in seen]
+    matches = Matches(np.array(known), np.broadcast_to(on_nodes, shape), scores, touching, matched)
     detection_scores = np.broadcast_to(detection_scores, len(seen))
     evidence.add_frame(seen, matches, detection_scores, np.array([camera_m, 0, 0]))
 
@@ -238,9 +237,7 @@ def test_evidence_continues_from_its_balances(seed: int) -> None:
     rng = np.random.default_rng(seed)
     evidence, restored = JointEvidence(), JointEvidence()
     for _ in range(30):
-        owners = rng.permutation(6)[: rng.integers(1, 5)].tolist()
-        add_frame(
-            evidence, owners, [*owners, 6], rng.integers(0, 2, (len(owners), len(owners) + 1))
-        )
+        slots = rng.permutation(6)[: rng.integers(1, 5)].tolist()
+        add_frame(evidence, slots, [*slots, 6], rng.integers(0, 2, (len(slots), len(slots) + 1)))
     restored.restore(evidence.balances)
     assert restored.balances == evidence.balances

@@ -21,10 +21,12 @@ def distribution(label: int, certainty: float = 0.85) -> np.ndarray:
 def named(labels: list[int], frames_per_s: float = 10.0) -> np.ndarray:
     """Class distribution (COUNT,) after frames with these labels."""
     records = NodeRecords()
-    records.add(1, distribution(labels[0])[0], 0)
+    records.add(0, 1, distribution(labels[0])[0], 0)
     classes = distribution(labels[0])
     for index, label in enumerate(labels[1:], 1):
-        classes = records.name([0], distribution(label), round(index * 1e9 / frames_per_s))
+        classes = records.name(
+            np.array([0]), distribution(label), round(index * 1e9 / frames_per_s)
+        )
     return classes[0]
 
 
@@ -82,7 +84,7 @@ def test_the_filter_is_that_of_the_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frames = [rng.dirichlet(np.full(beliefs.LABELS, 0.5)) for _ in range(15)]
     records = NodeRecords()
-    records.add(1, frames[0], 0)
+    records.add(0, 1, frames[0], 0)
     for index, seen in enumerate(frames[1:], 1):
-        classes = records.name([0], seen[None], index * 10**8)
+        classes = records.name(np.array([0]), seen[None], index * 10**8)
     np.testing.assert_allclose(classes[0], reference(frames, 0.1), rtol=1e-9)

@@ -13,7 +13,7 @@ from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.paper_rule import (
     _nearest,
     bhattacharyya_bound,
-    nearest_row,
+    nearest_slot,
     observed,
     warm_up,
 )
@@ -27,14 +27,14 @@ from deworldsg_ros.scene.gaussian import (
 def table_of(means, covariances, classes, ids=None) -> NodeTable:
     nodes = NodeTable(classes.shape[1])
     for index in range(len(means)):
-        row = nodes.append(index + 1 if ids is None else int(ids[index]))
+        row = nodes.add(index + 1 if ids is None else int(ids[index]))
         nodes.put(row, means[index], covariances[index], classes[index], 1.0, 1)
     return nodes
 
 
 def search(mean, covariance, classes, nodes, delta_g=0.7, delta_c=0.8, skipped_row=-1) -> int:
     item = observed(mean, covariance, classes)
-    return nearest_row(item, nodes, bhattacharyya_bound(delta_g), delta_c, skipped_row)
+    return nearest_slot(item, nodes, bhattacharyya_bound(delta_g), delta_c, skipped_row)
 
 
 @given(seeds, st.sampled_from([0.05, 0.3, 0.7, 0.95]), st.sampled_from([0.2, 0.8, 1.0]))

@@ -40,18 +40,18 @@ def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
     grid, known = NodeGrid(), {}
     for _ in range(12):
         count = int(rng.integers(0, 30))
-        owners = rng.choice(150, count, replace=False)
-        means, bounds = rng.uniform(-12, 12, (count, 3)), rng.uniform(0.01, 0.6, count) ** 2
-        grid.put(owners.tolist(), np.arange(count), means, bounds)
-        known.update(zip(owners.tolist(), zip(means, BALL_DEVIATIONS * bounds**0.5)))
-        for owner in rng.choice(200, 10).tolist():
-            grid.remove(owner)
-            known.pop(owner, None)
+        slots = rng.choice(150, count, replace=False)
+        means, bounds = rng.uniform(-12, 12, (150, 3)), rng.uniform(0.01, 0.6, 150) ** 2
+        grid.put(slots, means, bounds)
+        known.update({slot: (means[slot], BALL_DEVIATIONS * bounds[slot] ** 0.5) for slot in slots})
+        for slot in rng.choice(200, 10).tolist():
+            grid.remove(slot)
+            known.pop(slot, None)
     frame = any_frame(rng)
     found = grid.in_view(frame).tolist()
     assert len(found) == len(set(found)) and set(found) <= known.keys()
-    for owner, (mean, radius) in known.items():
-        if owner not in found:
+    for slot, (mean, radius) in known.items():
+        if slot not in found:
             assert not shows(frame, mean, radius, rng)
 
 
@@ -60,10 +60,13 @@ def test_nodes_elsewhere_are_not_compared() -> None:
     frame = frame_arrays(np.eye(4), depth_grid(background_m=3.0))
     assert grid.in_view(frame).tolist() == []
     before, beside, behind_the_wall, behind = [0, 0, 2], [50, 0, 2], [0, 0, 30], [0, 0, -30]
-    means = np.array([before, beside, behind_the_wall, behind], np.float64)
-    grid.put([3, 5, 7, 9], np.arange(4), means, np.full(4, 0.01))
+    slots, bounds = np.array([3, 5, 7, 9]), np.full(10, 0.01)
+    means = np.zeros((10, 3))
+    means[slots] = before, beside, behind_the_wall, behind
+    grid.put(slots, means, bounds)
     assert grid.in_view(frame).tolist() == [3]
-    grid.put([5], np.array([0]), means, np.full(4, 0.01))
+    means[5] = before
+    grid.put(np.array([5]), means, bounds)
     assert sorted(grid.in_view(frame).tolist()) == [3, 5]
     grid.remove(3)
     grid.remove(3)

@@ -108,7 +108,7 @@ def test_two_halves_of_an_object_are_merged(graph, merging) -> None:
     assert merging.merge(graph, frame(1, (gap_right, TABLE))) == [2]
     for stamp in range(2, 8):
         merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
-    assert graph.nodes.ids.tolist() == [1]
+    assert list(graph.nodes.slot_of) == [1]
     assert graph.take_removals() == {2: 1}
     assert merging.merge(graph, frame(9, (gap_right, TABLE))) == [1]
 
@@ -178,7 +178,7 @@ def test_a_confirmed_node_out_of_view_stays(graph, merging) -> None:
     for stamp in range(3):
         merging.merge(graph, frame(stamp, (WHOLE, TABLE)))
     merging.merge(graph, frame(10_000))
-    assert graph.nodes.ids.tolist() == [1]
+    assert list(graph.nodes.slot_of) == [1]
 
 
 def test_observations_are_weighted_by_pixels(graph, merging) -> None:

@@ -33,7 +33,7 @@ LEFT = slab((-0.2, 0, 1), (0.3, 0.3, 0.004))
 def table_of(*surfaces: np.ndarray, capacity: int = 512) -> NodeTable:
     nodes = NodeTable(1, capacity)
     for index, points in enumerate(surfaces):
-        row = nodes.append(index + 1)
+        row = nodes.add(index + 1)
         mean, covariance = moments(points, 1e-6) if len(points) else (np.zeros(3), np.eye(3))
         nodes.put(row, mean, covariance, np.ones(1), 1.0, 1)
         nodes.set_surface(row, points.astype(np.float32))

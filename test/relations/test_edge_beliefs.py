@@ -81,7 +81,7 @@ def edges_of(builder: GraphBuilder) -> dict[tuple[int, int], wire.EdgeState]:
 
 
 def vote_at_random(builder: GraphBuilder, rng: np.random.Generator, frames: int = 40) -> None:
-    ids = builder.graph.nodes.ids.tolist()
+    ids = list(builder.graph.nodes.slot_of)
     for _ in range(frames):
         one, other = rng.choice(ids, 2, replace=False).tolist()
         logits = rng.normal(-1, 4, (2, WIDTH))
@@ -436,7 +436,7 @@ def test_edges_do_not_depend_on_the_history(world_model: str, seed: int) -> None
     builder, ids = room(DINNER, config(world_model=world_model), seed)
     for _ in range(6):
         vote_at_random(builder, rng, 10)
-        live = builder.graph.nodes.ids.tolist()
+        live = list(builder.graph.nodes.slot_of)
         T = np.eye(4)
         T[:2, 3] = rng.normal(0, 0.4, 2)
         builder.graph.move_node(int(rng.choice(live)), T)

@@ -100,7 +100,7 @@ def assert_equal(one: Pairs, other: Pairs) -> None:
 def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
     """Anything that may change a pair, at random."""
     graph = builder.graph
-    ids = graph.nodes.ids.tolist()
+    ids = list(graph.nodes.slot_of)
     kind = rng.choice(
         ["votes", "observe", "confirm", "add", "merge", "remove", "move", "take over"],
         p=[0.34, 0.2, 0.1, 0.12, 0.06, 0.06, 0.06, 0.06],

@@ -81,7 +81,8 @@ def test_a_correction_and_its_inverse_restore_the_graph(association: str, seed: 
 def test_older_nodes_stay_and_newer_ones_move_rigidly(association: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
     builder = built(rng, association)
-    first = dict(zip(builder.graph.nodes.ids.tolist(), builder.graph.nodes.first_seen_ns.tolist()))
+    nodes = builder.graph.nodes
+    first = {node_id: nodes.first_seen_ns[slot] for node_id, slot in nodes.slot_of.items()}
     before, evidence = states(builder.full()), dict(builder.graph.edges)
     T, since_ns = random_pose(rng), int(rng.integers(0, 14))
     moved = set(builder.apply_correction(T, since_ns))

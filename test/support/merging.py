@@ -125,7 +125,7 @@ def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> N
     """Apply all edits that stages make to a graph, in random order."""
     for _ in range(edits):
         stamp_ns = int(rng.integers(0, 10**12))
-        live = graph.nodes.ids.tolist()
+        live = sorted(graph.nodes.slot_of)
         ever = int(max([*live, 1]))
         gaussian = (rng.normal(size=3), random_covariances(rng, 1)[0], random_classes(rng, 1)[0])
         points = rng.normal(size=(4, 3)).astype(np.float32)

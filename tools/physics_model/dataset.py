@@ -60,7 +60,9 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
     objects = [item for item in content["objects"] if item.get("detectable") and item.get("vg")]
     truth = {(s, o): name for s, o, _, name in content["relationships"]}
     graph = graph_files.load(map_path)
-    for node_id in graph.nodes.ids[~graph.nodes.confirmed].tolist():
+    for node_id in list(graph.nodes.slot_of):
+        if graph.nodes.confirmed[graph.nodes.slot(node_id)]:
+            continue
         graph.remove_node(node_id)
     nodes = graph.nodes
     shapes = NodeShapes()
