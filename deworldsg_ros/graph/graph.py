@@ -14,12 +14,12 @@ from deworldsg_ros.graph.edits import Edit, EditLog
 from deworldsg_ros.graph.extent import even_moments
 from deworldsg_ros.graph.nodes import SAVED, IdState, NodeIds, NodeTable, Observations
 from deworldsg_ros.graph.pairs import (
-    EdgeArrays,
     EdgeEvidence,
-    EdgeMap,
+    EdgesByPair,
     Pair,
+    PairArrays,
+    PairStore,
     PairVotes,
-    VoteMap,
     VotesByPair,
 )
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
@@ -36,12 +36,10 @@ class GraphState:
     Attributes:
         vocabulary, frame_id: of the graph, and
         surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
-        revision: number of changes so far.
         nodes: arrays of n rows, by ascending ids, by their names in `NodeTable`.
         surface_points: (m, 3) float32, metres, those of one node after those of another.
         surface_counts: (n,) int64, number of points of each node.
-        edges: evidence of the directed pairs of ids.
-        votes: votes of frames on each unordered pair of ids.
+        pairs: evidence of edges, and votes.
         ids: the id memory.
         edits: of an operator, oldest first.
     """
@@ -51,10 +49,8 @@ class GraphState:
     nodes: Mapping[str, NDArray[Any]]
     surface_points: Float32
     surface_counts: Int64
-    edges: EdgeArrays
-    votes: Mapping[Pair, PairVotes]
+    pairs: PairArrays
     ids: IdState
-    revision: int
     surface_point_capacity: int
     remembered_frames: int
     even_gaussians: bool
@@ -73,6 +69,7 @@ class SceneGraph:
         surface_point_capacity: maximum number of surface points of a node.
         remembered_frames: number of newest frames that `nodes_of_frame` knows.
         nodes: the nodes as parallel arrays; read only.
+        pairs: what is known about pairs of nodes, by slots.
         edits: what an operator has said about nodes; read only.
         even_gaussians: messages show the `even_moments` of a node's surface instead of the pooled
             Gaussian.
@@ -93,11 +90,9 @@ class SceneGraph:
         self.even_gaussians = even_gaussians
         self.nodes = NodeTable(len(vocabulary.classes), surface_point_capacity)
         self.edits = EditLog()
-        self.revision = 0
         self._ids = NodeIds(self.nodes, remembered_frames)
         self._watchers: list[dict[int, int]] = []
-        self._edges = EdgeMap(len(vocabulary.predicates))
-        self._votes = VoteMap(len(vocabulary.predicates))
+        self.pairs = PairStore(self.nodes, len(vocabulary.predicates))
 
     @classmethod
     def from_state(cls, state: GraphState) -> SceneGraph:
@@ -110,11 +105,9 @@ class SceneGraph:
             state.even_gaussians,
         )
         graph.nodes.restore(state.nodes, state.surface_points, state.surface_counts)
-        graph._edges.restore(state.edges)
-        graph._votes.restore(state.votes)
+        graph.pairs.restore(state.pairs)
         graph._ids = NodeIds(graph.nodes, state.remembered_frames, state.ids)
         graph.edits = EditLog(state.edits)
-        graph.revision = state.revision
         return graph
 
     def state(self) -> GraphState:
@@ -127,10 +120,8 @@ class SceneGraph:
             nodes={name: getattr(nodes, name)[slots] for name in SAVED},
             surface_points=np.concatenate([NO_POINTS, *map(nodes.surface, slots.tolist())]),
             surface_counts=nodes.surface_counts[slots],
-            edges=self._edges.arrays().by_ids(),
-            votes=dict(sorted(self.votes.items())),
+            pairs=self.pairs.arrays(),
             ids=self._ids.state(),
-            revision=self.revision,
             surface_point_capacity=self.surface_point_capacity,
             remembered_frames=self.remembered_frames,
             even_gaussians=self.even_gaussians,
@@ -224,7 +215,6 @@ class SceneGraph:
         self.nodes.fuse(slots, seen)
         if classes_after is not None:
             self.nodes.class_probabilities[slots] = classes_after
-            self.revision += len(slots)  # each counts as two changes
         self._changed(slots)
 
     def drop_points(self, node_ids: Sequence[int], dropped: Bool) -> None:
@@ -292,16 +282,15 @@ class SceneGraph:
         return watcher
 
     def _changed(self, slots: Sequence[int] | Int64) -> None:
-        """Count one change for each slot."""
-        self.revision += len(slots)
+        """Tell those who watch that nodes have changed."""
         ids, known = self.nodes.ids[slots].tolist(), self.nodes.slot_of
         for watcher in self._watchers:
             watcher.update((node_id, known[node_id]) for node_id in ids)
 
     def copy_relations(self, node_id: int, new_id: int, without: Collection[int]) -> None:
         """Give a node the edges and votes of another one, except those with some nodes."""
-        self._edges.copy(node_id, new_id, without, self.revision)
-        self._votes.copy(node_id, new_id, without, self.revision)
+        slot, to = self.nodes.slot(node_id), self.nodes.slot(new_id)
+        self.pairs.copy(slot, to, self.nodes.slots_of(list(without)).tolist())
 
     def add_edit(self, edit: Edit) -> Edit:
         """Note an operator's edit, with a new number; the nodes that it replaces are hidden."""
@@ -321,11 +310,10 @@ class SceneGraph:
         if a_id == b_id:
             raise ValueError(f"node {a_id} cannot be merged with itself")
         kept_id, removed_id = min(a_id, b_id), max(a_id, b_id)
-        slot = self.nodes.slot(kept_id)
-        self.nodes.merge(slot, self.nodes.slot(removed_id))
+        slot, removed = self.nodes.slot(kept_id), self.nodes.slot(removed_id)
+        self.nodes.merge(slot, removed)
         self._changed([slot])
-        self._edges.repoint(removed_id, kept_id, self.revision)
-        self._votes.repoint(removed_id, kept_id, self.revision)
+        self.pairs.merge(removed, slot)
         self._remove(removed_id, kept_id)
         return kept_id
 
@@ -335,80 +323,51 @@ class SceneGraph:
         Gaussian, surface and edges are the newer node's. Class distributions average with the
         numbers of observations.
         """
-        slot = self.nodes.slot(old_id)
-        self.nodes.take_over(slot, self.nodes.slot(new_id))
+        slot, new = self.nodes.slot(old_id), self.nodes.slot(new_id)
+        self.nodes.take_over(slot, new)
         self._changed([slot])
-        self._edges.drop(old_id)
-        self._votes.drop(old_id)
-        self._edges.repoint(new_id, old_id, self.revision)
-        self._votes.repoint(new_id, old_id, self.revision)
+        self.pairs.drop(slot)
+        self.pairs.merge(new, slot)
         self._remove(new_id, old_id)
 
     def remove_node(self, node_id: int) -> None:
         """Remove a live node and its edges."""
-        self.nodes.slot(node_id)
-        self.revision += 1
-        self._edges.drop(node_id)
-        self._votes.drop(node_id)
+        self.pairs.drop(self.nodes.slot(node_id))
         self._remove(node_id, 0)
 
     @property
     def edges(self) -> Mapping[Pair, EdgeEvidence]:
         """Evidence of each directed pair (subject id, object id); read only."""
-        return self._edges.evidence
+        return EdgesByPair(self.nodes, self.pairs)
 
     @property
-    def votes(self) -> VotesByPair:
+    def votes(self) -> Mapping[Pair, PairVotes]:
         """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
-        return self._votes.pairs
-
-    def take_changed_votes(self) -> set[int]:
-        """Keys of the pairs whose votes changed since the last call; some may be removed."""
-        return self._votes.take_changed()
-
-    def seen_together(self, node_id: int) -> set[int]:
-        """Ids of the nodes that frames showed together with a node."""
-        return self._votes.partners(node_id)
+        return VotesByPair(self.nodes, self.pairs)
 
     def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
         """Count a frame that showed two live nodes; votes (2, R) or None, first row: a to b."""
-        self.revision += 1
-        self._votes.add((a_id, b_id), 1, counts, self.revision)
-
-    def add_frame_votes(self, seen: Int64, voted: Int64, votes: Float64) -> None:
-        """Count a frame that showed pairs of live nodes; see `VoteMap.add_frame`."""
-        self._votes.add_frame(seen, voted, votes, self.revision + 1)
-        self.revision += len(seen)
+        pair = self.nodes.slots_of([a_id, b_id])[None]
+        votes = np.zeros((0, self.pairs.predicate_count)) if counts is None else counts
+        self.pairs.add_frame(pair, np.concatenate([pair, pair[:, ::-1]])[: len(votes)], votes)
 
     def add_visual(self, subject_id: int, object_id: int, logits: Float64, stamp_ns: int) -> bool:
         """Sum a frame's visual logits (R,) into an edge (Eq. 9); False if it has no two nodes."""
-        pair = (self.resolve(subject_id), self.resolve(object_id))
+        pair = [self.resolve(subject_id), self.resolve(object_id)]
         if 0 in pair or pair[0] == pair[1]:
             return False
-        self.add_frame_visual({pair: logits}, stamp_ns)
+        self.pairs.add_visual(self.nodes.slots_of(pair)[None], logits[None], stamp_ns)
         return True
-
-    def add_frame_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int) -> None:
-        """As `add_visual`, by pairs of different live nodes."""
-        self._edges.add_visual(logits, stamp_ns, self.revision)
-        self.revision += len(logits)
 
     def add_neighbours(self, pairs: Iterable[Pair], stamp_ns: int) -> None:
         """Count a frame in which pairs of nodes (0 = removed) were geometric neighbours (Eq. 8).
 
         Pairs without two different nodes are left out.
         """
-        live = [pair for pair in pairs if pair[0] and pair[1] and pair[0] != pair[1]]
-        self._edges.add_neighbours(live, stamp_ns, self.revision)
-        self.revision += len(live)
-
-    def partners(self, node_id: int) -> Collection[int]:
-        """Ids of the nodes that share an edge with a node; do not change it."""
-        return self._edges.partners(node_id)
-
-    def take_changed_edges(self) -> set[Pair]:
-        """Pairs whose evidence changed since the last call; some may have been removed."""
-        return self._edges.take_changed()
+        slot_of = self.nodes.slot_of
+        live = [(slot_of[a], slot_of[b]) for a, b in pairs if a and b and a != b]
+        if live:
+            self.pairs.add_neighbours(np.array(live, np.int64), stamp_ns)
 
     def _remove(self, node_id: int, successor: int) -> None:
         for watcher in self._watchers:
@@ -420,8 +379,7 @@ class SceneGraph:
 
     def _drop(self, successors: Mapping[int, int]) -> None:
         for node_id, successor in successors.items():
-            self._edges.drop(node_id)
-            self._votes.drop(node_id)
+            self.pairs.drop(self.nodes.slot(node_id))
             self._remove(node_id, successor)
 
 

@@ -17,7 +17,7 @@ from deworldsg_ros.base.files import parse_json, paused_collector, read_regular,
 from deworldsg_ros.graph.edits import MAX_EDITS, Edit
 from deworldsg_ros.graph.graph import GraphState, SceneGraph
 from deworldsg_ros.graph.nodes import SAVED, IdState
-from deworldsg_ros.graph.pairs import MAX_ID, EdgeArrays, Pair, PairVotes
+from deworldsg_ros.graph.pairs import MAX_ID, PairArrays
 from deworldsg_ros.scene import limits
 from deworldsg_ros.scene.arrays import Int64
 from deworldsg_ros.scene.checks import (
@@ -62,7 +62,6 @@ class Header(msgspec.Struct):
     frame_id: str
     surface_point_capacity: Annotated[int, msgspec.Meta(ge=0, le=MAX_SURFACE_POINTS)]
     remembered_frames: Annotated[int, msgspec.Meta(ge=0, le=MAX_REMEMBERED_FRAMES)]
-    revision: Count
     next_id: Annotated[int, msgspec.Meta(ge=1, le=MAX_ID + 1)]
     # Files of earlier releases do not have it.
     even_gaussians: bool = False
@@ -147,27 +146,25 @@ def _check_edges(arrays: ArraysByName, header: Header, ids: Int64) -> None:
     shape = len(pairs), len(header.predicates)
     logits = checked(arrays, "edge_visual_logits", np.float64, *shape)
     within("edge_visual_logits", logits, *_sym(MAX_LOGIT))
-    counts = checked(arrays, "edge_counts", np.int64, len(pairs), 4)
+    counts = _counts(arrays, "edge_counts", len(pairs), 3)
     within("edge_counts (frames)", counts[:, 0], 0, MAX_COUNT)
     unseen = logits[counts[:, 0] == 0]
     holds("edge_visual_logits", not unseen.any(), "zeros for an edge without frames")
     _check_stamps("edge_counts (last_seen_ns)", counts[:, 1])
     within("edge_counts (neighbour_frames)", counts[:, 2], 0, MAX_COUNT)
-    within("edge_counts (revision)", counts[:, 3], 0, header.revision)
 
 
 def _check_votes(arrays: ArraysByName, header: Header, ids: Int64) -> None:
     pairs = checked(arrays, "vote_pairs", np.int64, None, 2)
     _check_pairs("vote_pairs", pairs, ids)
     holds("vote_pairs", (pairs[:, 0] < pairs[:, 1]).all(), "the smaller id first")
-    known = checked(arrays, "vote_known", np.int64, len(pairs), 3)
+    known = _counts(arrays, "vote_known", len(pairs), 2)
     within("vote_known (frames)", known[:, 0], 0, MAX_COUNT)
-    within("vote_known (revision)", known[:, 1], 0, header.revision)
-    within("vote_known (has votes)", known[:, 2], 0, 1)
-    voted = int(known[:, 2].sum())
+    within("vote_known (has votes)", known[:, -1], 0, 1)
+    voted = int(known[:, -1].sum())
     counts = checked(arrays, "vote_counts", np.float64, voted, 2, len(header.predicates))
     # A frame adds at most one vote, spread over the predicates.
-    most = known[known[:, 2] == 1, 0].astype(np.float64)[:, None, None] * (1 + 1e-9)
+    most = known[known[:, -1] == 1, 0].astype(np.float64)[:, None, None] * (1 + 1e-9)
     holds("vote_counts", ((counts >= 0) & (counts <= most)).all(), "0 to the number of frames")
 
 
@@ -188,6 +185,13 @@ def _check_id_memory(arrays: ArraysByName, header: Header, ids: Int64) -> None:
     counts = checked(arrays, "frame_node_counts", np.int64, len(stamps))
     lengths("frame_node_counts", counts, len(nodes))
     within("frame_nodes", nodes, 0, header.next_id - 1)
+
+
+def _counts(arrays: ArraysByName, name: str, count: int, width: int) -> Int64:
+    """Numbers (count, width); version 1 had a revision beside them."""
+    values = checked(arrays, name, np.int64, count, None)
+    holds(name, values.shape[1] in (width, width + 1), f"{width} columns")
+    return values
 
 
 def _check_pairs(name: str, pairs: Int64, ids: Int64) -> None:
@@ -251,7 +255,7 @@ def read_content(path: Path) -> bytes:
 # The graph that is read continues exactly as the one that was written.
 
 # A reader of version N reads N - 1 too.
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 def save(graph: SceneGraph, path: str | Path) -> None:
@@ -275,7 +279,6 @@ def to_arrays(state: GraphState) -> Arrays:
         "surface_point_capacity": state.surface_point_capacity,
         "remembered_frames": state.remembered_frames,
         "even_gaussians": state.even_gaussians,
-        "revision": state.revision,
         "next_id": state.ids.next_id,
     }
     return {
@@ -283,10 +286,7 @@ def to_arrays(state: GraphState) -> Arrays:
         **state.nodes,
         "surface_points": state.surface_points,
         "surface_point_counts": state.surface_counts,
-        "edge_pairs": state.edges.pairs,
-        "edge_visual_logits": state.edges.visual_logits,
-        "edge_counts": state.edges.counts,
-        **_vote_arrays(state),
+        **vars(state.pairs),
         **_id_arrays(state.ids),
         **_edit_arrays(state),
     }
@@ -296,17 +296,6 @@ def _edit_arrays(state: GraphState) -> Arrays:
     """Empty without edits, as in files of older releases."""
     content = msgspec.json.encode(list(state.edits))
     return {"edits": np.frombuffer(content, np.uint8)} if state.edits else {}
-
-
-def _vote_arrays(state: GraphState) -> Arrays:
-    votes, width = state.votes.values(), len(state.vocabulary.predicates)
-    voted = [item.counts for item in votes if item.counts is not None]
-    known = [(v.frames, v.revision, v.counts is not None) for v in votes]
-    return {
-        "vote_pairs": np.array(list(state.votes), np.int64).reshape(-1, 2),
-        "vote_known": np.array(known, np.int64).reshape(-1, 3),
-        "vote_counts": np.array(voted, np.float64).reshape(len(voted), 2, width),
-    }
 
 
 def _id_arrays(ids: IdState) -> Arrays:
@@ -349,10 +338,8 @@ def _state(arrays: Arrays) -> GraphState:
         nodes={name: _column(arrays, name) for name in SAVED},
         surface_points=arrays["surface_points"],
         surface_counts=arrays["surface_point_counts"],
-        edges=EdgeArrays(arrays["edge_pairs"], arrays["edge_visual_logits"], arrays["edge_counts"]),
-        votes=_votes(arrays) if "vote_pairs" in arrays else {},  # not in files of older releases
+        pairs=_pairs(arrays, len(header.predicates)),
         ids=_ids(arrays, header.next_id),
-        revision=header.revision,
         surface_point_capacity=header.surface_point_capacity,
         remembered_frames=header.remembered_frames,
         even_gaussians=header.even_gaussians,
@@ -381,14 +368,21 @@ def _column(arrays: Arrays, name: str) -> NDArray[Any]:
     return arrays[name]
 
 
-def _votes(arrays: Arrays) -> dict[Pair, PairVotes]:
-    counts = iter(arrays["vote_counts"])
-    return {
-        (first, second): PairVotes(frames, next(counts) if voted else None, revision)
-        for (first, second), (frames, revision, voted) in zip(
-            arrays["vote_pairs"].tolist(), arrays["vote_known"].tolist()
+def _pairs(arrays: Arrays, width: int) -> PairArrays:
+    edges = {name: arrays[name] for name in ("edge_pairs", "edge_visual_logits")}
+    # Version 1 had a revision after the counts, and between the two of votes.
+    edges["edge_counts"] = arrays["edge_counts"][:, :3]
+    if "vote_pairs" not in arrays:  # nor had its first files votes
+        none = np.zeros((0, 2), np.int64)
+        return PairArrays(
+            **edges, vote_pairs=none, vote_known=none, vote_counts=np.zeros((0, 2, width))
         )
-    }
+    return PairArrays(
+        **edges,
+        vote_pairs=arrays["vote_pairs"],
+        vote_known=arrays["vote_known"][:, [0, -1]],
+        vote_counts=arrays["vote_counts"],
+    )
 
 
 def _ids(arrays: Arrays, next_id: int) -> IdState:

@@ -1,19 +1,24 @@
-"""Directed pairs of nodes: their evidence, the votes of frames, and a map of both."""
+"""The pairs of nodes of the global graph: votes of frames, and the evidence of directed edges.
+
+A pair of nodes has one row, in which everything about it stands. The row stays as long as the pair
+is of any interest: a frame has shown both nodes, an edge has evidence, or somebody holds it. Other
+modules have arrays by row, too. The rows of a node are a list that is linked through the rows.
+"""
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import chain, repeat
-from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
+from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.scene.arrays import (
-    Columns,
+    Bool,
+    Float32,
     Float64,
     Int32,
     Int64,
@@ -21,26 +26,38 @@ from deworldsg_ros.scene.arrays import (
     softmax_weights,
 )
 
-# --- Directed edges: pairs of ids, and their evidence.
-
+# Subject and object of a directed pair, by their ids.
 Pair = tuple[int, int]
-# A `key` has two ids.
 MAX_ID = 2**31 - 1
-Ids = TypeVar("Ids", int, Int64)
 
-
-def key(first: Ids, second: Ids) -> Ids:
-    """One number for a pair of ids, the smaller first."""
-    return first << 31 | second
-
-
-def ends_of(pair_key: int) -> Pair:
-    """The two ids of a `key`."""
-    return pair_key >> 31, pair_key & 0x7FFFFFFF
+# A pair. Its first end is the node with the smaller id. Fields of two values have one for each
+# direction; in direction 0, the first end is the subject.
+PAIR = np.dtype(
+    [
+        # 0 in rows that are free.
+        ("ids", np.int32, 2),
+        ("slots", np.int32, 2),
+        # The next place in the list of either node. A place is 2 · row + end + 1 of an end of a
+        # pair; 0 = none.
+        ("links", np.int32, 2),
+        # Frames that showed both nodes, and rows of the sums of their votes; 0 = no votes.
+        ("shown", np.int64),
+        ("votes", np.int32, 2),
+        # See `EdgeEvidence`. Rows of the sums of the logits; 0 = zeros.
+        ("logits", np.int32, 2),
+        ("frames", np.int64, 2),
+        ("neighbour_frames", np.int64, 2),
+        ("last_seen_ns", np.int64, 2),
+        # Whether somebody wants the row, without any evidence.
+        ("held", np.bool_),
+    ],
+    align=True,
+)
+FIRST_ROWS = 64
 
 
 class EdgeEvidence(NamedTuple):
-    """Evidence of one directed pair of nodes (R predicates); a value, never changed in place.
+    """Evidence of one directed pair of nodes (R predicates).
 
     Attributes:
         visual_logits: (R,) float64, the sum of the visual relation logits (Eq. 9). Zeros if there
@@ -48,553 +65,542 @@ class EdgeEvidence(NamedTuple):
         frames: number of frames with visual evidence; 0 = a geometric neighbour only.
         last_seen_ns: time of the newest evidence of either kind.
         neighbour_frames: number of frames in which the pair was a geometric neighbour (Eq. 8).
-        revision: graph revision at which this last changed.
     """
 
     visual_logits: Float64
     frames: int
     last_seen_ns: int
     neighbour_frames: int
-    revision: int
 
 
-@dataclass(frozen=True)
-class EdgeArrays:
-    """Evidence of m directed pairs; a value, never changed in place.
-
-    Attributes:
-        pairs: (m, 2) int64, ids of subject and object.
-        visual_logits: (m, R) float64.
-        counts: (m, 4) int64, the other fields of `EdgeEvidence` in their order.
-    """
-
-    pairs: Int64
-    visual_logits: Float64
-    counts: Int64
-
-    @classmethod
-    def of(cls, evidence: Mapping[Pair, EdgeEvidence], predicate_count: int) -> EdgeArrays:
-        """The arrays of some pairs, in their order."""
-        logits, *counts = zip(*evidence.values()) if evidence else [()] * 5
-        return cls(
-            np.fromiter(chain.from_iterable(evidence), np.int64, 2 * len(evidence)).reshape(-1, 2),
-            np.concatenate([np.zeros(0), *logits]).reshape(len(evidence), predicate_count),
-            np.array(counts, np.int64).T.copy(),
-        )
-
-    def __len__(self) -> int:
-        return len(self.pairs)
-
-    def by_ids(self) -> EdgeArrays:
-        """The same, by ascending ids."""
-        order = np.lexsort(self.pairs.T[::-1])
-        return EdgeArrays(self.pairs[order], self.visual_logits[order], self.counts[order])
-
-    def at(self, row: int) -> EdgeEvidence:
-        """The evidence of a row."""
-        return EdgeEvidence(self.visual_logits[row], *self.counts[row].tolist())
-
-
-# --- The edges that a map file brings. Most of them never change.
-
-
-class SavedEdges:
-    """The edges of a map as arrays; a value is made when somebody asks for it.
-
-    Args:
-        arrays: of all edges.
-
-    Attributes:
-        changed: pairs that have newer evidence, with their rows.
-    """
-
-    def __init__(self, arrays: EdgeArrays) -> None:
-        self._arrays = arrays
-        # Both ends of each pair (2 · row + end), those of one node after those of another.
-        ends = arrays.pairs.ravel()
-        self._places = ends.argsort(kind="stable")
-        self._nodes = ends[self._places]
-        # False for pairs that were removed, and the number of the others.
-        self._live = np.ones(len(arrays), np.bool_)
-        self._count = len(arrays)
-        self.changed: dict[Pair, int] = {}
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __iter__(self) -> Iterator[Pair]:
-        """The pairs in their order, also those that changed."""
-        first, second = self._arrays.pairs[self._live].T.tolist()
-        return zip(first, second)
-
-    def get(self, pair: Pair) -> EdgeEvidence | None:
-        """The evidence of a pair; None if there is none, or if it has changed."""
-        row = self._row(pair)
-        return None if row is None or pair in self.changed else self._arrays.at(row)
-
-    def take(self, pair: Pair) -> EdgeEvidence | None:
-        """As `get`, for a pair that is about to change."""
-        row = self._row(pair)
-        if row is None or pair in self.changed:
-            return None
-        self.changed[pair] = row
-        return self._arrays.at(row)
-
-    def remove(self, pair: Pair) -> None:
-        """Forget a pair, if it is one of these."""
-        row = self._row(pair)
-        if row is not None:
-            self._live[row] = False
-            self._count -= 1
-            self.changed.pop(pair, None)
-
-    def partners(self, node_id: int) -> list[int]:
-        """Ids of the nodes that share a pair with a node, in the order of the pairs."""
-        others: list[int] = self._arrays.pairs.ravel()[self._places_of(node_id) ^ 1].tolist()
-        return others
-
-    def newest(self, values: Mapping[Pair, EdgeEvidence]) -> EdgeArrays:
-        """Arrays of these pairs with the newest values, and then of all other values."""
-        known, rows = self._arrays, np.flatnonzero(self._live)
-        if not values and len(rows) == len(known):
-            return known
-        width, changed = known.visual_logits.shape[1], self.changed
-        new = {pair: value for pair, value in values.items() if pair not in changed}
-        more = EdgeArrays.of(new, width)
-        if not len(rows):
-            return more
-        newer = EdgeArrays.of({pair: values[pair] for pair in changed}, width)
-        at = rows.searchsorted(np.array(list(changed.values()), np.int64))
-        logits = np.concatenate((known.visual_logits[rows], more.visual_logits))
-        counts = np.concatenate((known.counts[rows], more.counts))
-        logits[at], counts[at] = newer.visual_logits, newer.counts
-        return EdgeArrays(np.concatenate((known.pairs[rows], more.pairs)), logits, counts)
-
-    def _places_of(self, node_id: int) -> Int64:
-        start, stop = self._nodes.searchsorted([node_id, node_id + 1])
-        places = self._places[start:stop]
-        live: Int64 = places[self._live[places >> 1]]
-        return live
-
-    def _row(self, pair: Pair) -> int | None:
-        if not self._count:
-            return None
-        places = self._places_of(pair[0])
-        rows = places[places & 1 == 0] >> 1
-        rows = rows[self._arrays.pairs[rows, 1] == pair[1]]
-        return int(rows[0]) if len(rows) else None
-
-
-# --- The directed edges of the global graph: a sparse map, and the neighbours of each node.
-
-
-class EdgeMap:
-    """Directed pairs (subject id, object id) with their evidence."""
-
-    def __init__(self, predicate_count: int) -> None:
-        # All pairs without visual evidence share one row of zeros.
-        self._no_logits = np.zeros(predicate_count)
-        self._no_logits.flags.writeable = False
-        # All but those of a map that did not change since.
-        self._evidence: dict[Pair, EdgeEvidence] = {}
-        self._partners: dict[int, dict[int, None]] = {}
-        self._changed: set[Pair] = set()
-        self._saved = SavedEdges(EdgeArrays.of({}, predicate_count))
-        # Whether all saved edges count as changed.
-        self._restored = False
-
-    @property
-    def evidence(self) -> Mapping[Pair, EdgeEvidence]:
-        """The map itself, read only.
-
-        Pairs with `frames == 0` are geometric neighbours without visual evidence.
-        """
-        if not len(self._saved):
-            return MappingProxyType(self._evidence)
-        return _Newest(self._evidence, self._saved)
-
-    def arrays(self) -> EdgeArrays:
-        """The map as arrays, for `restore`."""
-        return self._saved.newest(self._evidence)
-
-    def partners(self, node_id: int) -> Collection[int]:
-        """Ids of the nodes that share a pair with a node; do not change it."""
-        known = self._partners.get(node_id)
-        return dict.fromkeys(self._saved.partners(node_id)) if known is None else known.keys()
-
-    def take_changed(self) -> set[Pair]:
-        """Pairs that changed since the last call; some may have been dropped."""
-        changed, self._changed = self._changed, set()
-        if self._restored:
-            changed.update(self._saved)
-            self._restored = False
-        return changed
-
-    def add_visual(self, logits: Mapping[Pair, Float64], stamp_ns: int, revision: int) -> None:
-        """Sum a frame's relation logits (R,) into pairs (Eq. 9).
-
-        Args:
-            logits: of each subject and object.
-            stamp_ns: of the frame.
-            revision: of the graph before the first pair; each pair adds one.
-
-        Raises:
-            ValueError: if the logits have another shape.
-        """
-        evidence = self._evidence
-        for pair, summand in logits.items():
-            if summand.shape != self._no_logits.shape:
-                raise ValueError(
-                    f"relation logits have shape {summand.shape}: expected {self._no_logits.shape}"
-                )
-            revision += 1
-            known = evidence.get(pair) or self._saved.take(pair)
-            if known is None:
-                self.add(pair, EdgeEvidence(summand, 1, stamp_ns, 0, revision))
-                continue
-            self._changed.add(pair)
-            summed, frames, last_ns, neighbour_frames, _ = known
-            evidence[pair] = EdgeEvidence(
-                summed + summand, frames + 1, max(last_ns, stamp_ns), neighbour_frames, revision
-            )
-
-    def add_neighbours(self, pairs: Sequence[Pair], stamp_ns: int, revision: int) -> None:
-        """Count a frame in which pairs were geometric neighbours (Eq. 8).
-
-        Args:
-            pairs: subject and object of each.
-            stamp_ns: of the frame.
-            revision: of the graph before the first pair; each pair adds one.
-        """
-        evidence = self._evidence
-        self._changed.update(pairs)
-        for pair in pairs:
-            revision += 1
-            known = evidence.get(pair) or self._saved.take(pair)
-            if known is None:
-                self.add(pair, EdgeEvidence(self._no_logits, 0, stamp_ns, 1, revision))
-                continue
-            summed, frames, last_ns, neighbour_frames, _ = known
-            evidence[pair] = EdgeEvidence(
-                summed, frames, max(last_ns, stamp_ns), neighbour_frames + 1, revision
-            )
-
-    def add(self, pair: Pair, more: EdgeEvidence) -> None:
-        """Add evidence to a pair: logits and frames are summed."""
-        known = self._evidence.get(pair) or self._saved.take(pair)
-        if known is None:
-            known = EdgeEvidence(self._no_logits, 0, more.last_seen_ns, 0, more.revision)
-            self._partners_of(pair[0])[pair[1]] = None
-            self._partners_of(pair[1])[pair[0]] = None
-        self._changed.add(pair)
-        self._evidence[pair] = EdgeEvidence(
-            known.visual_logits + more.visual_logits if more.frames else known.visual_logits,
-            known.frames + more.frames,
-            max(known.last_seen_ns, more.last_seen_ns),
-            known.neighbour_frames + more.neighbour_frames,
-            more.revision,
-        )
-
-    def restore(self, arrays: EdgeArrays) -> None:
-        """Fill an empty map with the `arrays` of another one."""
-        self._saved, self._restored = SavedEdges(arrays), True
-
-    def repoint(self, old_id: int, new_id: int, revision: int) -> None:
-        """Move all edges of one node to another, summing evidence; O(degree of `old_id`).
-
-        An edge between the two would become one from a node to itself and is dropped.
-        """
-        for (subject, object_), evidence in self._pop_all(old_id):
-            pair = (
-                new_id if subject == old_id else subject,
-                new_id if object_ == old_id else object_,
-            )
-            if pair[0] != pair[1]:
-                self.add(pair, evidence._replace(revision=revision))
-
-    def copy(self, old_id: int, new_id: int, without: Collection[int], revision: int) -> None:
-        """Give a node the edges of another one, except those to some nodes."""
-        for partner in list(self.partners(old_id)):
-            for pair, new in (
-                ((old_id, partner), (new_id, partner)),
-                ((partner, old_id), (partner, new_id)),
-            ):
-                evidence = self._evidence.get(pair) or self._saved.get(pair)
-                if partner not in without and evidence is not None:
-                    self.add(new, evidence._replace(revision=revision))
-
-    def drop(self, node_id: int) -> None:
-        """Drop all edges of a node."""
-        self._pop_all(node_id)
-
-    def _partners_of(self, node_id: int) -> dict[int, None]:
-        partners = self._partners.get(node_id)
-        if partners is None:
-            partners = self._partners[node_id] = dict.fromkeys(self._saved.partners(node_id))
-        return partners
-
-    def _pop_all(self, node_id: int) -> list[tuple[Pair, EdgeEvidence]]:
-        popped = []
-        for partner in self._partners_of(node_id):
-            self._partners_of(partner).pop(node_id)
-            for pair in ((node_id, partner), (partner, node_id)):
-                evidence = self._evidence.pop(pair, None) or self._saved.get(pair)
-                if evidence is not None:
-                    self._saved.remove(pair)
-                    popped.append((pair, evidence))
-                    self._changed.add(pair)
-        del self._partners[node_id]
-        return popped
-
-
-class _Newest(Mapping[Pair, EdgeEvidence]):
-    """Saved edges and newer evidence, in the order in which the pairs came."""
-
-    def __init__(self, newer: Mapping[Pair, EdgeEvidence], saved: SavedEdges) -> None:
-        self._newer = newer
-        self._saved = saved
-
-    def __len__(self) -> int:
-        return len(self._saved) + len(self._newer) - len(self._saved.changed)
-
-    def __iter__(self) -> Iterator[Pair]:
-        changed = self._saved.changed
-        return chain(self._saved, (pair for pair in self._newer if pair not in changed))
-
-    def __getitem__(self, pair: Pair) -> EdgeEvidence:
-        evidence = self._newer.get(pair) or self._saved.get(pair)
-        if evidence is None:
-            raise KeyError(pair)
-        return evidence
-
-
-# --- Votes of single frames on the relation of two nodes, also of frames that show no relation.
-
-
-@dataclass(frozen=True)
-class PairVotes:
+class PairVotes(NamedTuple):
     """The votes on one unordered pair of nodes (R predicates).
 
     Attributes:
         frames: number of frames that showed both nodes.
-        counts: (2, R) float64, sum over these frames of the probability of each predicate. Row 0:
+        counts: (2, R) float32, sum over these frames of the probability of each predicate. Row 0:
             the node with the smaller id is the subject. Row 1: it is the object. None = no votes.
-        revision: graph revision at which this last changed.
     """
 
     frames: int
-    counts: Float64 | None
-    revision: int
+    counts: Float32 | None
 
 
-class VoteMap(Columns):
-    """Unordered pairs (smaller id, larger id) with their votes; the id of a row is `key` of both.
+@dataclass(frozen=True)
+class PairArrays:
+    """Everything about the pairs of a graph, by ascending ids.
+
+    Attributes:
+        edge_pairs: (m, 2) int64, ids of subject and object.
+        edge_visual_logits: (m, R) float64.
+        edge_counts: (m, 3) int64, the other fields of `EdgeEvidence` in their order.
+        vote_pairs: (k, 2) int64, the smaller id first.
+        vote_known: (k, 2) int64, number of frames, and whether there are votes.
+        vote_counts: (l, 2, R) float64, the votes of those that have some.
+    """
+
+    edge_pairs: Int64
+    edge_visual_logits: Float64
+    edge_counts: Int64
+    vote_pairs: Int64
+    vote_known: Int64
+    vote_counts: Float64
+
+
+@dataclass
+class PairChanges:
+    """What changed since the reader emptied it.
+
+    Attributes:
+        votes: rows of the pairs that more frames have shown.
+        edges: rows of the pairs with other evidence of an edge.
+        gone: rows that have become free, with the ids of their pairs. The row may have another pair
+            by now.
+    """
+
+    votes: set[int] = field(default_factory=set)
+    edges: set[int] = field(default_factory=set)
+    gone: list[tuple[int, Pair]] = field(default_factory=list)
+
+    def clear(self) -> None:
+        """Forget all changes."""
+        self.votes.clear()
+        self.edges.clear()
+        self.gone.clear()
+
+
+class _Sums:
+    """Sums of R values each. Row 0 is zeros."""
+
+    def __init__(self, width: int, dtype: type[np.floating[Any]]) -> None:
+        self.rows: NDArray[Any] = np.zeros((FIRST_ROWS, width), dtype)
+        self._used, self._free = 1, list[int]()
+
+    def take(self, count: int) -> list[int]:
+        """Rows of zeros."""
+        taken = [self._free.pop() for _ in range(min(count, len(self._free)))]
+        missing = count - len(taken)
+        if self._used + missing > len(self.rows):
+            # Zeros that were never written take no memory.
+            larger = np.zeros((2 * (self._used + missing), self.rows.shape[1]), self.rows.dtype)
+            larger[: self._used] = self.rows[: self._used]
+            self.rows = larger
+        taken += range(self._used, self._used + missing)
+        self._used += missing
+        return taken
+
+    def free(self, rows: list[int]) -> None:
+        """Give rows back; 0 is ignored."""
+        known = [row for row in rows if row]
+        self.rows[known] = 0
+        self._free += known
+
+
+class PairStore:
+    """The pairs of the nodes of a graph.
 
     Args:
+        nodes: of the graph.
         predicate_count: R.
 
     Attributes:
-        frames, revisions: (n,) int64; see `PairVotes`.
-        sums: (n, 2) int32, the row of the votes of each direction; 0 = a row of zeros.
+        rows: (n,) of `PAIR`; read only. A new pair may replace the array by a larger one.
+        firsts: by slot of a node, the first place of its list; read only.
     """
 
-    frames: Int64
-    revisions: Int64
-    sums: Int32
-
-    def __init__(self, predicate_count: int) -> None:
-        super().__init__(
-            {"frames": (np.int64, ()), "revisions": (np.int64, ()), "sums": (np.int32, (2,))}
-        )
+    def __init__(self, nodes: NodeTable, predicate_count: int) -> None:
         self.predicate_count = predicate_count
-        # Most pairs have votes in one direction, so each direction has a row of its own.
-        self._votes = np.zeros((64, predicate_count))
-        self._used, self._free = 1, list[int]()
-        self._partners: dict[int, array[int]] = {}
-        self._changed: set[int] = set()
+        self.rows: NDArray[np.void] = np.zeros(FIRST_ROWS, PAIR)
+        self.firsts: Int32 = np.zeros(FIRST_ROWS, np.int32)
+        self._nodes = nodes
+        # By slot, the number of its pairs.
+        self._degrees: Int32 = np.zeros(FIRST_ROWS, np.int32)
+        self._used, self._free = 0, list[int]()
+        self._votes = _Sums(predicate_count, np.float32)
+        self._logits = _Sums(predicate_count, np.float64)
+        self._watchers: list[PairChanges] = []
+
+    def watch(self) -> PairChanges:
+        """What changes from now on. It starts with all pairs."""
+        changes = PairChanges(set(np.flatnonzero(self.rows["shown"]).tolist()))
+        changes.edges.update(np.flatnonzero(self._is_edge().any(axis=1)).tolist())
+        self._watchers.append(changes)
+        return changes
 
     @property
-    def pairs(self) -> VotesByPair:
-        """The map itself, read only."""
-        return VotesByPair(self)
+    def votes(self) -> Float32:
+        """Sums of votes, (l, R), by the rows that ``votes`` names."""
+        return self._votes.rows
 
-    def partners(self, node_id: int) -> set[int]:
-        """Ids of the nodes that were seen together with a node."""
-        return set(self._partners.get(node_id, ()))
+    @property
+    def logits(self) -> Float64:
+        """Sums of logits, (l, R), by the rows that ``logits`` names."""
+        return self._logits.rows
 
-    def take_changed(self) -> set[int]:
-        """Keys of the pairs whose votes changed since the last call; some may be dropped."""
-        changed, self._changed = self._changed, set()
-        return changed
+    def of(self, slots: Sequence[int] | Int64) -> Int64:
+        """The rows of the pairs of nodes, ascending, each once."""
+        self._make_slots()
+        return rows_of_nodes(self.rows, self.firsts, np.asarray(slots, np.int64))
 
-    def of(self, nodes: Int64) -> tuple[Int64, Float64]:
-        """Frames (m,) and votes (m, 2, R) of pairs of ids (m, 2), smaller first; 0 if unknown."""
-        rows = self._rows_of(key(nodes[:, 0], nodes[:, 1]).tolist())
-        if rows.min(initial=0) >= 0:
-            return self.frames[rows], self._votes[self.sums[rows]]
-        known = rows >= 0
-        frames, sums = np.zeros(len(rows), np.int64), np.zeros((len(rows), 2), np.int32)
-        frames[known], sums[known] = self.frames[rows[known]], self.sums[rows[known]]
-        return frames, self._votes[sums]
+    def find(self, slots: Int64) -> Int64:
+        """The row (m,) of each pair of slots (m, 2), in any order; -1 = there is none."""
+        self._make_slots()
+        return _find(self.rows, self.firsts, self._degrees, np.ascontiguousarray(slots))
 
-    def add(self, pair: Pair, frames: int, counts: Float64 | None, revision: int) -> None:
-        """Add frames and votes to a pair of different nodes.
+    def ensure(self, slots: Int64) -> Int64:
+        """The row (m,) of each pair of different slots (m, 2); missing pairs are added."""
+        rows = self.find(slots)
+        missing = rows < 0
+        if not missing.any():
+            return rows
+        pairs = list(dict.fromkeys((min(a, b), max(a, b)) for a, b in slots[missing].tolist()))
+        self._add(np.array(pairs, np.int64))
+        return self.find(slots)
 
-        Args:
-            pair: ids, in any order.
-            frames: number of frames that showed both.
-            counts: (2, R), first row with pair[0] as the subject; None = no votes.
-            revision: of the graph.
-        """
-        self.see(np.array([sorted(pair)]), np.array([frames]), np.array([revision]))
-        if counts is not None:
-            self.vote(np.array([pair, pair[::-1]], np.int64), np.ascontiguousarray(counts))
+    def hold(self, rows: Int64) -> None:
+        """Keep pairs, whatever evidence there is."""
+        self.rows["held"][rows] = True
 
-    def add_frame(self, seen: Int64, voted: Int64, votes: Float64, revision: int) -> None:
+    def release(self, rows: Int64) -> None:
+        """Keep pairs no longer if there is no evidence."""
+        self.rows["held"][rows] = False
+        known = self.rows.take(rows)
+        is_edge = (known["frames"] > 0) | (known["neighbour_frames"] > 0)
+        self._drop(rows[(known["shown"] == 0) & ~is_edge.any(axis=1)])
+
+    def add_frame(self, shown: Int64, voted: Int64, votes: Float64) -> None:
         """Add a frame.
 
         Args:
-            seen: (m, 2) pairs that it showed, the smaller id first.
-            voted: (k, 2) subject and object; each is one of these pairs.
+            shown: (m, 2) slots of different nodes that it showed together.
+            voted: (k, 2) slots of subject and object; each is one of these pairs, in any order.
             votes: (k, R).
-            revision: of the graph after the first pair; each pair adds one.
         """
-        revisions = np.arange(revision, revision + len(seen))
-        self.see(seen, np.ones(len(seen), np.int64), revisions)
-        self.vote(voted, votes)
+        rows = self.ensure(shown)
+        _show(self.rows, rows)
+        counted = votes.any(axis=1)
+        if counted.any():
+            self._sum(self._votes, "votes", voted[counted], votes[counted])
+        for changes in self._watchers:
+            changes.votes.update(rows.tolist())
 
-    def see(self, nodes: Int64, frames: Int64, revisions: Int64) -> None:
-        """Add frames (m,) to m pairs of ids (m, 2), the smaller first."""
-        keys = key(nodes[:, 0], nodes[:, 1]).tolist()
-        rows = self._rows_of(keys)
-        if (rows < 0).any():
-            new = [one for one in dict.fromkeys(keys) if one not in self.places]
-            self.extend(new)
-            for first, second in map(ends_of, new):
-                self._partners.setdefault(first, array("q")).append(second)
-                self._partners.setdefault(second, array("q")).append(first)
-            rows = self._rows_of(keys)
-        _see(self.frames, self.revisions, rows, frames, revisions)
-        self._changed.update(keys)
+    def add_visual(self, pairs: Int64, logits: Float64, stamp_ns: int) -> None:
+        """Sum a frame's relation logits (m, R) into m different directed pairs of slots (Eq. 9).
 
-    def _rows_of(self, keys: list[int]) -> Int64:
-        return np.fromiter(map(self.places.get, keys, repeat(-1)), np.int64, len(keys))
+        Raises:
+            ValueError: if the logits have another shape.
+        """
+        if logits.shape != (len(pairs), self.predicate_count):
+            raise ValueError(
+                f"relation logits have shape {logits.shape[1:]}: expected {(self.predicate_count,)}"
+            )
+        rows, ends = self._directed(pairs)
+        self._sum(self._logits, "logits", pairs, logits)
+        self._see(rows, ends, stamp_ns, 1, 0)
 
-    def vote(self, nodes: Int64, votes: Float64) -> None:
-        """Add votes (m, R) to m known pairs (m, 2), subject and object."""
-        if self._used + len(nodes) > len(self._votes):
-            # Zeros that were never written take no memory.
-            larger = np.zeros((2 * (self._used + len(nodes)), self.predicate_count))
-            larger[: self._used] = self._votes[: self._used]
-            self._votes = larger
-        rows = self._rows_of([key(min(pair), max(pair)) for pair in nodes.tolist()])
-        free = np.array(self._free, np.int64)
-        self._used, left = _vote(self.sums, self._votes, self._used, free, rows, nodes, votes)
-        del self._free[left:]
+    def add_neighbours(self, pairs: Int64, stamp_ns: int) -> None:
+        """Count a frame in which directed pairs (m, 2) were geometric neighbours (Eq. 8)."""
+        rows, ends = self._directed(pairs)
+        self._see(rows, ends, stamp_ns, 0, 1)
 
-    def restore(self, pairs: Mapping[Pair, PairVotes]) -> None:
-        """Fill an empty map with the `pairs` of another one."""
-        nodes, votes = np.array(list(pairs), np.int64).reshape(-1, 2), list(pairs.values())
-        frames, revisions = [one.frames for one in votes], [one.revision for one in votes]
-        self.see(nodes, np.array(frames, np.int64), np.array(revisions, np.int64))
-        voted = [index for index, one in enumerate(votes) if one.counts is not None]
-        counts = np.array([votes[index].counts for index in voted], np.float64)
-        directed = np.stack([nodes[voted], nodes[voted, ::-1]], axis=1)
-        self.vote(directed.reshape(-1, 2), counts.reshape(2 * len(voted), self.predicate_count))
+    def merge(self, slot: int, into: int) -> None:
+        """Add everything about the pairs of a node to those of another one, and drop it.
 
-    def repoint(self, old_id: int, new_id: int, revision: int) -> None:
-        """Move the votes of one node to another; votes between the two are dropped."""
-        for partner, votes in self.drop(old_id):
-            if partner != new_id:
-                counts = _seen_from(old_id, partner, votes)
-                self.add((new_id, partner), votes.frames, counts, revision)
+        A pair of the two would become one of a node with itself and is dropped.
+        """
+        for row in self.of([slot]).tolist():
+            self._add_to(row, slot, into)
+        self.drop(slot)
 
-    def copy(self, old_id: int, new_id: int, without: Collection[int], revision: int) -> None:
-        """Give a node the votes of another one, except those with some nodes."""
-        for partner in sorted(self.partners(old_id) - set(without)):
-            votes = self.pairs[min(old_id, partner), max(old_id, partner)]
-            counts = _seen_from(old_id, partner, votes)
-            self.add((new_id, partner), votes.frames, counts, revision)
+    def copy(self, slot: int, to: int, without: Collection[int]) -> None:
+        """Give a node everything about the pairs of another one, except those with some slots."""
+        for row in self.of([slot]).tolist():
+            if not set(self.rows["slots"][row].tolist()) & set(without) - {slot}:
+                self._add_to(row, slot, to)
 
-    def drop(self, node_id: int) -> list[tuple[int, PairVotes]]:
-        """Remove all votes of a node; returns them with the other node of each pair."""
-        dropped = []
-        for partner in sorted(self._partners.pop(node_id, ())):
-            self._partners[partner].remove(node_id)
-            pair = (min(node_id, partner), max(node_id, partner))
-            dropped.append((partner, self.pairs[pair]))
-            pair_key = key(*pair)
-            self._changed.add(pair_key)
-            places = self.sums[self.row(pair_key)]
-            self._votes[places] = 0.0
-            self._free.extend(places[places > 0].tolist())
-            self.remove(pair_key)
-        return dropped
+    def drop(self, slot: int) -> None:
+        """Drop all pairs of a node."""
+        self._drop(self.of([slot]))
+
+    def evidence(self, row: int, end: int) -> EdgeEvidence:
+        """The evidence of an edge."""
+        known = self.rows[row]
+        return EdgeEvidence(
+            self.logits[known["logits"][end]],
+            int(known["frames"][end]),
+            int(known["last_seen_ns"][end]),
+            int(known["neighbour_frames"][end]),
+        )
+
+    def counts(self, rows: Int64) -> Float32:
+        """The sums of votes (m, 2, R) on pairs."""
+        counts: Float32 = self.votes[self.rows["votes"][rows]]
+        return counts
+
+    def arrays(self) -> PairArrays:
+        """Everything, for `restore`."""
+        rows, ends = np.nonzero(self._is_edge())
+        known, ids = self.rows.take(rows), self.rows["ids"][rows].astype(np.int64)
+        at = np.arange(len(rows))
+        pairs = np.stack([ids[at, ends], ids[at, 1 - ends]], axis=1)
+        edges = np.lexsort(pairs.T[::-1])
+        counts = [known[name][at, ends] for name in EdgeEvidence._fields[1:]]
+        shown = np.flatnonzero(self.rows["shown"])
+        shown = shown[np.lexsort(self.rows["ids"][shown].T[::-1])]
+        votes = self.rows["votes"][shown]
+        voted = votes.any(axis=1)
+        frames = self.rows["shown"][shown]
+        # Sums in float32 may exceed the number of frames by rounding.
+        most = frames[voted, None, None].astype(np.float64)
+        return PairArrays(
+            edge_pairs=pairs[edges],
+            edge_visual_logits=self.logits[known["logits"][at, ends]][edges],
+            edge_counts=np.stack(counts, axis=1)[edges],
+            vote_pairs=self.rows["ids"][shown].astype(np.int64),
+            vote_known=np.stack([frames, voted.astype(np.int64)], axis=1),
+            vote_counts=np.minimum(self.votes[votes[voted]].astype(np.float64), most),
+        )
+
+    def restore(self, arrays: PairArrays) -> None:
+        """Fill an empty store with the `arrays` of another one."""
+        edges, voted = arrays.edge_pairs, arrays.vote_pairs
+        pairs = np.concatenate([np.sort(edges, axis=1), voted])
+        ids, place = np.unique(pairs, axis=0, return_inverse=True)
+        known, slots = self._nodes.ids, self._nodes.ids.argsort()
+        at = slots[known[slots].searchsorted(ids)]
+        rows = self._add(at)[place.ravel()]
+        row, end = rows[: len(edges)], (edges[:, 0] > edges[:, 1]).astype(np.int64)
+        for name, column in zip(EdgeEvidence._fields[1:], arrays.edge_counts.T):
+            self.rows[name][row, end] = column
+        visual = arrays.edge_counts[:, 0] > 0
+        taken = self._logits.take(int(visual.sum()))
+        self.rows["logits"][row[visual], end[visual]] = taken
+        self.logits[taken] = arrays.edge_visual_logits[visual]
+        row = rows[len(edges) :]
+        self.rows["shown"][row] = arrays.vote_known[:, 0]
+        row, places = np.nonzero(arrays.vote_counts.any(axis=2))
+        taken = self._votes.take(len(row))
+        of_pair = rows[len(edges) :][arrays.vote_known[:, 1] > 0]
+        self.rows["votes"][of_pair[row], places] = taken
+        self.votes[taken] = arrays.vote_counts[row, places]
+
+    def _is_edge(self) -> Bool:
+        """(n, 2), whether a direction has evidence."""
+        found: Bool = (self.rows["frames"] > 0) | (self.rows["neighbour_frames"] > 0)
+        return found
+
+    def _directed(self, pairs: Int64) -> tuple[Int64, Int64]:
+        """Rows and directions (m,) of directed pairs of slots (m, 2)."""
+        rows = self.ensure(pairs)
+        ends = (self.rows["slots"][rows, 0] != pairs[:, 0]).astype(np.int64)
+        return rows, ends
+
+    def _sum(self, sums: _Sums, name: str, pairs: Int64, values: Float64) -> None:
+        """Add values (m, R) to the sums of directed pairs (m, 2)."""
+        rows, ends = self._directed(pairs)
+        places = self.rows[name]
+        new = dict.fromkeys(
+            (row, end)
+            for row, end, place in zip(rows.tolist(), ends.tolist(), places[rows, ends].tolist())
+            if not place
+        )
+        for (row, end), place in zip(new, sums.take(len(new))):
+            places[row, end] = place
+        _add(sums.rows, places[rows, ends], values)
+
+    def _see(
+        self, rows: Int64, ends: Int64, stamp_ns: int, frames: int, neighbour_frames: int
+    ) -> None:
+        _see(self.rows, rows, ends, stamp_ns, frames, neighbour_frames)
+        for changes in self._watchers:
+            changes.edges.update(rows.tolist())
+
+    def _add_to(self, row: int, slot: int, to: int) -> None:
+        """Add everything about a pair of a node to the pair of another node with the same one."""
+        of = self.rows["slots"][row].tolist()
+        end = of.index(slot)
+        if of[1 - end] == to:
+            return
+        pair = np.array([[to, of[1 - end]]], np.int64)
+        new, turned = (int(one[0]) for one in self._directed(pair))
+        old, ends = self.rows[row], [end, 1 - end]
+        into = [turned, 1 - turned]
+        known = self.rows[new]
+        known["shown"] += old["shown"]
+        for name in ("frames", "neighbour_frames"):
+            known[name][into] += old[name][ends]
+        known["last_seen_ns"][into] = np.maximum(
+            known["last_seen_ns"][into], old["last_seen_ns"][ends]
+        )
+        for sums, name in ((self._votes, "votes"), (self._logits, "logits")):
+            for direction in (pair, pair[:, ::-1]):
+                source = self.rows[name][row, ends[int(direction is not pair)]]
+                if source:
+                    self._sum(sums, name, direction, sums.rows[[source]].astype(np.float64))
+        for changes in self._watchers:
+            changes.votes.add(new)
+            changes.edges.add(new)
+
+    def _add(self, slots: Int64) -> Int64:
+        """Add new pairs of slots (m, 2); returns their rows."""
+        self._make_slots()
+        taken = [self._free.pop() for _ in range(min(len(slots), len(self._free)))]
+        missing = len(slots) - len(taken)
+        if self._used + missing > len(self.rows):
+            larger = np.zeros(2 * (self._used + missing), PAIR)
+            larger[: self._used] = self.rows[: self._used]
+            self.rows = larger
+        rows = np.array([*taken, *range(self._used, self._used + missing)], np.int64)
+        self._used += missing
+        ids = self._nodes.ids[slots]
+        turned = ids[:, 0] > ids[:, 1]
+        ids[turned], slots = ids[turned, ::-1], np.where(turned[:, None], slots[:, ::-1], slots)
+        self.rows["ids"][rows], self.rows["slots"][rows] = ids, slots
+        link(self.rows, self.firsts, self._degrees, rows)
+        return rows
+
+    def _drop(self, rows: Int64) -> None:
+        """Free the rows of pairs."""
+        for row in rows.tolist():
+            known = self.rows[row]
+            first, second = known["ids"].tolist()
+            for changes in self._watchers:
+                changes.gone.append((row, (first, second)))
+                changes.votes.discard(row)
+                changes.edges.discard(row)
+            self._votes.free(known["votes"].tolist())
+            self._logits.free(known["logits"].tolist())
+            _unlink(self.rows, self.firsts, self._degrees, row)
+            self.rows[row] = np.zeros((), PAIR)
+            self._free.append(row)
+
+    def _make_slots(self) -> None:
+        """Make room for lists of the nodes."""
+        count = len(self._nodes.ids)
+        while len(self.firsts) < count:
+            self.firsts = np.concatenate([self.firsts, np.zeros_like(self.firsts)])
+            self._degrees = np.concatenate([self._degrees, np.zeros_like(self._degrees)])
+
+
+@kernel
+def _show(pairs: NDArray[Any], rows: Int64) -> None:
+    """Count a frame that showed pairs."""
+    for row in rows:
+        pairs[row].shown += 1
+
+
+@kernel
+def _see(
+    pairs: NDArray[Any],
+    rows: Int64,
+    ends: Int64,
+    stamp_ns: int,
+    frames: int,
+    neighbour_frames: int,
+) -> None:
+    """Add frames to directions (m,) of pairs (m,)."""
+    for index in range(len(rows)):
+        pair, end = pairs[rows[index]], ends[index]
+        pair.frames[end] += frames
+        pair.neighbour_frames[end] += neighbour_frames
+        pair.last_seen_ns[end] = max(pair.last_seen_ns[end], stamp_ns)
+
+
+@kernel
+def _add(sums: NDArray[Any], rows: Int32, values: Float64) -> None:
+    """Add values (m, R) to rows (m,) of sums."""
+    for index in range(len(rows)):
+        for place in range(values.shape[1]):
+            sums[rows[index], place] += values[index, place]
+
+
+@kernel
+def rows_of_nodes(pairs: NDArray[Any], firsts: Int32, slots: Int64) -> Int64:
+    """Rows of the pairs of nodes (k,), ascending, each once."""
+    count = 0
+    for slot in slots:
+        place = firsts[slot]
+        while place:
+            count += 1
+            place = pairs[(place - 1) >> 1].links[(place - 1) & 1]
+    rows = np.empty(count, np.int64)
+    count = 0
+    for slot in slots:
+        place = firsts[slot]
+        while place:
+            rows[count] = (place - 1) >> 1
+            count += 1
+            place = pairs[(place - 1) >> 1].links[(place - 1) & 1]
+    rows.sort()
+    kept = 0
+    for index in range(count):
+        if kept == 0 or rows[index] != rows[kept - 1]:
+            rows[kept] = rows[index]
+            kept += 1
+    return rows[:kept].copy()
+
+
+@kernel
+def _find(pairs: NDArray[Any], firsts: Int32, degrees: Int32, slots: Int64) -> Int64:
+    """The row of each pair of slots (m, 2); -1 = none. The shorter list of both is searched."""
+    rows = np.empty(len(slots), np.int64)
+    for index in range(len(slots)):
+        a, b = slots[index, 0], slots[index, 1]
+        if degrees[b] < degrees[a]:
+            a, b = b, a
+        rows[index], place = -1, firsts[a]
+        while place:
+            row, end = (place - 1) >> 1, (place - 1) & 1
+            if pairs[row].slots[1 - end] == b:
+                rows[index] = row
+                break
+            place = pairs[row].links[end]
+    return rows
+
+
+@kernel
+def link(pairs: NDArray[Any], firsts: Int32, degrees: Int32, rows: Int64) -> None:
+    """Enter pairs in the lists of both their nodes."""
+    for row in rows:
+        for end in range(2):
+            slot = pairs[row].slots[end]
+            pairs[row].links[end] = firsts[slot]
+            firsts[slot] = 2 * row + end + 1
+            degrees[slot] += 1
+
+
+@kernel
+def _unlink(pairs: NDArray[Any], firsts: Int32, degrees: Int32, row: int) -> None:
+    """Take a pair out of the lists of both its nodes."""
+    for end in range(2):
+        slot, wanted = pairs[row].slots[end], 2 * row + end + 1
+        degrees[slot] -= 1
+        place = firsts[slot]
+        if place == wanted:
+            firsts[slot] = pairs[row].links[end]
+            continue
+        while pairs[(place - 1) >> 1].links[(place - 1) & 1] != wanted:
+            place = pairs[(place - 1) >> 1].links[(place - 1) & 1]
+        pairs[(place - 1) >> 1].links[(place - 1) & 1] = pairs[row].links[end]
+
+
+class EdgesByPair(Mapping[Pair, EdgeEvidence]):
+    """The evidence of the edges of a graph by subject and object, in the order of their rows."""
+
+    def __init__(self, nodes: NodeTable, store: PairStore) -> None:
+        self._nodes, self._store = nodes, store
+
+    def __len__(self) -> int:
+        return int(self._store._is_edge().sum())
+
+    def __iter__(self) -> Iterator[Pair]:
+        rows, ends = np.nonzero(self._store._is_edge())
+        for (first, second), end in zip(self._store.rows["ids"][rows].tolist(), ends.tolist()):
+            yield (second, first) if end else (first, second)
+
+    def __getitem__(self, pair: Pair) -> EdgeEvidence:
+        row = _row(self._nodes, self._store, pair)
+        end = int(pair[0] > pair[1])
+        known = self._store.rows[row]
+        if not (known["frames"][end] or known["neighbour_frames"][end]):
+            raise KeyError(pair)
+        return self._store.evidence(row, end)
 
 
 class VotesByPair(Mapping[Pair, PairVotes]):
-    """A vote map by pairs."""
+    """The votes on the pairs of a graph, the smaller id first, in the order of their rows."""
 
-    def __init__(self, votes: VoteMap) -> None:
-        self._map = votes
-
-    def of(self, nodes: Int64) -> tuple[Int64, Float64]:
-        """See `VoteMap.of`."""
-        return self._map.of(nodes)
+    def __init__(self, nodes: NodeTable, store: PairStore) -> None:
+        self._nodes, self._store = nodes, store
 
     def __len__(self) -> int:
-        return len(self._map)
+        return int((self._store.rows["shown"] > 0).sum())
 
     def __iter__(self) -> Iterator[Pair]:
-        return (ends_of(key) for key in self._map.places)
+        rows = np.flatnonzero(self._store.rows["shown"])
+        return ((first, second) for first, second in self._store.rows["ids"][rows].tolist())
 
     def __getitem__(self, pair: Pair) -> PairVotes:
-        votes = self._map
-        row = votes.places.get(key(*pair))
-        if row is None:
+        row = _row(self._nodes, self._store, pair)
+        known = self._store.rows[row]
+        if pair[0] > pair[1] or not known["shown"]:
             raise KeyError(pair)
-        counts = votes.of(np.array([pair]))[1][0] if votes.sums[row].any() else None
-        return PairVotes(int(votes.frames[row]), counts, int(votes.revisions[row]))
+        counts = self._store.counts(np.array([row]))[0] if known["votes"].any() else None
+        return PairVotes(int(known["shown"]), counts)
 
 
-def _seen_from(node_id: int, partner: int, votes: PairVotes) -> Float64 | None:
-    """The votes of a pair, first row with the node as the subject."""
-    return votes.counts if votes.counts is None or node_id < partner else votes.counts[::-1]
+def _row(nodes: NodeTable, store: PairStore, pair: Pair) -> int:
+    """The row of a pair of ids; KeyError if there is none."""
+    slots = [nodes.slot_of.get(node_id) for node_id in pair]
+    if None in slots or slots[0] == slots[1]:
+        raise KeyError(pair)
+    row = int(store.find(np.array([slots], np.int64))[0])
+    if row < 0:
+        raise KeyError(pair)
+    return row
 
 
-@kernel
-def _see(frames: Int64, revisions: Int64, rows: Int64, more: Int64, newest: Int64) -> None:
-    for index in range(len(rows)):
-        frames[rows[index]] += more[index]
-        revisions[rows[index]] = newest[index]
-
-
-@kernel
-def _vote(
-    sums: Int32,
-    known: Float64,
-    used: int,
-    free: Int64,
-    rows: Int64,
-    nodes: Int64,
-    votes: Float64,
-) -> tuple[int, int]:
-    """Sum votes by pair and direction; returns how many rows of votes are used, and still free."""
-    left = len(free)
-    for index in range(len(rows)):
-        row, end = rows[index], int(nodes[index, 0] > nodes[index, 1])
-        if not votes[index].any():
-            continue
-        if sums[row, end] == 0:
-            if left > 0:
-                left -= 1
-                sums[row, end] = free[left]
-            else:
-                sums[row, end] = used
-                used += 1
-        for predicate in range(votes.shape[1]):
-            known[sums[row, end], predicate] += votes[index, predicate]
-    return used, left
+# --- Votes of single frames on the relation of two nodes, also of frames that show no relation.
 
 
 def frame_votes(logits: Float64, weights: SoftmaxWeights | None = None) -> Float64:

@@ -55,5 +55,8 @@ def add_relations(graph: SceneGraph, local: LocalGraph, node_ids: list[int]) -> 
     for (subject, object_), logits in zip(local.relations.pairs.tolist(), local.relations.logits):
         pair = (node_ids[subject], node_ids[object_])
         sums[pair] = sums[pair] + logits if pair in sums else logits
-    live = {pair: logits for pair, logits in sums.items() if 0 not in pair and pair[0] != pair[1]}
-    graph.add_frame_visual(live, local.stamp_ns)
+    live = [pair for pair in sums if 0 not in pair and pair[0] != pair[1]]
+    if live:
+        slots = [[graph.nodes.slot_of[node_id] for node_id in pair] for pair in live]
+        logits = np.array([sums[pair] for pair in live])
+        graph.pairs.add_visual(np.array(slots, np.int64), logits, local.stamp_ns)

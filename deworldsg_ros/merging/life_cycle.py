@@ -148,11 +148,8 @@ class LifeCycle:
         scores: dict[int, float] = {}
         for node_id, score in zip(node_ids, local.scores.tolist()):
             scores[node_id] = max(scores.get(node_id, 0.0), score)
-        shown = {
-            node_id: visibility
-            for node_id, visibility in zip(view.ids.tolist(), view.visibilities.tolist())
-            if visibility > NOT_VISIBLE and records.has(slot_of.get(node_id))
-        }
+        seen = (view.visibilities > NOT_VISIBLE) & self._live(view)
+        shown = dict(zip(view.ids[seen].tolist(), view.visibilities[seen].tolist()))
         ids = sorted(scores.keys() | shown.keys())
         slots = graph.nodes.slots_of(ids)
         records.look(
@@ -171,21 +168,25 @@ class LifeCycle:
 
     def _absent(self, graph: SceneGraph, view: View, detected: Collection[int]) -> list[int]:
         """Nodes that enough consecutive frames have seen through."""
-        records, slot_of, absent = self._records, graph.nodes.slot_of, []
-        present = {*detected, *view.ids[view.visibilities >= HALF].tolist()}
-        frames = records.rows["through_frames"]
-        for node_id in present:
-            slot = slot_of.get(node_id)
-            if slot is not None and records.has(slot):
-                frames[slot] = 0
-        for node_id in view.ids[view.through].tolist():
-            slot = slot_of.get(node_id)
-            if slot is None or node_id in present or not records.has(slot):
+        live = self._live(view)
+        frames, absent = self._records.rows["through_frames"], []
+        present = live & (view.visibilities >= HALF)
+        slot_of = graph.nodes.slot_of
+        frames[[slot_of[node_id] for node_id in detected if node_id in slot_of]] = 0
+        frames[view.slots[present]] = 0
+        through = live & view.through & ~present
+        for node_id, slot in zip(view.ids[through].tolist(), view.slots[through].tolist()):
+            if node_id in detected:
                 continue
             frames[slot] += 1
             if frames[slot] >= ABSENT_FRAMES:
                 absent.append(node_id)
         return absent
+
+    def _live(self, view: View) -> Bool:
+        """Whether (m,) the nodes of a view still have a record after this frame."""
+        live: Bool = self._records.rows["node_id"][view.slots] == view.ids
+        return live
 
     def hidden(self, graph: SceneGraph) -> dict[int, str]:
         """The nodes that are not published, each with its reason, in words."""

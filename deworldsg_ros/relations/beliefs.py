@@ -1,38 +1,59 @@
-"""The beliefs of the edges of the global graph: evidence in, messages out."""
+"""The beliefs of the edges of the global graph: evidence in, messages out.
+
+Three sources are combined for each pair of nodes: the fused geometry of both, judged by the
+physical world model; the votes of all frames that showed both; and the prior of their classes.
+Relations of different pairs exclude each other (`rules`). Beliefs are computed anew only around
+the pairs that changed.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from typing import Optional
+from dataclasses import dataclass
+from typing import Any
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import Config
 from deworldsg_ros.graph.graph import SceneGraph
-from deworldsg_ros.graph.messages import listed, some_of
-from deworldsg_ros.graph.pairs import EdgeEvidence, Pair, ends_of, key
+from deworldsg_ros.graph.messages import DECIMALS, listed, some_of
+from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph.publication import MEASURED_A_CALL, NEW_A_CALL
-from deworldsg_ros.relations.pairs import PairTable
+from deworldsg_ros.relations.pairs import PairTable, joined
 from deworldsg_ros.relations.paper import (
     OUTLIER_RATE,
+    PROVENANCES,
     ClassPairPrior,
     PaperBeliefs,
     Prior,
     bounded_logits,
     edge_state,
     entropy_nats,
+    fuse_distributions,
     visual_distribution,
 )
-from deworldsg_ros.relations.physics import load_physics_model
-from deworldsg_ros.relations.settled import ChangedBeliefs, RobustBeliefs
+from deworldsg_ros.relations.physics import (
+    believed_logits,
+    floor_odds,
+    load_physics_model,
+    relation_counts,
+    vote_logits,
+)
+from deworldsg_ros.relations.rules import settle, take_in
 from deworldsg_ros.relations.states import (
     NONE,
     RELATIONS_OF_STATE,
     STATE_COUNT,
+    PredicateNames,
     canonical_predicates,
+    predicate_probabilities,
+    related_pairs,
     said_predicates,
+    uncertain,
 )
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, SoftmaxWeights
 from deworldsg_ros.scene.errors import RefusedInput
@@ -41,8 +62,11 @@ from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
 from deworldsg_ros.wire import messages as wire
 
-# --- The predictions of the embedded world model as the prior of class pairs (Eq. 9-10).
-
+# Votes of objects whose means are farther apart are not counted.
+MAX_DISTANCE_M = 2.5
+# Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
+# 12 objects changes about 80 pairs.
+JUDGED_A_CALL = 12
 # A prediction of a pair enters the prior of its classes if the model says, with this probability,
 # that the pair is related in this direction. Otherwise it abstains.
 MIN_RELATED = 0.5
@@ -52,24 +76,24 @@ UNIT = 2.0**-40
 
 ClassPair = tuple[int, int]
 
+# --- The predictions of the embedded world model as the prior of class pairs (Eq. 9-10).
+
 
 @kernel
-def _predictions(
-    rows: Int64, judged: Bool, state_logits: Float64, named: Float64
-) -> tuple[Int64, Bool]:
+def _predictions(beliefs: NDArray[Any], named: Float64) -> tuple[Int64, Bool]:
     """Predictions (k, 2, NONE) of pairs in both directions, in `UNIT`s; and which there are."""
-    values = np.zeros((len(rows), 2, NONE), np.int64)
-    told = np.zeros((len(rows), 2), np.bool_)
+    values = np.zeros((len(beliefs), 2, NONE), np.int64)
+    told = np.zeros((len(beliefs), 2), np.bool_)
     weights = np.empty(STATE_COUNT, np.float64)
     predictions = np.empty(NONE, np.float64)
-    for index in range(len(rows)):
-        logits, best, total = state_logits[rows[index]], 0.0, 0.0
+    for index in range(len(beliefs)):
+        logits, best, total = beliefs[index].state_logits, 0.0, 0.0
         for state in range(STATE_COUNT):
             best = max(best, logits[state])  # the first one is 0
         for state in range(STATE_COUNT):
             weights[state] = math.exp(logits[state] - best)
             total += weights[state]
-        if not judged[rows[index]] or weights[0] / total >= 1.0 - MIN_RELATED:
+        if not beliefs[index].judged or weights[0] / total >= 1.0 - MIN_RELATED:
             continue
         for end in range(2):
             related = 0.0
@@ -105,31 +129,30 @@ class PredictedPrior:
         self._named = (named & (self._canonical >= 0)).astype(np.float64)
         # By class pair: sum of the predictions of each relation, and their number.
         self._sums: dict[ClassPair, tuple[Int64, int]] = {}
-        # By key of a pair: what it adds, to which class pair.
+        # By row of a pair: what it adds, to which class pair.
         self._told: dict[int, list[tuple[ClassPair, Int64]]] = {}
 
     def __len__(self) -> int:
         """Number of class pairs that have a prior."""
         return len(self._sums)
 
-    def follow(self, table: PairTable, keys: Collection[int]) -> None:
-        """Take in the pairs with these keys as they are now, in place of what they said before."""
-        for pair_key in keys:
-            for pair, values in self._told.pop(pair_key, ()):
+    def follow(self, table: PairTable, rows: Collection[int]) -> None:
+        """Take in the pairs of these rows as they are now, in place of what they said before."""
+        for row in rows:
+            for pair, values in self._told.pop(row, ()):
                 self._add(pair, -values, -1)
-        known = table.places
-        rows = np.array([known[pair_key] for pair_key in keys if pair_key in known], np.int64)
-        values, told = _predictions(rows, table.judged, table.state_logits, self._named)
+        known = np.fromiter(rows, np.int64, len(rows))
+        known = known[table.beliefs["known"][known]]
+        values, told = _predictions(table.beliefs.take(known), self._named)
         places, ends = np.nonzero(told)
         if not len(places):
             return
-        of_rows = rows[places]
-        classes = table.shapes.best_classes[table.ends[of_rows]].tolist()
-        for place, end, pair_key, both in zip(
-            places.tolist(), ends.tolist(), table.ids[of_rows].tolist(), classes
+        classes = table.classes(known[places])
+        for place, end, row, both in zip(
+            places.tolist(), ends.tolist(), known[places].tolist(), classes.tolist()
         ):
             pair = (both[end], both[1 - end])
-            self._told.setdefault(pair_key, []).append((pair, values[place, end]))
+            self._told.setdefault(row, []).append((pair, values[place, end]))
             self._add(pair, values[place, end], 1)
 
     def _add(self, classes: ClassPair, values: Int64, count: int) -> None:
@@ -156,19 +179,222 @@ class PredictedPrior:
         return priors, has_prior
 
 
+# --- The beliefs beyond the paper: is a pair related at all, and by what.
+
+
+@dataclass(frozen=True)
+class ChangedBeliefs:
+    """Beliefs of pairs of nodes that were computed anew.
+
+    Attributes:
+        unrelated: rows of pairs without a belief.
+        rows: (k,) of pairs with one.
+        probabilities: (k, 2, R) that the predicate holds, in both directions; sums over R are at
+            most 1.
+        sources: (k, 2) indices into `PROVENANCES`.
+    """
+
+    unrelated: Int64
+    rows: Int64
+    probabilities: Float64
+    sources: Int64
+
+
+class RobustBeliefs:
+    """Beliefs of all edges of a graph.
+
+    Args:
+        config: sections ``relations`` and ``perception`` are used.
+        graph: whose edges these are.
+        table: the geometry of its pairs.
+    """
+
+    def __init__(self, config: Config, graph: SceneGraph, table: PairTable) -> None:
+        self._config = config.relations
+        self._geometry = config.relations.world_model != "none"
+        self._own_head = config.perception.relation_head == "geometric"
+        self._graph = graph
+        self._table = table
+        self._model = load_physics_model()
+        self._names = PredicateNames.of(graph.vocabulary.predicates)
+        # Rows of the pairs into which a prior may enter, by class pair; some do not any more.
+        self._by_classes: dict[ClassPair, set[int]] = {}
+        # Nodes of each circle of supports that was cut.
+        self._circles: list[set[int]] = []
+
+    def refresh(self, prior: Prior) -> ChangedBeliefs:
+        """Compute the beliefs that may have changed since the last call.
+
+        Args:
+            prior: of class pairs, from the predictions of a world model.
+        """
+        table = self._table
+        rows = np.array(sorted(table.changed_rows), np.int64)
+        known = table.beliefs["known"][rows]
+        changed = self._settle(rows[known])
+        again = set().union(*map(self._open_rows, prior.changed))
+        changed = joined(changed, [*rows[known].tolist(), *again])
+        table.changed_rows.clear()
+        table.changed_slots.clear()
+        prior.changed.clear()
+        return self._beliefs(changed, rows[~known], prior)
+
+    def _settle(self, rows: Int64) -> Int64:
+        """Relations around pairs that were judged; returns the rows whose relations changed."""
+        table = self._table
+        shapes = table.shapes
+        slots = joined(self._graph.pairs.rows["slots"][rows], table.changed_slots)
+        slots = slots[shapes["node_id"][slots] > 0]
+        if not len(slots):
+            return slots
+        if len(rows):
+            self._take_in(rows)
+        slots = self._reopen_circles(slots)
+        if self._geometry:
+            floor_odds(shapes, slots, table.floor_m, self._model.floor)
+        cut, changed = settle(table.scene, slots)
+        for place in cut.tolist():
+            self._note_circle(place)
+        return changed
+
+    def _take_in(self, rows: Int64) -> None:
+        """What the evidence on each of some pairs alone says."""
+        table, model, pairs = self._table, self._model, self._graph.pairs
+        beliefs = table.beliefs
+        counts, others = relation_counts(pairs.counts(rows), self._names.relation_of)
+        beliefs["other_votes"][rows] = others
+        geometry = beliefs["state_logits"][rows].astype(np.float64)
+        unknown = ~beliefs["judged"][rows]
+        geometry[unknown] = 0.0
+        votes, near = vote_logits(counts, pairs.rows["shown"][rows], model.votes)
+        independent = unknown if self._own_head else np.ones_like(unknown)
+        logits = believed_logits(model, geometry, votes, independent)
+        worth = np.where(independent, model.source_weights[1], 1.0)
+        take_in(table.scene, rows, logits, votes, near, worth)
+
+    def _reopen_circles(self, slots: Int64) -> Int64:
+        """The objects, and those of the circles that contain one of them."""
+        if not self._circles:
+            return slots
+        shapes, slot_of = self._table.shapes, self._graph.nodes.slot_of
+        ids = set(shapes["node_id"][slots].tolist())
+        opened = [circle for circle in self._circles if not circle.isdisjoint(ids)]
+        self._circles = [circle for circle in self._circles if circle.isdisjoint(ids)]
+        more = [slot_of[i] for circle in opened for i in circle if i in slot_of]
+        return joined(slots, [slot for slot in more if shapes["node_id"][slot] > 0])
+
+    def _note_circle(self, place: int) -> None:
+        """Remember the nodes of the circle of supports that was cut at a place."""
+        pairs, kept = self._graph.pairs, self._table.beliefs["kept"]
+        ends_of = pairs.rows["slots"]
+        row, end = place >> 1, place & 1
+        circle = [int(ends_of[row, end])]
+        slot = int(ends_of[row, 1 - end])
+        while slot not in circle:
+            circle.append(slot)
+            rows = pairs.of([slot])
+            ends = (ends_of[rows, 1] == slot).astype(np.int64)
+            likely = np.flatnonzero(kept[rows, ends] > 0.5)
+            if not len(likely):
+                break
+            slot = int(ends_of[rows[likely[0]], 1 - ends[likely[0]]])
+        self._circles.append(set(self._table.shapes["node_id"][circle].tolist()))
+
+    def _beliefs(self, rows: Int64, gone: Int64, prior: Prior) -> ChangedBeliefs:
+        """Beliefs of pairs in both directions: few of those in reach are related."""
+        table, pairs = self._table, self._graph.pairs
+        related = related_pairs(table.beliefs, rows)
+        gone = np.concatenate([gone, rows[~related]])
+        table.beliefs["open"][gone] = False
+        rows = rows[related]
+        probabilities, voted = predicate_probabilities(
+            table.beliefs.take(rows),
+            pairs.counts(rows),
+            pairs.rows["shown"][rows],
+            self._names,
+            self._model.vote_scales,
+        )
+        judged = table.beliefs["judged"][rows].repeat(2).reshape(-1, 2)
+        self._add_prior(rows, probabilities, judged, prior)
+        visual, prior_alone, fused = range(3)
+        sources = np.where(judged, np.where(voted, fused, prior_alone), visual)
+        return ChangedBeliefs(gone, rows, probabilities, sources)
+
+    def _add_prior(self, rows: Int64, probabilities: Float64, judged: Bool, prior: Prior) -> None:
+        """Eq. 10 with the prior of class pairs, in place; and whether a world model spoke."""
+        open_ = uncertain(probabilities, self._config.entropy_threshold_nats)
+        best = self._table.classes(rows)
+        self._index(rows, open_, best)
+        places, ends = np.nonzero(open_)
+        if not len(places):
+            return
+        classes = np.column_stack([best[places, ends], best[places, 1 - ends]])
+        priors, has_prior = prior.lookup(classes)
+        if not has_prior.any():
+            return
+        fused, active = fuse_prior(
+            probabilities[places, ends],
+            priors,
+            has_prior,
+            self._config.fusion_alpha,
+            self._config.entropy_threshold_nats,
+        )
+        probabilities[places, ends] = fused
+        judged[places, ends] |= active
+
+    def _index(self, rows: Int64, open_: Bool, classes: Int64) -> None:
+        """Note the class pairs whose prior may enter pairs."""
+        beliefs = self._table.beliefs
+        if not open_.any() and not beliefs["open"][rows].any():
+            return
+        same = (beliefs["open"][rows] == open_) & (beliefs["classes"][rows] == classes)
+        beliefs["open"][rows], beliefs["classes"][rows] = open_, classes
+        for index, end in np.argwhere(open_ & ~same.all(axis=1, keepdims=True)).tolist():
+            both = classes[index].tolist()
+            pair = both[end], both[1 - end]
+            self._by_classes.setdefault(pair, set()).add(int(rows[index]))
+
+    def _open_rows(self, classes: ClassPair) -> set[int]:
+        """Rows of the pairs into which the prior of a class pair may enter."""
+        known = self._by_classes.pop(classes, None)
+        if not known:
+            return set()
+        rows = np.fromiter(known, np.int64, len(known))
+        beliefs = self._table.beliefs.take(rows)
+        there = (beliefs["classes"] == classes).all(axis=1) & (beliefs["open"][:, 0] > 0)
+        back = (beliefs["classes"] == classes[::-1]).all(axis=1) & (beliefs["open"][:, 1] > 0)
+        found = set(rows[there | back].tolist())
+        if found:
+            self._by_classes[classes] = found
+        return found
+
+
+def fuse_prior(
+    probabilities: Float64, priors: Float64, has_prior: Bool, alpha: float, threshold_nats: float
+) -> tuple[Float64, Bool]:
+    """Eq. 10 for pairs that are related with some probability.
+
+    The prior says by what a pair is related, not whether. It enters where the distribution over
+    predicates, given that one holds, has an entropy above the threshold.
+
+    Args:
+        probabilities: (m, R), row sums at most 1.
+        priors: (m, R) distributions, and
+        has_prior: (m,) bool.
+        alpha: weight of Eq. 10.
+        threshold_nats: entropy.
+
+    Returns:
+        (m, R) with the same row sums, and (m,) bool: the prior entered.
+    """
+    related = probabilities.sum(axis=1)
+    given = probabilities / np.maximum(related, 1e-300)[:, None]
+    active = has_prior & (entropy_nats(given) > threshold_nats) & (related > 0) & (alpha > 0)
+    fused = fuse_distributions(given, priors, np.where(active, alpha, 0.0))
+    return np.where(active[:, None], related[:, None] * fused, probabilities), active
+
+
 # --- The beliefs of the edges of the global graph: evidence in, messages out.
-
-# Votes of objects whose means are farther apart are not counted.
-MAX_DISTANCE_M = 2.5
-# Pairs in reach that are judged anew in a call that may leave some for the next one. A frame of
-# 12 objects changes about 80 pairs.
-JUDGED_A_CALL = 12
-NO_EVIDENCE = EdgeEvidence(np.zeros(0), 0, 0, 0, 0)
-
-# What a message is made from, beside the evidence of its edge: probabilities, as bytes; where they
-# come from; and whether it speaks for both directions. None = no message.
-_Basis = Optional[tuple[bytes, wire.Provenance, bool]]
-_UNSAID: tuple[_Basis, _Basis] = (None, None)
 
 
 class EdgeBeliefs:
@@ -208,8 +434,6 @@ class EdgeBeliefs:
         names = graph.vocabulary.predicates
         self._symmetric = np.array([plain(name) in SYMMETRIC for name in names], np.bool_)
         self._begun = False
-        # Of both directions of the pairs with a message, by key.
-        self._basis: dict[int, tuple[_Basis, _Basis]] = {}
 
     def weigh(self, local: LocalGraph, weights: SoftmaxWeights | None = None) -> LocalGraph:
         """A frame's local graph with the relation logits as they enter the sum of Eq. 9.
@@ -232,13 +456,14 @@ class EdgeBeliefs:
         self.up.observe(local.T_world_camera)
         if self._robust is None or len(node_ids) < 2:
             return
-        ids = np.array(node_ids, np.int64)
-        close, nodes = _counted(ids, local.means_world)
+        slot_of = self._graph.nodes.slot_of
+        slots = np.array([slot_of.get(node_id, -1) for node_id in node_ids], np.int64)
+        close, shown = _counted(slots, local.means_world)
         # In the order of the rows; of two relations of one pair of rows, the last one counts.
         last = {pair: at for at, pair in enumerate(map(tuple, local.relations.pairs.tolist()))}
         told = sorted((sorted(pair), at) for pair, at in last.items() if close[pair])
         rows = [at for _, at in told]
-        self._graph.add_frame_votes(nodes, ids[local.relations.pairs[rows]], votes[rows])
+        self._graph.pairs.add_frame(shown, slots[local.relations.pairs[rows]], votes[rows])
 
     def add(self, evidence: RelationEvidence) -> None:
         """Take in neighbour pairs (Eq. 8) and the world model's predictions.
@@ -277,10 +502,10 @@ class EdgeBeliefs:
         """
         prior = self._follow_table(whole)
         self._begun = self._begun or not self.waiting
-        if self._robust is not None:
-            if self._table is not None and not self._table.begun:
+        if self._robust is not None and self._table is not None:
+            if not self._table.begun:
                 return [], False
-            return self._follow(self._robust.refresh(prior)), self._begun
+            return self._follow(self._table, self._robust.refresh(prior)), self._begun
         assert self._paper is not None
         return self._paper.refresh(prior), self._begun
 
@@ -292,73 +517,85 @@ class EdgeBeliefs:
         limits = (None, None) if whole else _limits(table, self._begun and table.begun)
         table.refresh(self.up.up_world(exact=whole or not self._begun), *limits)
         if self._predicted is not None:
-            self._predicted.follow(table, table.changed_pairs)
+            self._predicted.follow(table, table.changed_rows)
         if self._robust is None:
-            table.changed_pairs.clear()
-            table.changed_nodes.clear()
+            for known in (table.changed_rows, table.changed_slots, table.gone, table.changes.edges):
+                known.clear()
         return prior if self._predicted is None else self._predicted
 
-    def _follow(self, beliefs: ChangedBeliefs) -> list[Pair]:
-        """Messages of the edges that are probable enough."""
-        evidence_changed = self._graph.take_changed_edges()
-        said, mutual = said_predicates(beliefs.probabilities, self._symmetric)
-        changed = []
-        for pair_key in self._basis.keys() & beliefs.unrelated:
-            changed += self._say(pair_key, _UNSAID)
-        for index, (pair_key, ends) in enumerate(zip(beliefs.pairs, said.tolist())):
-            if any(ends) or pair_key in self._basis:
-                there, back = (
-                    _basis(beliefs, index, end, mutual[index]) if ends[end] else None
-                    for end in (0, 1)
-                )
-                changed += self._say(pair_key, (there, back))
-        changed += (evidence_changed & self.states.keys()).difference(changed)
-        self._tell(changed)
+    def _follow(self, table: PairTable, beliefs: ChangedBeliefs) -> list[Pair]:
+        """Write the messages of the edges that are probable enough; returns those that changed."""
+        changed: list[Pair] = []
+        for gone in table.gone:
+            changed += [pair for pair in (gone, gone[::-1]) if self.states.pop(pair, None)]
+        table.gone.clear()
+        said, mutual = said_predicates(beliefs.probabilities, beliefs.sources, self._symmetric)
+        nothing = np.zeros((len(beliefs.unrelated), 2), np.int64)
+        for rows, numbers in ((beliefs.unrelated, nothing), (beliefs.rows, said)):
+            differ = numbers != table.beliefs["said"][rows]
+            if not differ.any():
+                continue
+            table.beliefs["said"][rows] = numbers
+            at, ends = np.nonzero(differ)
+            ids = self._graph.pairs.rows["ids"][rows[at]].tolist()
+            pairs = [(b, a) if end else (a, b) for (a, b), end in zip(ids, ends.tolist())]
+            for pair, is_said in zip(pairs, numbers[at, ends].tolist()):
+                if not is_said:
+                    del self.states[pair]
+            told = numbers[at, ends] != 0
+            self._tell(beliefs, at[told], ends[told], mutual)
+            changed += pairs
+        return changed + self._follow_evidence(table, changed)
+
+    def _tell(self, beliefs: ChangedBeliefs, at: Int64, ends: Int64, mutual: Bool) -> None:
+        """Write the messages of some directions of pairs."""
+        if not len(at):
+            return
+        rows = beliefs.rows[at]
+        for (first, second), end, one, source, both, evidence in zip(
+            self._graph.pairs.rows["ids"][rows].tolist(),
+            ends.tolist(),
+            listed(beliefs.probabilities[at, ends], self._graph.vocabulary.predicates, self._top_k),
+            beliefs.sources[at, ends].tolist(),
+            mutual[at].tolist(),
+            self._evidence(rows, ends),
+        ):
+            pair = (second, first) if end else (first, second)
+            self.states[pair] = edge_state(
+                pair, one, provenance=PROVENANCES[source], mutual=both, **evidence
+            )
+
+    def _follow_evidence(self, table: PairTable, told: Collection[Pair]) -> list[Pair]:
+        """Bring the other messages up to date with the evidence of their edges."""
+        rows = np.array(sorted(table.changes.edges), np.int64)
+        table.changes.edges.clear()
+        at, ends = np.nonzero(table.beliefs["said"][rows])
+        rows, known, changed = rows[at], set(told), []
+        for (first, second), end, evidence in zip(
+            self._graph.pairs.rows["ids"][rows].tolist(),
+            ends.tolist(),
+            self._evidence(rows, ends),
+        ):
+            pair = (second, first) if end else (first, second)
+            if pair not in known:
+                evidence["entropy_nats"] = round(evidence["entropy_nats"], DECIMALS)
+                self.states[pair] = msgspec.structs.replace(self.states[pair], **evidence)
+                changed.append(pair)
         return changed
 
-    def _say(self, pair_key: int, now: tuple[_Basis, _Basis]) -> list[Pair]:
-        """Note what the messages of a pair are made from; returns the directions that changed."""
-        before = self._basis.pop(pair_key, _UNSAID)
-        if now != _UNSAID:
-            self._basis[pair_key] = now
-        first, second = ends_of(pair_key)
-        pairs = ((first, second), (second, first))
-        return [pair for pair, old, new in zip(pairs, before, now) if old != new]
-
-    def _basis_of(self, pair: Pair) -> _Basis:
-        return self._basis.get(key(min(pair), max(pair)), _UNSAID)[pair[0] > pair[1]]
-
-    def _tell(self, pairs: list[Pair]) -> None:
-        """Write the messages of edges, or remove those that are not said any more."""
-        bases = {pair: basis for pair in pairs if (basis := self._basis_of(pair))}
-        for pair in pairs:
-            if pair not in bases:
-                del self.states[pair]
-        if not bases:
-            return
-        graph = self._graph
-        probabilities = np.array([np.frombuffer(basis[0]) for basis in bases.values()])
-        evidence = [graph.edges.get(pair, NO_EVIDENCE) for pair in bases]
-        logits = np.zeros(probabilities.shape)
-        for row, item in enumerate(evidence):
-            if item.frames:
-                logits[row] = item.visual_logits
+    def _evidence(self, rows: Int64, ends: Int64) -> list[dict[str, Any]]:
+        """What the messages of directed pairs say of their evidence."""
+        pairs = self._graph.pairs
+        if not len(rows):
+            return []
+        logits = pairs.logits[pairs.rows["logits"][rows, ends]]
         entropies = entropy_nats(visual_distribution(logits)).tolist()
-        told = listed(probabilities, graph.vocabulary.predicates, self._top_k)
-        shown, _ = graph.votes.of(np.sort(np.array(list(bases)), axis=1))
-        for (pair, basis), one, item, entropy, frames in zip(
-            bases.items(), told, evidence, entropies, shown.tolist()
-        ):
-            _, provenance, mutual = basis
-            self.states[pair] = edge_state(
-                pair,
-                one,
-                provenance=provenance,
-                entropy_nats=entropy,
-                observations=item.frames,
-                shown=frames,
-                mutual=mutual,
-            )
+        observations = pairs.rows["frames"][rows, ends].tolist()
+        shown = pairs.rows["shown"][rows].tolist()
+        return [
+            {"entropy_nats": entropy, "observations": frames, "shown": both}
+            for entropy, frames, both in zip(entropies, observations, shown)
+        ]
 
     def _check_vocabulary(self, evidence: RelationEvidence) -> None:
         seen, known = evidence.vocabulary, self._graph.vocabulary
@@ -373,31 +610,25 @@ class EdgeBeliefs:
 
 
 @kernel
-def _counted(node_ids: Int64, means_world: Float64) -> tuple[Bool, Int64]:
-    """Whether (n, n) frames count for each two rows: two live nodes that are close.
+def _counted(slots: Int64, means_world: Float64) -> tuple[Bool, Int64]:
+    """Whether (n, n) frames count for each two rows: two nodes (-1 = none) that are close.
 
-    Also the nodes (k, 2) of these pairs of rows, the smaller id first.
+    Also the slots (k, 2) of these pairs of rows.
     """
-    size = len(node_ids)
-    close, nodes = np.zeros((size, size), np.bool_), np.empty((size * size // 2, 2), np.int64)
+    size = len(slots)
+    close, shown = np.zeros((size, size), np.bool_), np.empty((size * size // 2, 2), np.int64)
     count = 0
     for a in range(size):
         for b in range(a + 1, size):
             squared_m2 = 0.0
             for axis in range(3):
                 squared_m2 += (means_world[a, axis] - means_world[b, axis]) ** 2
-            live = node_ids[a] > 0 and node_ids[b] > 0 and node_ids[a] != node_ids[b]
+            live = slots[a] >= 0 and slots[b] >= 0 and slots[a] != slots[b]
             if live and squared_m2 < MAX_DISTANCE_M**2:
                 close[a, b] = close[b, a] = True
-                nodes[count, 0] = min(node_ids[a], node_ids[b])
-                nodes[count, 1] = max(node_ids[a], node_ids[b])
+                shown[count, 0], shown[count, 1] = slots[a], slots[b]
                 count += 1
-    return close, nodes[:count]
-
-
-def _basis(beliefs: ChangedBeliefs, index: int, end: int, mutual: np.bool_) -> _Basis:
-    """What the message of one direction of a pair is made from."""
-    return beliefs.probabilities[index, end].tobytes(), beliefs.source(index, end), bool(mutual)
+    return close, shown[:count].copy()
 
 
 def _limits(table: PairTable, begun: bool) -> tuple[int, int]:

@@ -6,14 +6,14 @@ All lengths are metres in an upright frame: axes 0 and 1 are horizontal, axis 2 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
+from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.relations.reach import REACH_M
-from deworldsg_ros.scene.arrays import Columns, Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 
 # Points of a node that its shape uses, which is all that a node keeps. With half of them, tables
 # have no point near the small objects on them.
@@ -43,60 +43,30 @@ FEATURES = (
 )  # fmt: skip
 
 
-class NodeShapes(Columns):
-    """Shapes of n nodes in the upright frame; see `Columns` for rows and ids.
+def measure(
+    shapes: NDArray[np.void],
+    slots: Int64,
+    points_world: Float32,
+    counts: Int64,
+    R_up_world: Float64,
+) -> None:
+    """Write the shapes of nodes.
 
-    Attributes:
-        low, high: (n, 3) trimmed bounds.
-        means: (n, 3), and
-        covariances: (n, 3, 3) of the points.
-        counts: (n,) int64, number of points used.
+    Args:
+        shapes: (n,) of `SHAPE`.
+        slots: (k,) of the nodes, in it and in
+        points_world: (n, K, 3) samples of surfaces, world frame, and
+        counts: (n,) numbers of their points.
+        R_up_world: (3, 3) rotation from the world frame to the upright frame.
     """
-
-    low: Float64
-    high: Float64
-    means: Float64
-    covariances: Float64
-    counts: Int64
-
-    def __init__(self, more: Mapping[str, tuple[DTypeLike, tuple[int, ...]]] | None = None) -> None:
-        super().__init__(
-            {
-                "low": (np.float64, (3,)),
-                "high": (np.float64, (3,)),
-                "means": (np.float64, (3,)),
-                "covariances": (np.float64, (3, 3)),
-                "counts": (np.int64, ()),
-                **(more or {}),
-            }
-        )
-
-    def put(
-        self,
-        rows: Int64,
-        points_world: Float32,
-        counts: Int64,
-        point_rows: Int64,
-        R_up_world: Float64,
-    ) -> None:
-        """Replace the shapes of rows.
-
-        Args:
-            rows: (k,) of the nodes.
-            points_world: (S, K, 3) samples of surfaces, world frame.
-            counts: (S,) numbers of their points.
-            point_rows: (k,) which sample each node has.
-            R_up_world: (3, 3) rotation from the world frame to the upright frame.
-        """
-        self.counts[rows] = np.minimum(counts[point_rows], SHAPE_POINTS)
-        shapes = (self.low, self.high, self.means, self.covariances, self.counts)
-        if is_upright(R_up_world):
-            _measure(rows, points_world, point_rows, *shapes)
-            return
-        for start in range(0, len(rows), TURNED_AT_ONCE):
-            part = slice(start, start + TURNED_AT_ONCE)
-            turned = upright(points_world[point_rows[part]], R_up_world)
-            _measure(rows[part], turned, np.arange(len(turned)), *shapes)
+    shapes["count"][slots] = np.minimum(counts[slots], SHAPE_POINTS)
+    if is_upright(R_up_world):
+        _measure(shapes, slots, points_world, slots)
+        return
+    for start in range(0, len(slots), TURNED_AT_ONCE):
+        part = slots[start : start + TURNED_AT_ONCE]
+        turned = upright(points_world[part], R_up_world)
+        _measure(shapes, part, turned, np.arange(len(turned)))
 
 
 def is_upright(R_up_world: Float64) -> bool:
@@ -114,62 +84,39 @@ def upright(points_world: Float32, R_up_world: Float64) -> Float32:
 
 
 @kernel
-def _measure(
-    rows: Int64,
-    points: Float32,
-    point_rows: Int64,
-    low: Float64,
-    high: Float64,
-    means: Float64,
-    covariances: Float64,
-    counts: Int64,
-) -> None:
-    """The shape of each of some rows, from the first of its points in (S, K, 3)."""
-    for index in range(len(rows)):
-        cloud = points[point_rows[index]]
-        _measure_row(rows[index], cloud, low, high, means, covariances, counts)
+def _measure(shapes: NDArray[Any], slots: Int64, points: Float32, point_rows: Int64) -> None:
+    """Bounds without outer points, mean and covariance of the points of nodes, in (S, K, 3)."""
+    for index in range(len(slots)):
+        shape = shapes[slots[index]]
+        if not shape.count:
+            continue
+        cloud = points[point_rows[index], : shape.count]
+        cut = int(np.rint(TRIM_FRACTION * (shape.count - 1)))
+        for axis in range(3):
+            least, greatest, total = _ends(cloud, axis, cut)
+            # Give back what the quantiles cut off an evenly covered surface. Not in height: most
+            # visible points of a table are at one height.
+            given = 0.0
+            if axis < 2:
+                given = (greatest - least) * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
+            shape.low[axis], shape.high[axis] = least - given, greatest + given
+            shape.mean[axis] = total / len(cloud)
+        for i in range(3):
+            for j in range(i, 3):
+                total = 0.0
+                for k in range(len(cloud)):
+                    total += (cloud[k, i] - shape.mean[i]) * (cloud[k, j] - shape.mean[j])
+                shape.covariance[i, j] = shape.covariance[j, i] = total / len(cloud)
 
 
 @kernel
-def _measure_row(
-    row: int,
-    points: Float32,
-    low: Float64,
-    high: Float64,
-    means: Float64,
-    covariances: Float64,
-    counts: Int64,
-) -> None:
-    """Bounds without outer points, mean and covariance of the first of points (K, 3)."""
-    if not counts[row]:
-        return
-    cloud = points[: counts[row]]
-    cut = int(np.rint(TRIM_FRACTION * (counts[row] - 1)))
-    for axis in range(3):
-        least, greatest, total = _ends(cloud[:, axis], cut)
-        # Give back what the quantiles cut off an evenly covered surface. Not in height: most
-        # visible points of a table are at one height.
-        given = 0.0
-        if axis < 2:
-            given = (greatest - least) * TRIM_FRACTION / (1.0 - 2.0 * TRIM_FRACTION)
-        low[row, axis], high[row, axis] = least - given, greatest + given
-        means[row, axis] = total / len(cloud)
-    for i in range(3):
-        for j in range(i, 3):
-            total = 0.0
-            for k in range(len(cloud)):
-                total += (cloud[k, i] - means[row, i]) * (cloud[k, j] - means[row, j])
-            covariances[row, i, j] = covariances[row, j, i] = total / len(cloud)
-
-
-@kernel
-def _ends(values: Float32, cut: int) -> tuple[float, float, float]:
-    """The values (k,) that `cut` others are below, and above; and the sum of all."""
+def _ends(points: Float32, axis: int, cut: int) -> tuple[float, float, float]:
+    """The coordinates that `cut` others are below, and above; and the sum of all."""
     least = np.full(cut + 1, np.inf)
     greatest = np.full(cut + 1, -np.inf)
     total = 0.0
-    for k in range(len(values)):
-        value = np.float64(values[k])
+    for k in range(len(points)):
+        value = np.float64(points[k, axis])
         total += value
         if value < least[cut]:
             place = cut
@@ -207,111 +154,78 @@ def rotation_to_upright(up_world: Float64) -> Float64:
 
 
 @kernel
-def pair_features(  # noqa: D417
-    first: Int64,
-    second: Int64,
-    low: Float64,
-    high: Float64,
-    means: Float64,
-    covariances: Float64,
-    counts: Int64,
-    points: Float32,
-    floor_m: float,
+def pair_features(
+    first: Int64, second: Int64, shapes: NDArray[Any], points: Float32, floor_m: float
 ) -> Float64:
-    """Features (2, m, len(FEATURES)) of pairs of rows: first to second, and second to first.
+    """Features (2, m, len(FEATURES)) of pairs: first to second, and second to first.
 
     Args:
-        first: (m,) rows, and
-        second: (m,) rows of the pairs.
-        low, high, means, covariances, counts: columns of `NodeShapes`.
-        points: (n, K, 3) points of the rows in the upright frame; the first `counts` are used.
+        first: (m,) places in the shapes, and
+        second: (m,) places of the pairs.
+        shapes: (n,) of `SHAPE`.
+        points: (n, K, 3) points of the shapes in the upright frame; the first ``count`` are used.
         floor_m: height of the floor.
     """
     result = np.zeros((2, len(first), len(FEATURES)))
     for pair in range(len(first)):
-        a, b = first[pair], second[pair]
+        one, other = shapes[first[pair]], shapes[second[pair]]
+        of_one, of_other = points[first[pair], : one.count], points[second[pair], : other.count]
         there, back = result[0, pair], result[1, pair]
-        _bounds(there, a, b, low, high, counts, floor_m)
-        _contact(there, a, b, low, high, counts, points)
-        _contact(back, b, a, low, high, counts, points)
-        there[15] = _enclosure(a, b, low, high, counts, points)
-        there[16] = _enclosure(b, a, low, high, counts, points)
-        there[17] = _inside(a, b, low, high, counts, points)
-        there[18] = _inside(b, a, low, high, counts, points)
-        there[19] = _distance(a, b, low, high, counts, points)
-        there[20] = _mahalanobis(a, b, means, covariances)
-        _reverse(there, back)
+        _bounds(there, one, other, floor_m)
+        _contact(there, one, other, of_other)
+        _contact(back, other, one, of_one)
+        there[15] = _enclosure(one, of_other)
+        there[16] = _enclosure(other, of_one)
+        there[17] = _inside(of_one, other)
+        there[18] = _inside(of_other, one)
+        there[19] = _distance(one, other, of_one, of_other)
+        there[20] = _mahalanobis(one, other)
+        # The opposite direction, without what `_contact` writes.
+        for place in (0, 1, 2, 3, 19, 20):
+            back[place] = there[place]
+        for place in (21, 22, 33):
+            back[place] = -there[place]
+        for place in (4, 15, 17, 25, 34):
+            back[place], back[place + 1] = there[place + 1], there[place]
+        for place in (27, 28, 29):
+            back[place], back[place + 3] = there[place + 3], there[place]
+        back[23], back[24] = -there[24], -there[23]
     return result
 
 
 @kernel
-def centre_steps(first: Int64, second: Int64, low: Float64, high: Float64) -> Float64:
-    """Horizontal distances (m,) of the centres of the bounds of pairs of rows, (m,) each."""
-    steps = np.empty(len(first), np.float64)
-    for pair in range(len(first)):
-        a, b = first[pair], second[pair]
-        x = (low[a, 0] + high[a, 0]) / 2.0 - (low[b, 0] + high[b, 0]) / 2.0
-        y = (low[a, 1] + high[a, 1]) / 2.0 - (low[b, 1] + high[b, 1]) / 2.0
-        steps[pair] = math.sqrt(x * x + y * y)
-    return steps
-
-
-@kernel
-def _bounds(
-    out: Float64, a: int, b: int, low: Float64, high: Float64, counts: Int64, floor_m: float
-) -> None:
+def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
     """Features 0 to 5 and 21 to 35: sizes, gaps and heights of the bounds."""
-    overlap_x = min(high[a, 0], high[b, 0]) - max(low[a, 0], low[b, 0])
-    overlap_y = min(high[a, 1], high[b, 1]) - max(low[a, 1], low[b, 1])
+    overlap_x = min(one.high[0], other.high[0]) - max(one.low[0], other.low[0])
+    overlap_y = min(one.high[1], other.high[1]) - max(one.low[1], other.low[1])
     gap_x, gap_y = max(0.0, -overlap_x), max(0.0, -overlap_y)
     out[0] = math.sqrt(gap_x * gap_x + gap_y * gap_y)
     out[1], out[2] = min(overlap_x, overlap_y), max(overlap_x, overlap_y)
-    out[3] = min(high[a, 2], high[b, 2]) - max(low[a, 2], low[b, 2])
+    out[3] = min(one.high[2], other.high[2]) - max(one.low[2], other.low[2])
     shared = max(0.0, overlap_x) * max(0.0, overlap_y)
-    out[4] = min(1.0, shared / _area(a, low, high))
-    out[5] = min(1.0, shared / _area(b, low, high))
-    out[21] = low[a, 2] - low[b, 2]
-    out[22] = high[a, 2] - high[b, 2]
-    out[23] = low[a, 2] - high[b, 2]
-    out[24] = high[a, 2] - low[b, 2]
-    out[25] = low[a, 2] - floor_m
-    out[26] = low[b, 2] - floor_m
-    for row, place in ((a, 27), (b, 30)):
-        x, y = high[row, 0] - low[row, 0], high[row, 1] - low[row, 1]
+    out[4] = min(1.0, shared / _area(one))
+    out[5] = min(1.0, shared / _area(other))
+    out[21] = one.low[2] - other.low[2]
+    out[22] = one.high[2] - other.high[2]
+    out[23] = one.low[2] - other.high[2]
+    out[24] = one.high[2] - other.low[2]
+    out[25] = one.low[2] - floor_m
+    out[26] = other.low[2] - floor_m
+    for shape, place in ((one, 27), (other, 30)):
+        x, y = shape.high[0] - shape.low[0], shape.high[1] - shape.low[1]
         out[place] = math.log(max(0.01, max(x, y)))
         out[place + 1] = math.log(max(0.01, min(x, y)))
-        out[place + 2] = math.log(max(0.01, high[row, 2] - low[row, 2]))
+        out[place + 2] = math.log(max(0.01, shape.high[2] - shape.low[2]))
     out[33] = out[27] - out[30]
-    out[34] = math.log(float(counts[a]))
-    out[35] = math.log(float(counts[b]))
+    out[34] = math.log(float(one.count))
+    out[35] = math.log(float(other.count))
 
 
 @kernel
-def _reverse(there: Float64, back: Float64) -> None:
-    """Fill the features of the opposite direction, except `_contact`'s."""
-    for place in (0, 1, 2, 3, 19, 20):
-        back[place] = there[place]
-    for place in (21, 22, 33):
-        back[place] = -there[place]
-    for one, other in (
-        (4, 5),
-        (15, 16),
-        (17, 18),
-        (25, 26),
-        (34, 35),
-        (27, 30),
-        (28, 31),
-        (29, 32),
-    ):
-        back[one], back[other] = there[other], there[one]
-    back[23], back[24] = -there[24], -there[23]
-
-
-@kernel
-def _mahalanobis(a: int, b: int, means: Float64, covariances: Float64) -> float:
+def _mahalanobis(one: Any, other: Any) -> float:
     """Distance of the means in standard deviations of both objects."""
-    offset = means[a] - means[b]
-    s = covariances[a] + covariances[b]
+    offset = one.mean - other.mean
+    s = one.covariance + other.covariance
     for axis in range(3):
         s[axis, axis] += 1e-4
     # Cholesky factor of the symmetric matrix, and forward substitution.
@@ -327,22 +241,20 @@ def _mahalanobis(a: int, b: int, means: Float64, covariances: Float64) -> float:
 
 
 @kernel
-def _contact(
-    out: Float64, a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32
-) -> None:
-    """Features 6 to 14: the surface of b around the bottom of a."""
-    bottom = low[a, 2]
+def _contact(out: Float64, one: Any, other: Any, points: Float32) -> None:
+    """Features 6 to 14: the surface of the other one, its points, around the bottom of one."""
+    left, back, bottom = one.low[0], one.low[1], one.low[2]
     around, layer, higher, lower, level = 0, 0, 0, 0, 0
     soft, soft_step = 0.0, 0.0
     top = -1e9
     total, squares = 0.0, 0.0
     cells = np.zeros((8, 8), np.bool_)
-    width_x = high[a, 0] - low[a, 0] + 2 * MARGIN_M
-    width_y = high[a, 1] - low[a, 1] + 2 * MARGIN_M
-    for k in range(counts[b]):
-        x = points[b, k, 0] - low[a, 0] + MARGIN_M
-        y = points[b, k, 1] - low[a, 1] + MARGIN_M
-        step = bottom - points[b, k, 2]
+    width_x = one.high[0] - left + 2 * MARGIN_M
+    width_y = one.high[1] - back + 2 * MARGIN_M
+    for k in range(len(points)):
+        x = points[k, 0] - left + MARGIN_M
+        y = points[k, 1] - back + MARGIN_M
+        step = bottom - points[k, 2]
         level += int(abs(step) < LAYER_M)
         if -0.05 < step < 0.3:
             off_x = max(0.0, -x, x - width_x)
@@ -355,7 +267,7 @@ def _contact(
         if x < 0.0 or y < 0.0 or x > width_x or y > width_y:
             continue
         around += 1
-        z = np.float64(points[b, k, 2])
+        z = np.float64(points[k, 2])
         if z < bottom + 0.025:
             top = max(top, z)
         if abs(z - bottom) < LAYER_M:
@@ -369,37 +281,36 @@ def _contact(
             lower += 1
     out[6] = min(1.0, bottom - top) if top > -1e8 else 1.0
     # Cells of the footprint that the layer covers. A surface with few points cannot cover all.
-    cell_limit = min(64.0, max(8.0, counts[b] * width_x * width_y / _area(b, low, high)))
+    cell_limit = min(64.0, max(8.0, len(points) * width_x * width_y / _area(other)))
     out[7] = min(1.0, cells.sum() / cell_limit)
     out[8] = np.log(1.0 + layer)
     out[9] = higher / max(1, around)
     out[10] = lower / max(1, around)
     out[12] = soft_step / soft if soft > 1e-3 else 0.3
     out[13] = np.log(1.0 + soft)
-    out[14] = level / max(1, counts[b])
+    out[14] = level / max(1, len(points))
     if layer > 1:
         out[11] = np.sqrt(max(0.0, squares / layer - (total / layer) ** 2))
 
 
 @kernel
-def _area(row: int, low: Float64, high: Float64) -> float:
-    return float(max(0.01, high[row, 0] - low[row, 0]) * max(0.01, high[row, 1] - low[row, 1]))
+def _area(shape: Any) -> float:
+    x, y = shape.high[0] - shape.low[0], shape.high[1] - shape.low[1]
+    return float(max(0.01, x) * max(0.01, y))
 
 
 @kernel
-def _enclosure(
-    a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32
-) -> float:
-    """Fraction of eight directions around the centre of a in which b has points beside a."""
-    x = (low[a, 0] + high[a, 0]) / 2
-    y = (low[a, 1] + high[a, 1]) / 2
-    reach = REACH_M / 2 + max(high[a, 0] - low[a, 0], high[a, 1] - low[a, 1]) / 2
-    bottom, top = low[a, 2] + 0.02, high[a, 2] + 0.1
+def _enclosure(one: Any, points: Float32) -> float:
+    """Fraction of eight directions around the centre of one in which points are beside it."""
+    x = (one.low[0] + one.high[0]) / 2
+    y = (one.low[1] + one.high[1]) / 2
+    reach = REACH_M / 2 + max(one.high[0] - one.low[0], one.high[1] - one.low[1]) / 2
+    bottom, top = one.low[2] + 0.02, one.high[2] + 0.1
     found = 0
-    for k in range(counts[b]):
-        if points[b, k, 2] < bottom or points[b, k, 2] > top:
+    for k in range(len(points)):
+        if points[k, 2] < bottom or points[k, 2] > top:
             continue
-        step_x, step_y = points[b, k, 0] - x, points[b, k, 1] - y
+        step_x, step_y = points[k, 0] - x, points[k, 1] - y
         if step_x * step_x + step_y * step_y < reach * reach:
             half = int(step_y >= 0.0)
             quarter = int(step_x >= 0.0)
@@ -413,52 +324,59 @@ def _enclosure(
 
 
 @kernel
-def _within(point: Float32, low: Float64, high: Float64, margin_m: float) -> bool:
-    """Whether a point is inside bounds, or at most a margin outside."""
+def _within(point: Float32, shape: Any, margin_m: float) -> bool:
+    """Whether a point is inside the bounds of a shape, or at most a margin outside."""
     within = True
     for axis in range(3):
-        within &= low[axis] - margin_m < point[axis] < high[axis] + margin_m
+        within &= shape.low[axis] - margin_m < point[axis] < shape.high[axis] + margin_m
     return within
 
 
 @kernel
-def _inside(a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32) -> float:
-    """Fraction of the points of a inside the bounds of b."""
+def _inside(points: Float32, shape: Any) -> float:
+    """Fraction of points inside the bounds of a shape."""
     inside = 0
-    for k in range(counts[a]):
-        inside += int(_within(points[a, k], low[b], high[b], 0.01))
-    fraction: float = inside / max(1, counts[a])
+    for k in range(len(points)):
+        inside += int(_within(points[k], shape, 0.01))
+    fraction: float = inside / max(1, len(points))
     return fraction
 
 
 @kernel
-def _distance(a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32) -> float:
+def _distance(one: Any, other: Any, of_one: Float32, of_other: Float32) -> float:
     """Smallest distance of two points that are near the other's bounds; at most 1 m.
 
     Only the first points near the other object are compared.
     """
     best = 1.0
-    near_a = _near(a, b, low, high, counts, points)
-    near_b = _near(b, a, low, high, counts, points)
-    for i in near_a:
-        for j in near_b:
+    near_one, near_other = _near(of_one, other), _near(of_other, one)
+    for i in near_one:
+        for j in near_other:
             squared = 0.0
             for axis in range(3):
-                step = np.float64(points[a, i, axis]) - np.float64(points[b, j, axis])
+                step = np.float64(of_one[i, axis]) - np.float64(of_other[j, axis])
                 squared += step * step
             best = min(best, squared)
     return math.sqrt(best)
 
 
 @kernel
-def _near(a: int, b: int, low: Float64, high: Float64, counts: Int64, points: Float32) -> Int64:
-    """Indices of the first 48 points of a that are within 0.15 m of the bounds of b."""
+def _near(points: Float32, shape: Any) -> Int64:
+    """Indices of the first 48 points that are within 0.15 m of the bounds of a shape."""
     found = np.empty(48, np.int64)
     count = 0
-    for k in range(counts[a]):
-        if _within(points[a, k], low[b], high[b], 0.15):
+    for k in range(len(points)):
+        if _within(points[k], shape, 0.15):
             found[count] = k
             count += 1
             if count == len(found):
                 break
     return found[:count]
+
+
+def centre_steps(shapes: NDArray[np.void], first: Int64, second: Int64) -> Float64:
+    """Horizontal distances (m,) of the centres of the bounds of pairs of places (m,)."""
+    centres = (shapes["low"] + shapes["high"]) / 2.0
+    steps = centres[first] - centres[second]
+    distances: Float64 = np.sqrt(steps[:, 0] * steps[:, 0] + steps[:, 1] * steps[:, 1])
+    return distances

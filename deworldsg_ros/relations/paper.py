@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Protocol
 
@@ -388,12 +387,12 @@ class PaperBeliefs:
         self._graph = graph
         self._top_k = top_k
         self.states: dict[Pair, wire.EdgeState] = {}
+        self._changes = graph.pairs.watch()
         self._touched = graph.watch_nodes()
-        # Classes of subject and object of each pair of published nodes, and the pairs of each two.
-        self._classes: dict[Pair, tuple[int, int]] = {}
-        self._by_classes: dict[tuple[int, int], set[Pair]] = {}
-        # Classes of the published nodes.
-        self._class_of: dict[int, int] = {}
+        # By slot, the class of a published node; -1 = none.
+        self._classes = np.full(0, -1, np.int64)
+        # Rows of the pairs with an edge between two classes; some have none any more.
+        self._by_classes: dict[tuple[int, int], set[int]] = {}
 
     def refresh(self, prior: Prior) -> list[Pair]:
         """Bring `states` up to date; returns the pairs with another message, or none.
@@ -401,83 +400,77 @@ class PaperBeliefs:
         Args:
             prior: of class pairs.
         """
-        touched = self._graph.take_changed_edges() | self._follow_nodes()
-        for classes in prior.changed:
-            touched |= self._by_classes.get(classes, set())
-        prior.changed.clear()
-        pairs = sorted(pair for pair in touched if self._index(pair))
-        made = self._make(pairs, *prior.lookup(self._pair_classes(pairs)))
         changed = []
-        for pair in touched:
-            state, known = made.get(pair), self.states.get(pair)
-            if state == known:
-                continue
-            changed.append(pair)
-            if state is None:
-                del self.states[pair]
-            else:
-                self.states[pair] = state
+        for _, ids in self._changes.gone:
+            changed += [pair for pair in (ids, ids[::-1]) if self.states.pop(pair, None)]
+        touched = self._changes.edges | self._follow_nodes()
+        for classes in prior.changed:
+            touched |= self._by_classes.pop(classes, set())
+        prior.changed.clear()
+        rows = np.array(sorted(touched), np.int64)
+        self._changes.clear()
+        made = self._make(rows, prior)
+        for first, second in self._graph.pairs.rows["ids"][rows].tolist():
+            for pair in ((first, second), (second, first)):
+                state, known = made.get(pair), self.states.get(pair)
+                if state == known:
+                    continue
+                changed.append(pair)
+                if state is None:
+                    del self.states[pair]
+                else:
+                    self.states[pair] = state
         return changed
 
-    def _follow_nodes(self) -> set[Pair]:
-        """Pairs of the nodes that came, went or have another class now."""
+    def _follow_nodes(self) -> set[int]:
+        """Rows of the pairs of nodes that came, went or have another class now."""
         nodes, edits, names = self._graph.nodes, self._graph.edits, self._graph.vocabulary
-        pairs = set()
-        for node_id in self._touched:
-            best = -1
-            if node_id in nodes and nodes.confirmed[row := nodes.slot(node_id)]:
-                best = int(edits.believed_classes(nodes, names, [row]).argmax())
-            if self._class_of.get(node_id, -1) == best:
-                continue
-            self._class_of[node_id] = best
-            if best < 0:
-                del self._class_of[node_id]
-            for other in self._graph.partners(node_id):
-                pairs.update({(node_id, other), (other, node_id)})
+        if len(self._classes) < len(nodes.ids):
+            more = len(nodes.ids) - len(self._classes)
+            self._classes = np.pad(self._classes, (0, more), constant_values=-1)
+        slots = np.array(sorted(set(self._touched.values())), np.int64)
         self._touched.clear()
-        return pairs
+        classes = edits.believed_classes(nodes, names, slots).argmax(axis=1)
+        classes = np.where(nodes.confirmed[slots], classes, -1)
+        differ = classes != self._classes[slots]
+        self._classes[slots] = classes
+        return set(self._graph.pairs.of(slots[differ]).tolist())
 
-    def _index(self, pair: Pair) -> bool:
-        """Note the classes of a pair; false if it is no pair of published nodes."""
-        if pair in self._classes:
-            self._by_classes[self._classes.pop(pair)].discard(pair)
-        if pair not in self._graph.edges or not (self._class_of.keys() >= set(pair)):
-            return False
-        classes = self._class_of[pair[0]], self._class_of[pair[1]]
-        self._classes[pair] = classes
-        self._by_classes.setdefault(classes, set()).add(pair)
-        return True
-
-    def _pair_classes(self, pairs: Sequence[Pair]) -> Int64:
-        return np.array([self._classes[pair] for pair in pairs], np.int64).reshape(-1, 2)
-
-    def _make(
-        self, pairs: Sequence[Pair], priors: Float64, has_prior: Bool
-    ) -> dict[Pair, wire.EdgeState | None]:
-        """Messages of edges (Eq. 9-10); None = no belief."""
-        made: dict[Pair, wire.EdgeState | None] = dict.fromkeys(pairs)
-        if not pairs:
-            return made
-        evidence = [self._graph.edges[pair] for pair in pairs]
-        logits = np.array([item.visual_logits for item in evidence])
-        has_visual = np.array([item.frames > 0 for item in evidence])
+    def _make(self, rows: Int64, prior: Prior) -> dict[Pair, wire.EdgeState]:
+        """Messages of the edges of some pairs (Eq. 9-10); without those that have no belief."""
+        pairs = self._graph.pairs
+        known = pairs.rows.take(rows)
+        published = (self._classes[known["slots"]] >= 0).all(axis=1)
+        is_edge = (known["frames"] > 0) | (known["neighbour_frames"] > 0)
+        at, ends = np.nonzero(is_edge & published[:, None])
+        if not len(at):
+            return {}
+        of_ends = self._classes[known["slots"][at]]
+        order = np.arange(len(at))
+        classes = np.column_stack([of_ends[order, ends], of_ends[order, 1 - ends]])
+        for row, (subject, object_) in zip(rows[at].tolist(), classes.tolist()):
+            self._by_classes.setdefault((subject, object_), set()).add(row)
+        frames = known["frames"][at, ends]
         fused = fuse_edges(
-            logits,
-            has_visual,
-            priors,
-            has_prior,
+            pairs.logits[known["logits"][at, ends]],
+            frames > 0,
+            *prior.lookup(classes),
             self._config.fusion_alpha,
             self._config.entropy_threshold_nats,
         )
-        rows = np.flatnonzero(fused.known).tolist()
+        believed = np.flatnonzero(fused.known)
         names = self._graph.vocabulary.predicates
-        for row, told in zip(rows, listed(fused.probabilities[rows], names, self._top_k)):
-            made[pairs[row]] = edge_state(
-                pairs[row],
-                told,
-                provenance=PROVENANCES[fused.provenance_codes[row]],
-                entropy_nats=float(fused.entropies_nats[row]),
-                observations=evidence[row].frames,
+        told = listed(fused.probabilities[believed], names, self._top_k)
+        made = {}
+        for index, one in zip(believed.tolist(), told):
+            first, second = known["ids"][at[index]].tolist()
+            pair = (second, first) if ends[index] else (first, second)
+            made[pair] = edge_state(
+                pair,
+                one,
+                provenance=PROVENANCES[fused.provenance_codes[index]],
+                entropy_nats=float(fused.entropies_nats[index]),
+                observations=int(frames[index]),
             )
         return made
 

@@ -7,9 +7,10 @@ import zipfile
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.relations.geometry import FEATURES
@@ -58,50 +59,32 @@ class VoteScales(NamedTuple):
     even: float
 
 
-def relation_counts(votes: Float64, relation_of: Int64) -> Float64:
-    """Votes by relation.
+@kernel
+def relation_counts(votes: Float32, relation_of: Int64) -> tuple[Float64, Float64]:
+    """What votes are on.
 
     Args:
-        votes: (..., R) sums of the votes.
+        votes: (m, ends, R) sums of the votes, in some directions.
         relation_of: (R,) relation of each predicate, -1 = it names none.
 
     Returns:
-        (..., NONE) float64.
+        (m, ends, NONE) votes by relation; and (m,) most votes on a predicate that names no physical
+        relation.
     """
-    flat = np.ascontiguousarray(votes, np.float64).reshape(-1, 1, len(relation_of))
-    counts, others = np.empty((len(flat), 1, NONE)), np.empty(len(flat))
-    count_votes(np.arange(len(flat)), flat, relation_of, counts, others)
-    return counts.reshape(*votes.shape[:-1], NONE)
-
-
-@kernel
-def count_votes(
-    rows: Int64, votes: Float64, relation_of: Int64, counts: Float64, others: Float64
-) -> None:
-    """Write what votes are on.
-
-    Args:
-        rows: (k,) where to write.
-        votes: (k, ends, R) sums of the votes, in some directions.
-        relation_of: (R,) relation of each predicate, -1 = it names none.
-        counts: (m, ends, NONE) votes by relation; written.
-        others: (m,) most votes on a predicate that names no physical relation; written.
-    """
-    for index in range(len(rows)):
-        row, most = rows[index], 0.0
+    counts = np.zeros((len(votes), votes.shape[1], NONE), np.float64)
+    others = np.zeros(len(votes), np.float64)
+    for row in range(len(votes)):
         for end in range(votes.shape[1]):
-            for relation in range(NONE):
-                counts[row, end, relation] = 0.0
             for name in range(len(relation_of)):
                 if relation_of[name] >= 0:
-                    counts[row, end, relation_of[name]] += votes[index, end, name]
+                    counts[row, end, relation_of[name]] += votes[row, end, name]
                 else:
-                    most = max(most, votes[index, end, name])
-        others[row] = most
+                    others[row] = max(others[row], votes[row, end, name])
+    return counts, others
 
 
-def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
-    """Logits (m, STATE_COUNT) of the states of pairs.
+def vote_logits(counts: Float64, frames: Int64, scales: VoteScales) -> tuple[Float64, Float64]:
+    """Logits (m, STATE_COUNT) of the states of pairs, and (m,) of near against "not related".
 
     A relation that has a converse has the votes of both.
 
@@ -113,16 +96,12 @@ def vote_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64
     return _vote_logits(counts, frames, *scales)
 
 
-def near_logits(counts: Float64, frames: Float64, scales: VoteScales) -> Float64:
-    """Logits (m,) of near against "not related"; arguments as in `vote_logits`."""
-    return _near_logits(counts, frames, *scales)
-
-
 @kernel
 def _vote_logits(
-    counts: Float64, frames: Float64, slope: float, n_half: float, floor: float, even: float
-) -> Float64:
+    counts: Float64, frames: Int64, slope: float, n_half: float, floor: float, even: float
+) -> tuple[Float64, Float64]:
     logits = np.zeros((len(counts), STATE_COUNT), np.float64)
+    near = np.empty(len(counts), np.float64)
     for row in range(len(counts)):
         for state in range(1, STATE_COUNT):
             votes = 0.0
@@ -131,23 +110,14 @@ def _vote_logits(
                 if relation != NONE:
                     votes += counts[row, end, relation] / _NAMED[state]
             logits[row, state] = evidence(votes, frames[row], slope, n_half, floor, even)
-    return logits
-
-
-@kernel
-def _near_logits(
-    counts: Float64, frames: Float64, slope: float, n_half: float, floor: float, even: float
-) -> Float64:
-    logits = np.empty(len(counts), np.float64)
-    for row in range(len(counts)):
         votes = (counts[row, 0, NEAR] + counts[row, 1, NEAR]) / 2.0
-        logits[row] = evidence(votes, frames[row], slope, n_half, floor, even)
-    return logits
+        near[row] = evidence(votes, frames[row], slope, n_half, floor, even)
+    return logits, near
 
 
 @kernel
 def evidence(
-    votes: float, frames: float, slope: float, n_half: float, floor: float, even: float
+    votes: float, frames: int, slope: float, n_half: float, floor: float, even: float
 ) -> float:
     """Evidence in nats of votes among frames, 0 without frames: the formula above."""
     fraction = votes / max(frames, 1e-9)
@@ -251,26 +221,23 @@ class PhysicsModel:
 
 
 @kernel
-def floor_odds(  # noqa: D417
-    rows: Int64, low: Float64, high: Float64, counts: Int64, floor_m: float, floor: Float64
-) -> Float64:
-    """Odds (k,) that objects stand on the floor; 0 for those without points.
+def floor_odds(shapes: NDArray[Any], slots: Int64, floor_m: float, floor: Float64) -> None:
+    """Write the odds that objects stand on the floor; 0 for those without points.
 
     Args:
-        rows: (k,) of the objects.
-        low, high, counts: columns of `NodeShapes`.
+        shapes: (n,) of `SHAPE`.
+        slots: (k,) of the objects.
         floor_m: height of the floor.
         floor: of `PhysicsModel`.
     """
     offset, by_bottom, by_height = floor
-    odds = np.zeros(len(rows), np.float64)
-    for index in range(len(rows)):
-        row = rows[index]
-        if counts[row]:
-            rise, height = abs(low[row, 2] - floor_m), high[row, 2] - low[row, 2]
+    for slot in slots:
+        shape = shapes[slot]
+        shape.floor_odds = 0.0
+        if shape.count:
+            rise, height = abs(shape.low[2] - floor_m), shape.high[2] - shape.low[2]
             logit = offset + by_bottom * rise + by_height * math.log(height + 0.01)
-            odds[index] = math.exp(min(max(logit, -MAX_FLOOR_LOGIT), MAX_FLOOR_LOGIT))
-    return odds
+            shape.floor_odds = math.exp(min(max(logit, -MAX_FLOOR_LOGIT), MAX_FLOOR_LOGIT))
 
 
 def believed_logits(

@@ -1,11 +1,13 @@
-"""The physical states of a pair, and the predicates that name them."""
+"""The physical states of a pair, the predicates that name them, and what is kept of both."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
@@ -39,6 +41,80 @@ RELATIONS_OF_STATE: Int64 = np.array(
         )
     ],
     np.int64,
+)
+
+
+# --- What is kept of each published node, and of each pair of them.
+#
+# Numba takes no arrays of bool within records; these are 0 and 1.
+
+# By slot of the node; zeros for nodes that are not published. Lengths are metres in the upright
+# frame: axes 0 and 1 are horizontal, axis 2 is up.
+SHAPE = np.dtype(
+    [
+        ("node_id", np.int64),
+        # Number of points of the shape, their trimmed bounds, mean and covariance.
+        ("count", np.int64),
+        ("low", np.float64, 3),
+        ("high", np.float64, 3),
+        ("mean", np.float64, 3),
+        ("covariance", np.float64, (3, 3)),
+        # The class of the highest probability, and whether it is a table, and a seat.
+        ("best_class", np.int64),
+        ("seating", np.uint8, 2),
+        # Odds that it stands on the floor; the probability that it does; the sum of the odds of all
+        # that it may rest on (`rules`).
+        ("floor_odds", np.float64),
+        ("on_floor", np.float64),
+        ("total", np.float64),
+        # Zero and false between the calls of the rules.
+        ("share", np.float64),
+        ("mark", np.bool_),
+    ],
+    align=True,
+)
+
+# By row of the pair (`graph.pairs`); zeros for pairs that are not followed. Fields of two values
+# have one for each direction. A node has fifteen such pairs: most numbers have 32 bits.
+BELIEF = np.dtype(
+    [
+        # Both nodes are published, and the pair was judged at least once.
+        ("known", np.bool_),
+        # It waits to be judged, and has another geometry since.
+        ("waits", np.bool_),
+        ("moved", np.bool_),
+        # Both nodes have enough points. Then the logits are those of the physical model.
+        ("judged", np.bool_),
+        ("state_logits", np.float32, STATE_COUNT),
+        # Horizontal gap of the bounds; infinite out of reach. Difference of the heights of the
+        # bottoms, and horizontal distance of the centres, where in reach.
+        ("gap_m", np.float32),
+        ("bottom_step_m", np.float32),
+        ("centre_step_m", np.float32),
+        # Most votes on a predicate that names no physical relation, and the exponent of all votes.
+        ("other_votes", np.float32),
+        ("votes_worth", np.float32),
+        # By the pair alone: its states; that one end rests on the other; logits that votes add to
+        # "near"; a table and a seat in its reach; false if it is apart and no votes matter.
+        ("states", np.float32, STATE_COUNT),
+        ("carried", np.float64, 2),
+        ("near_votes", np.float32),
+        ("with_", np.uint8, 2),
+        ("live", np.bool_),
+        # After what others exclude: that one end rests on the other; that both stand side by side;
+        # that the pair counts among neighbours; that it is one of the nearest of an end.
+        ("kept", np.float64, 2),
+        ("near", np.float32),
+        ("eligible", np.bool_),
+        ("close", np.uint8, 2),
+        ("relations", np.float32, (2, NONE + 1)),
+        # Whether a prior may enter, by classes of subject and object; and a number for the
+        # probabilities in the message, 0 = no message.
+        ("open", np.uint8, 2),
+        ("classes", np.int32, 2),
+        ("said", np.int64, 2),
+    ],
+    align=True,
 )
 
 
@@ -91,37 +167,47 @@ SAME_PROBABILITY = 0.01
 # Probabilities are rounded to this many decimals, so that a tiny change makes no new message.
 DECIMALS = 3
 _SCALE = 10.0**DECIMALS
+# Of the 64-bit hash FNV-1a.
+_PRIME = np.int64(0x100000001B3)
+
+
+class PredicateNames(NamedTuple):
+    """What the predicates of a vocabulary name.
+
+    Attributes:
+        relation_of: (R,) relation of each predicate; -1 = it names none.
+        canonical: (NONE,) predicate that names each relation; -1 = there is none.
+        with_index: of the predicate "with"; -1 = there is none.
+    """
+
+    relation_of: Int64
+    canonical: Int64
+    with_index: int
+
+    @classmethod
+    def of(cls, predicates: Sequence[str]) -> PredicateNames:
+        """Those of a vocabulary."""
+        with_index = predicates.index("with") if "with" in predicates else -1
+        return cls(relation_of_predicates(predicates), canonical_predicates(predicates), with_index)
 
 
 @kernel
-def related_pairs(  # noqa: D417
-    rows: Int64, relations: Float64, other_votes: Float64
-) -> Bool:
-    """Whether pairs may be related, or have votes beyond the physical relations; (k,) bool.
-
-    Args:
-        rows: (k,) of the pairs.
-        relations, other_votes: see `PairRows`.
-    """
+def related_pairs(beliefs: NDArray[Any], rows: Int64) -> Bool:
+    """Whether pairs (k,) may be related, or have votes beyond the physical relations; (k,) bool."""
     related = np.empty(len(rows), np.bool_)
     for index in range(len(rows)):
-        row = rows[index]
-        free = min(relations[row, 0, NONE], relations[row, 1, NONE])
-        related[index] = free < 1.0 - MIN_RELATED or other_votes[row] >= MIN_OTHER_VOTES
+        belief = beliefs[rows[index]]
+        free = min(belief.relations[0, NONE], belief.relations[1, NONE])
+        related[index] = free < 1.0 - MIN_RELATED or belief.other_votes >= MIN_OTHER_VOTES
     return related
 
 
 @kernel
 def predicate_probabilities(
-    rows: Int64,
-    relations: Float64,
-    votes: Float64,
-    frames: Float64,
-    by_votes: Float64,
-    with_: Bool,
-    relation_of: Int64,
-    canonical: Int64,
-    with_index: int,
+    beliefs: NDArray[Any],
+    votes: Float32,
+    frames: Int64,
+    names: PredicateNames,
     scales: Float64,
 ) -> tuple[Float64, Bool]:
     """Probabilities (k, 2, R) of the predicates in both directions, and (k, 2) bool: any votes.
@@ -132,27 +218,22 @@ def predicate_probabilities(
     those on "on" are.
 
     Args:
-        rows: (k,) of the pairs.
-        relations: (m, 2, NONE + 1) probabilities.
-        votes: (k, 2, R) sums of the votes; they count as float32.
-        frames: (m,) number of frames that showed both.
-        by_votes: (m,) exponent of the votes.
-        with_: (m, 2) bool; a table and a seat in its reach.
-        relation_of: (R,) relation of each predicate; -1 = it names none.
-        canonical: (NONE,) predicate that names each relation; -1 = there is none.
-        with_index: of the predicate "with"; -1 = there is none.
+        beliefs: (k,) of the pairs, `BELIEF`.
+        votes: (k, 2, R) sums of the votes.
+        frames: (k,) number of frames that showed both.
+        names: of the vocabulary.
         scales: (4,) of `VoteScales`.
     """
+    relation_of, canonical, with_index = names
     count, _, width = votes.shape
     result, voted = np.zeros((count, 2, width)), np.zeros((count, 2), np.bool_)
-    sums, told = np.empty(NONE), np.empty(width, np.float32)
+    sums = np.empty(NONE)
     for index in range(count):
-        row = rows[index]
         for end in range(2):
-            out = result[index, end]
+            relations, with_ = beliefs[index].relations[end], beliefs[index].with_[end]
+            told, out = votes[index, end], result[index, end]
             sums[:], others = NAMING_VOTES, 0.0
             for name in range(width):
-                told[name] = votes[index, end, name]
                 voted[index, end] |= told[name] != 0.0
                 if relation_of[name] >= 0:
                     sums[relation_of[name]] += told[name]
@@ -161,15 +242,15 @@ def predicate_probabilities(
             for name in range(width):
                 relation = relation_of[name]
                 if relation >= 0 and canonical[relation] >= 0:
-                    out[name] = relations[row, end, relation] * told[name] / sums[relation]
+                    out[name] = relations[relation] * told[name] / sums[relation]
             for relation in range(NONE):
-                is_with = relation == NEAR and with_index >= 0 and with_[row, end]
+                is_with = relation == NEAR and with_index >= 0 and with_ > 0
                 name = with_index if is_with else canonical[relation]
                 if canonical[relation] >= 0:
-                    out[name] += relations[row, end, relation] * NAMING_VOTES / sums[relation]
+                    out[name] += relations[relation] * NAMING_VOTES / sums[relation]
             if others >= MIN_OTHER_VOTES:
-                free = relations[row, end, NONE]
-                _add_others(out, free, told, frames[row], by_votes[row], relation_of, scales)
+                worth = scales[0] * beliefs[index].votes_worth
+                _add_others(out, relations[NONE], told, frames[index], worth, relation_of, scales)
     return result, voted
 
 
@@ -178,15 +259,14 @@ def _add_others(
     out: Float64,
     free: float,
     votes: Float32,
-    frames: float,
-    by_votes: float,
+    frames: int,
+    slope: float,
     relation_of: Int64,
     scales: Float64,
 ) -> None:
     """Probabilities of the predicates that name no physical relation, of a pair that is `free`."""
-    slope, n_half, low, even = scales
-    worth = frames / (frames + n_half) * slope * by_votes
-    total = 1.0
+    _, n_half, low, even = scales
+    worth, total = frames / (frames + n_half) * slope, 1.0
     for name in range(len(out)):
         if relation_of[name] < 0:
             share = (votes[name] / max(frames, 1e-9) + low) / (even + low)
@@ -220,30 +300,36 @@ def uncertain(probabilities: Float64, threshold_nats: float) -> Bool:
 
 
 @kernel
-def said_predicates(probabilities: Float64, symmetric: Bool) -> tuple[Bool, Bool]:
+def said_predicates(probabilities: Float64, sources: Int64, symmetric: Bool) -> tuple[Int64, Bool]:
     """Round probabilities (k, 2, R) in place, and find what of them is published.
 
     Args:
         probabilities: of the predicates of pairs in both directions.
+        sources: (k, 2) numbers of what they come from.
         symmetric: (R,) bool, the predicates that hold in both directions or in none.
 
     Returns:
-        (k, 2) bool, whether a direction is published; and (k,) bool, whether the first direction
-        speaks for both.
+        (k, 2) a number for the probabilities and their source, 0 if the direction is not published;
+        and (k,) bool, whether the first direction speaks for both.
     """
     count, _, width = probabilities.shape
-    said, mutual = np.empty((count, 2), np.bool_), np.zeros(count, np.bool_)
+    said, mutual = np.zeros((count, 2), np.int64), np.zeros(count, np.bool_)
     best, most = np.empty(2, np.int64), np.empty(2, np.float64)
     for row in range(count):
         for end in range(2):
             best[end], most[end] = 0, 0.0
+            number = np.int64(sources[row, end])
             for name in range(width):
-                value = np.rint(probabilities[row, end, name] * _SCALE) / _SCALE
-                probabilities[row, end, name] = value
-                if value > most[end]:
-                    best[end], most[end] = name, value
-            said[row, end] = most[end] >= MIN_PROBABILITY
+                value = np.rint(probabilities[row, end, name] * _SCALE)
+                number = (number ^ np.int64(value)) * _PRIME  # FNV-1a, which wraps around
+                probabilities[row, end, name] = value / _SCALE
+                if probabilities[row, end, name] > most[end]:
+                    best[end], most[end] = name, probabilities[row, end, name]
+            if most[end] >= MIN_PROBABILITY:
+                said[row, end] = number << 2 | 1
         if said[row, 0] and said[row, 1] and best[0] == best[1] and symmetric[best[0]]:
             mutual[row] = abs(most[0] - most[1]) <= SAME_PROBABILITY
-            said[row, 1] = not mutual[row]
+            if mutual[row]:
+                said[row, 0] |= 2
+                said[row, 1] = 0
     return said, mutual
