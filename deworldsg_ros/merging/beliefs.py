@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.merging.views import VISIBILITIES
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 # --- The class of a node: a hidden Markov model, because wrong names come in spells.
 #
@@ -331,37 +331,27 @@ def _look(record: Any, counts: Float64) -> tuple[float, float]:
 
 
 @kernel
-def probabilities(records: NDArray[Any], counts: Float64, slots: Int64, prior: float) -> Float64:
-    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`."""
+def probabilities(
+    records: NDArray[Any], counts: Float64, slots: Int64, prior: float, with_misses: bool
+) -> Float64:
+    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`.
+
+    Without misses, it is that of a detector that always finds what it sees.
+    """
     result = np.empty(len(slots))
     for index in range(len(slots)):
-        result[index] = _probability(records[slots[index]], counts, prior, True)
+        record = records[slots[index]]
+        found, missed = _look(record, counts)
+        score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
+        log_odds = prior + SCORE * math.log(score / (1.0 - score))
+        log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
+        if with_misses:
+            log_odds -= MISSES * math.log1p(record.missed + missed)
+            if record.last_ns - record.first_ns < MOMENT_NS:
+                since = record.missed_since + (missed if record.detected == 0 else 0.0)
+                log_odds -= MOMENT * math.log1p(since)
+        result[index] = 1.0 / (1.0 + math.exp(-log_odds))
     return result
-
-
-@kernel
-def are_missed(
-    records: NDArray[Any], counts: Float64, slots: Int64, prior: float, minimum: float
-) -> Bool:
-    """Whether (n,) only the misses make the probability of each of n nodes less than a minimum."""
-    result = np.empty(len(slots), np.bool_)
-    for index in range(len(slots)):
-        result[index] = _probability(records[slots[index]], counts, prior, False) >= minimum
-    return result
-
-
-@kernel
-def _probability(record: Any, counts: Float64, prior: float, with_misses: bool) -> float:
-    found, missed = _look(record, counts)
-    score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
-    log_odds = prior + SCORE * math.log(score / (1.0 - score))
-    log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
-    if with_misses:
-        log_odds -= MISSES * math.log1p(record.missed + missed)
-        if record.last_ns - record.first_ns < MOMENT_NS:
-            since = record.missed_since + (missed if record.detected == 0 else 0.0)
-            log_odds -= MOMENT * math.log1p(since)
-    return float(1.0 / (1.0 + math.exp(-log_odds)))
 
 
 def merge(record: Any, other: Any) -> None:

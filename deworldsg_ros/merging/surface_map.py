@@ -7,6 +7,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging import cell_kernels
@@ -17,7 +18,6 @@ from deworldsg_ros.merging.cell_kernels import (
     SumArrays,
     TableArrays,
 )
-from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.views import NEAR_M, FrameArrays
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt64
 
@@ -232,7 +232,7 @@ class VoxelMap:
         """Score of each cell in each block of `cells` (m, 64)."""
         return self._table.scores[self._rows_of(owner)]
 
-    def memory(self, owners: Int64) -> Memory:
+    def memory(self, owners: Int64) -> Arrays:
         """The cells and scores of all owners as arrays by name; the blocks of each ascend.
 
         Args:

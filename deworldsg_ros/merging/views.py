@@ -113,15 +113,6 @@ def with_seen(covered: Float64, slots: Int64, seen: Float64, seen_slots: Int64) 
 
 
 @kernel
-def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    return (
-        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-    )
-
-
-@kernel
 def _see(
     points: Float32, counts: Int64, slots: Int64, values: Int64, frame: FrameArrays
 ) -> tuple[Int64, Bool, Float64]:
@@ -167,8 +158,11 @@ def _compare(
     height, width = depth_mm.shape
     behind = present = inside = 0
     for index in range(count):
-        x, y, z = points[index, 0], points[index, 1], points[index, 2]
-        right, down, ahead = _in_camera(T, np.float64(x), np.float64(y), np.float64(z))
+        x, y = np.float64(points[index, 0]), np.float64(points[index, 1])
+        z = np.float64(points[index, 2])
+        right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
         if ahead < NEAR_M:
             continue
         u, v = fx * right / ahead + cx, fy * down / ahead + cy

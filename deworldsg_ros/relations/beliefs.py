@@ -56,9 +56,9 @@ from deworldsg_ros.relations.states import (
     uncertain,
 )
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, SoftmaxWeights
+from deworldsg_ros.scene.camera import UpEstimator
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
-from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
 from deworldsg_ros.wire import messages as wire
 

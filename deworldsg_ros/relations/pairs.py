@@ -15,15 +15,17 @@ from deworldsg_ros.graph.pairs import Pair, PairChanges
 from deworldsg_ros.graph.publication import NEW_A_CALL
 from deworldsg_ros.relations.geometry import (
     FEATURES,
+    MIN_SHAPE_POINTS,
     SHAPE_POINTS,
+    ReachGrid,
     centre_steps,
+    in_reach,
     measure,
     pair_features,
     rotation_to_upright,
     upright,
 )
 from deworldsg_ros.relations.physics import PairInputs, PhysicsModel
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach
 from deworldsg_ros.relations.rules import Scene
 from deworldsg_ros.relations.states import BELIEF, SHAPE
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64

@@ -180,7 +180,10 @@ def share_supports(scene: Scene, slots: Int64) -> Int64:
     for slot in slots:
         node, weakest, least = slot, 0, 2.0
         for _ in range(MAX_CIRCLE):
-            place = _likely(scene, node)
+            # The pair in which the object probably rests on the other one.
+            place = firsts[node]
+            while place and beliefs[(place - 1) >> 1].kept[(place - 1) & 1] <= 0.5:
+                place = pairs[(place - 1) >> 1].links[(place - 1) & 1]
             if not place:
                 break
             row, end = (place - 1) >> 1, (place - 1) & 1
@@ -193,18 +196,6 @@ def share_supports(scene: Scene, slots: Int64) -> Int64:
                 count += 1
                 break
     return cut[:count].copy()
-
-
-@kernel
-def _likely(scene: Scene, slot: int) -> int:
-    """The place of the pair in which an object probably rests on the other one; 0 = none."""
-    place = scene.firsts[slot]
-    while place:
-        row, end = (place - 1) >> 1, (place - 1) & 1
-        if scene.beliefs[row].kept[end] > 0.5:
-            return int(place)
-        place = scene.pairs[row].links[end]
-    return 0
 
 
 @kernel
@@ -236,8 +227,15 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
             now = False
             belief.near = 0.0
             if not np.isinf(belief.gap_m):
+                # Probability that the other one rests on the same support.
+                together, at = 0.0, firsts[other]
+                while at:
+                    ends = pairs[(at - 1) >> 1].slots
+                    share = shapes[ends[1 - ((at - 1) & 1)]].share
+                    together += beliefs[(at - 1) >> 1].kept[(at - 1) & 1] * share
+                    at = pairs[(at - 1) >> 1].links[(at - 1) & 1]
                 floor = shapes[slot].on_floor * shapes[other].on_floor
-                belief.near = _beside(belief, floor, _together(scene, other))
+                belief.near = _beside(belief, floor, together)
                 _share(belief, states)
                 now = belief.near * states[0] > MIN_NEIGHBOUR
             if now != belief.eligible and not shapes[other].mark:
@@ -259,19 +257,6 @@ def _spread(scene: Scene, slot: int, factor: float) -> None:
         other = scene.pairs[row].slots[1 - end]
         scene.shapes[other].share = factor * scene.beliefs[row].kept[end]
         place = scene.pairs[row].links[end]
-
-
-@kernel
-def _together(scene: Scene, slot: int) -> float:
-    """Probability that an object rests on the support of another one, whose shares are given."""
-    total = 0.0
-    place = scene.firsts[slot]
-    while place:
-        row, end = (place - 1) >> 1, (place - 1) & 1
-        other = scene.pairs[row].slots[1 - end]
-        total += scene.beliefs[row].kept[end] * scene.shapes[other].share
-        place = scene.pairs[row].links[end]
-    return total
 
 
 @kernel

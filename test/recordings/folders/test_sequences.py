@@ -21,8 +21,7 @@ from support.sequences import (
     write_sequence,
 )
 
-from deworldsg_ros.recordings.folders import detect_dataset
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions, detect_dataset
 from deworldsg_ros.recordings.folders.sequence import resample, rotated_intrinsics, rotated_pose
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.writer import write_mcap
