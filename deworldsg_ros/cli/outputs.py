@@ -192,7 +192,7 @@ class RunObserver:
     def findings(
         self, recording: Recording, pipeline: Pipeline, drops: Mapping[str, Mapping[str, int]]
     ) -> list[Finding]:
-        """What is off with the run so far.
+        """Findings about the run so far.
 
         Args:
             recording: of the frames.

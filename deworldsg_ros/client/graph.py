@@ -501,7 +501,7 @@ class SceneGraph(GraphContent):
         return explain_object(item, self.relations_of(item), self.frames(item.id))
 
     def changes_since(self, before: SceneGraph) -> Changes:
-        """What differs from an earlier graph, in the same world frame.
+        """Differences from an earlier graph, in the same world frame.
 
         Ids are compared if the earlier graph is of the same session. Otherwise objects are
         recognised by place and class.

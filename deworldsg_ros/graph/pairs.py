@@ -109,7 +109,7 @@ class PairArrays:
 
 @dataclass
 class PairChanges:
-    """What changed since the reader emptied it.
+    """Changes since the reader emptied it.
 
     Attributes:
         votes: rows of the pairs that more frames have shown.
@@ -181,7 +181,7 @@ class PairStore:
         self._watchers: list[PairChanges] = []
 
     def watch(self) -> PairChanges:
-        """What changes from now on. It starts with all pairs."""
+        """All changes from now on. It starts with all pairs."""
         changes = PairChanges(set(np.flatnonzero(self.rows["shown"]).tolist()))
         changes.edges.update(np.flatnonzero(self._is_edge().any(axis=1)).tolist())
         self._watchers.append(changes)

@@ -188,7 +188,7 @@ Key = tuple[int, int]
 
 
 class SeenFrame(msgspec.Struct, frozen=True, array_like=True, order=True):
-    """What one frame said: how clearly (0 to 1), when, and which class or predicate."""
+    """Evidence of one frame: how clear (0 to 1), when, and which class or predicate."""
 
     strength: Annotated[float, msgspec.Meta(ge=0.0, le=1.0 + 1e-9)]
     stamp_ns: Stamp

@@ -318,7 +318,7 @@ def _end_look(record: Any, counts: Float64, camera_moves: bool) -> None:
 
 @kernel
 def _look(record: Any, counts: Float64) -> tuple[float, float]:
-    """What the present look adds to D and to M."""
+    """The summands of the present look for D and M."""
     if record.shown == 0:
         return 0.0, 0.0
     fraction = record.detected / record.shown

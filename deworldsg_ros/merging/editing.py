@@ -266,7 +266,7 @@ Belongs = Callable[[Float32], Bool]
 
 
 class EditReply(msgspec.Struct, frozen=True):
-    """What an edit did.
+    """The result of an edit.
 
     Attributes:
         kind: as the request: set_label, merge, split, delete or undo.

@@ -127,7 +127,7 @@ class SurfaceMerging:
             apply_correction(records, graph, node_ids, T_correction)
 
     def _see(self, graph: SceneGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
-        """What the frame shows of the nodes that may be in view."""
+        """Compare the frame with the nodes that may be in view."""
         if frame is None:
             return see_nothing(local)
         slots = self._records.grid.in_view(frame)

@@ -66,7 +66,7 @@ class View:
 
 
 def see(nodes: NodeTable, slots: Int64, local: LocalGraph, frame: FrameArrays) -> View:
-    """What a frame shows of some nodes.
+    """Compare a frame with some nodes.
 
     Args:
         nodes: of the graph.

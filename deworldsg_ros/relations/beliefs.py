@@ -23,7 +23,7 @@ from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph.messages import DECIMALS, listed, some_of
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph.publication import MEASURED_A_CALL, NEW_A_CALL
-from deworldsg_ros.relations.pairs import PairTable, joined
+from deworldsg_ros.relations.pairs import AT_ONCE, PairTable, joined
 from deworldsg_ros.relations.paper import (
     OUTLIER_RATE,
     PROVENANCES,
@@ -247,8 +247,9 @@ class RobustBeliefs:
         slots = slots[shapes["node_id"][slots] > 0]
         if not len(slots):
             return slots
-        if len(rows):
-            self._take_in(rows)
+        # In parts, so that a whole map needs no large arrays.
+        for start in range(0, len(rows), AT_ONCE):
+            self._take_in(rows[start : start + AT_ONCE])
         slots = self._reopen_circles(slots)
         if self._geometry:
             floor_odds(shapes, slots, table.floor_m, self._model.floor)
@@ -258,7 +259,7 @@ class RobustBeliefs:
         return changed
 
     def _take_in(self, rows: Int64) -> None:
-        """What the evidence on each of some pairs alone says."""
+        """Take in the evidence on each of some pairs alone."""
         table, model, pairs = self._table, self._model, self._graph.pairs
         beliefs = table.beliefs
         counts, others = relation_counts(pairs.counts(rows), self._names.relation_of)
@@ -584,7 +585,7 @@ class EdgeBeliefs:
         return changed
 
     def _evidence(self, rows: Int64, ends: Int64) -> list[dict[str, Any]]:
-        """What the messages of directed pairs say of their evidence."""
+        """The evidence of directed pairs as their messages have it."""
         pairs = self._graph.pairs
         if not len(rows):
             return []

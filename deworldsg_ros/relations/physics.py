@@ -61,7 +61,7 @@ class VoteScales(NamedTuple):
 
 @kernel
 def relation_counts(votes: Float32, relation_of: Int64) -> tuple[Float64, Float64]:
-    """What votes are on.
+    """Votes by relation.
 
     Args:
         votes: (m, ends, R) sums of the votes, in some directions.
@@ -173,7 +173,7 @@ class PhysicsModel:
 
     @cached_property
     def votes(self) -> VoteScales:
-        """What votes are worth."""
+        """The weights of votes."""
         return VoteScales(*self.vote_scales.tolist())
 
     @cached_property

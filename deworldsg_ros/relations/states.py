@@ -172,7 +172,7 @@ _PRIME = np.int64(0x100000001B3)
 
 
 class PredicateNames(NamedTuple):
-    """What the predicates of a vocabulary name.
+    """The relations that the predicates of a vocabulary name.
 
     Attributes:
         relation_of: (R,) relation of each predicate; -1 = it names none.

@@ -165,7 +165,7 @@ class Supervised:
         self._model, self._lost, self._failures = model, False, 0
 
     def hung(self) -> str:
-        """What is wrong with a model that never returns, in words; "" = it may return."""
+        """The fault of a model that never returns, in words; "" = it may return."""
         call, busy_s = self._call, time.monotonic() - self._since_s
         if call is None or call.done() or busy_s < HUNG_LIMITS * self._limit_s:
             return ""
@@ -175,7 +175,7 @@ class Supervised:
         )
 
     def problem(self) -> str:
-        """What is wrong, in words; "" = nothing."""
+        """The fault, in words; "" = none."""
         if hung := self.hung():
             return hung
         call, busy_s = self._call, time.monotonic() - self._since_s
@@ -362,7 +362,7 @@ class Relating:
         self._reasoner.configure(config)
 
     def problems(self) -> list[str]:
-        """What is wrong with the world model, in words."""
+        """The fault of the world model, in words."""
         return [] if self._model is None else list(filter(None, [self._model.problem()]))
 
     def hung(self) -> str:

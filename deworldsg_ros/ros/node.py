@@ -280,7 +280,7 @@ class StageNode(OverridableNode):
         return []
 
     def hung(self) -> str:
-        """What never returns, in words; "" = nothing; for subclasses."""
+        """The call that never returns, in words; "" = none; for subclasses."""
         return ""
 
     def more_values(self) -> dict[str, str]:
