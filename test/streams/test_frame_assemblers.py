@@ -243,28 +243,6 @@ def test_a_refused_message_is_counted_and_the_others_are_used(bad, reason, lost)
     assert [(drop[0], drop[2]) for drop in told] == [(reason, 1)]
 
 
-def test_a_jump_is_refused_and_a_relocalisation_is_accepted():
-    xs = [0.0, 0.1, 9.0, 0.2] + [5.0] * 6
-    frames, drops = feed(
-        [event for row, x in enumerate(xs) for event in complete(T0 + row * PERIOD, x)]
-    )
-    assert len(frames) == 5
-    assert drops == {"pose_jump": 5}
-
-
-def test_an_older_image_is_stale():
-    frames, drops = feed([*complete(T0), Event("rgb", rgb(T0), T0), *complete(T0 + PERIOD)])
-    assert len(frames) == 2
-    assert drops == {"stale": 1}
-
-
-def test_frames_continue_after_a_recording_restarts():
-    first = frames_at([T0 + step * PERIOD for step in range(30)])
-    frames, drops = feed(first + first)
-    assert len(frames) >= 30 + 28
-    assert drops["time_jump"] >= 1
-
-
 CLOCKS = ["pose", "depth", "rgb"]
 
 
