@@ -91,12 +91,6 @@ class NodeProcess:
         """Process id."""
         return self._process.pid
 
-    @property
-    def cpu_s(self) -> float:
-        """Processor time so far, seconds."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
     def wait(self, limit_s: float) -> int:
         """Wait for the end of the process; returns its exit code."""
         return self._process.wait(limit_s)
