@@ -6,7 +6,6 @@ import hashlib
 import json
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -54,23 +53,21 @@ FRAMES = 6
 EXPORTS = ("graphml", "csv", "ply")
 
 
-@lru_cache
-def _validator(name: str) -> Any:
-    schema = json.loads((ROOT / "msg_schemas" / f"{name}.schema.json").read_text())
-    return jsonschema.Draft202012Validator(schema)
-
-
 def _example(name: str) -> bytes:
     return (ROOT / "msg_schemas" / f"{name}.example.json").read_bytes()
 
 
+SNAPSHOT = SceneGraph(wire.decode(_example("scene_graph"), wire.SceneGraphMessage))
+
+
 def _message(name: str, use: Callable[[Any], object]) -> Target:
     """A kind of message. What `wire.decode` accepts has to fit the committed schema."""
+    schema = json.loads((ROOT / "msg_schemas" / f"{name}.schema.json").read_text())
+    validator = jsonschema.Draft202012Validator(schema)
 
     def read(folder: Path) -> None:
-        text = (folder / "message.json").read_bytes()
-        message = wire.decode(text, wire.MESSAGES[name])
-        _validator(name).validate(json.loads(wire.encode(message)))
+        message = wire.decode((folder / "message.json").read_bytes(), wire.MESSAGES[name])
+        validator.validate(json.loads(wire.encode(message)))
         use(message)
 
     def make(folder: Path) -> None:
@@ -79,37 +76,28 @@ def _message(name: str, use: Callable[[Any], object]) -> Target:
     return Target(f"wire_{name}", make, read, weight=6)
 
 
-def _rows_are_distributions(rows: np.ndarray) -> bool:
-    return bool((rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4))
-
-
-def _boxes_are_ordered(boxes: np.ndarray) -> bool:
-    return bool((boxes[:, :2] <= boxes[:, 2:]).all())
+def _check_objects(graph: FrameGraph | LocalGraph) -> None:
+    rows, boxes = graph.class_probabilities, graph.boxes_xyxy
+    assert (rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4)
+    assert (boxes[:, :2] <= boxes[:, 2:]).all()
 
 
 def _use_frame_graph(message: wire.FrameGraphMessage) -> None:
     graph: FrameGraph = codec.frame_graph_from_message(message)
-    assert _rows_are_distributions(graph.class_probabilities)
-    assert _boxes_are_ordered(graph.boxes_xyxy)
+    _check_objects(graph)
     assert codec.frame_graph_to_message(graph) is not None
 
 
-def _check_local_graph(local: LocalGraph) -> None:
-    assert _rows_are_distributions(local.class_probabilities)
-    assert _boxes_are_ordered(local.boxes_xyxy)
+def _use_local_graph(message: wire.LocalGraphMessage) -> None:
+    local: LocalGraph = codec.local_graph_from_message(message)
+    _check_objects(local)
     assert len(set(local.instance_ids.tolist())) == len(local)
     assert local.pixel_counts.min(initial=1) >= 1
     rotation = local.T_world_camera[:3, :3]
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2)
     for covariance in local.covariances_world:
         np.linalg.cholesky(covariance)
-    for subject, object_ in local.relations.pairs.tolist():
-        assert subject != object_
-
-
-def _use_local_graph(message: wire.LocalGraphMessage) -> None:
-    local = codec.local_graph_from_message(message)
-    _check_local_graph(local)
+    assert (local.relations.pairs[:, 0] != local.relations.pairs[:, 1]).all()
     for config in CONFIGS.values():
         builder = GraphBuilder(config, local.vocabulary, local.frame_id)
         builder.integrate(local)
@@ -144,37 +132,25 @@ def _use_snapshot(message: wire.SceneGraphMessage) -> None:
 def _ask_as_a_client(graph: SceneGraph) -> None:
     """Questions are answered, or refused in words."""
     for item in list(graph)[:2]:
-        for question in (
-            lambda item=item: ask(graph, f"anything near {item.label}"),
-            lambda item=item: graph.goal_near(item),
-            lambda item=item: graph.explain(item),
-            lambda item=item: graph.neighbours(item),
-        ):
+        for method in (graph.goal_near, graph.explain, graph.neighbours):
             with suppress(ClientError):
-                question()
-    graph.changes_since(_snapshot())
+                method(item)
+        with suppress(ClientError):
+            ask(graph, f"anything near {item.label}")
+    graph.changes_since(SNAPSHOT)
 
 
 def _combine(message: wire.SceneGraphMessage) -> None:
     """A fleet goes on whatever one of its robots sends."""
     fleet = Fleet()
-    fleet.update("good", _snapshot().message)
+    fleet.update("good", SNAPSHOT.message)
     fleet.combine()
     fleet.update("other", message)
     whole = fleet.combine()
-    assert {node.label for node in _snapshot().message.nodes} <= {
-        item.label for item in whole.nodes
-    }
-    wire.decode(wire.encode(whole), wire.SceneGraphMessage)
-    for name in fleet.members:
-        part = fleet.part_for(name)
+    assert {node.label for node in SNAPSHOT} <= {node.label for node in whole.nodes}
+    for part in (whole, *map(fleet.part_for, fleet.members)):
         if part is not None:
             wire.decode(wire.encode(part), wire.SceneGraphMessage)
-
-
-@lru_cache
-def _snapshot() -> SceneGraph:
-    return SceneGraph(wire.decode(_example("scene_graph"), wire.SceneGraphMessage))
 
 
 def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
