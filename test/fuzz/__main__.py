@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-from fuzz.harness import CORPUS, keep, replay, run_cases
+from fuzz.harness import CORPUS, keep, run_cases
 from fuzz.targets import TARGETS
 
 
@@ -21,12 +21,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=time.time_ns() // 10**9, help="of the cases")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--corpus", type=Path, default=CORPUS, help="folder of failed cases")
-    parser.add_argument("--replay", action="store_true", help="run the cases of the corpus only")
     options = parser.parse_args()
-    if options.replay:
-        report = replay(options.targets, options.corpus)
-        print(report)
-        return 1 if report.failures else 0
     print(f"seed {options.seed}, {len(options.targets)} targets, {options.jobs} processes")
     report = run_cases(
         options.targets, seed=options.seed, jobs=options.jobs, seconds=60 * options.minutes

@@ -11,29 +11,10 @@ from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from support.evaluation import (
-    CLASSES,
-    PREDICATES,
-    segment,
-    write_dataset,
-    write_ply,
-    write_predictions,
-)
+from support import evaluation, sequences
+from support import recordings as camera
 from support.merging import VOCABULARY, random_local_graphs
-from support.recordings import (
-    CAMERA,
-    WORLD,
-    camera_items,
-    depth_mm,
-    encoded,
-    pose,
-    rgb_pixels,
-    stamp_ns,
-    transform,
-    write_bag,
-    write_seven_scenes,
-)
-from support.sequences import write_ground_truth, write_room, write_sequence
+from support.recordings import pose, stamp_ns
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 from support.view import make_edge, make_graph, make_node
 
@@ -50,7 +31,7 @@ from deworldsg_ros.recordings.folders.sequence import read_ground_truth, read_in
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.recordings.source import TF_MESSAGE
 from deworldsg_ros.wire import messages as wire
-from fuzz.target import Target
+from fuzz.target import Target, one_file
 
 # --- hypothesis: whole documents -------------------------------------------------------------
 
@@ -100,17 +81,17 @@ def _frames() -> list[Any]:
     return [frame(stamp, *few) for stamp in range(1, 7)]
 
 
-def _write_map(association: str, folder: Path) -> None:
+def _write_map(association: str, path: Path) -> None:
     builder = GraphBuilder(_map_config(association), VOCABULARY, "world")
     paper = association == "paper"
     for local in random_local_graphs(np.random.default_rng(3), 20) if paper else _frames():
         builder.integrate(local)
-    write_map(builder, folder / "room.map")
+    write_map(builder, path)
 
 
-def _read_map(association: str, folder: Path) -> None:
+def _read_map(association: str, path: Path) -> None:
     """Continue as graph_node does: publish, merge frames, publish, save."""
-    builder = read_map(_map_config(association), folder / "room.map")
+    builder = read_map(_map_config(association), path)
     builder.update()
     _check_graph(builder.full())
     if builder.graph.vocabulary == VOCABULARY and builder.graph.frame_id == "world":
@@ -120,9 +101,14 @@ def _read_map(association: str, folder: Path) -> None:
             builder.integrate(dataclasses.replace(local, stamp_ns=stamp))
         builder.update()
         _check_graph(builder.full())
-    again = folder.parent / f"{folder.name}.again"
+    again = path.parents[1] / f"{association}.again"
     write_map(builder, again)
     read_map(_map_config(association), again)
+
+
+def _map(association: str, weight: int) -> Target:
+    write, read = partial(_write_map, association), partial(_read_map, association)
+    return one_file(f"map_{association}", "room.map", write, read, weight=weight)
 
 
 def _check_graph(message: wire.SceneGraphMessage) -> None:
@@ -153,16 +139,16 @@ def _read_recording(folder: Path) -> None:
 
 
 def _write_bag(storage: str, folder: Path) -> None:
-    write_bag(folder / "bag", camera_items(3), storage)
+    camera.write_bag(folder / "bag", camera.camera_items(3), storage)
 
 
 def _write_bag_with_tf(folder: Path) -> None:
-    items = camera_items(3, compressed=False, with_pose=False)
+    items = camera.camera_items(3, compressed=False, with_pose=False)
     items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
     for i in range(3):
-        moving = transform(stamp_ns(i), WORLD, CAMERA, pose(i))
+        moving = camera.transform(stamp_ns(i), camera.WORLD, camera.CAMERA, pose(i))
         items.append(("/tf", TF_MESSAGE, stamp_ns(i), moving))
-    write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
+    camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
 
 
 def _write_tum(folder: Path) -> None:
@@ -170,9 +156,9 @@ def _write_tum(folder: Path) -> None:
     rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for index in range(2):
         stamp = f"{1 + index * 0.1:.4f}"
-        for name, pixels in (("rgb", rgb_pixels(index)), ("depth", depth_mm(index))):
+        for name, pixels in (("rgb", camera.rgb_pixels(index)), ("depth", camera.depth_mm(index))):
             (sequence / name).mkdir(parents=True, exist_ok=True)
-            (sequence / name / f"{stamp}.png").write_bytes(encoded(pixels))
+            (sequence / name / f"{stamp}.png").write_bytes(camera.encoded(pixels))
             rows[name].append(f"{stamp} {name}/{stamp}.png")
         rows["groundtruth"].append(f"{stamp} 0.{index} 0 1 0 0 0 1")
     for name, lines in rows.items():
@@ -180,18 +166,18 @@ def _write_tum(folder: Path) -> None:
 
 
 def _write_rooms(folder: Path) -> None:
-    write_room(folder, 2)
-    write_ground_truth(folder / "data" / "room_0")
+    sequences.write_room(folder, 2)
+    sequences.write_ground_truth(folder / "data" / "room_0")
 
 
 def _write_replica(folder: Path) -> None:
-    write_dataset(folder, {"room_0": ([("chair", 1)], [])})
-    write_sequence(folder / "data" / "room_0", 2)
+    evaluation.write_dataset(folder, {"room_0": ([("chair", 1)], [])})
+    sequences.write_sequence(folder / "data" / "room_0", 2)
 
 
 def _write_annotations(layout: str, folder: Path) -> None:
     scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
-    write_dataset(folder, scans, layout=layout)
+    evaluation.write_dataset(folder, scans, layout=layout)
 
 
 def _read_annotations(layout: str, folder: Path) -> None:
@@ -207,18 +193,18 @@ _ANNOTATIONS = (_write_annotations, _read_annotations)
 # --- other files -----------------------------------------------------------------------------
 
 
-def _write_trajectory(folder: Path) -> None:
-    write_tum(folder / "poses.txt", [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)])
+def _write_trajectory(path: Path) -> None:
+    write_tum(path, [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)])
 
 
-def _read_trajectory(folder: Path) -> None:
-    found = read_trajectory(folder / "poses.txt")
+def _write_kitti(path: Path) -> None:
+    np.savetxt(path, [pose(i)[:3].ravel() for i in range(4)], "%.9g")
+
+
+def _read_trajectory(path: Path) -> None:
+    found = read_trajectory(path)
     assert len(found) and np.isfinite(found.T_world_cameras).all()
     found.at(stamp_ns(1) + 5, 1, 1, 10**8)
-
-
-def _write_kitti(folder: Path) -> None:
-    np.savetxt(folder / "poses.txt", [pose(i)[:3].ravel() for i in range(4)], "%.9g")
 
 
 def _write_pose_files(folder: Path) -> None:
@@ -226,49 +212,49 @@ def _write_pose_files(folder: Path) -> None:
         np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
 
 
-def _write_ply(form: str, folder: Path) -> None:
+def _write_ply(form: str, path: Path) -> None:
     points = np.random.default_rng(0).random((5, 3))
-    write_ply(folder / "points.ply", points, np.arange(5), form)
+    evaluation.write_ply(path, points, np.arange(5), form)
 
 
-def _read_ply(folder: Path) -> None:
-    columns = read_vertices(folder / "points.ply", ("x", "y", "z", "objectId"))
+def _read_ply(path: Path) -> None:
+    columns = read_vertices(path, ("x", "y", "z", "objectId"))
     assert len({len(column) for column in columns.values()}) == 1
 
 
 PREDICTION = ScanPrediction(
-    (segment(1, 3), segment(2, 3)),
+    (evaluation.segment(1, 3), evaluation.segment(2, 3)),
     np.array([[0.1, 0.8, 0.1], [0.2, 0.2, 0.6]]),
     np.array([[0, 1]]),
     np.array([[0.7, 0.2, 0.1]]),
 )
 
 
-def _write_predictions(folder: Path) -> None:
+def _write_predictions(path: Path) -> None:
     predictions = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
-    write_predictions(folder / "predictions.json", predictions, len(CLASSES), len(PREDICATES))
+    sizes = len(evaluation.CLASSES), len(evaluation.PREDICATES)
+    evaluation.write_predictions(path, predictions, *sizes)
 
 
-def _write_pickle(protocol: int, folder: Path) -> None:
+def _write_pickle(protocol: int, path: Path) -> None:
     graph = {
         "pcd": [points.astype(np.float32) for points in PREDICTION.points_world],
         "cls": [scores.astype(np.float32) for scores in PREDICTION.class_scores],
         "edge_index": PREDICTION.edges.T,
         "edge_cls": PREDICTION.edge_scores.astype(np.float32),
     }
-    (folder / "predictions.pkl").write_bytes(pickle.dumps({"a": graph}, protocol))
+    path.write_bytes(pickle.dumps({"a": graph}, protocol))
 
 
-def _read_predictions(folder: Path) -> None:
-    path = next(folder.iterdir())
+def _read_predictions(path: Path) -> None:
     for prediction in read_predictions(path).values():
         assert len(prediction.class_scores) == len(prediction)
         assert len(prediction.edges) == len(prediction.edge_scores)
 
 
-def _write_card(folder: Path) -> None:
+def _write_card(path: Path) -> None:
     made = cards.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
-    cards.write_detector_card(folder / cards.DETECTOR_CARD, made)
+    cards.write_detector_card(path, made)
 
 
 def _write_probe_card(folder: Path) -> None:
@@ -283,10 +269,10 @@ def _read_probe_card(folder: Path) -> None:
     str(found.backbone)
 
 
-def _write_headers(folder: Path) -> None:
+def _write_headers(path: Path) -> None:
     entry = {"dtype": "F32", "shape": [2, 2], "data_offsets": [0, 16]}
     text = json.dumps({"a": entry, "b": entry}).encode()
-    (folder / "model.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
 
 
 def _write_graph(folder: Path) -> None:
@@ -294,24 +280,25 @@ def _write_graph(folder: Path) -> None:
     graph_files.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
 
 
-def _read_setting(folder: Path) -> None:
-    setting = (folder / "set.txt").read_bytes().decode(errors="surrogateescape")
-    effective_config(None, [setting])
+def _read_setting(path: Path) -> None:
+    effective_config(None, [path.read_bytes().decode(errors="surrogateescape")])
 
 
 TARGETS: list[Target] = [
-    Target("map_surface", partial(_write_map, "surface"), partial(_read_map, "surface"), weight=3),
-    Target("map_paper", partial(_write_map, "paper"), partial(_read_map, "paper"), weight=2),
-    Target(
+    _map("surface", weight=3),
+    _map("paper", weight=2),
+    one_file(
         "config_yaml",
-        lambda folder: (folder / "config.yaml").write_text(to_yaml(Config())),
-        lambda folder: effective_config(folder / "config.yaml"),
+        "config.yaml",
+        lambda path: path.write_text(to_yaml(Config())),
+        effective_config,
         documents=_configurations(),
         weight=2,
     ),
-    Target(
+    one_file(
         "set_option",
-        lambda folder: (folder / "set.txt").write_text("output.rate_hz=2.5"),
+        "set.txt",
+        lambda path: path.write_text("output.rate_hz=2.5"),
         _read_setting,
         documents=_settings(),
     ),
@@ -319,35 +306,38 @@ TARGETS: list[Target] = [
     Target("bag_sqlite", partial(_write_bag, "sqlite3"), _read_recording, weight=2),
     Target("bag_tf", _write_bag_with_tf, _read_recording),
     Target("tum", _write_tum, _read_recording),
-    Target(
-        "seven_scenes", lambda folder: write_seven_scenes(folder / "seq-01", 2), _read_recording
-    ),
-    Target("scan_3rscan", lambda folder: write_sequence(folder / "scan", 2), _read_recording),
+    Target("seven_scenes", lambda at: camera.write_seven_scenes(at / "seq-01", 2), _read_recording),
+    Target("scan_3rscan", lambda at: sequences.write_sequence(at / "scan", 2), _read_recording),
     Target("scan_replica", _write_replica, _read_recording),
     Target("scan_rooms", _write_rooms, _read_recording),
     *(
         Target(f"annotations_{layout}", *(partial(do, layout) for do in _ANNOTATIONS))
         for layout in ("replica", "3rscan")
     ),
-    Target("trajectory_tum", _write_trajectory, _read_trajectory),
-    Target("trajectory_kitti", _write_kitti, _read_trajectory),
+    one_file("trajectory_tum", "poses.txt", _write_trajectory, _read_trajectory),
+    one_file("trajectory_kitti", "poses.txt", _write_kitti, _read_trajectory),
     Target("trajectory_folder", _write_pose_files, read_trajectory),
-    Target("ply_ascii", partial(_write_ply, "ascii"), _read_ply),
-    Target("ply_binary", partial(_write_ply, "binary_little_endian"), _read_ply),
-    Target("predictions_json", _write_predictions, _read_predictions, documents=JSON_DOCUMENTS),
-    Target("predictions_pickle_2", partial(_write_pickle, 2), _read_predictions),
-    Target("predictions_pickle_5", partial(_write_pickle, 5), _read_predictions),
-    Target(
+    one_file("ply_ascii", "points.ply", partial(_write_ply, "ascii"), _read_ply),
+    one_file("ply_binary", "points.ply", partial(_write_ply, "binary_little_endian"), _read_ply),
+    one_file(
+        "predictions_json",
+        "predictions.json",
+        _write_predictions,
+        _read_predictions,
+        documents=JSON_DOCUMENTS,
+    ),
+    *(
+        one_file(f"predictions_pickle_{number}", "predictions.pkl", write, _read_predictions)
+        for number, write in ((2, partial(_write_pickle, 2)), (5, partial(_write_pickle, 5)))
+    ),
+    one_file(
         "checkpoint_card",
+        cards.DETECTOR_CARD,
         _write_card,
-        lambda folder: cards.read_detector_card(folder / cards.DETECTOR_CARD),
+        cards.read_detector_card,
         documents=JSON_DOCUMENTS,
     ),
     Target("probe_card", _write_probe_card, _read_probe_card, documents=JSON_DOCUMENTS),
-    Target(
-        "safetensors",
-        _write_headers,
-        lambda folder: hub.read_headers(folder / "model.safetensors"),
-    ),
+    one_file("safetensors", "model.safetensors", _write_headers, hub.read_headers),
     Target("scene_graph", _write_graph, graph_files.read_graph, documents=JSON_DOCUMENTS),
 ]

@@ -91,7 +91,7 @@ def run_cases(
     return report
 
 
-def keep(report: Report, corpus: Path = CORPUS) -> list[Path]:
+def keep(report: Report, corpus: Path) -> list[Path]:
     """Write the cases that failed to the corpus; returns their paths."""
     kept = []
     for (target, _), failure in report.failures.items():
@@ -104,19 +104,8 @@ def keep(report: Report, corpus: Path = CORPUS) -> list[Path]:
     return kept
 
 
-def replay(names: Iterable[str], corpus: Path = CORPUS) -> Report:
-    """Run the cases that failed once."""
-    report, worker = Report(), Worker()
-    try:
-        for name in names:
-            report.run(worker, name, corpus_cases(name, corpus))
-    finally:
-        worker.close()
-    return report
-
-
-def corpus_cases(target: str, corpus: Path = CORPUS) -> list[tuple[str, bytes]]:
+def corpus_cases(target: str) -> list[tuple[str, bytes]]:
     """Cases of a target that failed once, as file name and content."""
-    found = sorted((corpus / target).glob("*"))
+    found = sorted((CORPUS / target).glob("*"))
     kept = [(unquote(path.name.rpartition(".")[0]), path.read_bytes()) for path in found]
     return kept + LARGE_CASES.get(target, [])

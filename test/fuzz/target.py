@@ -6,6 +6,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 from hypothesis import strategies as st
@@ -72,3 +73,16 @@ class Target:
             use(name, content)
 
         each()
+
+
+def one_file(
+    name: str,
+    file: str,
+    write: Callable[[Path], object],
+    read: Callable[[Path], object],
+    **options: Any,
+) -> Target:
+    """A target with one file; `write` and `read` get its path."""
+    return Target(
+        name, lambda folder: write(folder / file), lambda folder: read(folder / file), **options
+    )
