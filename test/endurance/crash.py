@@ -28,14 +28,8 @@ LONGEST_LIFE_S = 4.0
 
 @dataclass(frozen=True)
 class Recovery:
-    """What a kill cost.
-
-    Attributes:
-        node: name of the killed node.
-        start_s: from the restart until the node is ready.
-        whole_s: from then until the graph is updated again.
-        problem: what was lost, in words; "" = nothing.
-    """
+    """What a kill of a node cost: the time until it was ready, from then until the graph was
+    updated again, and what was lost, in words."""
 
     node: str
     start_s: float
@@ -44,7 +38,6 @@ class Recovery:
 
     @property
     def recovered_s(self) -> float:
-        """From the restart until the graph is updated again."""
         return self.start_s + self.whole_s
 
 
@@ -57,20 +50,18 @@ def kill_and_restart(rig: Rig, name: str) -> Recovery:
     started_s = time.monotonic()
     rig.start(name)
     process = rig.processes[name]
-    if not rig.run(START_LIMIT_S, lambda: "ready" in process.log or not process.alive):
-        return Recovery(name, START_LIMIT_S, 0.0, "not ready")
-    if not process.alive:
-        return Recovery(name, 0.0, 0.0, f"ended: {process.log[-300:]}")
-    ready_s, before, problem = time.monotonic(), rig.updates, ""
-    if not rig.run(PATIENCE_S, lambda: rig.updates > before and rig.graph is not None):
-        problem = f"the graph is not updated in {PATIENCE_S:g} s"
-    whole_s = time.monotonic() - ready_s
+    rig.run(START_LIMIT_S, lambda: "ready" in process.log or not process.alive)
+    ready_s, before = time.monotonic(), rig.updates
+    if not process.alive or "ready" not in process.log:
+        return Recovery(name, ready_s - started_s, 0.0, f"not ready: {process.log[-300:]}")
+    whole = rig.run(PATIENCE_S, lambda: rig.updates > before and rig.graph is not None)
+    problem = "" if whole else f"the graph is not updated in {PATIENCE_S:g} s"
     if rig.graph is not None:
         lost = sorted(kept - {node.id for node in rig.graph.nodes})
         # A node can be merged into another, or be seen to be gone, before the first whole graph.
         if len(lost) > 0.1 * len(kept):
             problem = f"ids {lost} of {len(kept)} are lost"
-    return Recovery(name, ready_s - started_s, whole_s, problem)
+    return Recovery(name, ready_s - started_s, time.monotonic() - ready_s, problem)
 
 
 def kept_ids(rig: Rig) -> set[int]:

@@ -12,8 +12,8 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,38 +43,30 @@ FRAMES_PER_UPDATE = 10
 ROOM_DISTANCE_M = 20.0
 
 
-@dataclass
 class Series:
     """A value over time, such as the memory of a process."""
 
-    times_s: list[float] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-
-    def add(self, time_s: float, value: float) -> None:
-        """Add a sample."""
-        self.times_s.append(time_s)
-        self.values.append(value)
+    def __init__(self, samples: Iterable[tuple[float, float]] = ()) -> None:
+        self.samples = list(samples)  # of the time in seconds, and the value
 
     def settled(self, settle_s: float) -> Series:
         """The samples after a time."""
-        first = int(np.searchsorted(self.times_s, settle_s))
-        return Series(self.times_s[first:], self.values[first:])
+        return Series(sample for sample in self.samples if sample[0] >= settle_s)
 
     def slope_per_h(self) -> float:
         """Median slope between samples that are half of the time apart (as Theil and Sen)."""
-        half = len(self.times_s) // 2
-        times_s, values = np.array(self.times_s), np.array(self.values)
+        half = len(self.samples) // 2
         if half < 1:
             return 0.0
-        slopes = (values[half : 2 * half] - values[:half]) / (
-            times_s[half : 2 * half] - times_s[:half]
-        )
-        return float(3600 * np.median(slopes))
+        samples = np.array(self.samples)
+        times_s, values = (samples[half : 2 * half] - samples[:half]).T
+        return float(3600 * np.median(values / times_s))
 
     def ends(self) -> tuple[float, float]:
         """Medians of the first and the last third."""
-        third = max(1, len(self.values) // 3)
-        return float(np.median(self.values[:third])), float(np.median(self.values[-third:]))
+        values = [value for _, value in self.samples]
+        third = max(1, len(values) // 3)
+        return float(np.median(values[:third])), float(np.median(values[-third:]))
 
 
 @dataclass(frozen=True)
@@ -88,7 +80,6 @@ class Costs:
 
     @property
     def slower(self) -> float:
-        """How much slower the last frames are."""
         return self.last / self.first
 
 
@@ -121,10 +112,10 @@ def replay(minutes: float, folder: Path) -> tuple[dict[str, Series], Series]:
         while (now_s := time.monotonic() - started_s) < 60 * minutes:
             for name, process in rig.processes.items():
                 assert process.alive, process.log[-500:]
-                memory[name].add(now_s, allocated_mb(process.pid))
+                memory[name].samples.append((now_s, allocated_mb(process.pid)))
             latency_ms = rig.values.get("graph_node", {}).get("latency mean ms")
             if latency_ms is not None:
-                latencies.add(now_s, float(latency_ms))
+                latencies.samples.append((now_s, float(latency_ms)))
             rig.run(SAMPLE_PERIOD_S)
     finally:
         rig.close()
@@ -186,7 +177,7 @@ def problems_of_replay(minutes: float) -> Iterator[str]:
     for name, series in memory.items():
         settled = series.settled(settle_s)
         slope = settled.slope_per_h()
-        print(f"{name}: {settled.values[-1]:.0f} MB, {slope:+.2f} MB an hour")
+        print(f"{name}: {settled.samples[-1][1]:.0f} MB, {slope:+.2f} MB an hour")
         if 60 * minutes >= LEAST_SLOPE_S and slope > MAX_SLOPE_MB_PER_H:
             yield f"{name} grows by {slope:.2f} MB an hour"
     first_ms, last_ms = latencies.settled(settle_s).ends()

@@ -15,9 +15,7 @@ pytestmark = pytest.mark.timeout(1500)
 
 def test_the_slope_of_memory_is_that_of_most_samples():
     random = np.random.default_rng(0)
-    series = Series()
-    for second in range(3600):
-        series.add(second, 200 + second / 3600 * 5 + random.normal(0, 1))
+    series = Series((at_s, 200 + at_s / 3600 * 5 + random.normal(0, 1)) for at_s in range(3600))
     assert series.slope_per_h() == pytest.approx(5, abs=0.3)
     assert series.settled(3599).slope_per_h() == 0.0
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
-from support.nodes import Camera, NodeProcess, Peer, peer, run_to_end
+from support.nodes import Camera, NodeProcess, Peer, peer
 from visualization_msgs.msg import MarkerArray
 
 from deworldsg_ros.config import Config
@@ -189,31 +188,3 @@ def test_an_interrupt_ends_each_node_with_0(run):
     for process in run.processes.values():
         assert process.interrupt() == 0, process.log
         assert "Traceback" not in process.log
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("-p", "lifting.tau:=7.0"), "error: .*lifting.tau is 7.0, expected float >= 0 and <= 1"),
-        (("-p", "lifting.tua:=0.1"), "error: .*lifting.tua .did you mean lifting.tau"),
-        (("-p", "inputs.world_up:=y"), "error: .*put it in quotes"),
-        (("--params-file", "missing.yaml"), "missing.yaml"),
-    ],
-)
-def test_a_bad_parameter_ends_the_start_with_2(tmp_path, words, says):
-    code, log = run_to_end("graph_node", tmp_path, "--ros-args", *words)
-    assert code == 2
-    assert len(re.findall(f"(?m)^.*{says}.*$", log)) == 1
-    assert "Traceback" not in log
-
-
-def test_parameters_come_from_a_file(tmp_path, root_dir):
-    file = str(root_dir / "config" / "paper_rules.yaml")
-    clock = {"use_sim_time": "true"}
-    with NodeProcess("graph_node", tmp_path, "--params-file", file, parameters=clock) as process:
-        process.wait_ready()
-        with peer() as me:
-            statuses = me.statuses()
-            # Diagnostics do not wait for a /clock that never comes.
-            me.spin_until(lambda: len(statuses) >= 2, LIMIT_S, "diagnostics")
-        assert process.interrupt() == 0, process.log

@@ -219,28 +219,6 @@ def test_after_the_maximum_wait_the_available_pose_is_used():
     assert len(assembler.pop_ready(2 * SECOND)) == 1
 
 
-@pytest.mark.parametrize(
-    ("bad", "reason", "lost"),
-    [
-        ({"rgb": image(np.zeros((6, 8, 3), np.uint8), "yuv422", T0)}, "unknown_encoding", 1),
-        ({"rgb": image(np.zeros((5, 8, 3), np.uint8), "rgb8", T0)}, "grid_mismatch", 1),
-        ({"depth": image(np.zeros((3, 4), np.uint16), "16UC1", T0)}, "grid_mismatch", 1),
-        ({"camera_info": camera_info(T0, (0.0,) * 9)}, "invalid_intrinsics", 0),
-        ({"pose": pose(T0, float("nan"))}, "invalid_pose", 0),
-        ({"pose": pose(T0, frame_id="odom")}, "wrong_frame", 0),
-    ],
-)
-def test_a_refused_message_is_counted_and_the_others_are_used(bad, reason, lost):
-    """Poses are interpolated, and the intrinsics stay."""
-    steps = [complete(T0 + step * PERIOD) for step in (-1, 0, 1)]
-    steps[1] = complete(T0, **bad)
-    told: list[tuple[str, str, int]] = []
-    assembler = filled(*sum(steps, []), on_drop=lambda *drop: told.append(drop))
-    assert len(assembler.pop_ready(None)) == 3 - lost
-    assert assembler.drops == {reason: 1}
-    assert [(drop[0], drop[2]) for drop in told] == [(reason, 1)]
-
-
 CLOCKS = ["pose", "depth", "rgb"]
 
 
