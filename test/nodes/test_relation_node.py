@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import pytest
+from msgspec.structs import replace
 from std_msgs.msg import String
 from support.nodes_bench import PAIRING, Bench, alone, send_pair
+from support.reference_updates import diff
+from support.view import make_graph, make_node
 
 from deworldsg_ros.checkpoints.cards import CheckpointCard, write_detector_card
 from deworldsg_ros.nodes.relation_node import RelationNode
@@ -47,19 +47,6 @@ def test_predictions_follow_the_pairs_of_a_frame():
         clips_are(at, encoded=3)
 
 
-def node(node_id: int, label: str, observations: int) -> wire.NodeState:
-    return wire.NodeState(
-        id=node_id,
-        label=label,
-        classes=[wire.Belief(label, 1.0)],
-        mean_m=[0.0, 0.0, 1.0],
-        covariance_m2=np.eye(3).ravel().tolist(),
-        observations=observations,
-        first_seen=wire.Stamp(0, 0),
-        last_seen=wire.Stamp(0, 0),
-    )
-
-
 def test_the_published_graph_selects_the_pairs_of_the_world_model():
     """Lost updates and a restarted graph_node, too."""
     topics = {**PAIRING, "/scene_graph/updates": String, "/scene_graph": String}
@@ -67,23 +54,12 @@ def test_the_published_graph_selects_the_pairs_of_the_world_model():
     with Bench(RelationNode, topics, latched, parameters=WORLD_MODEL) as at:
 
         def publish(sequence: int, stamp_ns: int, observations: int) -> None:
-            stamp = wire.stamp_from_ns(stamp_ns)
-            common: dict[str, Any] = {
-                "stamp": stamp,
-                "frame_id": "map",
-                "sequence": sequence,
-                "nodes": [node(1, "chair", observations), node(2, "cup", observations)],
-                "edges": [],
-            }
-            update = wire.SceneGraphUpdateMessage(
-                schema=wire.schema_of(wire.SceneGraphUpdateMessage),
-                removed_nodes=[],
-                removed_edges=[],
-                associations=[wire.Association(stamp, [1, 2])],
-                **common,
-            )
-            whole = wire.SceneGraphMessage(schema=wire.schema_of(wire.SceneGraphMessage), **common)
-            at.send(**{"/scene_graph/updates": update, "/scene_graph": whole})
+            stamp, labels = wire.stamp_from_ns(stamp_ns), ("chair", "cup")
+            nodes = [make_node(i, labels[i - 1], observations=observations) for i in (1, 2)]
+            graph = replace(make_graph(nodes), stamp=stamp, sequence=sequence)
+            before = replace(graph, sequence=sequence - 1, nodes=[])
+            update = diff(before, graph, associations=[wire.Association(stamp, [1, 2])])
+            at.send(**{"/scene_graph/updates": update, "/scene_graph": graph})
 
         stamp_ns = send_pair(at)
         clips_are(at, encoded=1)  # without a graph, every pair is encoded

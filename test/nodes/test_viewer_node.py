@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from sensor_msgs.msg import Image
 from std_msgs.msg import String
 from support.nodes_bench import Bench, instances, local_graph, rgb, works
+from support.reference_updates import diff
 from support.view import make_graph, make_node
 
 import deworldsg_ros.nodes.viewer_node as module
@@ -24,54 +28,30 @@ TOPICS = {
 }
 
 
-class Recorder(GraphReplica):
-    """A viewer without a page."""
-
-    def __init__(self):
-        super().__init__()
-        self.views, self.reasons = [], []
-        self.closed = False
-
-    def look(self, view):
-        self.views.append(view)
-
-    def say(self, why_empty):
-        self.reasons.append(why_empty)
-
-    def close(self):
-        self.closed = True
-
-
 @pytest.fixture
 def at(monkeypatch):
-    made = Recorder()
+    """The node with a viewer without a page."""
+    viewer = GraphReplica()
+    viewer.look, viewer.say, viewer.close = Mock(), Mock(), Mock()
 
     def make(options, why_empty, on_error):
-        made.on_error = on_error
-        return made
+        viewer.on_error = on_error
+        return viewer
 
     monkeypatch.setattr(module, "make_viewer", make)
     with Bench(ViewerNode, TOPICS, reliable(50, latched=True)) as bench:
-        bench.viewer = made
+        bench.viewer = viewer
         yield bench
-    assert made.closed
+    viewer.close.assert_called_once()
 
 
 def cup_update(sequence, stamp_ns=0):
     """An update with one more cup."""
     stamp = wire.stamp_from_ns(stamp_ns)
-    return wire.SceneGraphUpdateMessage(
-        schema=wire.schema_of(wire.SceneGraphUpdateMessage),
-        stamp=stamp,
-        frame_id="map",
-        session="a",
-        sequence=sequence,
-        removed_nodes=[],
-        removed_edges=[],
-        nodes=[make_node(sequence, "cup")],
-        edges=[],
-        associations=[wire.Association(stamp, [sequence])],
-    )
+    graph = replace(make_graph([make_node(sequence, "cup")]), stamp=stamp, sequence=sequence)
+    before = replace(graph, sequence=sequence - 1, nodes=[])
+    update = diff(before, graph, associations=[wire.Association(stamp, [sequence])])
+    return replace(update, session="a")
 
 
 def send_frame(at, sequence):
@@ -85,8 +65,8 @@ def send_frame(at, sequence):
 
 def test_updates_and_frames_reach_the_viewer(at):
     send_frame(at, 1)
-    at.expect(lambda: at.viewer.views, "a frame")
-    (view,) = at.viewer.views
+    at.expect(lambda: at.viewer.look.called, "a frame")
+    view = at.viewer.look.call_args.args[0]
     assert view.stamp_ns == at.stamp_ns and view.node_ids == (1,)
     assert view.rgb.shape == (48, 64, 3) and view.instances.max() == 1
     np.testing.assert_array_equal(view.T_world_camera, np.eye(4))
@@ -109,8 +89,8 @@ def test_a_gap_is_closed_by_the_next_snapshot(at):
 def test_without_a_graph_it_says_what_is_missing(at):
     assert at.node.waiting_for(0) == ["no graph on /scene_graph"]
     at.send(__scene_graph=empty_scene_graph("map"))
-    at.expect(lambda: at.viewer.reasons, "another reason")
-    assert "empty" in at.viewer.reasons[-1]
+    at.expect(lambda: at.viewer.say.called, "another reason")
+    assert "empty" in at.viewer.say.call_args.args[0]
     assert at.node.waiting_for(0) == []
 
 
