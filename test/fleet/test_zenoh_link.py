@@ -73,20 +73,6 @@ def test_a_follower_has_the_graph_also_after_the_router_was_away(endpoint, opene
     assert follower.replica.message() == graph(3, "cup", "bowl", "chair")
 
 
-def test_robots_are_found_and_asked_at_the_same_time(opened):
-    robots = Robots(opened())
-    assert robots.ask(1.0) == {}
-    kept = []
-    for name in ("ada", "bob"):
-        session = opened()
-        kept.append(Feed(session, robot_key(name), log_of(1, name)))
-        kept.append(session.liveliness().declare_token(robot_key(name)))
-    until(lambda: robots.ask(1.0).keys() == {"ada", "bob"})
-    robots.ask(1.0)
-    labels = {name: item.replica.nodes[1].label for name, item in robots.followers.items()}
-    assert labels == {"ada": "ada", "bob": "bob"}
-
-
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [

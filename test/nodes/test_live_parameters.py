@@ -16,7 +16,6 @@ from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import fields
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.wire import messages as wire
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
@@ -59,18 +58,6 @@ def test_thresholds_and_rates_change_while_the_node_runs(whole):
     assert change(node, "merging.hellinger_threshold", 0.5)[0]
     assert node.graph.wait_idle(5.0)
     assert node.graph._builder.merging._bound > before  # the first one was made with 0.25
-
-
-def test_a_score_threshold_is_that_of_the_next_frame():
-    with Bench(SegmentationNode, CAMERA) as at:
-        texts = at.peer.collect("deworldsg/frame_graph")
-        works(at, lambda: send_frame(at))
-        assert change(at.node, "perception.score_threshold", 0.85)[0]
-        works(at, lambda: send_frame(at))
-        at.expect(lambda: len(texts) == 2, "frame graphs")
-        graphs = [wire.decode(text, wire.FrameGraphMessage) for text in texts]
-        least, least_after = (min(item.score for item in graph.objects) for graph in graphs)
-        assert least < 0.85 < least_after
 
 
 def test_other_parameters_and_values_out_of_range_are_refused(whole):

@@ -33,7 +33,6 @@ from deworldsg_ros.ros.node import Waiting, serve
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.streams import frames
 from deworldsg_ros.streams.poses import stamp_ns_of
-from deworldsg_ros.wire import messages as wire
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
@@ -134,17 +133,6 @@ def test_images_that_come_too_fast_are_left_to_dds(segmentation, monkeypatch):
         at.expect(lambda: at.products() - before + lost() == 12, "each to be processed or lost")
     assert lost() > 0
     works(at, lambda: send_frame(at))
-
-
-def test_one_process_builds_and_publishes_the_graph(whole):
-    updates = whole.peer.collect("/scene_graph/updates")
-    for _ in range(3):
-        works(whole, lambda: send_frame(whole))
-    whole.expect(lambda: whole.node.graph.newest_ns == whole.stamp_ns, "the newest frame")
-    whole.expect(lambda: "edges" in whole.node.more_values(), "the whole graph")
-    for text in updates:
-        assert wire.decode(text, wire.SceneGraphUpdateMessage).associations
-    assert whole.node.health.drops == {}
 
 
 def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(whole, monkeypatch):

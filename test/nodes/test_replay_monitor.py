@@ -146,12 +146,6 @@ def test_a_replay_starts_when_the_nodes_have_told_that_they_are_connected(monito
     assert connections.missing({}, 100.1) != []
 
 
-def test_nodes_that_tell_nothing_are_given_time_to_connect(monitor):
-    for at_s in (100.0, 99.9 + SETTLE_S, 100.0 + SETTLE_S):
-        is_connected = at_s == 100.0 + SETTLE_S
-        assert (monitor.connections.missing({}, at_s) == []) is is_connected
-
-
 def test_counts_of_a_restarted_node_begin_again(monitor):
     monitor.tell("segmentation_node", {"dropped overrun": "2"})
     assert monitor.window.in_flight == 0

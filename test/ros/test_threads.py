@@ -59,20 +59,6 @@ def test_a_worker_keeps_the_order_and_drops_the_oldest():
     assert held.worker.stop(LIMIT_S)
 
 
-def test_a_worker_that_does_not_keep_up_takes_the_newest():
-    """One that had a pause processes all."""
-    held = Held(max_busy_s=0.2)
-    held.submit_first()
-    held.submit(1, 2, 3, 4)
-    time.sleep(0.3)
-    held.finish()
-    assert (held.done, held.overruns) == ([0, 4], [1, 2, 3])
-    held.submit(5, 6, 7, 8)
-    held.finish()
-    assert (held.done, held.overruns) == ([0, 4, 5, 6, 7, 8], [1, 2, 3])
-    assert held.worker.stop(LIMIT_S)
-
-
 def test_a_worker_stops_with_items_in_its_queue():
     held = Held()
     held.submit_first()

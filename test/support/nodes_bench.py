@@ -235,8 +235,8 @@ class Bench:
         self.peer.close()
 
 
-def bench(make: type[StageNode], topics: dict[str, type], **options: Any) -> Iterator[Bench]:
-    with Bench(make, topics, **options) as made:
+def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
+    with Bench(make, topics) as made:
         yield made
 
 
