@@ -120,12 +120,12 @@ def test_a_stalled_subscriber_does_not_delay_the_graph(graph):
 def test_images_that_come_too_fast_are_left_to_dds(segmentation, monkeypatch):
     """They are not received, and they are counted."""
     at, before = segmentation, segmentation.products()
-    monkeypatch.setattr(joining, "TAKE_PERIOD_S", LIMIT_S)  # nothing while a frame waits
 
     def lost() -> int:
         return at.node.health.drops.get("lost_rgb", 0)
 
-    with held(at) as (begin, _):
+    with held(at) as (begin, _), monkeypatch.context() as patch:
+        patch.setattr(joining, "TAKE_PERIOD_S", LIMIT_S)  # nothing while a frame waits
         for _ in range(12):
             send_frame(at)
             at.peer.spin_for(0.1)  # serves one message at a time
