@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from std_srvs.srv import Trigger
+from support.cli import DEMO_ROOM
 from support.nodes import Camera, NodeProcess, Peer, peer
 from visualization_msgs.msg import MarkerArray
 
@@ -34,15 +35,6 @@ FRAMES = 12
 LIMIT_S = 60.0
 
 pytestmark = pytest.mark.timeout(240)
-
-
-@pytest.fixture(scope="module")
-def recording_path(root_dir, request):
-    """The recording that ships, else the kitchen."""
-    shipped = sorted((root_dir / "bags").glob("*/metadata.yaml"))
-    if shipped:
-        return shipped[0].parent
-    return request.getfixturevalue("shared_dir") / "data" / "redkitchen"
 
 
 @dataclass
@@ -77,9 +69,9 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, recording_path):
+def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("nodes")
-    source = open_source(recording_path)
+    source = open_source(DEMO_ROOM)
     stamps = itertools.islice((m.stamp_ns for m in source.messages() if m.role is Role.RGB), FRAMES)
     last_ns = max(stamps)
     messages = list(
@@ -134,9 +126,9 @@ def test_the_updates_rebuild_the_published_graph_exactly(run):
     assert wire.encode(replica.message()) == run.graphs[-1]
 
 
-def test_one_process_gives_the_same_graph(run, recording_path):
+def test_one_process_gives_the_same_graph(run):
     pipeline = Pipeline(Config())
-    for frame in itertools.islice(open_recording(recording_path).frames(), FRAMES):
+    for frame in itertools.islice(open_recording(DEMO_ROOM).frames(), FRAMES):
         pipeline.process(frame)
     while pipeline.builder.update() or pipeline.builder.waiting:
         pass
