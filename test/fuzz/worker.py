@@ -183,6 +183,7 @@ def _limit_memory(above: int | None) -> None:
 def _where(error: BaseException) -> str:
     """The deepest line of this project in a traceback; equal places are one failure."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [f for f in frames if f.filename.startswith(str(ROOT)) and "/.venv/" not in f.filename]
+    package = str(ROOT / "deworldsg_ros")  # not the alarm, which is deeper
+    own = [frame for frame in frames if frame.filename.startswith(package)]
     deepest = (own or frames)[-1]
     return f"{Path(deepest.filename).name}:{deepest.lineno} {deepest.name}"
