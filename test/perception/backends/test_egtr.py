@@ -82,52 +82,43 @@ def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
     assert relations.std() > 0.1 and connectivity.std() > 0.01
 
 
-@torch.no_grad()
-def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folder):
-    config = settings(detector_path=str(folder))
-    detector = RtDetrDetector(config)
-    head = EgtrRelationHead(settings(predicate_set="checkpoint"), detector)
-    every = detector.detect(image(), 0.0)
-    classes = torch.from_numpy(every.class_probabilities.argmax(axis=1))
-    relations, connectivity = naive(random_head(), torch.from_numpy(every.features), classes)
-    kept = every.take(np.arange(0, QUERIES, 4))
-    names = [CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
-    count = len(kept)
-    top = count * (count - 1)
-    found = relate(head, kept, names, top)
-    assert len(found.pairs) == top and len(set(map(tuple, found.pairs.tolist()))) == top
-    subjects, objects = 4 * found.pairs.T
-    # float32: logits reach 20, and the order of the sums differs from processor to processor.
-    assert np.allclose(found.logits, relations[subjects, objects].numpy(), rtol=1e-5, atol=5e-5)
-    ranks = (relations.sigmoid().amax(-1) * connectivity.sigmoid())[subjects, objects].numpy()
-    expected = ranks * every.scores[subjects] * every.scores[objects]
-    assert np.abs(found.scores - expected).max() < 1e-6
-    assert (np.diff(found.scores) <= 0).all()
-    best = relate(head, kept, names, 3)
-    assert np.array_equal(best.pairs, found.pairs[:3])
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return save_paper_checkpoint(tmp_path_factory.mktemp("paper"))
 
 
-def relate(head, found, names, top):
-    return head.relate(segmented(names, found.scores, found.features), top)
-
-
-def test_few_objects_and_no_features(folder):
+@torch.no_grad()
+def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folder):
     detector = RtDetrDetector(settings(detector_path=str(folder)))
     head = EgtrRelationHead(settings(predicate_set="checkpoint"), detector)
-    found = detector.detect(image(), 0.0)
-    names = [CLASSES[c] for c in found.class_probabilities.argmax(axis=1)]
+    every = detector.detect(image(), 0.0)
+    classes = every.class_probabilities.argmax(axis=1)
+    features = torch.from_numpy(every.features)
+    relations, connectivity = naive(random_head(), features, torch.from_numpy(classes))
+
+    def relate(kept, top):
+        names = [CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
+        return head.relate(segmented(names, kept.scores, kept.features), top)
+
+    kept = every.take(np.arange(0, QUERIES, 4))
+    top = len(kept) * (len(kept) - 1)
+    found = relate(kept, top)
+    assert len(found.pairs) == top and len(set(map(tuple, found.pairs.tolist()))) == top
+    subjects, objects = 4 * found.pairs.T
+    # float32: logits reach 20, and the order of the sums differs from processor to processor.
+    expected = relations[subjects, objects].numpy()
+    assert np.allclose(found.logits, expected, rtol=1e-5, atol=5e-5)
+    ranks = (relations.sigmoid().amax(-1) * connectivity.sigmoid())[subjects, objects].numpy()
+    expected = ranks * every.scores[subjects] * every.scores[objects]
+    assert np.abs(found.scores - expected).max() < 1e-6
+    assert (np.diff(found.scores) <= 0).all()
+    assert np.array_equal(relate(kept, 3).pairs, found.pairs[:3])
+    # Few objects, and no features.
     for count in (0, 1):
-        few = found.take(slice(count))
-        assert relate(head, few, names[:count], 10).logits.shape == (0, len(PREDICATES))
-    two = relate(head, found.take(slice(2)), names[:2], 10)
-    assert sorted(two.pairs.tolist()) == [[0, 1], [1, 0]]
+        assert relate(every.take(slice(count)), 10).logits.shape == (0, len(PREDICATES))
+    assert sorted(relate(every.take(slice(2)), 10).pairs.tolist()) == [[0, 1], [1, 0]]
     with pytest.raises(ValueError, match="without query features"):
-        head.relate(segmented(names, found.scores), 5)
+        head.relate(segmented(CLASSES[:2], every.scores[:2]), 5)
 
 
 def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
@@ -140,92 +131,56 @@ def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
     assert found.scores.tolist() == [0.45, 0.3, 0.3]
 
 
+def build(folder, world_up="auto", **changes):
+    names = {"detector": "rtdetr", "relation_head": "egtr", "predicate_set": "checkpoint"}
+    config = settings(**{**names, "detector_path": str(folder), **changes})
+    return build_perception(config, world_up=world_up)
+
+
 def test_rtdetr_sam2_and_egtr_as_one_stage(folder, tmp_path):
-    config = settings(
-        detector="rtdetr",
-        segmenter="sam2",
-        relation_head="egtr",
-        detector_path=str(folder),
-        segmenter_path=str(save_sam2(tmp_path)),
-        predicate_set="checkpoint",
-        score_threshold=0.0,
-        max_relations=10,
-        # Random weights put their boxes anywhere.
-        refine_detections=False,
-    )
-    perception = build_perception(config, world_up="z")
+    # Random weights put their boxes anywhere: they are not refined.
+    limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
+    segmenter = {"segmenter": "sam2", "segmenter_path": str(save_sam2(tmp_path))}
+    perception = build(folder, "z", **segmenter, **limits)
     depth_m = np.full((48, 64), 1.5, np.float32)
-    intrinsics = Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48)
-    frame = RgbdFrame(1, image(), depth_m, intrinsics, np.eye(4))
-    seen = perception.perceive(frame)
+    frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
+    seen, again = perception.perceive(frame), perception.perceive(frame)
     assert perception.vocabulary.classes == CLASSES
     assert perception.vocabulary.predicates == PREDICATES
-    assert 2 <= len(seen.frame_graph) <= QUERIES and "segmenter_error" not in seen.drops
-    assert len(seen.frame_graph.relations.pairs) == min(
-        10, len(seen.frame_graph) * (len(seen.frame_graph) - 1)
-    )
-    assert "relation_head_error" not in seen.drops
-    again = perception.perceive(frame)
+    count = len(seen.frame_graph)
+    assert 2 <= count <= QUERIES
+    assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
+    assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
     assert np.array_equal(again.instances, seen.instances)
     assert np.array_equal(again.frame_graph.relations.logits, seen.frame_graph.relations.logits)
 
 
-def build(folder, **changes):
-    config = settings(
-        **{"detector": "rtdetr", "detector_path": str(folder), "relation_head": "egtr", **changes}
-    )
-    return build_perception(config)
+def refused(match, folder, **changes):
+    with pytest.raises(ConfigurationError, match=match):
+        build(folder, **changes)
 
 
-def test_another_detector_is_refused():
-    with pytest.raises(ConfigurationError, match="reads the queries of the detector 'rtdetr'"):
-        build("", detector="nanodet")
-
-
-def test_a_checkpoint_without_head_is_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="has no egtr_head.safetensors: make it from"):
-        build(save_rtdetr(tmp_path))
-
-
-def test_another_label_set_is_refused(folder, tmp_path):
-    with pytest.raises(ConfigurationError, match="predicate_set is '3dssg'.* set it to 'check"):
-        build(folder, predicate_set="3dssg")
-    other = save_paper_checkpoint(tmp_path / "a", labels=CLASSES[:4])
-    with pytest.raises(ConfigurationError, match="has 4 classes, but .* trained on 7"):
-        build(other, predicate_set="checkpoint")
+def test_a_detector_or_label_set_that_does_not_fit_is_refused(folder, tmp_path):
+    refused("'rtdetr'", "", detector="nanodet")
+    refused("no egtr_head.safetensors", save_rtdetr(tmp_path / "headless"))
+    refused("'3dssg'", folder, predicate_set="3dssg")
+    refused("has 4 classes.* 7", save_paper_checkpoint(tmp_path / "a", labels=CLASSES[:4]))
     counted = save_paper_checkpoint(tmp_path / "b", {"predicates": ("on",)})
-    with pytest.raises(ConfigurationError, match="deworldsg.json of .* names 1 predicates, exp"):
-        build(counted, predicate_set="checkpoint")
-
-
-def test_another_decoder_is_refused(tmp_path):
-    deeper = save_paper_checkpoint(tmp_path, decoder_layers=LAYERS + 1)
-    with pytest.raises(ConfigurationError, match="has 5 layers of 32 .* reads 4 layers of 32"):
-        build(deeper, predicate_set="checkpoint")
+    refused("deworldsg.json of .* names 1 predicates", counted)
+    deeper = save_paper_checkpoint(tmp_path / "c", decoder_layers=LAYERS + 1)
+    refused("has 5 layers of 32 .* 4 layers of 32", deeper)
     # The head accepts a detector with fewer layers.
     card = read_detector_card(deeper / DETECTOR_CARD)
     write_detector_card(deeper / DETECTOR_CARD, msgspec.structs.replace(card, decoder_layers=3))
-    build(deeper, predicate_set="checkpoint")
-
-
-def test_missing_class_pair_statistics_are_refused(tmp_path):
-    from safetensors.torch import load_file, save_file
-
-    save_paper_checkpoint(tmp_path)
-    path = tmp_path / "egtr_head.safetensors"
-    parameters = load_file(path)
-    del parameters["triplet_dist"], parameters["rel_dist"]
-    save_file(parameters, path)
-    with pytest.raises(ConfigurationError, match="no class-pair statistics .* `frequency_bias`"):
-        build(tmp_path, predicate_set="checkpoint")
+    build(deeper)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"proj_q.1.weight": None}, r"1 missing \(proj_q.1.weight\)"),
-        ({"rel_predictor.layers.2.weight": None}, r"1 missing \(rel_predictor.layers.2.weight\)"),
-        ({"proj_v.0.weight": torch.zeros(2)}, r"1 unknown \(proj_v.0.weight\)"),
+        ({"proj_q.1.weight": None}, r"missing \(proj_q.1.weight\)"),
+        ({"rel_predictor.layers.2.weight": None}, r"missing \(rel_predictor.layers.2.weight\)"),
+        ({"proj_v.0.weight": torch.zeros(2)}, r"unknown \(proj_v.0.weight\)"),
         ({"rel_predictor_gate.bias": torch.zeros(2)}, "size mismatch for rel_predictor_gate.bias"),
         ({"triplet_dist": torch.zeros(2, 2)}, r"triplet_dist has shape \(2, 2\)"),
     ],
@@ -237,8 +192,14 @@ def test_a_head_with_other_parameters_is_refused_by_name(change, message):
         EgtrNetwork.for_parameters(parameters, "head.safetensors")
 
 
-def test_a_damaged_head_file_is_refused(folder, tmp_path):
-    save_rtdetr(tmp_path, card=CheckpointCard(predicates=PREDICATES))
-    (tmp_path / "egtr_head.safetensors").write_bytes(b"damaged")
-    with pytest.raises(ConfigurationError, match=r"egtr_head.safetensors cannot be read \(.*get"):
-        build(tmp_path, predicate_set="checkpoint")
+def test_a_head_file_that_is_damaged_or_incomplete_is_refused(tmp_path):
+    from safetensors.torch import save_file
+
+    save_rtdetr(tmp_path, card=CheckpointCard(predicates=PREDICATES, frequency_bias=True))
+    head = tmp_path / "egtr_head.safetensors"
+    head.write_bytes(b"damaged")
+    refused(r"egtr_head\.safetensors cannot be read", tmp_path)
+    parameters = random_head().state_dict()
+    del parameters["triplet_dist"], parameters["rel_dist"]
+    save_file(parameters, head)
+    refused("no class-pair statistics .* `frequency_bias`", tmp_path)
