@@ -11,7 +11,6 @@ from support.evaluation import one_hot, segment, write_dataset
 from typer.testing import CliRunner
 
 from deworldsg_ros.cli.app import app
-from deworldsg_ros.config import load_config, to_mapping
 from deworldsg_ros.evaluation.rows import REPLICA_TEST_SCANS
 
 SCAN = ((("chair", 1), ("table", 2)), ((1, 2, "near"),))
@@ -60,21 +59,3 @@ def test_one_command_prints_the_file_below_the_row_of_the_paper(
     assert rows[name]["relationship_recall"] == pytest.approx((len(scans) - 1) / len(scans))
     assert rows[name]["predicate_recall"] == 1.0
     assert (out / "table.csv").is_file() and (out / "table.tex").is_file()
-
-
-def test_released_yaml_differs_from_paper_yaml_in_what_options_can_say(root_dir):
-    paper, released = (
-        to_mapping(load_config(root_dir / "config" / name))
-        for name in ("paper.yaml", "released.yaml")
-    )
-    different = {
-        f"{section}.{field}": value
-        for section, values in released.items()
-        for field, value in values.items()
-        if value != paper[section][field]
-    }
-    assert different == {
-        "perception.segmenter": "sam3",
-        "perception.segmenter_path": "./models/sam3",
-        "relations.entropy_threshold_nats": 0.0,
-    }
