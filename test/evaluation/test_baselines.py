@@ -7,23 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from deworldsg_ros.evaluation import baselines
 from deworldsg_ros.evaluation.baselines import (
-    BASELINES,
     BaselineGraph,
     BaselineNode,
     BaselinePipeline,
     Fross,
     Kim,
-    box_covariance,
-    build_baseline,
-    class_similarity,
-    colour_histogram,
-    densest_colour,
-    evaluation_points,
-    position_similarities,
-    top_classes,
-    window_points,
-    without_outliers,
 )
 from deworldsg_ros.evaluation.runner import to_prediction
 from deworldsg_ros.graph.extent import surface_points
@@ -92,7 +82,7 @@ def test_fross_lifts_the_centre_of_the_box():
 
 
 def test_fross_covariance_is_positive_definite_off_the_axis_too():
-    covariance = box_covariance(600, 30, 40, 200, 3.0, CAMERA)
+    covariance = baselines.box_covariance(600, 30, 40, 200, 3.0, CAMERA)
     np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
     assert np.linalg.eigvalsh(covariance).min() > 0
     # What the Jacobian sees of it is the box's own covariance, but for what z got on top.
@@ -116,7 +106,7 @@ def test_fross_leaves_out_invalid_depth():
     assert lifted.drops == {"no_centre_depth": 1, "empty_box": 1}
     depth_m = depth_of(1.0)
     depth_m[:, :320] = 0.0
-    points = evaluation_points(320, 240, 400, 200, depth_m, CAMERA, np.eye(4))
+    points = baselines.evaluation_points(320, 240, 400, 200, depth_m, CAMERA, np.eye(4))
     # Columns 220, 270, 320, 370 and rows 190, 240; the first two columns have no depth.
     expected = [[0, -0.1, 1], [0.1, -0.1, 1], [0, 0, 1], [0.1, 0, 1]]
     np.testing.assert_allclose(points, expected, atol=1e-12)
@@ -182,7 +172,7 @@ def test_relations_are_counted_and_follow_their_nodes():
 )
 def test_kim_windows(side, first, last):
     box = np.array([100, 100, 100 + side, 100 + side], float)
-    points = window_points(box, depth_of(1.0), CAMERA)
+    points = baselines.window_points(box, depth_of(1.0), CAMERA)
     columns = np.unique(np.rint(points[:, 0] * 500 + 320).astype(int))
     assert (columns[0], columns[-1]) == (first, last)
 
@@ -191,10 +181,12 @@ def test_kim_leaves_out_far_points_and_outliers():
     box = [100, 100, 300, 300]
     depth_m = depth_of(1.0)
     depth_m[200, 200] = 12.0
-    assert len(window_points(np.array(box, float), depth_m, CAMERA)) == 41 * 41 - 1
+    assert len(baselines.window_points(np.array(box, float), depth_m, CAMERA)) == 41 * 41 - 1
     grid = np.stack(np.meshgrid(np.arange(10), np.arange(10), [0]), axis=-1).reshape(-1, 3) * 0.01
-    np.testing.assert_array_equal(without_outliers(np.vstack([grid, [[5.0, 5.0, 5.0]]])), grid)
-    assert len(without_outliers(grid[:10])) == 10
+    np.testing.assert_array_equal(
+        baselines.without_outliers(np.vstack([grid, [[5.0, 5.0, 5.0]]])), grid
+    )
+    assert len(baselines.without_outliers(grid[:10])) == 10
     # More than ten points are needed.
     for columns, drops in (((195, 205), {"few_window_points": 1}), ((185, 215), {})):
         depth_m = depth_of(0.0)
@@ -205,23 +197,25 @@ def test_kim_leaves_out_far_points_and_outliers():
 
 
 def test_kim_compares_classes_positions_and_colours():
-    assert top_classes(np.array([0.1, 0.4, 0.2, 0.3])) == {1, 2, 3}
+    assert baselines.top_classes(np.array([0.1, 0.4, 0.2, 0.3])) == {1, 2, 3}
     for one in ([0.0, 1.0, 0.0, 0.0], [0.1, 0.7, 0.1, 0.1]):
-        assert top_classes(np.array(one)) == {1}
+        assert baselines.top_classes(np.array(one)) == {1}
     three = frozenset({1, 2, 3})
     for other, expected in (({4, 5, 6}, 0.0), ({1, 5, 6}, 0.8), ({1, 2}, 0.9), (three, 1.0)):
-        assert class_similarity(three, frozenset(other)) == expected
-    assert class_similarity(frozenset({1}), frozenset({1})) == 1.0
-    assert class_similarity(frozenset(), frozenset()) == 0.0
+        assert baselines.class_similarity(three, frozenset(other)) == expected
+    assert baselines.class_similarity(frozenset({1}), frozenset({1})) == 1.0
+    assert baselines.class_similarity(frozenset(), frozenset()) == 0.0
     # 0.56 m is 0.112 of 5 m; at 1.12 m it is a half.
     means = np.array([[0.5, 0.5, 0.5], [1.12, 0, 0], [1.12, 1.12, -1.12]])
-    np.testing.assert_allclose(position_similarities(np.zeros(3), means), [1, 2.5 / 3, 0.5])
+    np.testing.assert_allclose(
+        baselines.position_similarities(np.zeros(3), means), [1, 2.5 / 3, 0.5]
+    )
     rgb = np.full((20, 20, 3), (250, 5, 5), np.uint8)
     rgb[:3] = (0, 0, 250)
-    histogram = colour_histogram(rgb, np.array([0, 0, 19, 19], float))
+    histogram = baselines.colour_histogram(rgb, np.array([0, 0, 19, 19], float))
     assert sorted(histogram[histogram > 0].tolist()) == [60, 340]
     # The middle of the bin, (240, 16, 16), is nearest to red.
-    assert densest_colour(histogram) == (255, 0, 0)
+    assert baselines.densest_colour(histogram) == (255, 0, 0)
 
 
 def test_kim_similarity_and_threshold():
@@ -249,11 +243,11 @@ class Still:
         return Perceived(seen, np.zeros((480, 640), np.uint16), {})
 
 
-@pytest.mark.parametrize("name", list(BASELINES))
+@pytest.mark.parametrize("name", list(baselines.BASELINES))
 def test_a_still_camera_sees_each_object_once(name):
     depth_m = depth_of(2.0)
     depth_m[100:301, 200:331] = 0.0
-    pipeline = BaselinePipeline(build_baseline(name), Still())
+    pipeline = BaselinePipeline(baselines.build_baseline(name), Still())
     with pytest.raises(RefusedInput, match="no frame"):
         pipeline.graph()
     for stamp in range(4):
@@ -270,4 +264,4 @@ def test_a_still_camera_sees_each_object_once(name):
 
 def test_an_unknown_baseline_is_refused_by_name():
     with pytest.raises(EvaluationError, match="frost.*fross, kim"):
-        build_baseline("frost")
+        baselines.build_baseline("frost")

@@ -71,29 +71,14 @@ def test_official_numbers(shared_dir, case, file_name):
             assert supports == official["prediction_supports"]
 
 
-def test_rank():
-    # Scores, index, rank: of equals the last comes first, NaN before every number.
-    nan, inf = math.nan, math.inf
-    for scores, index, expected in (
-        ([], 0, NO_RANK),
-        ([1.0], 0, 0),
-        ([1.0], 5, NO_RANK),
-        ([0.5, 0.5], 0, 1),
-        ([0.5, 0.5], 1, 0),
-        ([0.0, 0.0, 0.0], 2, 0),
-        ([0.0, -0.0], 0, 1),
-        ([nan, 9.0], 1, 1),
-        ([nan, 9.0], 0, 0),
-        ([nan, 9.0, nan], 0, 1),
-        ([inf, nan], 0, 1),
-    ):
-        assert rank(np.array(scores), index) == expected, (scores, index)
-    # It is that of a flipped stable sort.
+def test_rank_is_that_of_a_flipped_stable_sort():
+    """Of equals the last comes first, NaN before every number."""
     generator = np.random.default_rng(3)
     for _ in range(50):
-        scores = generator.choice([0.0, 0.25, 1.0, nan, inf], 12)
+        scores = generator.choice([0.0, -0.0, 0.25, 1.0, np.nan, np.inf], 12)
         order = np.argsort(scores, kind="stable")[::-1]
         assert [rank(scores, index) for index in order] == list(range(12))
+    assert rank(np.array([]), 0) == rank(np.array([1.0]), 5) == NO_RANK
 
 
 def test_triple_rank_takes_every_cell_of_the_table():
@@ -142,17 +127,14 @@ def test_void_predictions(best, second, nothing, kept):
     assert matching.prediction_of == ({1: 0} if kept else {})
 
 
-def test_which_points_and_segments_count():
+def test_which_points_count():
     # Points of other ids are removed before the search.
     surface_points = np.array([[0.0, 0, 0], [0.0, 0, 0.08]])
     prediction = [np.zeros((3, 3))]
     assert match([1], surface_points, np.array([50, 1]), prediction).prediction_of == {1: 0}
     assert match([1, 50], surface_points, np.array([50, 1]), prediction).prediction_of == {50: 0}
-    # Most points win, and the first of equals.
-    ids = np.repeat(1, 20)
-    segments = [segment(1, 6), segment(1, 8), segment(1, 8)]
-    assert match([1], surface(ids), ids, segments).prediction_of == {1: 1}
     # Points that are not finite do not vote, but count.
+    ids = np.repeat(1, 20)
     matching = match([1], surface(ids), ids, [np.vstack([segment(1), np.full((11, 3), np.nan)])])
     assert (matching.supports, matching.skipped_points) == ((None,), 11)
 

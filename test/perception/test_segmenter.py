@@ -17,15 +17,9 @@ from support.perception import (
     render,
 )
 
+from deworldsg_ros.perception.backends import rgbd
 from deworldsg_ros.perception.backends.regions import adjacency
-from deworldsg_ros.perception.backends.rgbd import (
-    COLOUR_STEP,
-    DEPTH_STEP,
-    DISTANCE_WEIGHT,
-    MAX_DEPTH_COST,
-    RgbdSegmenter,
-    upsample_labels,
-)
+from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter, upsample_labels
 
 CHEST = Slab((-0.3, 1.6, 0), (0.3, 2.1, 0.5), (60, 90, 160))
 PICTURE = Slab((-0.4, 3.999, 0.5), (0.4, 4.0, 1.1), (20, 60, 90))
@@ -142,13 +136,13 @@ def plain_label(labels, cell_rgb, cell_depth, rgb, z, y, x, stride):
         if not (0 <= b < rows and 0 <= a < columns):
             continue
         r, g, w = rgb.astype(f) - cell_rgb[b, a].astype(f)
-        cost = (r * r + g * g + w * w) / f(COLOUR_STEP * COLOUR_STEP)
+        cost = (r * r + g * g + w * w) / f(rgbd.COLOUR_STEP * rgbd.COLOUR_STEP)
         if 0 < z < np.inf and cell_depth[b, a] > 0:
-            d = (z - cell_depth[b, a]) / (f(DEPTH_STEP) * z)
-            cost += min(d * d, f(MAX_DEPTH_COST))
+            d = (z - cell_depth[b, a]) / (f(rgbd.DEPTH_STEP) * z)
+            cost += min(d * d, f(rgbd.MAX_DEPTH_COST))
         d = f(y - b * stride - stride // 2) / f(stride)
         e = f(x - a * stride - stride // 2) / f(stride)
-        costs.append(cost + f(DISTANCE_WEIGHT) * (d * d + e * e))
+        costs.append(cost + f(rgbd.DISTANCE_WEIGHT) * (d * d + e * e))
         found.append(labels[b, a])
     return found[int(np.argmin(costs))]
 

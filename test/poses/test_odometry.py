@@ -11,16 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.corner_room import INTRINSICS, LEVEL, camera_at, corner_frame, walk
 
-from deworldsg_ros.poses.odometry import (
-    HAS_ODOMETRY,
-    LEVEL_CAMERA,
-    RgbdOdometry,
-    fit_fraction,
-    points_of,
-    refine,
-    surface_of,
-    track_poses,
-)
+from deworldsg_ros.poses import odometry
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
 from deworldsg_ros.poses.trajectory import Perturbation, PoseNoise, parse_noise, perturb_poses
 from deworldsg_ros.recordings.posing import gate_jumps
 from deworldsg_ros.scene.camera import (
@@ -98,7 +90,7 @@ def test_tracking_continues_after_a_frame_without_depth():
     frames = [replace(corner_frame(T, k), T_world_camera=np.eye(4)) for k, T in enumerate(path)]
     frames[2] = without_depth(frames[2])
     lost = []
-    tracked = list(track_poses(frames, path[0], lost.append))
+    tracked = list(odometry.track_poses(frames, path[0], lost.append))
     assert [frame.stamp_ns for frame in tracked] == [0, 1, 3, 4]
     for frame in tracked:
         assert_near(frame.T_world_camera, path[frame.stamp_ns], 0.02, 0.5)
@@ -131,10 +123,10 @@ def test_depth_fits_itself_and_no_other_view():
     depth_m = corner_frame(LEVEL).depth_m
     T = camera_at(3.0, 0.1)
     moved, there = corner_frame(T).depth_m, invert_pose(T) @ LEVEL
-    points = points_of(depth_m, INTRINSICS)
+    points = odometry.points_of(depth_m, INTRINSICS)
 
     def fit(depth_m, T=np.eye(4)):
-        return fit_fraction(points, depth_m, T, INTRINSICS)
+        return odometry.fit_fraction(points, depth_m, T, INTRINSICS)
 
     assert fit(depth_m) == 1.0
     assert fit(moved, there) > 0.95 and fit(moved) < 0.6
@@ -144,14 +136,14 @@ def test_depth_fits_itself_and_no_other_view():
 def test_a_wrong_guess_is_refined():
     start, T = camera_at(20.0, 1.2, -0.8), camera_at(26.0, 1.28, -0.83)
     truth = invert_pose(T) @ start
-    points = points_of(corner_frame(start).depth_m, INTRINSICS)
+    points = odometry.points_of(corner_frame(start).depth_m, INTRINSICS)
     depth_m = corner_frame(T).depth_m
     guess = rigid_motion(np.array([0.06, -0.05, 0.04]), np.radians([1.0, -2.0, 1.0])) @ truth
-    refined = refine(points, surface_of(depth_m, INTRINSICS), guess, INTRINSICS)
+    refined = odometry.refine(points, odometry.surface_of(depth_m, INTRINSICS), guess, INTRINSICS)
     assert_near(refined, truth, 0.01, 0.3)
     # Without surfaces the guess stays.
-    no_surface = surface_of(np.zeros_like(depth_m), INTRINSICS)
-    np.testing.assert_array_equal(refine(points, no_surface, guess, INTRINSICS), guess)
+    no_surface = odometry.surface_of(np.zeros_like(depth_m), INTRINSICS)
+    np.testing.assert_array_equal(odometry.refine(points, no_surface, guess, INTRINSICS), guess)
 
 
 STEPS, STEP_M = 400, 0.05

@@ -5,28 +5,11 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from support.torch_models import (
-    CLASSES,
-    LAYERS,
-    PREDICATES,
-    QUERIES,
-    WIDTH,
-    image,
-    random_head,
-    save_paper_checkpoint,
-    save_rtdetr,
-    save_sam2,
-    segmented,
-    settings,
-    torch,
-)
+from support import torch_models as models
+from support.torch_models import image, settings, torch
 
-from deworldsg_ros.checkpoints.cards import (
-    DETECTOR_CARD,
-    CheckpointCard,
-    read_detector_card,
-    write_detector_card,
-)
+from deworldsg_ros.checkpoints import cards
+from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
 from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector, best_pairs
@@ -66,13 +49,13 @@ def naive(network, features, classes=None):
 
 
 @pytest.mark.parametrize("bias", [False, True])
-@pytest.mark.parametrize("used", [1, LAYERS - 1, LAYERS])
+@pytest.mark.parametrize("used", [1, models.LAYERS - 1, models.LAYERS])
 @torch.no_grad()
 def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
-    network = random_head().double()
+    network = models.random_head().double()
     generator = torch.Generator().manual_seed(used)
-    features = torch.randn(40, 2 * used + 1, WIDTH, generator=generator, dtype=torch.float64)
-    classes = torch.randint(0, len(CLASSES), (40,), generator=generator)
+    features = torch.randn(40, 2 * used + 1, models.WIDTH, generator=generator, dtype=torch.float64)
+    classes = torch.randint(0, len(models.CLASSES), (40,), generator=generator)
     relations, connectivity = naive(network, features, classes if bias else None)
     kept = torch.tensor([31, 2, 17, 5, 0, 39])
     found = network(features[kept], classes[kept] if bias else None)
@@ -84,7 +67,7 @@ def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return save_paper_checkpoint(tmp_path_factory.mktemp("paper"))
+    return models.save_paper_checkpoint(tmp_path_factory.mktemp("paper"))
 
 
 @torch.no_grad()
@@ -94,13 +77,13 @@ def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folder):
     every = detector.detect(image(), 0.0)
     classes = every.class_probabilities.argmax(axis=1)
     features = torch.from_numpy(every.features)
-    relations, connectivity = naive(random_head(), features, torch.from_numpy(classes))
+    relations, connectivity = naive(models.random_head(), features, torch.from_numpy(classes))
 
     def relate(kept, top):
-        names = [CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
-        return head.relate(segmented(names, kept.scores, kept.features), top)
+        names = [models.CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
+        return head.relate(models.segmented(names, kept.scores, kept.features), top)
 
-    kept = every.take(np.arange(0, QUERIES, 4))
+    kept = every.take(np.arange(0, models.QUERIES, 4))
     top = len(kept) * (len(kept) - 1)
     found = relate(kept, top)
     assert len(found.pairs) == top and len(set(map(tuple, found.pairs.tolist()))) == top
@@ -115,10 +98,10 @@ def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folder):
     assert np.array_equal(relate(kept, 3).pairs, found.pairs[:3])
     # Few objects, and no features.
     for count in (0, 1):
-        assert relate(every.take(slice(count)), 10).logits.shape == (0, len(PREDICATES))
+        assert relate(every.take(slice(count)), 10).logits.shape == (0, len(models.PREDICATES))
     assert sorted(relate(every.take(slice(2)), 10).pairs.tolist()) == [[0, 1], [1, 0]]
     with pytest.raises(ValueError, match="without query features"):
-        head.relate(segmented(CLASSES[:2], every.scores[:2]), 5)
+        head.relate(models.segmented(models.CLASSES[:2], every.scores[:2]), 5)
 
 
 def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
@@ -140,15 +123,15 @@ def build(folder, world_up="auto", **changes):
 def test_rtdetr_sam2_and_egtr_as_one_stage(folder, tmp_path):
     # Random weights put their boxes anywhere: they are not refined.
     limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
-    segmenter = {"segmenter": "sam2", "segmenter_path": str(save_sam2(tmp_path))}
+    segmenter = {"segmenter": "sam2", "segmenter_path": str(models.save_sam2(tmp_path))}
     perception = build(folder, "z", **segmenter, **limits)
     depth_m = np.full((48, 64), 1.5, np.float32)
     frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
     seen, again = perception.perceive(frame), perception.perceive(frame)
-    assert perception.vocabulary.classes == CLASSES
-    assert perception.vocabulary.predicates == PREDICATES
+    assert perception.vocabulary.classes == models.CLASSES
+    assert perception.vocabulary.predicates == models.PREDICATES
     count = len(seen.frame_graph)
-    assert 2 <= count <= QUERIES
+    assert 2 <= count <= models.QUERIES
     assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
     assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
     assert np.array_equal(again.instances, seen.instances)
@@ -162,16 +145,20 @@ def refused(match, folder, **changes):
 
 def test_a_detector_or_label_set_that_does_not_fit_is_refused(folder, tmp_path):
     refused("'rtdetr'", "", detector="nanodet")
-    refused("no egtr_head.safetensors", save_rtdetr(tmp_path / "headless"))
+    refused("no egtr_head.safetensors", models.save_rtdetr(tmp_path / "headless"))
     refused("'3dssg'", folder, predicate_set="3dssg")
-    refused("has 4 classes.* 7", save_paper_checkpoint(tmp_path / "a", labels=CLASSES[:4]))
-    counted = save_paper_checkpoint(tmp_path / "b", {"predicates": ("on",)})
+    refused(
+        "has 4 classes.* 7", models.save_paper_checkpoint(tmp_path / "a", labels=models.CLASSES[:4])
+    )
+    counted = models.save_paper_checkpoint(tmp_path / "b", {"predicates": ("on",)})
     refused("deworldsg.json of .* names 1 predicates", counted)
-    deeper = save_paper_checkpoint(tmp_path / "c", decoder_layers=LAYERS + 1)
+    deeper = models.save_paper_checkpoint(tmp_path / "c", decoder_layers=models.LAYERS + 1)
     refused("has 5 layers of 32 .* 4 layers of 32", deeper)
     # The head accepts a detector with fewer layers.
-    card = read_detector_card(deeper / DETECTOR_CARD)
-    write_detector_card(deeper / DETECTOR_CARD, msgspec.structs.replace(card, decoder_layers=3))
+    card = cards.read_detector_card(deeper / DETECTOR_CARD)
+    cards.write_detector_card(
+        deeper / DETECTOR_CARD, msgspec.structs.replace(card, decoder_layers=3)
+    )
     build(deeper)
 
 
@@ -186,7 +173,7 @@ def test_a_detector_or_label_set_that_does_not_fit_is_refused(folder, tmp_path):
     ],
 )
 def test_a_head_with_other_parameters_is_refused_by_name(change, message):
-    parameters = {**random_head().state_dict(), **change}
+    parameters = {**models.random_head().state_dict(), **change}
     parameters = {name: value for name, value in parameters.items() if value is not None}
     with pytest.raises(ConfigurationError, match=message):
         EgtrNetwork.for_parameters(parameters, "head.safetensors")
@@ -195,11 +182,13 @@ def test_a_head_with_other_parameters_is_refused_by_name(change, message):
 def test_a_head_file_that_is_damaged_or_incomplete_is_refused(tmp_path):
     from safetensors.torch import save_file
 
-    save_rtdetr(tmp_path, card=CheckpointCard(predicates=PREDICATES, frequency_bias=True))
+    models.save_rtdetr(
+        tmp_path, card=CheckpointCard(predicates=models.PREDICATES, frequency_bias=True)
+    )
     head = tmp_path / "egtr_head.safetensors"
     head.write_bytes(b"damaged")
     refused(r"egtr_head\.safetensors cannot be read", tmp_path)
-    parameters = random_head().state_dict()
+    parameters = models.random_head().state_dict()
     del parameters["triplet_dist"], parameters["rel_dist"]
     save_file(parameters, head)
     refused("no class-pair statistics .* `frequency_bias`", tmp_path)

@@ -10,18 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deworldsg_ros.perception.backends import nanodet
 from deworldsg_ros.perception.backends.nanodet import (
-    BINS,
-    CANDIDATE_SCORE,
-    INPUT_SIZE,
-    STRIDES,
     NanoDetDetector,
     SoftmaxCalibration,
-    Tables,
-    cluster_boxes,
     combine,
     decode,
-    letterbox,
 )
 from deworldsg_ros.scene.arrays import pairwise_iou
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -74,13 +68,13 @@ def test_iou_and_suppression_equal_the_plain_loops(rows):
     for a, row in zip(boxes, pairwise_iou(boxes, boxes)):
         assert np.allclose(row, [plain_iou(a, b) for b in boxes])
     limits = {"same_class_iou": 0.4, "any_class_iou": 0.7}
-    found = cluster_boxes(boxes, scores, classes, **limits)
+    found = nanodet.cluster_boxes(boxes, scores, classes, **limits)
     assert found.tolist() == plain_suppression(boxes, scores, classes, 0.4, 0.7)
 
 
 # Scores and logits of the codes grow evenly: from 0 to 1, and from -64 to 63.5.
 CODES = np.arange(256)
-TABLES = Tables(
+TABLES = nanodet.Tables(
     input_codes=np.tile(CODES.astype(np.uint8)[:, None], 3),
     logits=np.tile((CODES.astype(np.float32) - 128) / 2, (3, 1)),
     scores=np.tile(CODES.astype(np.float32) / 255, (3, 1)),
@@ -90,22 +84,22 @@ TABLES = Tables(
 def empty_heads():
     """Codes of every cell: scores of 0.012, logits of 0."""
     heads = []
-    for stride in STRIDES:
-        side = INPUT_SIZE // stride
-        head = np.full((side, side, len(COCO_CLASSES) + 4 * BINS), 128, np.uint8)
+    for stride in nanodet.STRIDES:
+        side = nanodet.INPUT_SIZE // stride
+        head = np.full((side, side, len(COCO_CLASSES) + 4 * nanodet.BINS), 128, np.uint8)
         head[..., : len(COCO_CLASSES)] = 3
         heads.append(head)
     return heads
 
 
-@pytest.mark.parametrize("level", range(len(STRIDES)))
+@pytest.mark.parametrize("level", range(len(nanodet.STRIDES)))
 def test_decode_one_cell(level):
-    stride, row, column = STRIDES[level], 5, 7
+    stride, row, column = nanodet.STRIDES[level], 5, 7
     heads = empty_heads()
     cell = heads[level][row, column]
     cell[CUP] = 230
     # Distances 1, 2, 3 and 4.5 strides: one sharp bin, or two equal ones beside each other.
-    sides = cell[len(COCO_CLASSES) :].reshape(4, BINS)
+    sides = cell[len(COCO_CLASSES) :].reshape(4, nanodet.BINS)
     for side, bins in enumerate([[1], [2], [3], [4, 5]]):
         sides[side, bins] = 228
     boxes, scores = decode(heads, TABLES)
@@ -118,7 +112,7 @@ def test_decode_one_cell(level):
 
 @pytest.mark.parametrize(("code", "count"), [(0, 0), (38, 0), (39, 1)])
 def test_decode_takes_scores_above_the_limit(code, count):
-    assert TABLES.scores[0, 38] <= CANDIDATE_SCORE < TABLES.scores[0, 39]
+    assert TABLES.scores[0, 38] <= nanodet.CANDIDATE_SCORE < TABLES.scores[0, 39]
     heads = empty_heads()
     heads[0][0, 0, CUP] = code
     boxes, scores = decode(heads, TABLES)
@@ -180,7 +174,7 @@ def test_calibrated_distributions_can_merge():
 def test_letterbox_keeps_the_aspect(shape):
     rgb = np.full((*shape, 3), (255, 128, 1), np.uint8)
     codes = 255 - TABLES.input_codes
-    pixels, scale = letterbox(rgb, codes)
+    pixels, scale = nanodet.letterbox(rgb, codes)
     assert pixels.shape == (1, 416, 416, 4) and pixels.dtype == np.uint8
     inside = (pixels[0, ..., :3] == (0, 127, 254)).all(axis=2)
     assert inside[0, 0]

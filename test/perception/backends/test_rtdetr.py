@@ -7,26 +7,11 @@ import shutil
 
 import numpy as np
 import pytest
-from support.torch_models import (
-    CLASSES,
-    IMAGENET,
-    LAYERS,
-    QUERIES,
-    WIDTH,
-    image,
-    random_rtdetr,
-    save_rtdetr,
-    save_sam,
-    settings,
-    torch,
-)
+from support import torch_models as models
+from support.torch_models import image, settings, torch
 
-from deworldsg_ros.checkpoints.cards import (
-    DETECTOR_CARD,
-    CheckpointCard,
-    read_detector_card,
-    write_detector_card,
-)
+from deworldsg_ros.checkpoints import cards
+from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -39,9 +24,9 @@ SOFTMAX = CheckpointCard(class_scores="softmax")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("rtdetr")
     return {
-        "v1": save_rtdetr(root / "v1", 1),
-        "v2": save_rtdetr(root / "v2", 2),
-        "softmax": save_rtdetr(root / "softmax", 1, card=SOFTMAX, normalise=True),
+        "v1": models.save_rtdetr(root / "v1", 1),
+        "v2": models.save_rtdetr(root / "v2", 2),
+        "softmax": models.save_rtdetr(root / "softmax", 1, card=SOFTMAX, normalise=True),
     }
 
 
@@ -56,20 +41,20 @@ def copy(folders, tmp_path):
 
 
 def with_card(folder, **fields):
-    write_detector_card(folder / DETECTOR_CARD, CheckpointCard(**fields))
+    cards.write_detector_card(folder / DETECTOR_CARD, CheckpointCard(**fields))
     return folder
 
 
 def reference(rgb, *, normalise=False, version=1):
     """Logits and boxes of the network that was saved, by a loop over its own modules."""
-    model = random_rtdetr(version)
+    model = models.random_rtdetr(version)
     pixels = torch.from_numpy(rgb.astype(np.float32)).permute(2, 0, 1)[None]
     pixels = torch.nn.functional.interpolate(
         pixels, size=(64, 64), mode="bilinear", antialias=True, align_corners=False
     )
     pixels = pixels / 255
     if normalise:
-        mean, std = (torch.tensor(IMAGENET[key])[:, None, None] for key in IMAGENET)
+        mean, std = (torch.tensor(models.IMAGENET[key])[:, None, None] for key in models.IMAGENET)
         pixels = (pixels - mean) / std
     with torch.no_grad():
         return model(pixels)
@@ -82,7 +67,7 @@ def test_all_detections_equal_the_queries_of_the_network(folders, version):
     output = reference(rgb, version=version)
     scores = output.logits[0].sigmoid().amax(-1)
     order = torch.argsort(scores, descending=True, stable=True)
-    assert len(found) == QUERIES
+    assert len(found) == models.QUERIES
     # float32: two resizers and two orders of sums, which differ from processor to processor.
     assert np.allclose(found.scores, scores[order].double(), atol=5e-5)
     cx, cy, w, h = output.pred_boxes[0][order].double().unbind(-1)
@@ -118,7 +103,7 @@ def test_threshold_keeps_the_best_in_order(folders):
     assert 0 < len(kept) < len(every)
     assert np.array_equal(kept.scores, every.scores[every.scores >= threshold])
     none = found.detect(image(), 1.0)
-    assert len(none) == 0 and none.class_probabilities.shape == (0, len(CLASSES))
+    assert len(none) == 0 and none.class_probabilities.shape == (0, len(models.CLASSES))
 
 
 @pytest.mark.parametrize("layers", [1, 3])
@@ -147,10 +132,10 @@ def test_queries_are_recorded_only_on_request(folders):
     for _ in range(2):
         watched.record_queries()
     found = watched.detect(image(), 0.0)
-    assert found.features.shape == (QUERIES, 2 * LAYERS + 1, WIDTH)
+    assert found.features.shape == (models.QUERIES, 2 * models.LAYERS + 1, models.WIDTH)
     assert found.features.dtype == np.float32
     # The last slot is what the class head reads.
-    head = random_rtdetr().model.decoder.class_embed[-1]
+    head = models.random_rtdetr().model.decoder.class_embed[-1]
     scores = head(torch.from_numpy(found.features[:, -1])).sigmoid().amax(-1)
     assert np.allclose(scores.detach(), found.scores, atol=1e-5)
     kept = found.take(np.array([3, 1]))
@@ -163,7 +148,7 @@ def test_other_images_and_half_precision_run_through(folders):
     read_only = image(120, 160)
     read_only.flags.writeable = False
     for rgb in (read_only, image(33, 47)):
-        assert len(found.detect(rgb, 0.0)) == QUERIES
+        assert len(found.detect(rgb, 0.0)) == models.QUERIES
     found.model, found.dtype = found.model.half(), torch.float16
     assert np.allclose(found.detect(image(), 0.0).scores, exact.scores, atol=0.05)
 
@@ -177,7 +162,7 @@ def test_a_missing_or_foreign_checkpoint_is_refused(tmp_path):
     refused("detector_path is empty", "")
     refused("no such folder", "/no/such/folder")
     refused("hf download nobody/nothing-of-that-name", "nobody/nothing-of-that-name")
-    refused("sam: expected rt_detr or rt_detr_v2", save_sam(tmp_path))
+    refused("sam: expected rt_detr or rt_detr_v2", models.save_sam(tmp_path))
 
 
 def test_missing_and_damaged_files_are_refused(copy):
@@ -187,7 +172,7 @@ def test_missing_and_damaged_files_are_refused(copy):
     (copy / DETECTOR_CARD).write_text('{"class_scores": "argmax"}')
     refused(r"deworldsg\.json: .*argmax", copy)
     (copy / DETECTOR_CARD).unlink()
-    assert read_detector_card(None) == CheckpointCard()
+    assert cards.read_detector_card(None) == CheckpointCard()
     preprocessing = copy / "preprocessor_config.json"
     text = preprocessing.read_text()
     wrong = {**json.loads(text), "do_normalize": True, "image_mean": [0.5]}
@@ -207,9 +192,9 @@ def test_missing_and_damaged_files_are_refused(copy):
 
 
 def test_unnamed_and_miscounted_classes_are_refused(tmp_path):
-    nameless = save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
+    nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
     refused("does not name its 3 classes", nameless)
-    short = save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
+    short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
     refused("names 1 classes, .* 6", short)
 
 

@@ -6,17 +6,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from support import torch_models as models
 from support.perception import on_image
-from support.torch_models import (
-    image,
-    save_rtdetr,
-    save_sam,
-    save_sam2,
-    save_sam3,
-    settings,
-    torch,
-    transformers,
-)
+from support.torch_models import image, settings, torch
 
 from deworldsg_ros.perception.backends.sam import (
     Sam2Segmenter,
@@ -49,11 +41,11 @@ BOXES = np.array(
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("sam")
     return {
-        "sam2": save_sam2(root / "sam2"),
-        "sam2_video": save_sam2(root / "sam2_video", video=True),
-        "sam3": save_sam3(root / "sam3"),
-        "sam3_video": save_sam3(root / "sam3_video", video=True),
-        "sam": save_sam(root / "sam"),
+        "sam2": models.save_sam2(root / "sam2"),
+        "sam2_video": models.save_sam2(root / "sam2_video", video=True),
+        "sam3": models.save_sam3(root / "sam3"),
+        "sam3_video": models.save_sam3(root / "sam3_video", video=True),
+        "sam": models.save_sam(root / "sam"),
     }
 
 
@@ -88,7 +80,7 @@ def test_one_mask_per_box_of_an_image_that_is_encoded_once(folders, name, monkey
 
 
 def test_sam2_masks_equal_those_of_the_network_on_the_stretched_image(folders):
-    model = transformers.Sam2Model.from_pretrained(folders["sam2"]).eval()
+    model = models.transformers.Sam2Model.from_pretrained(folders["sam2"]).eval()
     pixels = torch.from_numpy(RGB.astype(np.float32)).permute(2, 0, 1)[None]
     pixels = torch.nn.functional.interpolate(
         pixels, size=(128, 128), mode="bilinear", antialias=True, align_corners=False
@@ -111,7 +103,7 @@ def test_sam2_masks_equal_those_of_the_network_on_the_stretched_image(folders):
 
 def test_sam3_takes_its_tracker_from_the_published_layout(folders):
     """The published checkpoint has detector and tracker, with one vision encoder for both."""
-    whole = transformers.Sam3VideoModel.from_pretrained(folders["sam3_video"]).state_dict()
+    whole = models.transformers.Sam3VideoModel.from_pretrained(folders["sam3_video"]).state_dict()
     found = segmenter(folders, "sam3_video").model.state_dict()
     prefixes = {
         "vision_encoder.backbone.": "detector_model.vision_encoder.backbone.",
@@ -154,7 +146,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatc
         raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 1")
 
     refused("of sam: expected sam2 or sam2_video", Sam2Segmenter, folders["sam"])
-    refused("of rt_detr: expected sam", SamSegmenter, save_rtdetr(tmp_path))
+    refused("of rt_detr: expected sam", SamSegmenter, models.save_rtdetr(tmp_path))
     refused("of sam2: expected sam3_tracker", Sam3Segmenter, folders["sam2"])
     refused("segmenter_path is empty", Sam2Segmenter, "")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
