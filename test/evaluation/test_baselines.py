@@ -166,17 +166,6 @@ def test_relations_are_counted_and_follow_their_nodes():
     assert len(set(ids)) == 1 and not graph.counts
 
 
-@pytest.mark.parametrize(
-    ("side", "first", "last"),
-    [(20, 106, 114), (29, 108, 120), (30, 112, 118), (60, 124, 136), (200, 180, 220)],
-)
-def test_kim_windows(side, first, last):
-    box = np.array([100, 100, 100 + side, 100 + side], float)
-    points = baselines.window_points(box, depth_of(1.0), CAMERA)
-    columns = np.unique(np.rint(points[:, 0] * 500 + 320).astype(int))
-    assert (columns[0], columns[-1]) == (first, last)
-
-
 def test_kim_leaves_out_far_points_and_outliers():
     box = [100, 100, 300, 300]
     depth_m = depth_of(1.0)

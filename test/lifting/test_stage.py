@@ -16,7 +16,7 @@ from support.reference_lifting import reference_lift
 
 from deworldsg_ros.config import LiftingConfig
 from deworldsg_ros.lifting import Lifting, refine, stage
-from deworldsg_ros.lifting.stage import LiftingConstants, box_pixels, mask_pixels
+from deworldsg_ros.lifting.stage import LiftingConstants, box_pixels
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, LocalGraph, Relations, Vocabulary
@@ -275,19 +275,6 @@ def test_boxes_may_overlap_leave_the_image_and_have_no_depth():
         lifted = lift(blind, len(boxes), boxes=boxes, pixels="box")
         assert len(lifted) == 0
         assert lifted.drops == ({"few_mask_pixels": 1} if boxes else {})
-
-
-def test_a_rectangular_mask_has_the_pixels_of_its_box():
-    generator = np.random.default_rng(3)
-    depth_m = generator.uniform(1.0, 1.1, (30, 40)).astype(np.float32)
-    depth_m[generator.random((30, 40)) < 0.2] = 0.0
-    instances = np.zeros((30, 40), np.uint16)
-    instances[5:25, 7:33] = 1
-    mask = mask_pixels(depth_m, refine.masks_of(instances, 1).runs_of(0))
-    box = box_pixels(depth_m, np.array([7, 5, 32, 24], float))
-    assert len(mask) > 0
-    for name in ("columns", "rows", "depths_m"):
-        np.testing.assert_array_equal(getattr(mask, name), getattr(box, name))
 
 
 def test_warm_up_compiles_everything_that_a_frame_needs():

@@ -45,22 +45,6 @@ def test_the_instance_image_equals_the_pixel_by_pixel_rule(frame):
     assert np.array_equal(labels, pixelwise(*frame))
 
 
-@pytest.mark.parametrize(
-    ("classes", "scores", "expected"),
-    [
-        ([3, 3], [0.5, 0.6], 2),
-        ([3, 3], [0.5, 0.5], 1),
-        ([3, 4], [0.5, 0.6], 0),
-        # A third mask does not resolve the ambiguity of two classes.
-        ([3, 4, 3], [0.5, 0.6, 0.9], 0),
-    ],
-)
-def test_a_pixel_in_several_masks(classes, scores, expected):
-    masks = [MaskPatch(0, 0, np.ones(SHAPE, bool))] * len(classes)
-    labels = instance_image(masks, np.array(classes), np.array(scores), SHAPE)
-    assert (labels == expected).all()
-
-
 def test_more_masks_than_labels_are_refused():
     masks = [MaskPatch(0, 0, np.zeros((0, 0), dtype=bool))] * 65536
     with pytest.raises(ValueError, match="65536 masks"):

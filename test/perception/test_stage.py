@@ -227,11 +227,6 @@ def test_without_torch_the_error_names_the_package_to_install(field, name, monke
         build_perception(PerceptionConfig(**{field: name}))
 
 
-def test_features_have_one_row_per_object():
-    with pytest.raises(ValueError, match="2 scores, 1 features"):
-        Detections(np.zeros((2, 4)), np.ones((2, 1)), np.zeros(2), np.zeros((1, 3), np.float32))
-
-
 def test_vocabularies_are_the_published_ones():
     for names, count in ((COCO_CLASSES, 80), (VISUAL_GENOME_CLASSES, 150), (SCANNET_CLASSES, 20)):
         assert len(names) == len(set(names)) == count

@@ -9,19 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.corner_room import INTRINSICS, LEVEL, camera_at, corner_frame, walk
+from support.corner_room import LEVEL, camera_at, corner_frame, walk
 
-from deworldsg_ros.poses import odometry
-from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry
+from deworldsg_ros.poses.odometry import HAS_ODOMETRY, LEVEL_CAMERA, RgbdOdometry, track_poses
 from deworldsg_ros.poses.trajectory import Perturbation, PoseNoise, parse_noise, perturb_poses
 from deworldsg_ros.recordings.posing import gate_jumps
-from deworldsg_ros.scene.camera import (
-    Intrinsics,
-    check_pose,
-    invert_pose,
-    rigid_motion,
-    rotation_angle_deg,
-)
+from deworldsg_ros.scene.camera import Intrinsics, check_pose, invert_pose, rotation_angle_deg
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
 
@@ -90,7 +83,7 @@ def test_tracking_continues_after_a_frame_without_depth():
     frames = [replace(corner_frame(T, k), T_world_camera=np.eye(4)) for k, T in enumerate(path)]
     frames[2] = without_depth(frames[2])
     lost = []
-    tracked = list(odometry.track_poses(frames, path[0], lost.append))
+    tracked = list(track_poses(frames, path[0], lost.append))
     assert [frame.stamp_ns for frame in tracked] == [0, 1, 3, 4]
     for frame in tracked:
         assert_near(frame.T_world_camera, path[frame.stamp_ns], 0.02, 0.5)
@@ -117,33 +110,6 @@ def test_new_intrinsics_continue_from_the_last_pose():
     estimate = odometry.track(frame.rgb[::2, ::2], frame.depth_m[::2, ::2], half)
     np.testing.assert_array_equal(estimate, camera_at(0.0, 1.0))
     assert odometry.restarts == 1
-
-
-def test_depth_fits_itself_and_no_other_view():
-    depth_m = corner_frame(LEVEL).depth_m
-    T = camera_at(3.0, 0.1)
-    moved, there = corner_frame(T).depth_m, invert_pose(T) @ LEVEL
-    points = odometry.points_of(depth_m, INTRINSICS)
-
-    def fit(depth_m, T=np.eye(4)):
-        return odometry.fit_fraction(points, depth_m, T, INTRINSICS)
-
-    assert fit(depth_m) == 1.0
-    assert fit(moved, there) > 0.95 and fit(moved) < 0.6
-    assert fit(np.zeros_like(depth_m)) == fit(depth_m, np.diag([-1.0, 1.0, -1.0, 1.0])) == 0.0
-
-
-def test_a_wrong_guess_is_refined():
-    start, T = camera_at(20.0, 1.2, -0.8), camera_at(26.0, 1.28, -0.83)
-    truth = invert_pose(T) @ start
-    points = odometry.points_of(corner_frame(start).depth_m, INTRINSICS)
-    depth_m = corner_frame(T).depth_m
-    guess = rigid_motion(np.array([0.06, -0.05, 0.04]), np.radians([1.0, -2.0, 1.0])) @ truth
-    refined = odometry.refine(points, odometry.surface_of(depth_m, INTRINSICS), guess, INTRINSICS)
-    assert_near(refined, truth, 0.01, 0.3)
-    # Without surfaces the guess stays.
-    no_surface = odometry.surface_of(np.zeros_like(depth_m), INTRINSICS)
-    np.testing.assert_array_equal(odometry.refine(points, no_surface, guess, INTRINSICS), guess)
 
 
 STEPS, STEP_M = 400, 0.05

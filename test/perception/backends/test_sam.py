@@ -10,12 +10,7 @@ from support import torch_models as models
 from support.perception import on_image
 from support.torch_models import image, settings, torch
 
-from deworldsg_ros.perception.backends.sam import (
-    Sam2Segmenter,
-    Sam3Segmenter,
-    SamSegmenter,
-    as_patch,
-)
+from deworldsg_ros.perception.backends.sam import Sam2Segmenter, Sam3Segmenter, SamSegmenter
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -126,15 +121,6 @@ def test_inputs_are_scaled_as_each_network_expects(folders):
     assert pixels.shape == (1, 3, 128, 128)
     assert pixels[0, :, 96:].abs().max() == 0 and pixels[0, :, :96].abs().min() >= 0
     assert pixels[0, :, 95].abs().max() > 0
-
-
-@pytest.mark.parametrize("pixels", [[], [(3, 4)], [(0, 0), (5, 6)], [(2, 1), (4, 1)]])
-def test_a_patch_contains_all_pixels_of_the_mask(pixels):
-    mask = np.zeros((6, 7), bool)
-    for row, column in pixels:
-        mask[row, column] = True
-    patch = as_patch(mask)
-    assert np.array_equal(on_image(patch, mask.shape), mask)
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatch):
