@@ -21,7 +21,6 @@ from deworldsg_ros.perception.stage import Perceived
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import EvaluationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
-from deworldsg_ros.wire import messages as wire
 
 VOCABULARY = Vocabulary(("book", "chair", "table", "lamp"), ("near", "on"))
 CAMERA = Intrinsics(500.0, 500.0, 320.0, 240.0, 640, 480)
@@ -74,27 +73,18 @@ def test_fross_lifts_the_centre_of_the_box():
     # The grid from 320 - 25 on, every 50 pixels, below 320 + 25: one point, at (295, 215).
     np.testing.assert_allclose(lifted.points_world, [[-0.1, -0.1, 2.0]])
     assert lifted.weight == 1.0
+    # Off the axis: what the Jacobian sees of it is the box's own covariance; z gets a mean on top.
+    x, y = (600 - 320) / 500, (30 - 240) / 500
+    inverse = np.linalg.pinv([[500 / 3, 0, -x * 500 / 9], [0, 500 / 3, -y * 500 / 9]])
+    expected = inverse @ np.diag([40**2 / 12, 200**2 / 12]) @ inverse.T
+    expected[2, 2] += (expected[0, 0] + expected[1, 1]) / 2
+    found = baselines.box_covariance(600, 30, 40, 200, 3.0, CAMERA)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
     T = np.eye(4)
     T[:3] = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
     (turned,) = lift(Fross(), [[300, 140, 340, 340]], depth_of(2.0), T).nodes
     np.testing.assert_allclose(turned.mean_world, [1, 2, 5])
     assert turned.covariance_world[0, 0] > 20 * turned.covariance_world[1, 1]
-
-
-def test_fross_covariance_is_positive_definite_off_the_axis_too():
-    covariance = baselines.box_covariance(600, 30, 40, 200, 3.0, CAMERA)
-    np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
-    assert np.linalg.eigvalsh(covariance).min() > 0
-    # What the Jacobian sees of it is the box's own covariance, but for what z got on top.
-    x, y = (600 - 320) / 500, (30 - 240) / 500
-    jacobian = np.array([[500 / 3, 0, -x * 500 / 9], [0, 500 / 3, -y * 500 / 9]])
-    inverse = np.linalg.pinv(jacobian)
-    of_box = np.diag([40**2 / 12, 200**2 / 12])
-    bare = inverse @ of_box @ inverse.T
-    np.testing.assert_allclose(jacobian @ bare @ jacobian.T, of_box, atol=1e-9)
-    on_top = covariance - bare
-    assert on_top[2, 2] == pytest.approx((bare[0, 0] + bare[1, 1]) / 2)
-    assert np.abs(on_top[:2]).max() < 1e-12
 
 
 def test_fross_leaves_out_invalid_depth():
@@ -115,8 +105,7 @@ def test_fross_leaves_out_invalid_depth():
 def test_fross_merges_the_nearest_of_its_class_up_to_the_threshold():
     others = [node((0.05, 0, 0), (1, 0, 0, 0)), node((0.2, 0, 0)), node((-0.1, 0, 0))]
     assert Fross().choose(node(), others) == 2
-    assert Fross().choose(node(), others[:1]) is None
-    assert Fross().choose(node(), []) is None
+    assert Fross().choose(node(), others[:1]) is Fross().choose(node(), []) is None
     assert Fross().choose(node(), [node((0.99 * REACH_M, 0, 0))]) == 0
     assert Fross().choose(node(), [node((1.01 * REACH_M, 0, 0))]) is None
 
@@ -129,14 +118,7 @@ def test_fross_fuses_by_numbers_of_points():
     assert fused.weight == 4.0
     # 0 and 0 count as 1 and 1.
     fused = Fross().fuse(node(weight=0.0), node((1, 0, 0), weight=0.0))
-    np.testing.assert_allclose(fused.mean_world, [0.5, 0, 0])
-    assert fused.weight == 0.0
-    graph = graph_of(Fross())
-    for _ in range(3):
-        graph.integrate([node(weight=2.0)], NO_RELATIONS, 0)
-    (merged,) = graph.nodes.values()
-    assert (merged.observations, merged.weight) == (3, 6.0)
-    np.testing.assert_allclose(merged.covariance_world, 0.01 * np.eye(3))
+    assert (fused.mean_world[0], fused.weight) == (0.5, 0.0)
 
 
 def test_a_node_that_absorbed_another_is_compared_again():
@@ -145,8 +127,7 @@ def test_a_node_that_absorbed_another_is_compared_again():
     graph.integrate([node(), node((1.6 * REACH_M, 0, 0))], related((0, 1, 1)), 0)
     assert len(graph.nodes) == 2 and len(graph.counts) == 1
     ids = graph.integrate([node((0.8 * REACH_M, 0, 0), variance=0.05)], NO_RELATIONS, 1)
-    assert list(graph.nodes) == ids
-    assert graph.nodes[ids[0]].observations == 3
+    assert [item.observations for item in graph.nodes.values()] == [3] and list(graph.nodes) == ids
     # Both ends of the edge are one node now.
     assert not graph.counts
 
@@ -156,14 +137,9 @@ def test_relations_are_counted_and_follow_their_nodes():
     first = [node(), node((5, 0, 0), (1, 0, 0, 0))]
     for stamp, pairs in enumerate([[(1, 0, 1)], [(1, 0, 1), (0, 1, 0)], [(1, 0, 0)]]):
         graph.integrate(first, related(*pairs), stamp)
-    message = graph.message()
-    assert [(e.observations, e.predicate) for e in message.edges] == [(1, "near"), (3, "on")]
-    assert message.edges[1].probability == pytest.approx(2 / 3, abs=1e-4)
-    # It is a message like any other.
-    assert wire.decode(wire.encode(message), wire.SceneGraphMessage) == message
-    graph = graph_of(Fross())
-    ids = graph.integrate([node(), node()], related((0, 1, 1)), 0)
-    assert len(set(ids)) == 1 and not graph.counts
+    edges = graph.message().edges
+    assert [(e.observations, e.predicate) for e in edges] == [(1, "near"), (3, "on")]
+    assert edges[1].probability == pytest.approx(2 / 3, abs=1e-4)
 
 
 def test_kim_leaves_out_far_points_and_outliers():
@@ -171,11 +147,9 @@ def test_kim_leaves_out_far_points_and_outliers():
     depth_m = depth_of(1.0)
     depth_m[200, 200] = 12.0
     assert len(baselines.window_points(np.array(box, float), depth_m, CAMERA)) == 41 * 41 - 1
-    grid = np.stack(np.meshgrid(np.arange(10), np.arange(10), [0]), axis=-1).reshape(-1, 3) * 0.01
-    np.testing.assert_array_equal(
-        baselines.without_outliers(np.vstack([grid, [[5.0, 5.0, 5.0]]])), grid
-    )
-    assert len(baselines.without_outliers(grid[:10])) == 10
+    grid = 0.01 * np.array([(x, y, 0) for y in range(10) for x in range(10)])
+    kept = baselines.without_outliers(np.vstack([grid, [[5.0, 5.0, 5.0]]]))
+    np.testing.assert_array_equal(kept, grid)
     # More than ten points are needed.
     for columns, drops in (((195, 205), {"few_window_points": 1}), ((185, 215), {})):
         depth_m = depth_of(0.0)
@@ -187,38 +161,26 @@ def test_kim_leaves_out_far_points_and_outliers():
 
 def test_kim_compares_classes_positions_and_colours():
     assert baselines.top_classes(np.array([0.1, 0.4, 0.2, 0.3])) == {1, 2, 3}
-    for one in ([0.0, 1.0, 0.0, 0.0], [0.1, 0.7, 0.1, 0.1]):
-        assert baselines.top_classes(np.array(one)) == {1}
+    assert baselines.top_classes(np.array([0.1, 0.7, 0.1, 0.1])) == {1}
     three = frozenset({1, 2, 3})
     for other, expected in (({4, 5, 6}, 0.0), ({1, 5, 6}, 0.8), ({1, 2}, 0.9), (three, 1.0)):
         assert baselines.class_similarity(three, frozenset(other)) == expected
-    assert baselines.class_similarity(frozenset({1}), frozenset({1})) == 1.0
-    assert baselines.class_similarity(frozenset(), frozenset()) == 0.0
-    # 0.56 m is 0.112 of 5 m; at 1.12 m it is a half.
-    means = np.array([[0.5, 0.5, 0.5], [1.12, 0, 0], [1.12, 1.12, -1.12]])
-    np.testing.assert_allclose(
-        baselines.position_similarities(np.zeros(3), means), [1, 2.5 / 3, 0.5]
-    )
+    # The middle of the densest bin, (240, 16, 16), is nearest to red.
     rgb = np.full((20, 20, 3), (250, 5, 5), np.uint8)
     rgb[:3] = (0, 0, 250)
     histogram = baselines.colour_histogram(rgb, np.array([0, 0, 19, 19], float))
     assert sorted(histogram[histogram > 0].tolist()) == [60, 340]
-    # The middle of the bin, (240, 16, 16), is nearest to red.
     assert baselines.densest_colour(histogram) == (255, 0, 0)
-
-
-def test_kim_similarity_and_threshold():
     red, blue = np.zeros((2, 512), np.int64)
     red[7 * 64], blue[7] = 1, 1
     me = node(scores=(0.1, 0.6, 0.2, 0.1), colours=red)
     same = node((0.1, 0, 0), (0.1, 0.5, 0.3, 0.1), colours=red)
+    # 0.56 m is 0.112 of 5 m; at 1.12 m the similarity of a coordinate is a half.
     other = node((1.12, 0, 0), (0.0, 0.0, 0.0, 1.0), colours=blue)
-    colour = 1 - math.sqrt(2) / math.sqrt(3)
-    expected = [1.0, 0.4 * 2.5 / 3 + 0.1 * colour]
+    expected = [1.0, 0.4 * 2.5 / 3 + 0.1 * (1 - math.sqrt(2) / math.sqrt(3))]
     np.testing.assert_allclose(Kim().similarities(me, [same, other]), expected, atol=0.01)
     assert Kim().choose(me, [other, same]) == 1
-    assert Kim().choose(me, [other]) is None
-    assert Kim().choose(me, []) is None
+    assert Kim().choose(me, [other]) is Kim().choose(me, []) is None
     np.testing.assert_allclose(Kim().fuse(me, same).class_scores, [0.2, 1.1, 0.5, 0.2])
 
 

@@ -117,42 +117,32 @@ def test_boxes_are_true_and_masks_are_those_of_the_segmenter(tmp_path):
 
 
 def test_boxes_are_jittered_by_two_pixels_by_default(tmp_path):
-    root = write_room(tmp_path, frames=30)
     choice = FrontEndChoice("boxes")
     assert choice.describe() == "boxes jitter 2"
-    boxes, again = (
-        [item.frame_graph.boxes_xyxy for item in perceived(root, choice)] for _ in range(2)
-    )
-    assert all((one == two).all() for one, two in zip(boxes, again))
-    errors = np.concatenate([item - BOXES for item in boxes if len(item) == 3])
+    found = perceived(write_room(tmp_path, frames=30), choice)
+    boxes = [item.frame_graph.boxes_xyxy for item in found if len(item.frame_graph) == 3]
+    errors = np.array(boxes) - BOXES
     assert abs(errors.mean()) < 0.4
     assert 1.7 < errors.std() < 2.3
-    other = perceived(root, FrontEndChoice("boxes", seed=1))[0].frame_graph.boxes_xyxy
-    assert not np.array_equal(other, boxes[0])
 
 
 @pytest.mark.parametrize("kind", ["ground-truth", "boxes"])
 def test_faults_of_single_frames(tmp_path, kind):
-    root = write_room(tmp_path)
+    root = write_room(tmp_path, frames=12)
     missed = perceived(root, FrontEndChoice(kind, miss=1.0))
-    assert [len(item.frame_graph) for item in missed] == [0] * 3
+    assert [len(item.frame_graph) for item in missed] == [0] * 12
     for item in perceived(root, FrontEndChoice(kind, flip=1.0)):
         assert np.not_equal(classes_of(item), [1, 2, 0]).all()
     false = perceived(root, FrontEndChoice(kind, faults=Faults(false=8)))
     assert max(len(item.frame_graph) for item in false) > 3
-
-
-def test_faults_are_seeded_and_have_the_chosen_rates(tmp_path):
-    root = write_room(tmp_path, frames=40)
-    choice = FrontEndChoice("ground-truth", flip=0.3, miss=0.2, jitter_px=1.5, seed=5)
-    first, again = perceived(root, choice), perceived(root, choice)
-    for ours, theirs in zip(first, again):
-        assert (ours.frame_graph.boxes_xyxy == theirs.frame_graph.boxes_xyxy).all()
-        assert (ours.instances == theirs.instances).all()
-    sizes = [len(item.frame_graph) for item in first]
-    assert 0.65 < sum(sizes) / 120 < 0.92
-    other = perceived(root, replace(choice, seed=0))
-    assert [len(item.frame_graph) for item in other] != sizes
+    # They are seeded, and have the chosen rate.
+    choice = FrontEndChoice(kind, flip=0.3, miss=0.2, jitter_px=1.5, seed=5)
+    first, again, other = (
+        [item.frame_graph.boxes_xyxy.tolist() for item in perceived(root, replace(choice, seed=n))]
+        for n in (5, 5, 1)
+    )
+    assert first == again != other
+    assert 0.6 < np.sum([len(boxes) for boxes in first]) / 36 < 0.95
 
 
 @pytest.mark.parametrize(
@@ -246,8 +236,6 @@ def test_a_wrong_label_lasts_a_spell_and_has_the_chosen_rate():
         # Another class of the room, as surely as the right one would be.
         assert set(labels(item).values()) <= set(CLASSES)
         assert [part.class_probabilities.max() for part in item.detections] == [0.9] * 3
-    short = [labels(item)[1] != 0 for item in run(label=0.2, spell_s=0.5)]
-    assert min(lengths(short)) == 5
     # A second choice of the detection is the wrong label.
     given = seen()
     named = replace(given.detections[0], class_probabilities=spread({0: 0.7, 4: 0.2}, 6))
@@ -268,13 +256,9 @@ def test_false_boxes_last_and_are_on_the_background():
             assert int(part.class_probabilities.argmax()) in CLASSES
     # Fewer than asked for: some are too small to be seen, or lie on the objects.
     assert 0.7 < np.mean([len(item.detections) - 3 for item in items]) <= 2.3
-    value = next(part.instance for item in items for part in item.detections[3:])
+    value = items[-1].detections[-1].instance
     there = [any(part.instance == value for part in item.detections) for item in items]
     assert np.median(lengths(there)) >= 3
-    boxes = [part.box_xyxy for item in items for part in item.detections if part.instance == value]
-    steps = np.abs(np.diff(boxes, axis=0)).max(axis=1)
-    assert (steps == 0).any()
-    assert (steps > 5).any()
 
 
 def test_masks_bleed_merge_and_are_cut():

@@ -233,14 +233,3 @@ def test_calibration():
     beliefs = [Calibrated(0.8, True), Calibrated(0.8, False)]
     assert total_log_loss(beliefs) == pytest.approx(-math.log(0.8) - math.log(0.2))
     assert total_log_loss([Calibrated(1.0, False)]) == pytest.approx(-math.log(1e-3))
-
-
-def test_leaving_out_an_edge_that_holds_does_not_lower_the_log_loss():
-    def loss(*edges):
-        return measure_views(NODES, list(edges), HALL).edge_scores()["on"].log_loss
-
-    first, second = EdgeView(1, 2, "on", 0.6), EdgeView(4, 2, "on", 0.3)
-    full = loss(first, second)
-    assert loss(first) > full and loss() > full
-    # Leaving out an edge that does not hold lowers it.
-    assert loss(first, second, EdgeView(4, 1, "on", 0.3)) > full
