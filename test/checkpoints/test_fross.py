@@ -174,21 +174,17 @@ def test_parameters_are_where_they_belong(imported):
     assert model.config.id2label[4] == SCANNET_CLASSES[4]
     inner, decoder, layer = model.model, model.model.decoder, model.model.decoder.layers[2]
     aifi = next(m for n, m in model.named_modules() if n.endswith("aifi.0.layers.0"))
-    attention = "decoder.decoder.layers.2.self_attn."
-    in_decoder, in_encoder = "decoder.decoder.layers.2.", "encoder.encoder.0.layers.0."
+    in_decoder = "decoder.decoder.layers.2."
+    attention = f"{in_decoder}self_attn."
     spots = {
         f"{attention}out_proj.weight": layer.self_attn.o_proj.weight,
-        f"{in_decoder}norm1.bias": layer.self_attn_layer_norm.bias,
         f"{in_decoder}norm2.bias": layer.encoder_attn_layer_norm.bias,
         f"{in_decoder}norm3.bias": layer.final_layer_norm.bias,
-        f"{in_decoder}linear2.bias": layer.mlp.fc2.bias,
         "decoder.dec_score_head.1.weight": decoder.class_embed[1].weight,
         "decoder.dec_bbox_head.3.layers.2.bias": decoder.bbox_embed[3].layers[2].bias,
-        "decoder.enc_output.norm.weight": inner.enc_output[1].weight,
         "decoder.input_proj.1.norm.running_mean": inner.decoder_input_proj[1][1].running_mean,
         "encoder.input_proj.2.conv.weight": inner.encoder_input_proj[2][0].weight,
-        f"{in_encoder}norm2.weight": aifi.final_layer_norm.weight,
-        f"{in_encoder}linear1.weight": aifi.mlp.fc1.weight,
+        "encoder.encoder.0.layers.0.linear1.weight": aifi.mlp.fc1.weight,
         "encoder.pan_blocks.1.bottlenecks.2.conv2.conv.weight": (
             inner.encoder.pan_blocks[1].bottlenecks[2].conv2.conv.weight
         ),

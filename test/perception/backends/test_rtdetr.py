@@ -95,15 +95,19 @@ def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scor
     assert (q.max(axis=1) >= p.max(axis=1)).all()
 
 
-def test_threshold_keeps_the_best_in_order(folders):
+def test_threshold_keeps_the_best_in_order(folders, copy):
     found = detector(folders["v1"])
     every = found.detect(image(), 0.0)
     threshold = float(np.median(every.scores))
     kept = found.detect(image(), threshold)
     assert 0 < len(kept) < len(every)
     assert np.array_equal(kept.scores, every.scores[every.scores >= threshold])
-    none = found.detect(image(), 1.0)
-    assert len(none) == 0 and none.class_probabilities.shape == (0, len(models.CLASSES))
+    assert found.detect(image(), 1.0).class_probabilities.shape == (0, len(models.CLASSES))
+    # The default is that of the card or of the kind of scores.
+    assert found.default_score_threshold == 0.5
+    assert detector(folders["softmax"]).default_score_threshold == 0.7
+    own = with_card(copy, class_scores="softmax", score_threshold=0.3)
+    assert detector(own).default_score_threshold == 0.3
 
 
 @pytest.mark.parametrize("layers", [1, 3])
@@ -111,19 +115,6 @@ def test_fewer_decoder_layers_give_the_intermediate_output(copy, layers):
     found = detector(with_card(copy, decoder_layers=layers)).detect(image(), 0.0)
     inner = reference(image()).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
     assert np.allclose(found.scores, inner.sort(descending=True).values, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("card", "threshold"),
-    [
-        ({}, 0.5),
-        ({"class_scores": "sigmoid"}, 0.5),
-        ({"class_scores": "softmax"}, 0.7),
-        ({"class_scores": "softmax", "score_threshold": 0.3}, 0.3),
-    ],
-)
-def test_default_threshold_is_that_of_the_card_or_the_kind_of_scores(copy, card, threshold):
-    assert detector(with_card(copy, **card)).default_score_threshold == threshold
 
 
 def test_queries_are_recorded_only_on_request(folders):
