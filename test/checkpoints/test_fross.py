@@ -1,7 +1,5 @@
 """`deworldsg models import-fross`: every parameter of the published layout finds its place."""
 
-from __future__ import annotations
-
 import json
 import re
 

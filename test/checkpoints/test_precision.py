@@ -3,8 +3,6 @@
 A CPU stands in for a GPU: it computes in float16 and bfloat16, too. CUDA itself is not tested.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.checkpoints import clip, config_of, request, save_random_probe, save_vjepa2

@@ -1,7 +1,5 @@
 """The probe: saved, loaded, imported from the published file; misfits are refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

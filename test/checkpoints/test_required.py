@@ -1,7 +1,5 @@
 """Checkpoints that a configuration needs: what is missing is named before anything is loaded."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 from typer.testing import CliRunner

@@ -1,7 +1,5 @@
 """Checkpoints that older versions of transformers saved give the outputs of these versions."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

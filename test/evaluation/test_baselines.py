@@ -1,7 +1,5 @@
 """FROSS and Kim et al. on cases small enough to be computed by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

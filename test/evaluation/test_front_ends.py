@@ -1,7 +1,5 @@
 """Front ends that are replayed or made: what they hand to lifting, and their seeded faults."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

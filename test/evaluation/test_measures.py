@@ -1,7 +1,5 @@
 """Measures beside recall, on graphs whose faults are counted by hand."""
 
-from __future__ import annotations
-
 import csv
 import math
 

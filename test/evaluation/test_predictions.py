@@ -1,7 +1,5 @@
 """Prediction files: the open format, and official pickles that may be hostile."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from pathlib import Path

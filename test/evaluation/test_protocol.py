@@ -1,7 +1,5 @@
 """The protocol: the official program's numbers, and its rules one by one on data made here."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """A recording with its ground truth beside it is a data set of one scan."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From the released prediction files to the printed table, with made-up files of their layout."""
 
-from __future__ import annotations
-
 import json
 import pickle
 

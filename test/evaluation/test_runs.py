@@ -1,7 +1,5 @@
 """A scan through the pipeline and the protocol, from the command line too."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import subprocess

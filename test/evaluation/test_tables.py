@@ -1,7 +1,5 @@
 """Tables of methods: jobs that are kept and resumed, processes, a cluster, the command."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Switches and flips, counted on made-up streams of updates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

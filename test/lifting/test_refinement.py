@@ -1,7 +1,5 @@
 """Eq. 1-2: the inliers equal those of the reference for every kind of depth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

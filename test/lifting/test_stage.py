@@ -1,7 +1,5 @@
 """Eq. 3-4 and the stage: Gaussians, drops, relations, frames; masks and boxes without Eq. 1-2."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The whole stage on real Kinect frames of a kitchen."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import cv2

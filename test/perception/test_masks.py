@@ -1,7 +1,5 @@
 """Masks become an instance image; nested detections of one object are joined."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The geometric relation head on rendered scenes with obvious relations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fnmatch import fnmatch
 

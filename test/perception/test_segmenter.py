@@ -1,7 +1,5 @@
 """The RGB-D segmenter on rendered scenes with known masks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.perception import (

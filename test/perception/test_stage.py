@@ -1,7 +1,5 @@
 """The stage: composition, limits, counted drops, failing backends, configuration."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

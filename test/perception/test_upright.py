@@ -1,7 +1,5 @@
 """A camera on its side: frames are turned upright, results are turned back exactly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Drift: exact poses stay, drift and jumps are found, trembling is not taken for drift."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """RGB-D odometry on frames with exactly known poses, and poses that are perturbed on purpose."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

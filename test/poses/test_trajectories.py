@@ -1,7 +1,5 @@
 """Trajectory files: reading, validation, interpolation, and use with a recording."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Training clips: read from folders, or cropped from data sets as at run time."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

@@ -1,7 +1,5 @@
 """Training of probes: features on disk, split, fit, record, accuracy."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

@@ -1,7 +1,5 @@
 """The EGTR relation head: parity with the naive head, ranking, and checkpoints that are refused."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The detector: suppression, decoding, calibration, and the shipped weights."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """RT-DETR and RT-DETRv2: scores, boxes, preprocessing, layers, and checkpoints that are refused."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """SAM, SAM 2 and SAM 3: box prompts, batches of boxes, and checkpoints that are refused."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np
