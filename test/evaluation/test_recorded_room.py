@@ -73,14 +73,6 @@ def test_command_on_a_recording(tmp_path):
     assert stamp_ns == 1_750_000_000_000_000_000 + 9 * 800_000_000
 
 
-def test_true_boxes_of_a_recording_get_the_masks_of_the_segmenter(tmp_path):
-    values = values_of(tmp_path, evaluate("boxes", tmp_path, "--every", 25, "--max-frames", 3))
-    assert values["front_end"] == "boxes jitter 2"
-    # Three views far apart: one look is enough, and one node's centre is in its neighbour's box.
-    assert values["measures"]["found"] >= 20
-    assert values["measures"]["wrong_class"] <= 1
-
-
 def sides(size_m):
     """Sides (3,), the longer horizontal one first."""
     length, width, height = size_m

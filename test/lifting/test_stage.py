@@ -126,17 +126,6 @@ def test_empty_frames(count):
     assert (local.means_world.shape, local.covariances_world.shape) == ((0, 3), (0, 3, 3))
 
 
-@pytest.mark.parametrize(("number", "lifted"), [(9, 0), (10, 1)])
-def test_ten_valid_pixels_are_needed(number, lifted):
-    depth_m, instances = np.full((20, 20), 2.0), np.zeros((20, 20))
-    instances.ravel()[45 : 45 + number] = 1
-    instances[10, 10] = 1
-    depth_m[10, 10] = np.nan
-    local = lift(scene_of(instances, depth_m), 1)
-    assert len(local) == lifted
-    assert local.drops == ({} if lifted else {"few_mask_pixels": 1})
-
-
 def test_each_step_names_its_drop():
     depth_m, instances = np.full((40, 120), 2.0), np.zeros((40, 120))
     instances[2:8, 2:8] = 1

@@ -219,17 +219,6 @@ def test_the_surface_beneath_is_unknown_if_the_bottom_is_hidden():
     assert not np.isnan(layout.beneath[2]).any()
 
 
-def test_the_gap_of_turned_objects():
-    # Two strips on the floor, at 45 degrees, seen from 2 m above: their boxes overlap.
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    across = (u - v - 40) / np.sqrt(2)
-    instances = ((np.abs(across + 40) < 15) + 2 * (np.abs(across - 40) < 15)).astype(np.uint16)
-    depth_m, up_camera = np.full(SHAPE, 2.0, np.float32), np.array([0.0, 0.0, -1.0])
-    layout = measure_layout(depth_m, INTRINSICS, instances, 2, up_camera)
-    assert layout.gap_m[0, 1] == pytest.approx((80 - 30) * 2.0 / INTRINSICS.fx, abs=0.03)
-    assert layout.covered[0, 1] == layout.shared[0, 1] == 0
-
-
 def test_objects_without_pixels_depth_or_partner_are_not_related():
     _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
     head = GeometricRelationHead(REPLICA_SSG_PREDICATES)

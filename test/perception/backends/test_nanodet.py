@@ -108,16 +108,6 @@ def test_decode_one_cell(level):
     assert scores[0, CUP] == TABLES.scores[level, 230]
 
 
-@pytest.mark.parametrize(("code", "count"), [(0, 0), (38, 0), (39, 1)])
-def test_decode_takes_scores_above_the_limit(code, count):
-    assert TABLES.scores[0, 38] <= nanodet.CANDIDATE_SCORE < TABLES.scores[0, 39]
-    heads = empty_heads()
-    heads[0][0, 0, CUP] = code
-    boxes, scores = decode(heads, TABLES)
-    assert boxes.shape == (count, 4) and scores.shape == (count, 80)
-    assert len(combine(boxes, scores, 0.0)) == count
-
-
 def scores_of(scores):
     """A row of class scores for each dictionary."""
     rows = np.full((len(scores), 80), 0.01)
