@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -9,7 +10,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from support.evaluation import write_predictions
+from support.evaluation import one_hot, segment, write_dataset, write_predictions
 from support.sequences import write_room
 from typer.testing import CliRunner
 
@@ -336,6 +337,51 @@ def test_the_printed_numbers_are_in_the_paper(shared_dir):
         assert "&".join(f"{value:.1f}" for value in row.percents) in text, row
     for value in RUNTIME_MS.values():
         assert f"{value:.2f}ms" in text.replace("~", "").replace("\\", "")
+
+
+def write_released(path, scans, right):
+    """Predictions with the right classes in the first `right` scans, as the release stores them."""
+    content = {
+        scan: {
+            "pcd": [segment(1).astype(np.float32), segment(2).astype(np.float32)],
+            "cls": np.array([one_hot(1 if number < right else 0), one_hot(2)], np.float32),
+            "edge_index": np.array([[0], [1]]),
+            "edge_cls": np.array([one_hot(0)], np.float32),
+        }
+        for number, scan in enumerate(scans)
+    }
+    path.write_bytes(pickle.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("layout", "scans", "name", "printed"),
+    [
+        ("3rscan", ("a", "b"), "DeWorldSG", {"relationship_recall": 0.502, "object_recall": 0.75}),
+        ("replica", tuple(REPLICA_TEST_SCANS), "DeWorldSG", {"relationship_recall": 0.382}),
+        # A method that the paper does not print has no printed row.
+        ("3rscan", ("a", "b"), "Mine", None),
+    ],
+)
+def test_released_predictions_stand_below_the_row_of_the_paper(
+    tmp_path, layout, scans, name, printed
+):
+    scan = ((("chair", 1), ("table", 2)), ((1, 2, "near"),))
+    data = write_dataset(tmp_path / "data", dict.fromkeys(sorted(scans), scan), layout=layout)
+    file, out = tmp_path / "deworldsg_predictions.pkl", tmp_path / "out"
+    write_released(file, sorted(scans), len(scans) - 1)
+    options = ("--layout", layout, "--predictions", f"{name}={file}", "--json", out / "t.json")
+    result = invoke(data, "predictions", out, *options)
+    assert result.exit_code == 0, result.output
+    rows = {row["name"]: row for row in json.loads((out / "t.json").read_text())["rows"]}
+    if printed is None:
+        assert list(rows) == [name]
+        assert "only beside a row of the same method" in result.output
+    else:
+        assert list(rows) == [f"printed {name}", name]
+        assert rows[f"printed {name}"].items() >= printed.items()
+    assert rows[name]["relationship_recall"] == pytest.approx((len(scans) - 1) / len(scans))
+    assert rows[name]["predicate_recall"] == 1.0
+    assert (out / "table.csv").is_file() and (out / "table.tex").is_file()
 
 
 def test_slam_poses_start_at_the_first_true_pose(tmp_path):

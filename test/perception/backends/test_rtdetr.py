@@ -1,30 +1,34 @@
-"""RT-DETR and RT-DETRv2: scores, boxes, preprocessing, layers, and checkpoints that are refused."""
+"""RT-DETR, RT-DETRv2 and EGTR: parity with the networks, and checkpoints that are refused."""
 
 import json
 import shutil
 
+import msgspec
 import numpy as np
 import pytest
 from support import torch_models as models
-from support.torch_models import image, settings, torch
+from support.torch_models import CLASSES, LAYERS, PREDICATES, QUERIES, image, settings, torch
 
 from deworldsg_ros.checkpoints import cards
 from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
+from deworldsg_ros.perception import build_perception
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector, best_pairs
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
-
-SOFTMAX = CheckpointCard(class_scores="softmax")
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("rtdetr")
+    softmax = CheckpointCard(class_scores="softmax")
     return {
         "v1": models.save_rtdetr(root / "v1", 1),
         "v2": models.save_rtdetr(root / "v2", 2),
-        "softmax": models.save_rtdetr(root / "softmax", 1, card=SOFTMAX, normalise=True),
+        "softmax": models.save_rtdetr(root / "softmax", 1, card=softmax, normalise=True),
+        "paper": models.save_paper_checkpoint(root / "paper"),
     }
 
 
@@ -65,7 +69,7 @@ def test_all_detections_equal_the_queries_of_the_network(folders, version):
     output = reference(rgb, version=version)
     scores = output.logits[0].sigmoid().amax(-1)
     order = torch.argsort(scores, descending=True, stable=True)
-    assert len(found) == models.QUERIES
+    assert len(found) == QUERIES
     # float32: two resizers and two orders of sums, which differ from processor to processor.
     assert np.allclose(found.scores, scores[order].double(), atol=5e-5)
     cx, cy, w, h = output.pred_boxes[0][order].double().unbind(-1)
@@ -100,7 +104,7 @@ def test_threshold_keeps_the_best_in_order(folders, copy):
     kept = found.detect(image(), threshold)
     assert 0 < len(kept) < len(every)
     assert np.array_equal(kept.scores, every.scores[every.scores >= threshold])
-    assert found.detect(image(), 1.0).class_probabilities.shape == (0, len(models.CLASSES))
+    assert found.detect(image(), 1.0).class_probabilities.shape == (0, len(CLASSES))
     # The default is that of the card or of the kind of scores.
     assert found.default_score_threshold == 0.5
     assert detector(folders["softmax"]).default_score_threshold == 0.7
@@ -121,7 +125,7 @@ def test_queries_are_recorded_only_on_request(folders):
     for _ in range(2):
         watched.record_queries()
     found = watched.detect(image(), 0.0)
-    assert found.features.shape == (models.QUERIES, 2 * models.LAYERS + 1, models.WIDTH)
+    assert found.features.shape == (QUERIES, 2 * LAYERS + 1, models.WIDTH)
     assert found.features.dtype == np.float32
     # The last slot is what the class head reads.
     head = models.random_rtdetr().model.decoder.class_embed[-1]
@@ -137,61 +141,211 @@ def test_other_images_and_half_precision_run_through(folders):
     read_only = image(120, 160)
     read_only.flags.writeable = False
     for rgb in (read_only, image(33, 47)):
-        assert len(found.detect(rgb, 0.0)) == models.QUERIES
+        assert len(found.detect(rgb, 0.0)) == QUERIES
     found.model, found.dtype = found.model.half(), torch.float16
     assert np.allclose(found.detect(image(), 0.0).scores, exact.scores, atol=0.05)
 
 
-def refused(match, folder, **changes):
+def naive(network, features, classes=None):
+    """The head as it is printed: every pair's sources side by side, all of them at once."""
+    layers = (features.shape[1] - 1) // 2
+    count = len(features)
+    sources = []
+    for slot in range(layers + 1):
+        last = slot == layers
+        make_q = network.final_sub_proj if last else network.proj_q[slot]
+        make_k = network.final_obj_proj if last else network.proj_k[slot]
+        q = make_q(features[:, -1 if last else slot])
+        k = make_k(features[:, -1 if last else layers + slot])
+        pair = torch.cat([q[:, None].expand(-1, count, -1), k[None].expand(count, -1, -1)], -1)
+        sources.append(pair)
+    sources = torch.stack(sources, dim=2)
+    gates = torch.sigmoid(network.rel_predictor_gate(sources))
+    pairs = (gates * sources).sum(dim=2)
+
+    def perceptron(part):
+        first, second, last = part.layers
+        return last(torch.relu(second(torch.relu(first(pairs)))))
+
+    relations = perceptron(network.rel_predictor)
+    if classes is not None:
+        for i, subject in enumerate(classes):
+            for j, target in enumerate(classes):
+                relations[i, j] += network.triplet_dist[subject, target]
+    return relations, perceptron(network.connectivity_layer)[..., 0]
+
+
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("used", [1, LAYERS - 1, LAYERS])
+@torch.no_grad()
+def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
+    network = models.random_head().double()
+    generator = torch.Generator().manual_seed(used)
+    features = torch.randn(40, 2 * used + 1, models.WIDTH, generator=generator, dtype=torch.float64)
+    classes = torch.randint(0, len(CLASSES), (40,), generator=generator)
+    relations, connectivity = naive(network, features, classes if bias else None)
+    kept = torch.tensor([31, 2, 17, 5, 0, 39])
+    found = network(features[kept], classes[kept] if bias else None)
+    assert torch.allclose(found[0], relations[kept][:, kept], atol=1e-9, rtol=0)
+    assert torch.allclose(found[1], connectivity[kept][:, kept], atol=1e-9, rtol=0)
+    # A head that ignored its input would pass all of that.
+    assert relations.std() > 0.1 and connectivity.std() > 0.01
+
+
+@torch.no_grad()
+def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folders):
+    found_by = detector(folders["paper"])
+    head = EgtrRelationHead(settings(predicate_set="checkpoint"), found_by)
+    every = found_by.detect(image(), 0.0)
+    classes = every.class_probabilities.argmax(axis=1)
+    features = torch.from_numpy(every.features)
+    relations, connectivity = naive(models.random_head(), features, torch.from_numpy(classes))
+
+    def relate(kept, top):
+        names = [CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
+        return head.relate(models.segmented(names, kept.scores, kept.features), top)
+
+    kept = every.take(np.arange(0, QUERIES, 4))
+    top = len(kept) * (len(kept) - 1)
+    found = relate(kept, top)
+    assert len(found.pairs) == top and len(set(map(tuple, found.pairs.tolist()))) == top
+    subjects, objects = 4 * found.pairs.T
+    # float32: logits reach 20, and the order of the sums differs from processor to processor.
+    expected = relations[subjects, objects].numpy()
+    assert np.allclose(found.logits, expected, rtol=1e-5, atol=5e-5)
+    ranks = (relations.sigmoid().amax(-1) * connectivity.sigmoid())[subjects, objects].numpy()
+    expected = ranks * every.scores[subjects] * every.scores[objects]
+    assert np.abs(found.scores - expected).max() < 1e-6
+    assert (np.diff(found.scores) <= 0).all()
+    assert np.array_equal(relate(kept, 3).pairs, found.pairs[:3])
+    # Few objects, and no features.
+    for count in (0, 1):
+        assert relate(every.take(slice(count)), 10).logits.shape == (0, len(PREDICATES))
+    assert sorted(relate(every.take(slice(2)), 10).pairs.tolist()) == [[0, 1], [1, 0]]
+    with pytest.raises(ValueError, match="without query features"):
+        head.relate(models.segmented(CLASSES[:2], every.scores[:2]), 5)
+
+
+def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
+    logits = np.zeros((3, 3, 2))
+    found = best_pairs(logits, np.zeros((3, 3)), np.ones(3), 100)
+    assert len(found.pairs) == 6 and (found.pairs[:, 0] != found.pairs[:, 1]).all()
+    ranks = np.array([[1.0, 0.2, 0.3], [0.9, 1.0, 0.1], [0.3, 0.4, 1.0]])
+    found = best_pairs(logits, ranks, np.array([1.0, 0.5, 1.0]), 3)
+    assert found.pairs.tolist() == [[1, 0], [0, 2], [2, 0]]
+    assert found.scores.tolist() == [0.45, 0.3, 0.3]
+
+
+def stage(folder, world_up="auto", **changes):
+    names = {"detector": "rtdetr", "relation_head": "egtr", "predicate_set": "checkpoint"}
+    config = settings(**{**names, "detector_path": str(folder), **changes})
+    return build_perception(config, world_up=world_up)
+
+
+def test_rtdetr_sam2_and_egtr_as_one_stage(folders, tmp_path):
+    # Random weights put their boxes anywhere: they are not refined.
+    limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
+    segmenter = {"segmenter": "sam2", "segmenter_path": str(models.save_sam2(tmp_path))}
+    perception = stage(folders["paper"], "z", **segmenter, **limits)
+    depth_m = np.full((48, 64), 1.5, np.float32)
+    frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
+    seen, again = perception.perceive(frame), perception.perceive(frame)
+    vocabulary = perception.vocabulary
+    assert (vocabulary.classes, vocabulary.predicates) == (CLASSES, PREDICATES)
+    count = len(seen.frame_graph)
+    assert 2 <= count <= QUERIES
+    assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
+    assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
+    assert np.array_equal(again.instances, seen.instances)
+    assert np.array_equal(again.frame_graph.relations.logits, seen.frame_graph.relations.logits)
+
+
+def refused(match, build, *arguments, **changes):
     with pytest.raises(ConfigurationError, match=match):
-        detector(folder, **changes)
+        build(*arguments, **changes)
 
 
-def test_a_missing_or_foreign_checkpoint_is_refused(tmp_path):
-    refused("detector_path is empty", "")
-    refused("no such folder", "/no/such/folder")
-    refused("hf download nobody/nothing-of-that-name", "nobody/nothing-of-that-name")
-    refused("sam: expected rt_detr or rt_detr_v2", models.save_sam(tmp_path))
+def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatch):
+    refused("detector_path is empty", detector, "")
+    refused("no such folder", detector, "/no/such/folder")
+    refused("hf download nobody/nothing", detector, "nobody/nothing")
+    refused("sam: expected rt_detr or rt_detr_v2", detector, models.save_sam(tmp_path / "sam"))
+    nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
+    refused("does not name its 3 classes", detector, nameless)
+    short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
+    refused("names 1 classes, .* 6", detector, short)
+
+    def full(*arguments):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
+
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    refused("perception.device is 'cuda'", detector, folders["v1"], device="cuda")
+    monkeypatch.setattr(RtDetrDetector, "_forward", full)
+    refused("out of memory .* smaller perception.detector_p", detector, folders["v1"])
 
 
 def test_missing_and_damaged_files_are_refused(copy):
     from safetensors.torch import load_file, save_file
 
-    refused(r"deworldsg\.json is 9, .* 4", with_card(copy, decoder_layers=9))
+    refused(r"deworldsg\.json is 9, .* 4", detector, with_card(copy, decoder_layers=9))
     (copy / DETECTOR_CARD).write_text('{"class_scores": "argmax"}')
-    refused(r"deworldsg\.json: .*argmax", copy)
+    refused(r"deworldsg\.json: .*argmax", detector, copy)
     (copy / DETECTOR_CARD).unlink()
     assert cards.read_detector_card(None) == CheckpointCard()
     preprocessing = copy / "preprocessor_config.json"
     text = preprocessing.read_text()
     wrong = {**json.loads(text), "do_normalize": True, "image_mean": [0.5]}
     preprocessing.write_text(json.dumps(wrong))
-    refused(r"preprocessor_config\.json: ", copy)
+    refused(r"preprocessor_config\.json: ", detector, copy)
     preprocessing.write_text(text)
     model = copy / "model.safetensors"
     weights = load_file(model)
     gone = next(name for name in weights if name.endswith("enc_score_head.weight"))
     del weights[gone]
     save_file(weights, model, metadata={"format": "pt"})
-    refused(r"lacks 1 parameters .*enc_score_head\.weight", copy)
+    refused(r"lacks 1 parameters .*enc_score_head\.weight", detector, copy)
     model.write_bytes(b"no tensors")
-    refused("cannot be loaded", copy)
+    refused("cannot be loaded", detector, copy)
     model.unlink()
-    refused("cannot be loaded", copy)
+    refused("cannot be loaded", detector, copy)
 
 
-def test_unnamed_and_miscounted_classes_are_refused(tmp_path):
-    nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
-    refused("does not name its 3 classes", nameless)
-    short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
-    refused("names 1 classes, .* 6", short)
+def test_a_relation_head_that_does_not_fit_is_refused(folders, copy, tmp_path):
+    from safetensors.torch import save_file
+
+    refused("'rtdetr'", stage, "", detector="nanodet")
+    refused("no egtr_head.safetensors", stage, folders["v1"])
+    refused("'3dssg'", stage, folders["paper"], predicate_set="3dssg")
+    fewer = models.save_paper_checkpoint(tmp_path / "a", labels=CLASSES[:4])
+    refused("has 4 classes.* 7", stage, fewer)
+    counted = models.save_paper_checkpoint(tmp_path / "b", {"predicates": ("on",)})
+    refused("deworldsg.json of .* names 1 predicates", stage, counted)
+    deeper = models.save_paper_checkpoint(tmp_path / "c", decoder_layers=LAYERS + 1)
+    refused("has 5 layers of 32 .* 4 layers of 32", stage, deeper)
+    # The head accepts a detector with fewer layers.
+    card = cards.read_detector_card(deeper / DETECTOR_CARD)
+    card = msgspec.structs.replace(card, decoder_layers=3)
+    cards.write_detector_card(deeper / DETECTOR_CARD, card)
+    stage(deeper)
+    with_card(copy, predicates=PREDICATES, frequency_bias=True)
+    (copy / "egtr_head.safetensors").write_bytes(b"damaged")
+    refused(r"egtr_head\.safetensors cannot be read", stage, copy)
+    parameters = models.random_head().state_dict()
+    del parameters["triplet_dist"], parameters["rel_dist"]
+    save_file(parameters, copy / "egtr_head.safetensors")
+    refused("no class-pair statistics .* `frequency_bias`", stage, copy)
 
 
-def test_missing_cuda_and_memory_are_refused_with_a_remedy(folders, monkeypatch):
-    def full(*arguments):
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    refused("perception.device is 'cuda'", folders["v1"], device="cuda")
-    monkeypatch.setattr(RtDetrDetector, "_forward", full)
-    refused("out of memory .* smaller perception.detector_p", folders["v1"])
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("proj_q.1.weight", None, r"missing \(proj_q.1.weight\)"),
+        ("proj_v.0.weight", torch.zeros(2), r"unknown \(proj_v.0.weight\)"),
+        ("rel_predictor_gate.bias", torch.zeros(2), "size mismatch for rel_predictor_gate.bias"),
+        ("triplet_dist", torch.zeros(2, 2), r"triplet_dist has shape \(2, 2\)"),
+    ],
+)
+def test_a_head_with_other_parameters_is_refused_by_name(name, value, message):
+    parameters = {**models.random_head().state_dict(), name: value}
+    parameters = {name: value for name, value in parameters.items() if value is not None}
+    refused(message, EgtrNetwork.for_parameters, parameters, "head.safetensors")
