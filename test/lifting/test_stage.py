@@ -118,14 +118,6 @@ def test_a_thin_object_far_from_the_origin_keeps_its_precision():
     np.testing.assert_allclose(local.means_world[0] - 1000.0, reference.mean, atol=1e-12)
 
 
-@pytest.mark.parametrize("count", [0, 3])
-def test_empty_frames(count):
-    local = lift(scene_of(np.zeros((60, 80)), np.ones((60, 80))), count)
-    assert len(local) == 0
-    assert local.drops == ({"few_mask_pixels": count} if count else {})
-    assert (local.means_world.shape, local.covariances_world.shape) == ((0, 3), (0, 3, 3))
-
-
 def test_each_step_names_its_drop():
     depth_m, instances = np.full((40, 120), 2.0), np.zeros((40, 120))
     instances[2:8, 2:8] = 1
@@ -258,9 +250,9 @@ def test_boxes_may_overlap_leave_the_image_and_have_no_depth():
     assert [len(pixels) for pixels in found] == [4 * 5, 3 * 3, 0, 0]
     assert (found[1].columns.min(), found[1].rows.max()) == (2, 4)
     blind = scene_of(np.zeros((30, 40)), np.zeros((30, 40)))
-    for boxes in ([], [[0, 0, 20, 20]]):
-        lifted = lift(blind, len(boxes), boxes=boxes, pixels="box")
-        assert len(lifted) == 0
+    for boxes, pixels in (([], "box"), ([[0, 0, 20, 20]], "box"), ([[0, 0, 20, 20]], "refined")):
+        lifted = lift(blind, len(boxes), boxes=boxes, pixels=pixels)
+        assert (lifted.means_world.shape, lifted.covariances_world.shape) == ((0, 3), (0, 3, 3))
         assert lifted.drops == ({"few_mask_pixels": 1} if boxes else {})
 
 

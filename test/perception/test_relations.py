@@ -190,12 +190,6 @@ def test_flying_pixels_at_the_border_of_a_mask_do_not_change_the_relations():
     assert see("table, bowl:right, cup", flying_px=2) == expected
 
 
-def layout_of(*slabs):
-    _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE, *slabs])
-    count = 2 + len(slabs)
-    return measure_layout(depth_m, INTRINSICS, owner.astype(np.uint16), count, UP_CAMERA)
-
-
 @pytest.mark.parametrize(
     ("changed", "on"),
     [
@@ -208,15 +202,11 @@ def layout_of(*slabs):
     ],
 )
 def test_a_support_is_known_from_the_contact_or_from_the_bottom_edge(changed, on):
+    _, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE])
+    layout = measure_layout(depth_m, INTRINSICS, owner.astype(np.uint16), 2, UP_CAMERA)
     fields = {name: np.full((2, 2), value) for name, value in changed.items()}
-    logits = predicate_logits(replace(layout_of(), **fields), ["table", "cup"])["on"]
+    logits = predicate_logits(replace(layout, **fields), ["table", "cup"])["on"]
     assert (logits[1, 0] > 0) == on
-
-
-def test_the_surface_beneath_is_unknown_if_the_bottom_is_hidden():
-    layout = layout_of(Slab((-0.4, 1.2, 0.70), (0.1, 1.25, 0.98), (90, 90, 90)))
-    assert np.isnan(layout.beneath[1]).all()
-    assert not np.isnan(layout.beneath[2]).any()
 
 
 def test_objects_without_pixels_depth_or_partner_are_not_related():

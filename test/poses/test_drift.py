@@ -136,14 +136,3 @@ def test_a_loop_closure_does_not_correct_again_what_is_corrected():
     before = builder.graph.nodes.means.copy()
     assert builder.apply_correction(np.linalg.inv(error), 0) == [1]
     assert np.abs(builder.graph.nodes.means - before).max() < 0.03  # not 24 cm
-
-
-def test_a_moved_local_graph_equals_one_of_a_moved_camera():
-    local, T = frame(1, (OBJECT, CUP)), pose((10, 20, 30), (1, 2, 3))
-    there = moved(local, T)
-    (points,), (before,) = there.surface_points_world, local.surface_points_world
-    assert np.allclose(points, before @ T[:3, :3].T + T[:3, 3], atol=1e-5)
-    assert points.dtype == np.float32
-    assert np.array_equal(there.T_world_camera, T)
-    assert np.allclose(moved(there, np.linalg.inv(T)).means_world, local.means_world)
-    assert np.allclose(difference(np.eye(4), T)[:3], np.radians((10, 20, 30)))
