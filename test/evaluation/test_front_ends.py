@@ -218,25 +218,21 @@ def areas(items, value):
     return np.array([np.count_nonzero(item.instance_image == value) for item in items])
 
 
-def lengths(affected):
-    """Lengths of the runs of frames that are affected, save for the ends of the recording."""
-    text = "".join("x" if item else "." for item in affected)
-    return [len(part) for part in text.strip("x").split(".") if part]
-
-
 def test_a_wrong_label_lasts_a_spell_and_has_the_chosen_rate():
     items = run(label=0.2)
-    wrong = [[labels(item)[value] != value - 1 for item in items] for value in (1, 2, 3)]
-    assert 0.1 < np.mean(wrong) < 0.3
-    assert wrong[0] != wrong[1]
-    assert all(length % 20 == 0 for of_object in wrong for length in lengths(of_object))
+    wrong = np.array([[labels(item)[value] != value - 1 for item in items] for value in (1, 2, 3)])
+    assert 0.1 < wrong.mean() < 0.3
+    assert (wrong[0] != wrong[1]).any()
+    # A spell has 20 frames.
+    starts = np.flatnonzero(np.diff(wrong[0].astype(int), prepend=1) == 1)
+    assert len(starts) and all(wrong[0][start : start + 20].all() for start in starts)
     for item in items:
         # Another class of the room, as surely as the right one would be.
         assert set(labels(item).values()) <= set(CLASSES)
         assert [part.class_probabilities.max() for part in item.detections] == [0.9] * 3
 
 
-def test_false_boxes_last_and_are_on_the_background():
+def test_false_boxes_are_on_the_background():
     items = run(false=2.0)
     objects = seen().instance_image > 0
     for item in items:
@@ -247,9 +243,6 @@ def test_false_boxes_last_and_are_on_the_background():
             assert int(part.class_probabilities.argmax()) in CLASSES
     # Fewer than asked for: some are too small to be seen, or lie on the objects.
     assert 0.7 < np.mean([len(item.detections) - 3 for item in items]) <= 2.3
-    value = items[-1].detections[-1].instance
-    there = [any(part.instance == value for part in item.detections) for item in items]
-    assert np.median(lengths(there)) >= 3
 
 
 def test_masks_bleed_merge_and_are_cut():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.evaluation import one_hot, segment, write_dataset, write_json, write_ply
+from support.evaluation import one_hot, segment, write_dataset, write_json
 
 from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
 from deworldsg_ros.evaluation.scoring import (
@@ -254,46 +254,10 @@ def test_input_on_which_the_official_program_stops(tmp_path):
     assert math.isnan(evaluate_predictions(empty, {}).predicates.recall)
 
 
-PLY = "data/a/labels.instances.annotated.v2.ply"
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("dtype", ["float", "double"])
-def test_ply_flavours(tmp_path, form, dtype):
-    annotations = data_set(tmp_path, a=ROOM)
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    ids = np.array([1, 1, 2, 65535, 0])
-    write_ply(tmp_path / PLY, points, ids, form, dtype)
-    read = annotations.points("a")
-    expected = points.astype(np.float32).astype(np.float64) if dtype == "float" else points
-    assert (read.points_world == expected).all()
-    assert (read.object_ids == ids).all()
-    # A file that was cut is refused.
-    (tmp_path / PLY).write_bytes((tmp_path / PLY).read_bytes()[:-50])
-    with pytest.raises(RecordingError, match=r"annotated\.v2\.ply.*(of 5 rows|5 numbers)"):
-        annotations.points("a")
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        ("", "no PLY file"),
-        ("ply\nformat ascii 1.0\nend_header\n", "element vertex"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "y, z"),
-        ("ply\nformat strange 1.0\nend_header\n", "strange"),
-    ],
-)
-def test_a_bad_ply_is_refused(tmp_path, content, expected):
-    annotations = data_set(tmp_path, a=ROOM)
-    (tmp_path / PLY).write_text(content)
-    with pytest.raises(RecordingError, match=expected):
-        annotations.points("a")
-
-
 def test_a_missing_file_is_reported_with_its_source(tmp_path):
     with pytest.raises(RecordingError, match=r"replica_to_visual_genome\.json is missing.*Replica"):
         Annotations(tmp_path, "replica")
     annotations = data_set(tmp_path, a=ROOM)
-    (tmp_path / PLY).unlink()
+    (tmp_path / "data/a/labels.instances.annotated.v2.ply").unlink()
     with pytest.raises(RecordingError, match=r"annotated\.v2\.ply is missing"):
         evaluate_predictions(annotations, {})
