@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.perception import on_image
 
 from deworldsg_ros.perception.protocols import Detections, MaskPatch
-from deworldsg_ros.perception.stage import in_front_of, instance_image, join_nested
+from deworldsg_ros.perception.stage import instance_image, join_nested
 
 SHAPE = (6, 7)
 
@@ -53,14 +53,10 @@ SCREEN, CUP = [0.9, 0.1], [0.1, 0.9]
 OUTER, INNER, SECOND = [10, 10, 90, 70], [20, 20, 45, 60], [50, 20, 80, 60]
 
 
-def detections(*rows):
-    boxes, classes, scores = zip(*rows)
-    return Detections(np.array(boxes, float), np.array(classes, float), np.array(scores, float))
-
-
 def join(*rows, depths_m=None):
     """Detections (box, classes, score) and masks that are their boxes, joined."""
-    objects = detections(*rows)
+    boxes, classes, scores = (np.array(column, float) for column in zip(*rows))
+    objects = Detections(boxes, classes, scores)
     masks = [
         MaskPatch(y1, x1, np.ones((y2 - y1 + 1, x2 - x1 + 1), bool))
         for (x1, y1, x2, y2), _, _ in rows
@@ -70,7 +66,7 @@ def join(*rows, depths_m=None):
         depth_m[mask.window][mask.pixels] = value
     joined, joined_masks = join_nested(objects, masks, depth_m)
     # The input is unchanged.
-    assert objects.boxes_xyxy.tolist() == [list(box) for box, _, _ in rows]
+    assert np.array_equal(boxes, [box for box, _, _ in rows])
     assert len(joined) == len(joined_masks)
     return joined, joined_masks
 
@@ -117,21 +113,3 @@ def test_different_objects_are_not_joined(inner, classes, depths_m):
 def test_several_boxes_of_one_class(boxes, kept):
     joined, _ = join(*((box, SCREEN, 0.9 - 0.1 * k) for k, box in enumerate(boxes)))
     assert joined.boxes_xyxy.tolist() == list(kept or boxes)
-
-
-@pytest.mark.parametrize(
-    ("box", "classes", "in_front"),
-    [
-        (INNER, CUP, True),
-        (INNER, SCREEN, False),  # a part of the screen
-        ([60, 20, 99, 60], CUP, False),  # mostly beside it
-        ([0, 0, 99, 79], CUP, False),  # the support of the screen
-    ],
-)
-def test_weak_detections_in_front_are_inside_an_object_of_another_class(box, classes, in_front):
-    objects, weak = detections((OUTER, SCREEN, 0.8)), detections((box, classes, 0.3))
-    assert len(in_front_of(objects, weak)) == in_front
-    none = objects.take(slice(0))
-    assert len(in_front_of(none, weak)) == len(in_front_of(objects, none)) == 0
-    joined, masks = join_nested(none, [], np.zeros((80, 100), np.float32))
-    assert len(joined) == 0 and masks == []
