@@ -178,8 +178,7 @@ def test_the_main_table(root, tmp_path):
 
 def test_the_ablation_table_reports_failed_rows(root, tmp_path):
     out = tmp_path / "out"
-    setting = ("--set", "a:lifting.covariance_ridge_m2=0.5")
-    rows, text = table(root, "ablation", out, *setting)
+    rows, text = table(root, "ablation", out, "--set", "a:lifting.covariance_ridge_m2=0.5")
     assert [rows[name]["scan_count"] for name in "abcde"] == [1, 1, 1, 0, 0]
     assert rows["e"]["failed"]["room_0"]
     assert "failed:" in text

@@ -87,6 +87,11 @@ def test_masks_are_disjoint_deterministic_and_in_the_order_of_the_boxes():
         assert (mask & (owner == k)).sum() / (mask | (owner == k)).sum() > 0.8
     assert np.array_equal(images_of(rgb, depth_m, boxes[[2, 0, 1]]), [masks[k] for k in (2, 0, 1)])
     assert all(np.array_equal(a, b) for a, b in zip(before, (rgb, depth_m, boxes)))
+    # Read-only and sliced images use the same compiled kernel.
+    from_message = np.frombuffer(rgb.tobytes(), np.uint8).reshape(rgb.shape)
+    from_slice = np.repeat(depth_m, 2, axis=1)[:, ::2]
+    assert np.array_equal(images_of(from_message, from_slice, boxes), masks)
+    assert len(upsample_labels.signatures) == 1
     assert segment(rgb, depth_m, []) == []
 
 
@@ -106,17 +111,6 @@ def test_boxes_at_and_beyond_the_border(box):
         assert round(box[1]) <= y1 and y2 <= round(box[3])
     (patch,) = segment(rgb[:100, :90], depth_m[:100, :90], [5.0, 5, 80, 90])
     assert patch.pixels.shape == (86, 76)
-
-
-def test_read_only_and_sliced_images_use_the_same_compiled_kernel():
-    rgb, depth_m, owner = render([TABLE_TOP], 0.002)
-    compiled = len(upsample_labels.signatures)
-    (expected,) = segment(rgb, depth_m, box_of(owner == 1))
-    from_message = np.frombuffer(rgb.tobytes(), np.uint8).reshape(rgb.shape)
-    from_slice = np.repeat(depth_m, 2, axis=1)[:, ::2]
-    (found,) = segment(from_message, from_slice, box_of(owner == 1))
-    assert np.array_equal(found.pixels, expected.pixels)
-    assert len(upsample_labels.signatures) == compiled == 1
 
 
 def plain_label(labels, cell_rgb, cell_depth, rgb, z, y, x, stride):

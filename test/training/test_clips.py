@@ -112,53 +112,34 @@ def test_scans_outside_of_the_split_are_refused(rio, lists, split, message):
         assert {clip.group for clip in read_clips(rio, ClipChoice(4, 2, "test"))} == {"a"}
 
 
-def frames_of(folder, count, boxes_of):
-    """Grey images of 10, 20, 30 ... and the boxes of each."""
-    for number in range(count):
-        path = folder / f"{number}.png"
-        cv2.imwrite(str(path), np.full((40, 60, 3), 10 * number, np.uint8))
-        yield path, boxes_of(number)
-
-
-def box(*corners):
-    return np.array(corners, float)
-
-
-def test_clips_show_the_union_of_both_boxes(tmp_path):
-    def boxes_of(number):
-        other = {} if number == 5 else {2: box(20 + number, 10, 50, 35)}
-        return {1: box(5, 5, 25, 20), **other}
-
-    relations = [(2, 1, "on"), (1, 9, "near")]
-    options = {"clip_length": 4, "clips_per_pair": 2}
-    clips = cut_clips(
-        "scan", list(frames_of(tmp_path, 6, boxes_of)), (60, 40), relations, **options
-    )
-    assert [(c.group, c.pair, c.predicate) for c in clips] == [("scan", "scan 1 2", "on")] * 2
-    first, last = (clip.read() for clip in clips)
-    assert first.shape == (4, 31, 46, 3)  # pixels 5 to 50 by 5 to 35, the union
-    assert first[:, 0, 0, 0].tolist() == [0, 10, 10, 10]
-    assert last[:, 0, 0, 0].tolist() == [0, 10, 20, 30]
-    np.testing.assert_allclose(clips[0].boxes[4:], [0, 0, 20 / 46, 15 / 31])
-    assert len({clip.key for clip in clips}) == 2
-    assert cut_clips("scan", [], (60, 40), relations, **options) == []
-
-
 @pytest.mark.parametrize(
     ("window", "shown"),
     [
         ("last_frames", [10, 20, 30, 40, 50, 60]),
+        # It begins when both objects are seen.
         ("valid_interval", [30, 40, 50, 60, 60, 60]),
     ],
 )
-def test_the_valid_interval_begins_when_both_objects_are_seen(tmp_path, window, shown):
-    """Frame 2 shows one object, frame 4 is not annotated."""
-    one = {1: box(5, 5, 25, 20)}
-    both = {**one, 2: box(20, 10, 50, 35)}
-    frames = list(frames_of(tmp_path, 7, lambda number: {2: one, 4: None}.get(number, both)))
+def test_clips_show_the_union_of_both_boxes(tmp_path, window, shown):
+    """Frame 2 shows one object, frame 4 is not annotated, frame 7 shows one object."""
+    frames = []
+    for number in range(8):
+        path = tmp_path / f"{number}.png"
+        cv2.imwrite(str(path), np.full((40, 60, 3), 10 * number, np.uint8))
+        boxes = {1: np.array([5.0, 5, 25, 20]), 2: np.array([14.0 + number, 10, 50, 35])}
+        if number in (2, 7):
+            del boxes[2]
+        frames.append((path, None if number == 4 else boxes))
+    relations = [(2, 1, "on"), (1, 9, "near")]
     options = {"clip_length": 6, "clips_per_pair": 9, "window": window}
-    clip = cut_clips("scan", frames, (60, 40), [(2, 1, "on")], **options)[-1]
-    assert clip.read()[:, 0, 0, 0].tolist() == shown
+    clips = cut_clips("scan", frames, (60, 40), relations, **options)
+    assert {(c.group, c.pair, c.predicate) for c in clips} == {("scan", "scan 1 2", "on")}
+    assert len({clip.key for clip in clips}) == len(clips) == 5
+    last = clips[-1].read()
+    assert last.shape == (6, 31, 46, 3)  # pixels 5 to 50 by 5 to 35, the union
+    assert last[:, 0, 0, 0].tolist() == shown
+    np.testing.assert_allclose(clips[-1].boxes[4:], [0, 0, 20 / 46, 15 / 31])
+    assert cut_clips("scan", [], (60, 40), relations, **options) == []
 
 
 def test_boxes_of_a_frame(tmp_path):

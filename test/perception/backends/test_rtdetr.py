@@ -100,6 +100,7 @@ def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scor
 def test_threshold_keeps_the_best_in_order(folders, copy):
     found = detector(folders["v1"])
     every = found.detect(image(), 0.0)
+    assert every.features is None  # without a relation head
     threshold = float(np.median(every.scores))
     kept = found.detect(image(), threshold)
     assert 0 < len(kept) < len(every)
@@ -117,22 +118,6 @@ def test_fewer_decoder_layers_give_the_intermediate_output(copy, layers):
     found = detector(with_card(copy, decoder_layers=layers)).detect(image(), 0.0)
     inner = reference(image()).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
     assert np.allclose(found.scores, inner.sort(descending=True).values, atol=1e-5)
-
-
-def test_queries_are_recorded_only_on_request(folders):
-    watched = detector(folders["v1"])
-    assert watched.detect(image(), 0.0).features is None
-    for _ in range(2):
-        watched.record_queries()
-    found = watched.detect(image(), 0.0)
-    assert found.features.shape == (QUERIES, 2 * LAYERS + 1, models.WIDTH)
-    assert found.features.dtype == np.float32
-    # The last slot is what the class head reads.
-    head = models.random_rtdetr().model.decoder.class_embed[-1]
-    scores = head(torch.from_numpy(found.features[:, -1])).sigmoid().amax(-1)
-    assert np.allclose(scores.detach(), found.scores, atol=1e-5)
-    kept = found.take(np.array([3, 1]))
-    assert np.array_equal(kept.features, found.features[[3, 1]])
 
 
 def test_other_images_and_half_precision_run_through(folders):
@@ -196,6 +181,10 @@ def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folders)
     found_by = detector(folders["paper"])
     head = EgtrRelationHead(settings(predicate_set="checkpoint"), found_by)
     every = found_by.detect(image(), 0.0)
+    assert every.features.shape == (QUERIES, 2 * LAYERS + 1, models.WIDTH)
+    # The last slot is what the class head reads.
+    logits = found_by.model.model.decoder.class_embed[-1](torch.from_numpy(every.features[:, -1]))
+    assert np.allclose(logits.softmax(-1).amax(-1), every.scores, atol=1e-5)
     classes = every.class_probabilities.argmax(axis=1)
     features = torch.from_numpy(every.features)
     relations, connectivity = naive(models.random_head(), features, torch.from_numpy(classes))
