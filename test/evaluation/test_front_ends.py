@@ -146,10 +146,10 @@ def test_faults_of_single_frames(tmp_path, kind):
 @pytest.mark.parametrize(
     ("values", "offender"),
     [
-        ({"kind": "video"}, "video"),
-        ({"flip": -0.1}, "-0.1"),
-        ({"miss": 1.1}, "1.1"),
-        ({"jitter_px": -1.0}, "-1"),
+        ({"kind": "video"}, "--front-end video"),
+        ({"flip": -0.1}, "--flip -0.1"),
+        ({"miss": 1.1}, "--miss 1.1"),
+        ({"jitter_px": -1.0}, "--jitter -1"),
         *(
             ({"kind": "boxes", "faults": Faults(**{name: 0.1})}, f"{name} 0.1")
             for name in ("bleed", "merge", "cut")
