@@ -3,6 +3,8 @@
 A CPU stands in for a GPU: it computes in float16 and bfloat16, too. CUDA itself is not tested.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.checkpoints import clip, config_of, request, save_random_probe, save_vjepa2
@@ -46,7 +48,6 @@ def not_run(model, dtype):
     ("scale", "wanted", "run", "used", "words"),
     [
         (0.01, HALF, squared_norm, HALF, ""),
-        (0.01, BRAIN, squared_norm, BRAIN, ""),
         (1.0, BRAIN, squared_norm, BRAIN, ""),
         (1.0, HALF, squared_norm, SINGLE, "the network: float16 gives NaN or infinity"),
         (1.0, HALF, unstable, SINGLE, "a relative error of 20.0%"),
@@ -62,17 +63,12 @@ def test_half_precision_is_kept_where_it_is_exact_enough(scale, wanted, run, use
     assert words in caplog.text and bool(words) == bool(caplog.messages)
 
 
-class Device:
-    """Stands in for a GPU, of which only the type is read."""
-
-    type = "cuda"
-
-
 @pytest.mark.parametrize(("native", "wide"), [(True, BRAIN), (False, HALF)])
 def test_sam_prefers_bfloat16_where_the_device_has_it(monkeypatch, native, wide):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: native)
-    assert choose_dtype(Device()) == HALF
-    assert choose_dtype(Device(), wide_range=True) == wide
+    gpu = SimpleNamespace(type="cuda")  # only the type is read
+    assert choose_dtype(gpu) == HALF
+    assert choose_dtype(gpu, wide_range=True) == wide
     assert choose_dtype(CPU, wide_range=True) == SINGLE
 
 
@@ -87,19 +83,6 @@ def test_sam_in_bfloat16_gives_nearly_the_masks_of_float32(tmp_path, monkeypatch
     reduced = family(config)
     assert reduced.dtype == BRAIN
     assert (reduced._masks(image(60, 80), boxes) != exact).mean() < 0.05
-
-
-def test_a_segmenter_that_overflows_runs_in_single_precision(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(sam, "choose_dtype", lambda device, **_: HALF)
-    logits = Sam2Segmenter._test_logits
-
-    def overflowing(self, model, dtype):
-        return logits(self, model, dtype) * (1.0 if dtype == SINGLE else float("inf"))
-
-    monkeypatch.setattr(Sam2Segmenter, "_test_logits", overflowing)
-    segmenter = Sam2Segmenter(settings(segmenter_path=str(save_sam2(tmp_path))))
-    assert segmenter.dtype == next(segmenter.model.parameters()).dtype == SINGLE
-    assert "the segmenter: float16 gives NaN" in caplog.text
 
 
 def test_a_backbone_in_half_precision_gives_nearly_its_features(tmp_path, monkeypatch):

@@ -178,7 +178,6 @@ def backbone(tmp_path_factory):
 @pytest.mark.parametrize(
     ("identity", "inputs", "edge_belief", "told"),
     [
-        ({}, "clip", "robust", []),
         ({"fingerprint": ""}, "clip", "robust", ["does not know the weights of its backbone"]),
         # A probe that knows the subject stands beside the paper's rule.
         ({}, "clip_and_boxes", "robust", []),

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.evaluation import one_hot, write_predictions
+from support.evaluation import one_hot
 
-from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.evaluation.predictions import read_predictions
 from deworldsg_ros.scene.errors import EvaluationError
 
 
@@ -136,15 +136,3 @@ def test_a_bad_entry_of_the_open_format_is_refused_with_its_scan(tmp_path, node,
     with pytest.raises(EvaluationError, match=expected) as error:
         read(tmp_path / "p.json", {"scan 7": {"nodes": [node], "edges": edges}})
     assert "scan 7" in str(error.value)
-
-
-def test_round_trip(tmp_path):
-    generator = np.random.default_rng(1)
-    points = generator.normal(size=(4, 3)), np.zeros((0, 3))
-    scores = generator.random((2, 3)), generator.random((1, 2))
-    expected = ScanPrediction(points, scores[0], np.array([[1, 0]]), scores[1])
-    write_predictions(tmp_path / "p.json", {"a": expected}, 3, 2)
-    found = read_predictions(tmp_path / "p.json")["a"]
-    for name in ("class_scores", "edge_scores", "edges"):
-        assert (getattr(found, name) == getattr(expected, name)).all()
-    assert (found.points_world[0] == points[0]).all()

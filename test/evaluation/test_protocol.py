@@ -94,12 +94,7 @@ def test_triple_rank_takes_every_cell_of_the_table():
 
 @pytest.mark.parametrize(
     ("offset", "inside"),
-    [
-        ((0.0, 0.0, 0.1), False),
-        ((0.0, 0.08, 0.06), True),
-        ((0.0, 0.0, 0.1 - 1e-9), True),
-        ((0.0, 0.0, 0.1 + 1e-9), False),
-    ],
+    [((0.0, 0.0, 0.1), False), ((0.0, 0.08, 0.06), True), ((0.0, 0.0, 0.1 - 1e-9), True)],
 )
 def test_a_point_votes_when_strictly_nearer_than_the_threshold(offset, inside):
     matching = match([7], np.zeros((1, 3)), np.array([7]), [np.array([offset])])

@@ -16,7 +16,7 @@ from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import Config, RelationsConfig, load_config
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.predictions import read_predictions
-from deworldsg_ros.evaluation.reports import latex_rows, latex_text
+from deworldsg_ros.evaluation.reports import latex_text
 from deworldsg_ros.evaluation.runner import (
     ScanTask,
     evaluate_graph,
@@ -142,6 +142,7 @@ def test_command_on_a_data_set(root, tmp_path):
     rows = (out / "room_0" / "edges.csv").read_text().splitlines()
     assert sorted(row.split(",")[0] for row in rows) == ["right", "right", "verdict", "wrong"]
     assert (out / "results.tex").read_text().endswith("& 100.0 & 100.0 \\\\\n")
+    assert latex_text("100 % & a_b") == r"100 \% \& a\_b"
     header, first, _ = (out / "results.csv").read_text().splitlines()
     assert header.startswith("scan,object_recall") and first.startswith("room_0,1.0")
 
@@ -176,6 +177,7 @@ def test_command_on_graphs_and_predictions(root, tmp_path):
         ("run", ("--layout", "3rscan", "--front-end", "recorded"), "is missing"),
         ("run", ("--front-end", "video"), "backend, boxes, recorded"),
         ("run", ("--split", "train"), "has no scan"),
+        ("run", ("--poses", "odometry", "--poses", "perturbed"), "has 2 --poses"),
     ],
 )
 def test_command_errors_state_the_expected_value(root, tmp_path, command, arguments, expected):
@@ -206,11 +208,6 @@ def test_a_scan_of_the_training_of_the_probe_is_told(tmp_path, caplog):
         warn_of_training(probed, scan)
         warn_of_training(RelationsConfig(), scan)
     assert [message.split()[:2] for message in caplog.messages] == [["scan", "a"], ["scan", "b"]]
-
-
-def test_latex():
-    assert latex_text("100 % & a_b") == r"100 \% \& a\_b"
-    assert latex_rows({"x": {"object_recall": 0.5}}) == "x & -- & 50.0 & -- & -- & -- \\\\\n"
 
 
 @pytest.mark.slow

@@ -124,7 +124,7 @@ def test_processes_give_the_same_results_and_survive_a_crash(root, tmp_path, mon
     assert os.environ.get("OMP_NUM_THREADS") != "1"
 
 
-def test_a_failed_scan_does_not_stop_the_rest(root, tmp_path):
+def test_a_failed_scan_does_not_stop_the_rest(root, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     jobs = [job(root, tmp_path / "a", scan="room_9"), job(root, tmp_path / "a")]
     one_by_one = list(run_jobs(jobs, workers=1))
@@ -137,17 +137,12 @@ def test_a_failed_scan_does_not_stop_the_rest(root, tmp_path):
         results = {result.scan: result for result in found}
         assert results["room_9"].outcome is None and "room_9" in results["room_9"].failure
         assert results["room_0"].outcome.result.object_ranks == [0, 0, 0]
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(EvaluationError, match="pip install distributed"):
+        list(run_jobs(jobs, scheduler="tcp://nowhere:1"))
     # The traceback of an unexpected error is saved.
     assert "AttributeError" in run_job(job(root, tmp_path / "b", options=None)).failure
     assert "Traceback" in (tmp_path / "b" / "room_0" / "error.txt").read_text()
-
-
-def test_a_scheduler_without_dask_is_refused_with_the_package_to_install(
-    root, tmp_path, monkeypatch
-):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(EvaluationError, match="pip install distributed"):
-        list(run_jobs([job(root, tmp_path)], scheduler="tcp://nowhere:1"))
 
 
 def test_the_main_table(root, tmp_path):
@@ -292,7 +287,6 @@ def test_a_row_with_a_changed_method_has_no_printed_row(root_dir, tmp_path, sett
         ("main", "replica", REPLICA_TEST_SCANS, ("DeWorldSG",), ["DeWorldSG"]),
         ("main", "replica", {"rooms_0", "rooms_1"}, ("DeWorldSG",), []),
         ("pose", "3rscan", {"a"}, ("DeWorldSG",), []),
-        ("ablation", "replica", REPLICA_TEST_SCANS, ("(b) + masks",), []),
         ("runtime", "replica", {"a"}, ("DeWorldSG",), ["DeWorldSG as printed"]),
     ],
 )

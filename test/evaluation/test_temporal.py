@@ -81,39 +81,33 @@ def test_switches(parts, truth, associations, switches):
         assert quality.per_minute(quality.id_switches) == pytest.approx(40.0)
 
 
-@pytest.mark.parametrize(
-    ("parts", "merges", "removals", "flips"),
-    [
-        ([BOTH, MERGED], 1, 0, 0),
-        # Unpublished nodes do not count as removed.
-        ([GONE], 0, 0, 0),
-        # Labels that change are flips, unless the node was published again.
-        ([{"nodes": [node(1, label)]} for label in ("cup", "cup", "bowl", "cup")], 0, 0, 2),
-        ([{"nodes": [node(1)]}, GONE, {"nodes": [node(1, "bowl")]}], 0, 1, 0),
-    ],
-)
-def test_nodes_that_change(parts, merges, removals, flips):
-    quality = measure(*parts)
-    assert (quality.merges, quality.removals, quality.label_flips) == (merges, removals, flips)
-
-
 STATED, REMOVED = {"edges": [edge(1, 2)]}, {"removed_edges": [(1, 2)]}
+LABELS = [{"nodes": [node(1, label)]} for label in ("cup", "cup", "bowl", "cup")]
 
 
 @pytest.mark.parametrize(
-    ("parts", "flips"),
+    ("parts", "counts"),
     [
-        ([STATED, STATED], 0),
-        ([STATED, {"edges": [edge(1, 2, "near")]}], 1),
-        ([STATED, {**REMOVED, "edges": [edge(2, 1)]}], 1),
-        ([STATED, REMOVED, STATED], 0),
-        ([STATED, REMOVED, {"edges": [edge(1, 2, "near")]}], 1),
-        ([STATED, {"edges": [edge(1, 3, "near")]}], 0),
-        ([REMOVED], 0),
+        # Merges and removals. Unpublished nodes do not count as removed.
+        ([BOTH, MERGED], (1, 0, 0, 0)),
+        ([GONE], (0, 0, 0, 0)),
+        # Labels that change are flips, unless the node was published again.
+        (LABELS, (0, 0, 2, 0)),
+        ([LABELS[0], GONE, LABELS[2]], (0, 1, 0, 0)),
+        # Edges that change are flips, too.
+        ([STATED, STATED], (0, 0, 0, 0)),
+        ([STATED, {"edges": [edge(1, 2, "near")]}], (0, 0, 0, 1)),
+        ([STATED, {**REMOVED, "edges": [edge(2, 1)]}], (0, 0, 0, 1)),
+        ([STATED, REMOVED, STATED], (0, 0, 0, 0)),
+        ([STATED, REMOVED, {"edges": [edge(1, 2, "near")]}], (0, 0, 0, 1)),
+        ([STATED, {"edges": [edge(1, 3, "near")]}], (0, 0, 0, 0)),
+        ([REMOVED], (0, 0, 0, 0)),
     ],
 )
-def test_edges_that_change_are_flips(parts, flips):
-    assert measure(*parts).edge_flips == flips
+def test_changes(parts, counts):
+    quality = measure(*parts)
+    flips = quality.label_flips, quality.edge_flips
+    assert (quality.merges, quality.removals, *flips) == counts
 
 
 def test_the_true_object_covers_most_pixels_of_the_detection():

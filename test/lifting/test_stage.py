@@ -219,15 +219,6 @@ def test_inputs_of_another_size_or_range_are_refused(position, wrong, reason):
     assert refusal.value.reason == reason
 
 
-def behind_glass():
-    """An object at 1 m, seen on a part of its box, before a wall at 3 m; one flying pixel."""
-    instances = np.zeros((30, 40))
-    instances[10:20, 10:20] = 1
-    depth_m = np.where(instances, 1.0, 3.0)
-    depth_m[15, 15] = 2.0
-    return scene_of(instances, depth_m)
-
-
 @pytest.mark.parametrize(
     ("pixels", "count", "depth_m"),
     [
@@ -237,7 +228,12 @@ def behind_glass():
     ],
 )
 def test_masks_and_boxes_without_refinement(pixels, count, depth_m):
-    lifted = lift(behind_glass(), 1, boxes=[8, 8, 21, 21], pixels=pixels)
+    """An object at 1 m, seen on a part of its box, before a wall at 3 m; one flying pixel."""
+    instances = np.zeros((30, 40))
+    instances[10:20, 10:20] = 1
+    depths_m = np.where(instances, 1.0, 3.0)
+    depths_m[15, 15] = 2.0
+    lifted = lift(scene_of(instances, depths_m), 1, boxes=[8, 8, 21, 21], pixels=pixels)
     assert lifted.pixel_counts.tolist() == [count]
     assert lifted.depths_m[0] == pytest.approx(depth_m)
 

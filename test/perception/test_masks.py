@@ -43,12 +43,6 @@ def test_the_instance_image_equals_the_pixel_by_pixel_rule(frame):
     assert np.array_equal(labels, pixelwise(*frame))
 
 
-def test_more_masks_than_labels_are_refused():
-    masks = [MaskPatch(0, 0, np.zeros((0, 0), dtype=bool))] * 65536
-    with pytest.raises(ValueError, match="65536 masks"):
-        instance_image(masks, np.zeros(65536, np.int64), np.zeros(65536), SHAPE)
-
-
 SCREEN, CUP = [0.9, 0.1], [0.1, 0.9]
 OUTER, INNER, SECOND = [10, 10, 90, 70], [20, 20, 45, 60], [50, 20, 80, 60]
 

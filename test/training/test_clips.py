@@ -161,6 +161,7 @@ def test_an_index_names_groups_and_boxes(tmp_path):
     (clip,) = read_clip_folder(tmp_path)
     assert (clip.group, clip.pair, clip.predicate) == ("room 1", "room 1 1 2", "on")
     assert clip.boxes.tolist() == [0, 0, 0.5, 0.5, 0, 0.5, 1, 1]
+    assert of_length(clip.read(), 2).shape == (2, 8, 9, 3)
     for wrong, reported in (
         ({"clip": "b.npz"}, "line 2: .*'b.npz'"),
         ({"group": 3}, "line 2"),
@@ -170,12 +171,6 @@ def test_an_index_names_groups_and_boxes(tmp_path):
         index.write_text(f"{json.dumps(line)}\n{json.dumps({**line, **wrong})}\n")
         with pytest.raises(ConfigurationError, match=reported):
             read_clip_folder(tmp_path)
-
-
-def test_short_clips_repeat_their_last_frame_and_long_ones_keep_their_last_frames():
-    frames = np.arange(5, dtype=np.uint8).reshape(5, 1, 1, 1) * np.ones((1, 2, 2, 3), np.uint8)
-    assert of_length(frames, 3)[:, 0, 0, 0].tolist() == [2, 3, 4]
-    assert of_length(frames, 7)[:, 0, 0, 0].tolist() == [0, 1, 2, 3, 4, 4, 4]
 
 
 def test_videos_are_read_as_rgb(tmp_path):

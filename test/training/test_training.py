@@ -22,7 +22,6 @@ from deworldsg_ros.training.train import (
     score,
     split_by_group,
     train_probe,
-    write_confusion,
 )
 
 pytestmark = pytest.mark.models
@@ -92,7 +91,7 @@ def test_a_probe_is_better_than_chance_on_held_out_rooms_and_has_a_record(
     assert training["options"]["fit"]["seed"] == 1 and training["validation_by"] == "group"
     saved = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert saved["held_out"] == held_out
-    assert (tmp_path / "a" / "confusion.png").is_file()
+    assert cv2.imread(str(tmp_path / "a" / "confusion.png")).ndim == 3
     # The same seed gives the same probe.
     assert runs[0] == runs[1]
     states = probe.network.state_dict(), same.network.state_dict()
@@ -201,13 +200,9 @@ def test_training_stops_if_the_validation_loss_does_not_fall():
     assert len(found.validation_losses) == found.best_epoch + 4 < 100
 
 
-def test_scores_are_micro_and_macro(tmp_path):
+def test_scores_are_micro_and_macro():
     answers = np.eye(3)[[0, 0, 0, 1]]
     found = score(answers, np.array([0, 0, 1, 1]), np.array([0, 0, 0, 1]))
     assert found.confusion.tolist() == [[2, 0, 0], [1, 1, 0], [0, 0, 0]]
     assert (found.micro_accuracy, found.macro_accuracy) == (0.75, 0.75)
     assert (found.chance_macro, found.majority_micro) == (0.5, 0.5)
-    # A picture is drawn of them, and of nothing.
-    for confusion in (found.confusion, np.zeros((3, 3), np.int64)):
-        write_confusion(tmp_path / "confusion.png", confusion, PREDICATES[:3])
-        assert cv2.imread(str(tmp_path / "confusion.png")).ndim == 3

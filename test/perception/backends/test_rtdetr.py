@@ -13,7 +13,7 @@ from deworldsg_ros.checkpoints import cards
 from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
-from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector, best_pairs
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
@@ -212,16 +212,6 @@ def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folders)
     assert sorted(relate(every.take(slice(2)), 10).pairs.tolist()) == [[0, 1], [1, 0]]
     with pytest.raises(ValueError, match="without query features"):
         head.relate(models.segmented(CLASSES[:2], every.scores[:2]), 5)
-
-
-def test_ranking_leaves_out_self_pairs_even_where_all_scores_are_zero():
-    logits = np.zeros((3, 3, 2))
-    found = best_pairs(logits, np.zeros((3, 3)), np.ones(3), 100)
-    assert len(found.pairs) == 6 and (found.pairs[:, 0] != found.pairs[:, 1]).all()
-    ranks = np.array([[1.0, 0.2, 0.3], [0.9, 1.0, 0.1], [0.3, 0.4, 1.0]])
-    found = best_pairs(logits, ranks, np.array([1.0, 0.5, 1.0]), 3)
-    assert found.pairs.tolist() == [[1, 0], [0, 2], [2, 0]]
-    assert found.scores.tolist() == [0.45, 0.3, 0.3]
 
 
 def stage(folder, world_up="auto", **changes):
