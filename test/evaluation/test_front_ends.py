@@ -164,7 +164,6 @@ def test_bad_choices_are_refused(values, offender):
 def test_faults_are_parsed_described_and_checked():
     assert parse_faults("") == Faults()
     assert parse_faults("label=0.1, false=2,spell_s=1") == Faults(0.1, 2.0, spell_s=1.0)
-    assert Faults().describe() == ""
     assert parse_faults("cut=0.25,spell_s=1").describe() == "cut 0.25 spell_s 1"
     for text in ("lable=1", "label", "label=x"):
         with pytest.raises(ConfigurationError, match=f"'{text}'.*NAME=NUMBER"):

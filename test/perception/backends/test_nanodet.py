@@ -194,7 +194,6 @@ def test_the_shipped_weights_detect_a_clock():
     row = names.index("clock")
     assert plain_iou(found.boxes_xyxy[row], [308, 108, 492, 292]) > 0.8
     assert found.class_probabilities[row].max() > 0.7
-    assert np.allclose(found.class_probabilities.sum(axis=1), 1)
     assert len(detector.detect(np.full((480, 640, 3), 90, np.uint8), 0.4)) == 0
     with pytest.raises(ConfigurationError, match=r"nowhere\.onnx"):
         NanoDetDetector(weights=Path("nowhere.onnx"))

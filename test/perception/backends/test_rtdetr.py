@@ -272,6 +272,8 @@ def test_missing_and_damaged_files_are_refused(copy):
     assert cards.read_detector_card(None) == CheckpointCard()
     preprocessing = copy / "preprocessor_config.json"
     text = preprocessing.read_text()
+    preprocessing.unlink()
+    detector(copy)  # with the default values
     wrong = {**json.loads(text), "do_normalize": True, "image_mean": [0.5]}
     preprocessing.write_text(json.dumps(wrong))
     refused(r"preprocessor_config\.json: ", detector, copy)
@@ -318,6 +320,7 @@ def test_a_relation_head_that_does_not_fit_is_refused(folders, copy, tmp_path):
     ("name", "value", "message"),
     [
         ("proj_q.1.weight", None, r"missing \(proj_q.1.weight\)"),
+        ("rel_predictor.layers.2.weight", None, r"missing \(rel_predictor.layers.2.weight\)"),
         ("proj_v.0.weight", torch.zeros(2), r"unknown \(proj_v.0.weight\)"),
         ("rel_predictor_gate.bias", torch.zeros(2), "size mismatch for rel_predictor_gate.bias"),
         ("triplet_dist", torch.zeros(2, 2), r"triplet_dist has shape \(2, 2\)"),
