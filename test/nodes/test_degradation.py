@@ -6,9 +6,10 @@ import os
 import re
 import subprocess
 import sys
+from typing import Any
 
 import pytest
-from support.failing_backend import Backend
+from support.failing_backend import Backend, Faults
 from support.nodes_bench import CAMERA, PAIRING, Bench, send_frame, send_pair, works
 
 from deworldsg_ros.nodes.relation_node import RelationNode
@@ -17,9 +18,7 @@ from deworldsg_ros.perception import Perception
 from deworldsg_ros.relations.world_model import FakeWorldModel
 from deworldsg_ros.ros import models
 from deworldsg_ros.ros.health import ERROR, WARN
-from deworldsg_ros.ros.models import Faults, parse_faults
 from deworldsg_ros.ros.node import EXIT_HUNG, RESPAWN_VARIABLE
-from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire import messages as wire
 
 LIMIT_S = 0.5
@@ -27,13 +26,18 @@ HANG_S = 3.0
 
 
 @pytest.fixture(autouse=True)
-def loaded_on(monkeypatch):
+def loaded_on(monkeypatch, request):
     """Devices on which models are loaded; all limits are short."""
     devices: list[str] = []
+    faults = {**(getattr(request, "param", None) or {})}
+    unreachable = faults.pop("unreachable", 0)
 
     def build(config, *, world_up):
         devices.append(config.device)
-        backend = Backend()
+        if 0 < len(devices) - 1 <= unreachable:
+            raise RuntimeError("it is not there")
+        backend = Backend(**{part: Faults(**of) for part, of in faults.items()})
+        faults.clear()
         return Perception(backend, backend, backend, config, world_up=world_up)
 
     monkeypatch.setattr(models, "build_perception", build)
@@ -45,15 +49,16 @@ def loaded_on(monkeypatch):
 
 
 @pytest.fixture
-def at(request):
-    """segmentation_node with faults, the parameter of the test."""
-    with Bench(SegmentationNode, CAMERA, parameters={"debug.faults": request.param}) as made:
+def at(loaded_on):
+    """segmentation_node, whose models have the faults of the test."""
+    with Bench(SegmentationNode, CAMERA) as made:
         made.texts = made.peer.collect("deworldsg/frame_graph")
         yield made
 
 
-def with_faults(*faults: str):
-    return pytest.mark.parametrize("at", faults, indirect=True)
+def with_faults(*faults: dict[str, Any]):
+    """Faults by part; "unreachable" is how often the models cannot be loaded again."""
+    return pytest.mark.parametrize("loaded_on", faults, indirect=True)
 
 
 def objects_after_a_frame(at: Bench) -> int:
@@ -73,9 +78,9 @@ def warns(at: Bench, words: str) -> bool:
     return report.level == WARN and words in report.message
 
 
-@with_faults(*(f"{part}:raise:2" for part in ("detector", "segmenter", "relation_head")))
+@with_faults(*({part: {"raises": 2}} for part in ("detector", "segmenter", "relation_head")))
 def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, request):
-    part = request.node.callspec.params["at"].split(":")[0]
+    (part,) = request.node.callspec.params["loaded_on"]
     for count in (1, 2):
         products = at.products()
         at.refuses(f"{part}_error", lambda: send_frame(at))
@@ -88,7 +93,7 @@ def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, re
     assert loaded_on == ["auto"]
 
 
-@with_faults(f"segmenter:hang:{HANG_S}")
+@with_faults({"segmenter": {"hang_s": HANG_S}})
 def test_a_segmenter_that_hangs_gives_frames_without_objects(at):
     assert objects_after_a_frame(at) == 0
     assert objects_after_a_frame(at) == 0
@@ -99,7 +104,7 @@ def test_a_segmenter_that_hangs_gives_frames_without_objects(at):
     assert not warns(at, "the segmenter")
 
 
-@with_faults("detector:hang:1e9")
+@with_faults({"detector": {"hang_s": 1e9}})
 def test_a_detector_that_never_returns_is_an_error(at):
     at.refuses("detector_error", lambda: send_frame(at))
     at.expect(lambda: bool(at.node.hung()), "a hung detector")
@@ -110,34 +115,29 @@ def test_a_detector_that_never_returns_is_an_error(at):
     assert "the detector (Backend)" in statuses[-1].message
 
 
-@with_faults("detector:missing:1")
-def test_a_lost_detector_is_loaded_again_on_the_cpu(at, loaded_on):
+@with_faults({"detector": {"raises": 9}, "unreachable": 1})
+def test_a_model_that_keeps_failing_is_loaded_again_on_the_cpu(at, loaded_on):
     """As with a GPU that is gone: the model raises until it is on the CPU."""
-    at.refuses("detector_error", lambda: send_frame(at))
+    for _ in range(4):
+        at.refuses("detector_error", lambda: send_frame(at))
+        at.peer.spin_for(0.25)
     assert warns(at, "it is not there")
-    at.peer.spin_for(0.3)
     assert objects_after_a_frame(at) > 0
     assert loaded_on == ["auto", "cpu", "cpu"]
     assert not warns(at, "the detector")
 
 
-@with_faults("relation_head:raise:4")
-def test_a_model_that_keeps_failing_is_loaded_again(at, loaded_on):
-    for _ in range(6):
-        works(at, lambda: send_frame(at))
-        at.peer.spin_for(0.25)
-    assert drops(at, "relation_head_error") == 4
-    assert loaded_on[:2] == ["auto", "cpu"]
-
-
-@pytest.mark.parametrize("fault", ["raise:3", f"hang:{HANG_S}", "missing:1"])
+@pytest.mark.parametrize("fault", [{"raises": 3}, {"hang_s": HANG_S}])
 def test_relations_go_on_without_the_world_model(monkeypatch, fault):
-    monkeypatch.setattr(models, "build_world_model", lambda config, device: FakeWorldModel(2))
-    parameters = {
-        "relations.clip_length": 2,
-        "relations.max_clips_per_s": 0.0,
-        "debug.faults": f"world_model:{fault}",
-    }
+    faults = Faults(**fault)
+
+    class Faulty(FakeWorldModel):
+        def predict(self, *arguments):
+            faults.work()
+            return super().predict(*arguments)
+
+    monkeypatch.setattr(models, "build_world_model", lambda config, device: Faulty(2))
+    parameters = {"relations.clip_length": 2, "relations.max_clips_per_s": 0.0}
     with Bench(RelationNode, PAIRING, parameters=parameters) as at:
         predicted = []
         monkeypatch.setattr(at.node._relating._world_model, "_deliver", predicted.append)
@@ -221,14 +221,3 @@ def test_a_node_whose_model_holds_the_interpreter_ends_if_it_is_started_again(st
     assert process.returncode == 1
     assert "Timeout" in errors
     assert "in <lambda>" in errors
-
-
-def test_faults_are_parsed_or_refused():
-    assert parse_faults("")["detector"] == Faults()
-    faults = parse_faults("detector:raise:5, segmenter:hang:2.5,world_model:missing:0")
-    assert faults["detector"].raises == 5
-    assert faults["segmenter"].hang_s == 2.5
-    assert faults["world_model"].missing == 0
-    for text in ("detector", "lamp:raise:5", "detector:burn:1", "detector:raise:many"):
-        with pytest.raises(ConfigurationError, match=f"debug.faults has '{text}'"):
-            parse_faults(text)

@@ -151,7 +151,7 @@ def test_a_backend_that_fails_loses_only_its_own_results(caplog):
     # The features are sorted by score together with their objects.
     assert backend.features.tolist() == [[2, 3], [4, 5], [0, 1]]
 
-    found, _ = with_backend("relation head", times=3)
+    found, _ = with_backend("relation_head", times=3)
     assert len(found.frame_graph) == 3 and found.instances.any()
     assert found.frame_graph.relations.logits.shape == (0, 2)
     assert found.drops == {"relation_head_error": 3}

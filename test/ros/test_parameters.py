@@ -24,7 +24,7 @@ def resolve(overrides: dict[str, Any]) -> Parameters:
 def test_every_field_of_the_configuration_is_a_parameter_with_its_default():
     sections = to_mapping(Config())
     names = {f"{section}.{name}" for section, values in sections.items() for name in values}
-    assert set(FIELDS) == names | {"debug.faults"} | set(NodeOptions.__struct_fields__)
+    assert set(FIELDS) == names | set(NodeOptions.__struct_fields__)
     replay = {field.name for field in fields(ReplayParameters)}
     assert replay == names | set(ReplayOptions.__struct_fields__)
     parameters = resolve({})
