@@ -6,10 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from support.view import SAVED
 
 from deworldsg_ros.client import SceneGraph
-
-SAVED = Path(__file__).parent / "saved" / "scene_graph_v1.json"
 
 
 @pytest.fixture(scope="session")

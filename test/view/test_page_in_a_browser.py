@@ -7,19 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from PIL import Image
 from support.browser import browser, opened_page
-from support.view import make_edge, make_graph, make_node, make_room
+from support.view import SAVED, make_edge, make_graph, make_node, make_room
 
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.view import page
 from deworldsg_ros.wire import messages as wire
 
 pytestmark = pytest.mark.slow
-SAVED = Path(__file__).parents[1] / "client" / "saved" / "scene_graph_v1.json"
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +88,8 @@ def test_a_click_shows_an_object_and_escape_lets_go(chromium: Any, tmp_path: Pat
 
 
 def test_the_sliders_hide_what_is_less_probable(chromium: Any, tmp_path: Path) -> None:
-    nodes = [make_node(i, "cup", (i, 0, 0)) for i in (1, 2, 3)]
-    nodes[2] = msgspec.structs.replace(nodes[2], existence=0.4)
+    existences = {1: 1.0, 2: 1.0, 3: 0.4}
+    nodes = [make_node(i, "cup", (i, 0, 0), existence=e) for i, e in existences.items()]
     edges = [make_edge(1, 2, "on", 0.55), make_edge(2, 3, "on", 0.95)]
     with opened_page(chromium, url_of(make_graph(nodes, edges), tmp_path)) as shown:
         assert len(visible_arrows(shown)) == 2
@@ -118,8 +116,7 @@ def test_an_empty_graph_says_why(chromium: Any, tmp_path: Path) -> None:
     with opened_page(chromium, url_of(make_graph(), tmp_path)) as shown:
         assert "Nothing was detected" in shown.locator("#empty").inner_text()
     hidden = [wire.HiddenNode("cup", [0, 0, 0], 0.2, 1, "seen in too few frames")] * 3
-    graph = msgspec.structs.replace(make_graph(), hidden=hidden)
-    with opened_page(chromium, url_of(graph, tmp_path)) as shown:
+    with opened_page(chromium, url_of(make_graph(hidden=hidden), tmp_path)) as shown:
         assert "3: seen in too few frames" in shown.locator("#empty").inner_text()
 
 

@@ -49,17 +49,19 @@ def test_the_best_of_several_frames_is_taken() -> None:
     assert photo[32, 32, 2] > 200
 
 
-@pytest.mark.parametrize("what", ["covered", "behind", "outside", "no points"])
-def test_there_is_no_photo_of_what_no_frame_shows(what: str) -> None:
-    shown, node = frame(), patch()
-    if what == "covered":
-        shown = frame(depth_m=1.0)
-    elif what == "behind":
-        node = patch(z_m=-2.0)
-    elif what == "outside":
-        shown.T_world_camera[0, 3] = 5.0
-    else:
-        node = make_node(1, "cup")
+@pytest.mark.parametrize(
+    ("node", "depth_m", "x_m"),
+    [
+        (patch(), 1.0, 0),
+        (patch(z_m=-2.0), 2.0, 0),
+        (patch(), 2.0, 5),
+        (make_node(1, "cup"), 2.0, 0),
+    ],
+    ids=["covered", "behind", "outside", "no points"],
+)
+def test_there_is_no_photo_of_what_no_frame_shows(node, depth_m: float, x_m: float) -> None:
+    shown = frame(depth_m=depth_m)
+    shown.T_world_camera[0, 3] = x_m
     assert photos_of(make_graph([node]), [shown], 64) == {}
 
 
@@ -74,8 +76,7 @@ def test_an_album_keeps_evenly_spaced_frames_of_any_length(monkeypatch) -> None:
     monkeypatch.setattr(photos, "LEAST_FRAMES", 8)
     monkeypatch.setattr(photos, "MOST_BYTES", 0)
     for count in (3, 8, 9, 100, 1000):
-        album = Album()
-        one = frame()
+        album, one = Album(), frame()
         for index in range(count):
             album.add(replace(one, stamp_ns=index))
         kept = [item.stamp_ns for item in album.frames]
