@@ -11,7 +11,7 @@ pytest.importorskip("transformers")
 pytestmark = pytest.mark.models
 
 from support.checkpoints import save_vjepa2  # noqa: E402  after the guards
-from support.cli import printed, refusal  # noqa: E402
+from support.cli import invoke, printed, refusal  # noqa: E402
 from support.evaluation import write_dataset  # noqa: E402
 from support.pair_rooms import render_room  # noqa: E402
 
@@ -103,7 +103,8 @@ def test_a_published_probe_is_imported(tmp_path):
     }
     torch.save({name: torch.ones(shape) for name, shape in shapes.items()}, tmp_path / "p.pt")
     command = ("import-probe", tmp_path / "p.pt", tmp_path / "out")
-    assert "does not know the weights" in printed(*command, "--predicates", predicates)
+    result = invoke(*command, "--predicates", predicates)
+    assert result.exit_code == 0 and "does not know the weights" in result.output
     probe = load_probe(tmp_path / "out")
     assert probe.card.predicates == ("on", "near")
     rows = probe.predict(np.zeros((1, 1408), np.float32), np.zeros((1, 8), np.float32))

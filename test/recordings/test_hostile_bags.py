@@ -22,21 +22,13 @@ STRING = "std_msgs/msg/String"
 COUNT = 4
 
 
-def read(path: Path) -> list[RawMessage]:
-    """All messages."""
+def read(path: Path) -> tuple[list[RawMessage], list[str]]:
+    """All messages, and the notes on a bag, such as what was lost."""
     bag = RawBag(path)
     try:
-        return list(bag.messages([topic.key for topic in bag.topics]))
+        return list(bag.messages([topic.key for topic in bag.topics])), bag.losses
     finally:
         bag.close()
-
-
-def losses_of(path: Path) -> str:
-    """The notes on a bag, such as what was lost, after all its messages were read."""
-    bag = RawBag(path)
-    list(bag.messages([topic.key for topic in bag.topics]))
-    bag.close()
-    return "; ".join(bag.losses)
 
 
 def text_bag(folder: Path, plugin: StoragePlugin, mode: CompressionMode, times: list[int]) -> Path:
@@ -89,7 +81,7 @@ def test_a_database_that_computes_its_rows_is_refused(
         (bag / "metadata.yaml").write_text(metadata.replace("bag.db3", "notes.txt"))
     if place == "salvaged":
         (bag / "metadata.yaml").unlink()
-    with pytest.raises(RecordingError, match="is computed, by a view"):
+    with pytest.raises(RecordingError, match="is computed"):
         read(file if place == "file" else bag)
 
 
@@ -101,8 +93,9 @@ def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
     file, metadata = (bag / "bag.db3").rename(bag / name), bag / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("bag.db3", name))
     before = sorted(tmp_path.rglob("*"))
-    assert len(read(bag)) == len(read(file)) == 4 * COUNT
-    assert not losses_of(bag)
+    (messages, losses), (of_file, _) = read(bag), read(file)
+    assert len(messages) == len(of_file) == 4 * COUNT
+    assert not losses
     assert len(list(salvage_sqlite(file, print))) == 4 * COUNT
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -114,9 +107,9 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag = text_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE, [1, 2, 3])
-    assert [message.log_time_ns for message in read(bag)] == [1, 2, 3]
+    assert [message.log_time_ns for message in read(bag)[0]] == [1, 2, 3]
     monkeypatch.setattr(storage, "MIN_FILE_BYTES", 1_000_000)
-    with pytest.raises(RecordingError, match="unpacks to more than 1000000 bytes; if you trust"):
+    with pytest.raises(RecordingError, match="more than 1000000 bytes"):
         read(bag)
 
 
@@ -125,34 +118,29 @@ def test_a_compressed_message_unpacks_to_a_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugin: StoragePlugin
 ) -> None:
     bag = text_bag(tmp_path / "bag", plugin, CompressionMode.MESSAGE, [1, 2])
-    whole = read(bag)
+    whole, _ = read(bag)
     assert [len(message.data) for message in whole] == [600_009] * 2
-    metadata = bag / "metadata.yaml"
-    metadata.rename(tmp_path / "metadata.yaml")
-    assert read(bag) == whole
-    (tmp_path / "metadata.yaml").rename(metadata)
+    metadata = (bag / "metadata.yaml").rename(tmp_path / "metadata.yaml")
+    assert read(bag)[0] == whole
+    metadata.rename(bag / "metadata.yaml")
     monkeypatch.setattr(storage, "MAX_CHUNK_BYTES", 500_000)
-    assert read(bag) == []
-    assert (
-        "compressed messages are damaged and lost (a message is cut, or unpacks to more than "
-        in (losses_of(bag))
-    )
+    messages, losses = read(bag)
+    assert messages == [] and "unpacks to more than" in losses[0]
 
 
 def test_chunks_that_overlap_in_time_are_few(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one_by_one = text_bag(
-        tmp_path / "a", StoragePlugin.MCAP, CompressionMode.STORAGE, list(range(12))
+    orders = {"a": list(range(12)), "b": [0, 9, 1, 8, 2, 7, 3, 6]}
+    one_by_one, overlapping = (
+        text_bag(tmp_path / name, StoragePlugin.MCAP, CompressionMode.STORAGE, times)
+        for name, times in orders.items()
     )
-    overlapping = text_bag(
-        tmp_path / "b", StoragePlugin.MCAP, CompressionMode.STORAGE, [0, 9, 1, 8, 2, 7, 3, 6]
-    )
-    assert len(read(overlapping)) == 8
+    assert len(read(overlapping)[0]) == 8
     monkeypatch.setattr(storage, "MAX_BYTES_AT_ONCE", 4_000_000)
-    assert len(read(one_by_one)) == 12
+    assert len(read(one_by_one)[0]) == 12
     for path in (overlapping, overlapping / "b.mcap"):
-        with pytest.raises(RecordingError, match=r"4800\d+ bytes would be unpacked at once"):
+        with pytest.raises(RecordingError, match=r"4800\d+ bytes"):
             read(path)
 
 
@@ -179,7 +167,7 @@ def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.Mon
     path = tmp_path / "zeros.mcap"
     record = struct.pack("<BQ", storage.CHUNK, len(chunk + packed)) + chunk + packed
     path.write_bytes(storage.MAGIC + record)
-    with pytest.raises(RecordingError, match="no message could be read"):
+    with pytest.raises(RecordingError, match="no message"):
         RawBag(path)
     assert not taken
 
@@ -191,7 +179,7 @@ RGB = "/camera/color/image_raw/compressed"
 INFO = "/camera/color/camera_info"
 
 
-@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("plugin", StoragePlugin)
 @pytest.mark.parametrize("has_metadata", [True, False])
 @pytest.mark.parametrize(
     ("topic", "other"),
@@ -199,20 +187,18 @@ INFO = "/camera/color/camera_info"
      (RGB, POSE_STAMPED), (RGB, STRING)],
 )  # fmt: skip
 def test_a_topic_of_two_types_is_read_by_one(
-    tmp_path: Path, storage: StoragePlugin, has_metadata: bool, topic: str, other: str
+    tmp_path: Path, plugin: StoragePlugin, has_metadata: bool, topic: str, other: str
 ) -> None:
     items = camera_items(COUNT)
     messages = {msgtype: message for _, msgtype, _, message in items}
     messages[STRING] = typestore().types[STRING](data="x" * 50)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
-        connections = {
-            key: writer.add_connection(*key, typestore=typestore())
-            for key in [(topic, other), *sorted({(name, kind) for name, kind, _, _ in items})]
-        }
-        for time_ns in map(stamp_ns, range(COUNT)):
-            data = bytes(typestore().serialize_cdr(messages[other], other))
-            writer.write(connections[topic, other], time_ns, data)
-        for name, kind, time_ns, message in items:
+    wrong = [(topic, other, stamp_ns(index), messages[other]) for index in range(COUNT)]
+    with Writer(tmp_path / "bag", version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for name, kind, time_ns, message in [*wrong, *items]:
+            if (name, kind) not in connections:
+                added = writer.add_connection(name, kind, typestore=typestore())
+                connections[name, kind] = added
             data = bytes(typestore().serialize_cdr(message, kind))
             writer.write(connections[name, kind], time_ns, data)
     if not has_metadata:

@@ -39,7 +39,7 @@ def depth_mm(index: int) -> np.ndarray:
     return depth
 
 
-def pose(index: int) -> np.ndarray:
+def pose(index: float) -> np.ndarray:
     quat = np.array([0.01 * index, 0.2, -0.1, 0.9])
     return pose_from_quaternion(np.array([0.05 * index, 0.1, 1.2]), quat / np.linalg.norm(quat))
 
@@ -143,7 +143,7 @@ def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Pat
 
 def write_seven_scenes(folder: Path, count: int) -> Path:
     """Write a folder in the layout of 7-Scenes with registered depth. Every 4th frame exists."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     K = INTRINSICS.matrix
     (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, r)) for r in K))
     for index in range(count):
@@ -152,4 +152,38 @@ def write_seven_scenes(folder: Path, count: int) -> Path:
         stem.with_suffix(".color.jpg").write_bytes(encoded(bgr, ".jpg"))
         stem.with_suffix(".depth.png").write_bytes(encoded(depth_mm(index)))
         np.savetxt(stem.with_suffix(".pose.txt"), pose(index), "%.9g")
+    return folder
+
+
+TUM_T0_NS = 1305031102175304000  # more digits than a float64 has
+
+
+def write_tum(
+    folder: Path,
+    count: int = 4,
+    *,
+    depth_offset_ns: int = 5_000_000,
+    pose_step_ns: int = 50_000_000,
+) -> Path:
+    """Write a folder in the layout of TUM. Poses are not at the times of the images."""
+    rows: dict[str, list[tuple[int, str]]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    for index in range(count):
+        depth = np.full((HEIGHT, WIDTH), 5000 + 50 * index, np.uint16)
+        depth[0] = 0
+        time_ns = TUM_T0_NS + index * STEP_NS
+        bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
+        images = (("rgb", bgr, time_ns), ("depth", depth, time_ns + depth_offset_ns))
+        for name, pixels, at_ns in images:
+            (folder / name / f"{index}.png").write_bytes(encoded(pixels))
+            rows[name].append((at_ns, f"{name}/{index}.png"))
+    for number in range(-1, 2 * count + 2):
+        time_ns = TUM_T0_NS + number * pose_step_ns + 20_000_000
+        T = pose((time_ns - TUM_T0_NS) / STEP_NS)
+        values = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+        rows["groundtruth"].append((time_ns, " ".join(f"{value:.9f}" for value in values)))
+    for name, lines in rows.items():
+        text = [f"{ns // 10**9}.{ns % 10**9:09d} {content}" for ns, content in lines]
+        (folder / f"{name}.txt").write_text("\n".join(["# timestamp and content", *text]) + "\n")
     return folder
