@@ -7,9 +7,9 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ament_index_python.packages import (
@@ -43,7 +43,7 @@ class Install:
     prefix: Path
     site: Path
 
-    def environment(self) -> Mapping[str, str]:
+    def environment(self) -> dict[str, str]:
         """The environment of a shell in which the installation is sourced."""
         return {
             **os.environ,
@@ -53,19 +53,10 @@ class Install:
         }
 
 
-def run(*command: str | Path, cwd: Path, **options: object) -> str:
-    """Run a command and return its output; a failure shows the output."""
-    done = subprocess.run(
-        [str(part) for part in command],
-        cwd=cwd,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=110,
-        **options,  # type: ignore[call-overload]
-    )
-    assert done.returncode == 0, done.stdout
-    return done.stdout
+def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command; its errors are in its output."""
+    kept = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "timeout": 110}
+    return subprocess.run(list(map(str, command)), **{**kept, **options})
 
 
 def copy_sources(root: Path, target: Path) -> Path:
@@ -85,16 +76,18 @@ def install_with_pip(source: Path, folder: Path) -> Path:
     """The prefix of a `pip install .`."""
     # Without --ignore-installed pip would first uninstall the package from this environment.
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--ignore-installed")
-    prefix = folder / "prefix"
-    run(sys.executable, "-m", "pip", "install", *options, "--prefix", prefix, source, cwd=folder)
-    return prefix
+    pip = (sys.executable, "-m", "pip", "install", *options)
+    done = run(*pip, "--prefix", folder / "prefix", source, cwd=folder)
+    assert done.returncode == 0, done.stdout
+    return folder / "prefix"
 
 
 def install_with_colcon(source: Path, folder: Path) -> Path:
     """The prefix of a `colcon build`."""
     colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     assert colcon is not None, "colcon is missing: scripts/test installs it"
-    run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
+    done = run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
+    assert done.returncode == 0, done.stdout
     return folder / "install" / PACKAGE
 
 
@@ -128,23 +121,19 @@ def files_below(folder: Path) -> set[str]:
     }
 
 
-def test_ament_index_finds_the_package(sourced: Install) -> None:
-    assert get_package_prefix(PACKAGE) == str(sourced.prefix)
-    assert get_package_share_directory(PACKAGE) == str(sourced.prefix / "share" / PACKAGE)
-    assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
-
-
 def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_dir: Path) -> None:
+    assert get_package_prefix(PACKAGE) == str(sourced.prefix)
+    assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
     share = Path(get_package_share_directory(PACKAGE))
+    assert share == sourced.prefix / "share" / PACKAGE
     assert (share / "package.xml").is_file()
     for folder in SHARED:
         wanted = files_below(root_dir / folder)
         if folder != "launch":
             wanted = {name for name in wanted if not name.endswith(".py")}
         assert wanted <= files_below(share / folder)
-    assert {"default.yaml", "paper.yaml", "paper_rules.yaml", "fastdds.xml"} <= files_below(
-        share / "config"
-    )
+    configurations = {"default.yaml", "paper.yaml", "paper_rules.yaml", "fastdds.xml"}
+    assert configurations <= files_below(share / "config")
     assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
 
 
@@ -155,29 +144,23 @@ def test_ros2_run_finds_each_executable_once(sourced: Install) -> None:
     assert {path.name for path in (sourced.prefix / "bin").iterdir()} == {"deworldsg"}
 
 
-def test_python_package_has_all_its_files(install: Install, root_dir: Path) -> None:
-    assert files_below(root_dir / PACKAGE) <= files_below(install.site / PACKAGE)
-    assert any(name.endswith(".onnx") for name in files_below(install.site / PACKAGE))
-
-
 @pytest.mark.parametrize("executable", sorted(EXECUTABLES))
 def test_executable_starts_its_node(install: Install, tmp_path: Path, executable: str) -> None:
     """A configuration that cannot be used ends a node at start-up, with status 2 and the reason."""
-    done = subprocess.run(
-        [install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such_thing:=1"],
-        cwd=tmp_path,
-        env=install.environment(),
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
-    assert done.returncode == 2, done.stderr
-    assert "no_such_thing" in done.stderr
+    command = (install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such:=1")
+    done = run(*command, cwd=tmp_path, env=install.environment())
+    assert done.returncode == 2, done.stdout
+    assert "no_such" in done.stdout
 
 
-def test_deworldsg_help_lists_the_commands(install: Install, tmp_path: Path) -> None:
+def test_the_package_is_complete_and_its_command_runs(
+    install: Install, root_dir: Path, tmp_path: Path
+) -> None:
+    installed = files_below(install.site / PACKAGE)
+    assert files_below(root_dir / PACKAGE) <= installed
+    assert any(name.endswith(".onnx") for name in installed)
     command = install.prefix / "bin" / "deworldsg"
-    text = run(command, "--help", cwd=tmp_path, env=install.environment())
+    text = run(command, "--help", cwd=tmp_path, env=install.environment()).stdout
     for name in ("run", "demo", "convert", "info", "config", "evaluate"):
         assert re.search(rf"^ +{name} +[A-Z]", text, re.M), text
 
@@ -199,11 +182,6 @@ def test_executable_prefers_the_python_of_its_prefix(
     fake_python(tmp_path / "elsewhere", "path")
     if prefix_has_python:
         fake_python(tmp_path / "a prefix" / "bin", "prefix")
-    done = subprocess.run(
-        [executable, "an argument"],
-        env={"PATH": f"{tmp_path / 'elsewhere'}:/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        timeout=20,
-    )
+    path = f"{tmp_path / 'elsewhere'}:/usr/bin:/bin"
+    done = run(executable, "an argument", env={"PATH": path})
     assert done.stdout == f"{'prefix' if prefix_has_python else 'path'} an argument\n"

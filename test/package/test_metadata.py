@@ -36,26 +36,31 @@ def requirements(root: Path, *extras: str) -> dict[str, str]:
     return {re.split(r"[<>=!]", line)[0].lower(): line for line in done.stdout.split()}
 
 
-def test_versions_agree(root_dir: Path) -> None:
-    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
-    assert manifest.findtext("version") == deworldsg_ros.__version__
-    citation = yaml.safe_load((root_dir / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["version"] == deworldsg_ros.__version__
-    changelog = (root_dir / "CHANGELOG.md").read_text(encoding="utf-8")
-    newest = re.search(r"^## \[(\d[^\]]*)\]", changelog, re.M)
-    assert newest is not None and newest.group(1) == deworldsg_ros.__version__
+@pytest.fixture
+def manifest(root_dir: Path) -> ElementTree.Element:
+    return ElementTree.parse(root_dir / "package.xml").getroot()
 
 
-def test_descriptions_and_licences_agree(root_dir: Path) -> None:
-    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
-    pyproject = (root_dir / "pyproject.toml").read_text(encoding="utf-8")
-    assert f'description = "{(manifest.findtext("description") or "").rstrip(".")}"' in pyproject
-    setup = (root_dir / "setup.py").read_text(encoding="utf-8")
-    assert manifest.findtext("license") == "Apache-2.0" and 'license="Apache-2.0"' in setup
+def test_versions_descriptions_and_licences_agree(
+    root_dir: Path, manifest: ElementTree.Element
+) -> None:
+    texts = {
+        name: (root_dir / name).read_text(encoding="utf-8")
+        for name in ("CITATION.cff", "CHANGELOG.md", "pyproject.toml", "setup.py")
+    }
+    newest = re.search(r"^## \[(\d[^\]]*)\]", texts["CHANGELOG.md"], re.M)
+    assert newest is not None
+    cited = yaml.safe_load(texts["CITATION.cff"])["version"]
+    assert {manifest.findtext("version"), cited, newest[1]} == {deworldsg_ros.__version__}
+    described = (manifest.findtext("description") or "").rstrip(".")
+    assert f'description = "{described}"' in texts["pyproject.toml"]
+    assert manifest.findtext("license") == "Apache-2.0"
+    assert 'license="Apache-2.0"' in texts["setup.py"]
 
 
-def test_package_xml_declares_every_ros_package_that_is_imported(root_dir: Path) -> None:
-    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
+def test_package_xml_declares_every_ros_package_that_is_imported(
+    root_dir: Path, manifest: ElementTree.Element
+) -> None:
     assert manifest.findtext("name") == "deworldsg_ros"
     assert manifest.findtext("export/build_type") == "ament_python"
     declared = {element.text for element in manifest.findall("exec_depend")}
@@ -76,20 +81,14 @@ def imported_modules(root: Path) -> set[str]:
 
 
 def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
-    known = {
-        *requirements(root_dir),
-        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "store"),
-        *requirements(root_dir, "view", "foxglove"),
-    }
+    extras = ("models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
-        for name in imported_modules(root_dir)
-        if name not in sys.stdlib_module_names
-        and name not in ("deworldsg_ros", "__future__")
-        and not re.fullmatch(ROS_NAMES, name)
+        for name in imported_modules(root_dir) - set(sys.stdlib_module_names)
+        if name not in ("deworldsg_ros", "__future__") and not re.fullmatch(ROS_NAMES, name)
     }
     assert {"numpy", "msgspec", "torch"} <= libraries
-    assert libraries <= known
+    assert libraries <= {*requirements(root_dir), *requirements(root_dir, *extras)}
 
 
 @pytest.mark.parametrize(
@@ -111,9 +110,6 @@ def test_run_time_requirements_are_bounded_and_without_torch(root_dir: Path) -> 
     assert {"numpy", "scipy", "rosbags"} <= set(lines)
     assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in lines.values())
     assert not {"torch", "transformers"} & set(lines)
-
-
-def test_an_unknown_extra_is_refused(root_dir: Path) -> None:
     with pytest.raises(subprocess.CalledProcessError):
         requirements(root_dir, "no-such-extra")
 

@@ -63,15 +63,12 @@ def test_the_package_runs_no_code_of_a_file(root_dir: Path) -> None:
             assert (owner, called) != ("yaml", "unsafe_load"), f"{name}:{node.lineno}"
 
 
-def test_no_server_listens_to_other_machines_by_default(root_dir: Path) -> None:
+def test_servers_listen_to_this_machine_alone_by_default(root_dir: Path) -> None:
     """An address for all machines stands in texts at most."""
     for name, tree in sources(root_dir):
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 assert node.value not in ANYWHERE, f"{name}:{node.lineno}"
-
-
-def test_servers_listen_to_this_machine_alone() -> None:
     assert FleetOptions().listen == "tcp/127.0.0.1:7447"
     assert ViewerOptions().host == "127.0.0.1"
     assert inspect.signature(view).parameters["host"].default == "127.0.0.1"
