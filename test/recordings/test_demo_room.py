@@ -16,10 +16,9 @@ from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 FRAMES = 171
-RGB, DEPTH = "/rgb/image_raw/compressed", "/depth/image_raw/compressedDepth"
-INFO, POSE = "/rgb/camera_info", "/camera/pose"
+DEPTH, INFO, POSE = "/depth/image_raw/compressedDepth", "/rgb/camera_info", "/camera/pose"
 TYPES = {
-    RGB: "sensor_msgs/msg/CompressedImage",
+    "/rgb/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
     DEPTH: "sensor_msgs/msg/CompressedImage",
     INFO: "sensor_msgs/msg/CameraInfo",
     POSE: "geometry_msgs/msg/PoseStamped",
@@ -62,38 +61,17 @@ def test_each_topic_has_one_message_per_frame_with_the_same_stamp(messages, trut
     assert len(stamps[0]) == FRAMES == truth["frames"]
     assert set(np.diff(stamps[0])) == {100_000_000}
     assert str(stamps[0][0]) == truth["first_stamp_ns"]
-    assert sum(path.stat().st_size for path in DEMO_ROOM.iterdir()) < 20e6
-
-
-def test_images_decode_and_depth_is_in_the_range_of_a_room_with_holes(messages, truth):
-    picture = cv2.imdecode(np.asarray(messages[RGB][0].data), cv2.IMREAD_COLOR)
-    assert picture.shape == (480, 640, 3) and 60 < picture.mean() < 200
-    for message in messages[DEPTH][::40]:
-        assert message.format == "16UC1; compressedDepth png"
-        depth_m = depth_m_of(message)
-        valid = depth_m > 0
-        assert depth_m.shape == (480, 640) and 0.5 < valid.mean() < 1.0
-        assert depth_m[valid].min() >= 0.39 and depth_m.max() <= 4.7
     camera = truth["camera"]
     for info in messages[INFO]:
         fx, _, cx, _, fy, cy, *_ = info.k
         found = {"width": info.width, "height": info.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
         assert found.items() <= camera.items()
+    assert sum(path.stat().st_size for path in DEMO_ROOM.iterdir()) < 20e6
 
 
 def pose_of(message) -> np.ndarray:
     p, q = message.pose.position, message.pose.orientation
     return pose_from_quaternion(np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w]))
-
-
-def test_the_camera_walks_stands_still_and_comes_back(messages, truth):
-    assert {message.header.frame_id for message in messages[POSE]} == {"world"}
-    positions = np.array([pose_of(message)[:3, 3] for message in messages[POSE]])
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    assert steps.max() < 0.15 and steps.sum() > 4
-    first, last = (int(10 * s) for s in truth["standstill_s"])
-    assert last - first >= 15 and steps[first:last].max() < 0.01
-    assert np.linalg.norm(positions[0] - positions[-1]) < 0.05
 
 
 def test_depth_and_pose_put_the_table_where_the_ground_truth_has_it(messages, truth, instances):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import pickle
-import re
 import struct
 import zlib
 from pathlib import Path
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 from support.images import SCAN, many_scans
@@ -24,12 +24,16 @@ from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
 from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
 from deworldsg_ros.streams.images import decode, encoded_size
 
+YAML = (
+    *("[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45"),
+    *("x: " + "1" * 5000, "\udcff", "a: b: c"),
+)
+JSON = ("[" * 100_000, '"\\ud800"', "{", "1" * 5000)
+STAMPS = ("1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x")
+OPTIONS = (".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff")
 
-@pytest.mark.parametrize(
-    "text",
-    ["[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45",
-     "x: " + "1" * 5000, "\udcff", "a: b: c"],
-)  # fmt: skip
+
+@pytest.mark.parametrize("text", YAML)
 def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
     content = text.encode(errors="surrogateescape")
     with pytest.raises(ValueError, match=r"\w"):
@@ -39,49 +43,41 @@ def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
         effective_config(tmp_path / "config.yaml")
 
 
-@pytest.mark.parametrize("value", [".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff"])
+@pytest.mark.parametrize(
+    ("reader", "text"),
+    [*((parse_any_json, text) for text in JSON), *((stamp_ns_from_text, text) for text in STAMPS)],
+)
+def test_json_and_stamps_have_one_error(reader, text: str) -> None:
+    with pytest.raises(ValueError):
+        reader(text.encode() if reader is parse_any_json else text)
+
+
+@pytest.mark.parametrize("value", OPTIONS)
 def test_options_are_finite_numbers(value: str) -> None:
     with pytest.raises(ConfigurationError, match="--set"):
         effective_config(None, [f"inputs.max_depth_m={value}"])
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '"\\ud800"', "{", "1" * 5000])
-def test_json_has_one_error(text: str) -> None:
-    with pytest.raises(ValueError):
-        parse_any_json(text.encode())
-
-
-@pytest.mark.parametrize("text", ["1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x"])
-def test_stamps_have_32_bit_seconds(text: str) -> None:
-    with pytest.raises(ValueError):
-        stamp_ns_from_text(text)
 
 
 @pytest.mark.parametrize(
     ("pattern", "name"),
     [(COLOR_NAME, "frame-000001.color.jpg"), (FRAME_NAME, "frame-000001.pose.txt")],
 )
-def test_a_line_feed_ends_no_file_name(pattern: re.Pattern[str], name: str) -> None:
+def test_a_line_feed_ends_no_file_name(pattern, name: str) -> None:
     assert pattern.match(name)
     assert not pattern.match(f"{name}\n")
 
 
-def png(width: int, height: int) -> bytes:
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))]
-    chunks += [(b"IDAT", zlib.compress(bytes(1 << 20))), (b"IEND", b"")]
-    packed = b"\x89PNG\r\n\x1a\n"
-    for kind, data in chunks:
-        packed += struct.pack(">I", len(data)) + kind + data
-        packed += struct.pack(">I", zlib.crc32(kind + data))
-    return packed
-
-
 def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
-    content = png(65535, 65535)
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in (
+        (b"IHDR", struct.pack(">IIBBBBB", 65535, 65535, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(1 << 20))),
+        (b"IEND", b""),
+    ):
+        content += struct.pack(">I", len(data)) + kind + data
+        content += struct.pack(">I", zlib.crc32(kind + data))
     assert encoded_size(content) == (65535, 65535) and len(content) < 5000
-    with pytest.raises(ValueError, match="65535x65535"):
-        decode(content, cv2.IMREAD_UNCHANGED)
-    for other in (b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
+    for other in (content, b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
         with pytest.raises(ValueError):
             decode(other, cv2.IMREAD_UNCHANGED)
 
@@ -102,7 +98,7 @@ def nested(depth: int) -> list:
     return item
 
 
-def itself() -> list:
+def in_itself() -> list:
     item: list = []
     item.append(item)
     return item
@@ -112,26 +108,20 @@ def itself() -> list:
     ("content", "words"),
     [
         (pickle.dumps(nested(60)), "stands for more than"),
-        (pickle.dumps(itself()), "contains itself"),
+        (pickle.dumps(in_itself()), "contains itself"),
         (b"]r\xff\xff\xff\x7f.", "memo index"),
+        (b'{"num_classes": 1000000000000, "num_predicates": 1, "scans": {}}', "10000"),
     ],
-    ids=["shared", "itself", "memo"],
+    ids=["shared lists", "itself", "large memo", "many classes"],
 )
-def test_pickles_of_shared_lists_and_large_memos_are_refused(content: bytes, words: str) -> None:
-    with pytest.raises(EvaluationError, match=words):
-        load_pickle(content, "x.pkl")
-
-
-def test_predictions_of_many_classes_are_refused(tmp_path: Path) -> None:
+def test_predictions_without_end_are_refused(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "predictions.json"
-    path.write_text('{"num_classes": 1000000000000, "num_predicates": 1, "scans": {}}')
-    with pytest.raises(EvaluationError, match="10000"):
-        read_predictions(path)
+    path.write_bytes(content)
+    with pytest.raises(EvaluationError, match=words):
+        read_predictions(path) if content[:1] == b"{" else load_pickle(content, "x.pkl")
 
 
 def test_chunks_unpack_to_what_they_declare() -> None:
-    import lz4.frame
-
     bound_decompression()
     packed = lz4.frame.compress(bytes(1 << 24))
     assert decompress("lz4", packed, 1 << 24) == bytes(1 << 24)

@@ -5,27 +5,17 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import struct
-from contextlib import closing
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from support.recordings import camera_items, stamp_ns, write_bag
+from rosbags.rosbag2 import CompressionMode
+from support.recordings import camera_items, read_bag, stamp_ns, text_items, write_bag
 
 from deworldsg_ros.recordings.bags.storage import RawBag
-from deworldsg_ros.recordings.source import typestore
 from deworldsg_ros.scene.errors import RecordingError
 
 RGB = "/camera/color/image_raw/compressed"
-STRING = "std_msgs/msg/String"
 COUNT = 40
-
-
-def read(path, name=RGB):
-    """Messages of a topic, of any type, and what was lost."""
-    with closing(RawBag(path)) as bag:
-        keys = [topic.key for topic in bag.topics if topic.name == name]
-        return list(bag.messages(keys)), bag.losses
 
 
 @pytest.fixture(scope="module", params=["mcap", "sqlite3"])
@@ -39,20 +29,20 @@ def storage_file(bag):
 
 def test_folder_and_bare_file_give_all_messages_in_order(bag):
     for path in (bag, storage_file(bag)):
-        messages, losses = read(path)
+        messages, losses = read_bag(path, RGB)
         assert [m.log_time_ns for m in messages] == [stamp_ns(i) for i in range(COUNT)]
         assert not losses
     topics = RawBag(bag).topics
     assert {topic.count for topic in topics} == {COUNT}
     assert len(topics) == 4
-    assert read(bag, "/nothing") == ([], [])
+    assert read_bag(bag, "/nothing") == ([], [])
 
 
 def test_missing_metadata_is_reported_and_the_files_are_read(bag, tmp_path):
     folder = tmp_path / "killed"
     shutil.copytree(bag, folder)
     (folder / "metadata.yaml").unlink()
-    messages, losses = read(folder)
+    messages, losses = read_bag(folder, RGB)
     assert len(messages) == COUNT
     assert "metadata.yaml is missing" in losses[0]
 
@@ -63,8 +53,8 @@ def test_a_truncated_file_gives_its_beginning_and_reports_the_loss(bag, tmp_path
     cut = tmp_path / file.name
     content = file.read_bytes()
     cut.write_bytes(content[: int(len(content) * kept)])
-    whole, _ = read(file)
-    messages, losses = read(cut)
+    whole, _ = read_bag(file, RGB)
+    messages, losses = read_bag(cut, RGB)
     assert losses
     assert all("lost" in loss or "damaged" in loss for loss in losses), losses
     # What is left is in order and unchanged, but for one that the end of the file may cut.
@@ -87,22 +77,17 @@ def chunk_starts(content):
 
 def test_a_damaged_chunk_loses_only_its_own_messages(tmp_path):
     # Chunks of a megabyte: large messages make several.
-    writer = Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP)
-    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     noise = np.random.default_rng(0).integers(65, 90, (12, 400_000), dtype=np.uint8)
-    with writer:
-        connection = writer.add_connection("/s", STRING, typestore=typestore())
-        for index, letters in enumerate(noise):
-            text = typestore().types[STRING](data=letters.tobytes().decode())
-            writer.write(connection, index, typestore().serialize_cdr(text, STRING))
+    texts = [letters.tobytes().decode() for letters in noise]
+    write_bag(tmp_path / "bag", text_items(enumerate(texts)), "mcap", CompressionMode.STORAGE)
     file = tmp_path / "bag" / "bag.mcap"
-    whole, losses = read(file, "/s")
+    whole, losses = read_bag(file, "/s")
     assert len(whole) == 12 and not losses
     content = bytearray(file.read_bytes())
     start = chunk_starts(content)[1]
     content[start + 60 : start + 2000] = b"\xff" * 1940
     file.write_bytes(content)
-    messages, losses = read(file, "/s")
+    messages, losses = read_bag(file, "/s")
     assert any("damaged" in loss for loss in losses)
     times_ns = [message.log_time_ns for message in messages]
     assert len(set(times_ns)) == len(times_ns) < 12
@@ -118,7 +103,7 @@ def test_damaged_pages_of_a_database_lose_only_their_rows(tmp_path):
     start = len(content) // 2 // 4096 * 4096
     content[start : start + 4096] = b"\xff" * 4096
     file.write_bytes(content)
-    messages, losses = read(bag)
+    messages, losses = read_bag(bag, RGB)
     assert messages
     assert len(messages) < COUNT or losses
     with sqlite3.connect(file) as database, pytest.raises(sqlite3.DatabaseError):
@@ -153,5 +138,5 @@ def test_parts_of_a_split_bag_are_read_in_order_of_their_numbers(tmp_path):
         bag = write_bag(tmp_path / f"part{part}", items)
         shutil.move(storage_file(bag), tmp_path / f"room_{part}.mcap")
         shutil.rmtree(bag)
-    messages, _ = read(tmp_path)
+    messages, _ = read_bag(tmp_path, RGB)
     assert [m.log_time_ns for m in messages] == [stamp_ns(part) for part in range(12)]

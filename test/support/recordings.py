@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from deworldsg_ros.recordings import source as ros
+from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
 from deworldsg_ros.recordings.source import RoleMessage, typestore
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
 
@@ -19,6 +21,7 @@ INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, WIDTH, HEIGHT)
 STEP_NS = 100_000_000
 T0_NS = 5_000_000_000
 CAMERA, WORLD = "camera_optical", "map"
+STRING = "std_msgs/msg/String"
 
 
 def stamp_ns(index: int) -> int:
@@ -127,18 +130,39 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
     return items
 
 
-def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
+def write_bag(
+    folder: Path,
+    items: Iterable[Item],
+    storage: str = "mcap",
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
     """Write a rosbag2 folder. The messages of the items may be serialized."""
-    plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
-    connections: dict[str, Any] = {}
-    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+    connections: dict[tuple[str, str], Any] = {}
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if compression is not CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         for topic, msgtype, time_ns, message in items:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore())
+            key = topic, msgtype
+            if key not in connections:
+                connections[key] = writer.add_connection(*key, typestore=typestore())
             if not isinstance(message, bytes):
                 message = bytes(typestore().serialize_cdr(message, msgtype))
-            writer.write(connections[topic], time_ns, message)
+            writer.write(connections[key], time_ns, message)
     return folder
+
+
+def text_items(texts: Iterable[tuple[int, str]]) -> list[Item]:
+    """Texts on the topic /s, with their times."""
+    made = typestore().types[STRING]
+    return [("/s", STRING, time_ns, made(data=text)) for time_ns, text in texts]
+
+
+def read_bag(path: Path, topic: str | None = None) -> tuple[list[RawMessage], list[str]]:
+    """Messages of one topic or of all, and notes, such as what was lost."""
+    with closing(RawBag(path)) as bag:
+        keys = [item.key for item in bag.topics if topic in (None, item.name)]
+        return list(bag.messages(keys)), bag.losses
 
 
 def write_seven_scenes(folder: Path, count: int) -> Path:
