@@ -1,19 +1,14 @@
 """Options, refusals, and the commands that look at recordings and configurations."""
 
-from __future__ import annotations
-
-import io
 import re
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 from support.cli import deworldsg, invoke, printed, refusal
 from support.recordings import camera_items, write_bag, write_seven_scenes
 
 import deworldsg_ros
 from deworldsg_ros.cli.configuration import described_yaml, effective_config
-from deworldsg_ros.cli.terminal import working
 from deworldsg_ros.config import Config, load_config
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -22,7 +17,7 @@ GIVEN = ("--intrinsics", "60,61,31.5,23.5")
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     """An empty folder, in which the commands run."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "120")
@@ -153,10 +148,3 @@ def test_settings_have_the_type_of_their_field(setting, value):
     else:
         found = getattr(getattr(effective_config(None, [setting]), section), field)
         assert (found, type(found)) == (value, type(value))
-
-
-def test_without_a_terminal_the_text_of_the_spinner_is_printed():
-    console = Console(file=io.StringIO())
-    with working(console, "loading …"):
-        pass
-    assert console.file.getvalue() == "loading …\n"

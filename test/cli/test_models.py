@@ -32,7 +32,7 @@ FILES = {
 
 
 @pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch):
+def hub(monkeypatch):
     with FakeHub("facebook/dinov2-small", dict(FILES)).serving() as hub:
         monkeypatch.setenv("HF_ENDPOINT", hub.url)
         monkeypatch.setenv("HF_HUB_DISABLE_XET", "1")
@@ -43,7 +43,7 @@ def get(into: Path, name: str = "dinov2-small") -> str:
     return printed("models", "get", name, "--into", into)
 
 
-def test_a_model_is_fetched_verified_listed_and_kept(hub: FakeHub, tmp_path: Path) -> None:
+def test_a_model_is_fetched_verified_listed_and_kept(hub, tmp_path):
     shown = get(tmp_path)
     assert "licence mit" in shown and "commit 0123456789ab" in shown
     folder = tmp_path / "dinov2-small"
@@ -63,7 +63,7 @@ def test_a_model_is_fetched_verified_listed_and_kept(hub: FakeHub, tmp_path: Pat
     assert hub.requested == []
 
 
-def test_a_download_that_was_cut_continues_where_it_stopped(hub: FakeHub, tmp_path: Path) -> None:
+def test_a_download_that_was_cut_continues_where_it_stopped(hub, tmp_path):
     # The client writes pieces of 10 MB.
     weights = safetensors.save({"layer.weight": np.ones((6000, 1000), np.float32)})
     hub.files["model.safetensors"] = weights
@@ -76,9 +76,7 @@ def test_a_download_that_was_cut_continues_where_it_stopped(hub: FakeHub, tmp_pa
     assert (tmp_path / "dinov2-small" / "model.safetensors").read_bytes() == weights
 
 
-def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(
-    hub: FakeHub, tmp_path: Path
-) -> None:
+def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(hub, tmp_path):
     hub.damaged.add("model.safetensors")
     assert "checksum" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
     assert not (tmp_path / "dinov2-small" / "model.safetensors").exists()
@@ -91,7 +89,7 @@ def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(
     assert {name for _, name, _ in hub.requested} == {"model.safetensors"}
 
 
-def test_errors_name_the_remedy(hub: FakeHub, tmp_path: Path) -> None:
+def test_errors_name_the_remedy(hub, tmp_path):
     hub.files.pop("model.safetensors")
     for name, words in (
         ("dino", "expected paper, embedded, rtdetr_r18vd"),
@@ -101,9 +99,7 @@ def test_errors_name_the_remedy(hub: FakeHub, tmp_path: Path) -> None:
         assert words in refusal("models", "get", name, "--into", tmp_path)
 
 
-def test_the_groups_are_the_models_of_their_configurations(
-    root_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_groups_are_the_models_of_their_configurations(root_dir, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
     assert "nothing to download" in get(tmp_path, "embedded")
     assert list(tmp_path.iterdir()) == []
@@ -121,7 +117,7 @@ def test_the_groups_are_the_models_of_their_configurations(
     assert "deworldsg models get sam2.1-hiera-tiny" in refused
 
 
-def test_inspect_prints_names_and_shapes(tmp_path: Path) -> None:
+def test_inspect_prints_names_and_shapes(tmp_path):
     torch = pytest.importorskip("torch")
     (tmp_path / "model.safetensors").write_bytes(WEIGHTS)
     torch.save({"state_dict": {"a": torch.zeros(2, 3)}, "epoch": 3}, tmp_path / "model.ckpt")
@@ -132,7 +128,7 @@ def test_inspect_prints_names_and_shapes(tmp_path: Path) -> None:
     assert "state_dict.a  float32  2 x 3" in printed("models", "inspect", tmp_path / "model.ckpt")
 
 
-def test_inspect_refuses_other_files_and_dictionaries_without_end(tmp_path: Path) -> None:
+def test_inspect_refuses_other_files_and_dictionaries_without_end(tmp_path):
     torch = pytest.importorskip("torch")
     once = {"weight": torch.zeros(1)}
     itself: dict[str, object] = {**once}

@@ -1,7 +1,5 @@
 """`deworldsg train-probe` and `import-probe`, from a folder of clips and from a data set."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Processes of the demo and of the compiler: logs, exit codes, shutdown."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

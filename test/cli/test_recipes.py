@@ -40,8 +40,8 @@ def run_paper(root_dir: Path, out: str) -> Result:
 
 @pytest.mark.timeout(600)
 def test_the_paper_runs_with_models_of_a_hub_and_on_a_machine_without_network(
-    root_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    root_dir, tmp_path, monkeypatch
+):
     here, robot = tmp_path / "here", tmp_path / "robot"
     here.mkdir()
     monkeypatch.chdir(here)

@@ -1,12 +1,9 @@
 """`deworldsg run` and scripts/tour on the recording that ships."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from support.cli import COMMAND, DEMO_ROOM, ROOT, deworldsg, environment, printed
@@ -103,7 +100,7 @@ def test_files_are_equal_to_the_byte_whatever_the_threads_and_the_seed_of_hashes
 
 
 @pytest.mark.timeout(900)
-def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path: Path) -> None:
+def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path):
     path = os.pathsep.join([str(ROOT), *sys.path[1:]])
     done = subprocess.run(
         [sys.executable, ROOT / "scripts" / "tour.py", DEMO_ROOM, tmp_path / "out"],

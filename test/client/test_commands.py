@@ -13,18 +13,16 @@ from support.merging import VOCABULARY
 from support.surfaces import CUP, HERE, view
 from support.view import make_edge, make_graph, make_node
 
-from deworldsg_ros.cli.ask import parse_edit
 from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.client.combine import combine
 from deworldsg_ros.config import Config, MergingConfig
-from deworldsg_ros.graph.edits import SplitNode
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, read_map, write_map
 from deworldsg_ros.scene.camera import invert_pose, rigid_motion
 from deworldsg_ros.wire import messages as wire
 
 
-def test_questions_goals_and_explanations_are_tables_and_json(demo_out: Path) -> None:
+def test_questions_goals_and_explanations_are_tables_and_json(demo_out):
     assert "cup #13" in printed("query", demo_out, "cup", "on", "dining", "table")
     (answer,) = json.loads(printed("query", demo_out, "banana", "--json"))["answers"]
     assert answer["sure"] is False
@@ -37,7 +35,7 @@ def test_questions_goals_and_explanations_are_tables_and_json(demo_out: Path) ->
     assert json.loads(printed("explain", demo_out, "elephant", "--json"))["hidden"] == []
 
 
-def test_graphs_are_merged_compared_and_exported(demo_out: Path, room: SceneGraph) -> None:
+def test_graphs_are_merged_compared_and_exported(demo_out, room):
     T = rigid_motion(np.array([1.0, 2.0, 0.0]), np.array([0.0, 0.0, 0.5]))
     Path("other.json").write_text(wire.encode(combine(SceneGraph(make_graph()), room, T).message))
     merged = printed("merge", demo_out, "other.json", "both.json")
@@ -67,7 +65,7 @@ def test_graphs_are_merged_compared_and_exported(demo_out: Path, room: SceneGrap
     ],
 )
 @pytest.mark.usefixtures("demo_out")
-def test_what_is_refused(command: list[str], words: str) -> None:
+def test_what_is_refused(command, words):
     assert words in refusal(*command)
 
 
@@ -80,9 +78,7 @@ def test_what_is_refused(command: list[str], words: str) -> None:
         ["explain", "a", "\x1b[2J"],
     ],
 )  # fmt: skip
-def test_the_terminal_shows_names_as_text(
-    command: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_terminal_shows_names_as_text(command, monkeypatch):
     hostile = "cup\nelement vertex 9\x1b[2J\x00\ufffe"
     nodes = [make_node(1, hostile), make_node(2, "table", (0.4, 0, 0))]
     graphs = {"a": make_graph(nodes, [make_edge(1, 2, hostile)], hostile), "b": make_graph()}
@@ -106,7 +102,7 @@ def saved_map(folder: Path, config: Config) -> Path:
 
 
 @pytest.mark.parametrize("association", ["surface", "paper"])
-def test_a_map_is_edited_and_the_edit_undone(tmp_path: Path, association: str) -> None:
+def test_a_map_is_edited_and_the_edit_undone(tmp_path, association):
     config = Config(merging=MergingConfig(association=association))
     path = saved_map(tmp_path, config)
     before = read_map(config, path).full()
@@ -120,7 +116,7 @@ def test_a_map_is_edited_and_the_edit_undone(tmp_path: Path, association: str) -
     assert read_map(config, path).full() == before
 
 
-def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path: Path) -> None:
+def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path):
     path = saved_map(tmp_path, Config())
     before = path.read_bytes()
     for words, says in (
@@ -141,8 +137,3 @@ def test_a_refused_edit_leaves_the_map_as_it_is(tmp_path: Path) -> None:
         lock.release()
     assert "no.map" in refusal("edit", tmp_path / "no.map", "undo")
     assert path.read_bytes() == before
-
-
-def test_the_words_of_a_split() -> None:
-    expected = SplitNode(5, [[0.0, 1.0, 2.0], [-3.0, 4.0, 5.0]])
-    assert parse_edit(["split", "5", "0,1,2", "-3,4,5"]) == expected

@@ -49,7 +49,7 @@ class FakeClient(nullcontext):
 
 
 @pytest.fixture
-def page(root_dir: Path, demo_out: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+def page(root_dir, demo_out, monkeypatch):
     """The blocks of the page, with the files that it names and a client without ROS."""
     monkeypatch.setattr(deworldsg_ros.client, "SceneGraphClient", FakeClient, raising=False)
     for name in ("monday", "tuesday", "kitchen", "living_room"):
@@ -62,9 +62,7 @@ def page(root_dir: Path, demo_out: Path, monkeypatch: pytest.MonkeyPatch) -> lis
     return blocks(root_dir / "docs" / "use_the_graph.md")
 
 
-def test_the_readme_says_which_cup_is_on_the_table(
-    root_dir: Path, demo_out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_readme_says_which_cup_is_on_the_table(root_dir, demo_out, capsys):
     (block,) = [text for language, text in blocks(root_dir / "README.md") if language == "python"]
     assert len(block.strip().splitlines()) <= 10
     exec(compile(block, "README.md", "exec"), {})
@@ -73,7 +71,7 @@ def test_the_readme_says_which_cup_is_on_the_table(
     assert any("elephant" in line for line in lines)
 
 
-def test_the_python_of_the_page_runs(page: list[tuple[str, str]]) -> None:
+def test_the_python_of_the_page_runs(page):
     names: dict[str, object] = {}
     python = [text for language, text in page if language == "python"]
     assert len(python) >= 7
@@ -81,9 +79,7 @@ def test_the_python_of_the_page_runs(page: list[tuple[str, str]]) -> None:
         exec(compile(block, "use_the_graph.md", "exec"), names)
 
 
-def test_the_commands_of_the_page_run(
-    page: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_of_the_page_run(page, monkeypatch):
     server = Mock()  # test_mcp.py has the server itself
     monkeypatch.setattr(ask, "make_server", server)
     lines = [line for language, text in page if not language for line in text.splitlines()]

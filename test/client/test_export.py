@@ -1,11 +1,8 @@
 """Graphs in other formats."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -21,13 +18,13 @@ HOSTILE = "cup\nelement vertex 9\x1b[2J\x00\ufffe"
 
 @pytest.mark.timeout(60)  # the number of a long name once took hours
 @pytest.mark.parametrize("kind", sorted(FORMATS))
-def test_every_format_takes_an_empty_graph_and_a_long_name(tmp_path: Path, kind: str) -> None:
+def test_every_format_takes_an_empty_graph_and_a_long_name(tmp_path, kind):
     for graph in (make_graph(), make_graph([make_node(1, "x" * 400_000)])):
         for path in export(SceneGraph(graph), kind, tmp_path / "new" / "graph.x"):
             assert path.stat().st_size > 0
 
 
-def test_other_formats_and_folders_are_refused(tmp_path: Path) -> None:
+def test_other_formats_and_folders_are_refused(tmp_path):
     with pytest.raises(ClientError, match="'xml'"):
         export(SceneGraph(make_graph()), "xml", tmp_path / "x")
     (tmp_path / "file").touch()
@@ -35,7 +32,7 @@ def test_other_formats_and_folders_are_refused(tmp_path: Path) -> None:
         export(SceneGraph(make_graph()), "csv", tmp_path / "file" / "x.csv")
 
 
-def test_csv_has_all_objects_and_relations(room: SceneGraph, tmp_path: Path) -> None:
+def test_csv_has_all_objects_and_relations(room, tmp_path):
     first, second = export(room, "csv", tmp_path / "graph.csv")
     assert second.name == "graph_relations.csv"
     objects = list(csv.DictReader(first.open()))
@@ -44,7 +41,7 @@ def test_csv_has_all_objects_and_relations(room: SceneGraph, tmp_path: Path) -> 
     assert len(list(csv.DictReader(second.open()))) == len(room.relations())
 
 
-def test_networkx_reads_the_graphml_and_takes_the_graph(room: SceneGraph, tmp_path: Path) -> None:
+def test_networkx_reads_the_graphml_and_takes_the_graph(room, tmp_path):
     networkx = pytest.importorskip("networkx")
     (path,) = export(room, "graphml", tmp_path / "graph.graphml")
     read, made = networkx.read_graphml(path, node_type=int), room.to_networkx()
@@ -55,7 +52,7 @@ def test_networkx_reads_the_graphml_and_takes_the_graph(room: SceneGraph, tmp_pa
     assert made.edges[13, 5, "on"]["provenance"] == "fused"
 
 
-def test_the_splats_are_the_gaussians(room: SceneGraph, tmp_path: Path) -> None:
+def test_the_splats_are_the_gaussians(room, tmp_path):
     (path,) = export(room, "ply", tmp_path / "graph.ply")
     header, body = path.read_bytes().split(b"end_header\n", 1)
     names = [line.split()[-1] for line in header.decode().splitlines() if "property" in line]
@@ -71,7 +68,7 @@ def test_the_splats_are_the_gaussians(room: SceneGraph, tmp_path: Path) -> None:
         assert covariance == pytest.approx(np.array(item.covariance_m2), abs=1e-5)
 
 
-def test_spark_dsg_reads_its_json(room: SceneGraph, tmp_path: Path) -> None:
+def test_spark_dsg_reads_its_json(room, tmp_path):
     spark_dsg = pytest.importorskip("spark_dsg", reason="pip install 'deworldsg_ros[spark]'")
     (path,) = export(room, "spark_dsg", tmp_path / "graph.json")
     graph = spark_dsg.DynamicSceneGraph.load(str(path))
@@ -86,7 +83,7 @@ def test_spark_dsg_reads_its_json(room: SceneGraph, tmp_path: Path) -> None:
     assert edge.info.metadata.get()["relations"][0]["predicate"] == "on"
 
 
-def test_names_are_text_in_every_format(tmp_path: Path) -> None:
+def test_names_are_text_in_every_format(tmp_path):
     nodes = [make_node(1, HOSTILE), make_node(2, "table", (0.4, 0, 0))]
     hostile = SceneGraph(make_graph(nodes, [make_edge(1, 2, HOSTILE)], HOSTILE))
     written = {kind: export(hostile, kind, tmp_path / f"graph.{kind}") for kind in FORMATS}

@@ -30,7 +30,7 @@ def graph_of(*nodes, edges=(), **fields) -> SceneGraph:
 
 
 @pytest.fixture
-def corner() -> SceneGraph:
+def corner():
     """A cup on a table in the corner of two shelves; free towards +x and -y."""
     rim = [(0.05 * math.cos(a), 0.05 * math.sin(a) - 0.01, 0.8) for a in np.linspace(-3, 0, 20)]
     return graph_of(
@@ -42,7 +42,7 @@ def corner() -> SceneGraph:
     )
 
 
-def test_a_goal_is_at_the_distance_faces_the_object_and_is_free(corner: SceneGraph) -> None:
+def test_a_goal_is_at_the_distance_faces_the_object_and_is_free(corner):
     goal = corner.goal_near("cup", 0.9)
     spot = footprint(goal.position_m, (0, 0, 0), FLAT, UP)
     assert gap_m(spot, corner[1].footprint) > 0.9
@@ -66,12 +66,12 @@ def test_a_goal_is_at_the_distance_faces_the_object_and_is_free(corner: SceneGra
 
 
 @pytest.mark.parametrize(("distance", "words"), [(0.2, "cup #1 at 0.2 m"), (math.nan, "positive")])
-def test_no_free_side(corner: SceneGraph, distance: float, words: str) -> None:
+def test_no_free_side(corner, distance, words):
     with pytest.raises(ClientError, match=words):
         corner.goal_near("cup", distance)
 
 
-def test_a_goal_as_a_message_for_nav2(corner: SceneGraph) -> None:
+def test_a_goal_as_a_message_for_nav2(corner):
     pytest.importorskip("geometry_msgs")
     goal = corner.goal_near("cup", 0.9)
     message = goal.pose_stamped()
@@ -81,7 +81,7 @@ def test_a_goal_as_a_message_for_nav2(corner: SceneGraph) -> None:
     assert goal.to_dict()["pose"]["orientation"]["w"] == round(message.pose.orientation.w, 5)
 
 
-def test_a_goal_with_y_down() -> None:
+def test_a_goal_with_y_down():
     half = math.sqrt(0.5)  # third axis of the box along -y
     box = wire.GravityBox([0.0, 0.0, 0.5], [0.1, 0.2, 0.3], [half, 0.0, 0.0, half])
     graph = graph_of(make_node(1, "cup", (0, 0, 0.5), box=box), up=[0.0, -1.0, 0.0])
@@ -92,7 +92,7 @@ def test_a_goal_with_y_down() -> None:
 
 @pytest.mark.parametrize("size", [(0, 0, 0), (0.4, 0, 0.3), (0, 0, 0.3), (0.4, 0.1, 0)])
 @pytest.mark.parametrize("others", [0, 1, 3])
-def test_a_goal_near_objects_without_width(size, others: int) -> None:
+def test_a_goal_near_objects_without_width(size, others):
     behind = [boxed(2 + i, "cup", (1.5 + i, 0, 0.5), size) for i in range(others)]
     goal = graph_of(boxed(1, "post", (0, 0, 0.5), size), *behind).goal_near(1, 0.8)
     assert goal.distance_m == pytest.approx(0.8, abs=1e-3)
@@ -119,7 +119,7 @@ def standing(center, size, heading_rad: float):
         (1, (2, 1, math.pi / 2), 1.5),
     ],
 )
-def test_gaps_of_boxes_without_depth(width: float, other: tuple, gap: float) -> None:
+def test_gaps_of_boxes_without_depth(width, other, gap):
     x, other_width, heading = other
     first = standing((0, 0, 0), (width, 0, 1), 0)
     second = standing((x, 0, 0), (other_width, 0, 1), heading)
@@ -136,7 +136,7 @@ sizes = st.tuples(st.floats(0.05, 2), st.floats(0.05, 2), st.floats(0.05, 2))
 
 
 @given(places, sizes, angles, places, sizes, angles)
-def test_gaps_are_symmetric_and_zero_only_in_contact(p, s, a, q, t, b) -> None:
+def test_gaps_are_symmetric_and_zero_only_in_contact(p, s, a, q, t, b):
     first, second = standing(p, s, a), standing(q, t, b)
     gap = gap_m(first, second)
     assert gap == pytest.approx(gap_m(second, first))
@@ -149,7 +149,7 @@ def test_gaps_are_symmetric_and_zero_only_in_contact(p, s, a, q, t, b) -> None:
         assert point_gaps_m(corner, second.corners[None])[0] == pytest.approx(exact, abs=1e-7)
 
 
-def test_free_directions(corner: SceneGraph) -> None:
+def test_free_directions(corner):
     x, y, z = corner.free_direction("table", room=0.5)
     assert z == 0.0
     assert np.hypot(x, y) == pytest.approx(1.0)
@@ -162,7 +162,7 @@ def test_free_directions(corner: SceneGraph) -> None:
         graph_of(boxed(1, "cup", (0, 0, 1), (1, 1, 1)), *walls).free_direction("cup")
 
 
-def test_why(corner: SceneGraph) -> None:
+def test_why(corner):
     graph = graph_of(*corner.message.nodes, edges=[make_edge(1, 2, "on", 0.9)])
     why = graph.explain((1, 2))
     assert "evidence: seen in 4 frames" in why.lines
@@ -173,7 +173,7 @@ def test_why(corner: SceneGraph) -> None:
     assert "cup #1 may be one: 10%" in graph.explain("other").lines
 
 
-def test_hidden_objects_tell_why_they_are_hidden(corner: SceneGraph) -> None:
+def test_hidden_objects_tell_why_they_are_hidden(corner):
     message = make_graph(corner.message.nodes)
     message.hidden = [wire.HiddenNode("lamp", [1.0, 2.0, 3.0], 0.3, 2, "seen too little")]
     graph = SceneGraph(wire.decode(wire.encode(message), wire.SceneGraphMessage))
@@ -183,7 +183,7 @@ def test_hidden_objects_tell_why_they_are_hidden(corner: SceneGraph) -> None:
     assert "never detected" in graph.explain("sofa").lines[-1]
 
 
-def test_changes_between_sessions_are_found_by_place() -> None:
+def test_changes_between_sessions_are_found_by_place():
     before = graph_of(
         boxed(1, "table", (0, 0, 0.4), (1, 1, 0.8)),
         boxed(2, "cup", (0, 0, 0.85), (0.1, 0.1, 0.1)),

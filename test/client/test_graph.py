@@ -7,7 +7,6 @@ import math
 import subprocess
 import sys
 from dataclasses import FrozenInstanceError
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -26,7 +25,7 @@ LABELS = ["cup", "table", "dining table", "chair", "mug cup"]
 
 
 @pytest.fixture
-def small() -> SceneGraph:
+def small():
     """A cup on a table, a chair near the table, and a shelf far away."""
     nodes = [
         make_node(1, "cup", (0.0, 0.0, 0.80), np.diag([0.001, 0.001, 0.001])),
@@ -42,26 +41,18 @@ def ids(items) -> list[int]:
     return [item.id for item in items]
 
 
-def test_an_empty_graph_answers_nothing() -> None:
+def test_an_empty_graph_answers_nothing():
     graph = SceneGraph(make_graph())
     assert len(graph) == 0
     assert graph.objects("cup") == graph.relations() == graph.on("table") == []
     assert graph.up == (0.0, 0.0, 1.0)
     with pytest.raises(ClientError, match="'cup'.* none"):
         graph.one("cup")
-
-
-def test_objects_by_class_place_and_probability(small: SceneGraph) -> None:
-    assert ids(small.objects()) == [1, 2, 3, 4]
-    assert ids(small.objects("table")) == [2]
-    assert ids(small.objects(near=(1.0, 0.0, 0.4), within=1.2)) == [3, 2, 1]
-    assert ids(small.objects(near=small[1], within=0.1)) == [2]
-    assert small.objects("cup", min_probability=0.95) == []
     with pytest.raises(ClientError, match="near"):
-        small.objects(within=1.0)
+        graph.objects(within=1.0)
 
 
-def test_relations_from_both_ends(small: SceneGraph) -> None:
+def test_relations_from_both_ends(small):
     assert [i.text for i in small.relations("cup", "on")] == ["cup #1 standing on dining table #2"]
     assert small.relations("cup", "lying on") == []
     assert ids(small.on("table")) == [1]
@@ -75,7 +66,7 @@ def test_relations_from_both_ends(small: SceneGraph) -> None:
     assert SceneGraph(make_graph(small.message.nodes, edges)).relations("chair", "near") == []
 
 
-def test_neighbours_and_paths(small: SceneGraph) -> None:
+def test_neighbours_and_paths(small):
     neighbours = small.neighbours("table", within=1.0)
     assert [item.id for item, _ in neighbours] == [1, 3]
     assert neighbours[0][1] == 0.0
@@ -84,14 +75,14 @@ def test_neighbours_and_paths(small: SceneGraph) -> None:
     assert small.path("cup", "shelf") == []
 
 
-def test_objects_are_frozen_and_tell_everything(small: SceneGraph) -> None:
+def test_objects_are_frozen_and_tell_everything(small):
     cup = small[1]
     assert (cup.name, cup.probability, cup.box_source) == ("cup #1", 0.9, "gaussian")
     assert cup.other_classes == pytest.approx(0.0)
     assert cup.size_m == pytest.approx([12**0.5 * 0.0316] * 3, abs=2e-3)
     assert cup.to_dict()["sure"]
     with pytest.raises(FrozenInstanceError):
-        cup.label = "bowl"  # type: ignore[misc]
+        cup.label = "bowl"
     with pytest.raises(ClientError, match="object 9 .* 4 objects"):
         small[9]
     doubtful = SceneGraph(make_graph([msgspec.structs.replace(cup.state, existence=0.5)]))[1]
@@ -99,7 +90,7 @@ def test_objects_are_frozen_and_tell_everything(small: SceneGraph) -> None:
     assert not doubtful.is_sure
 
 
-def test_heights_follow_the_up_direction() -> None:
+def test_heights_follow_the_up_direction():
     node = make_node(1, "cup", (0.0, -2.0, 0.0), np.diag([0.01, 0.0003, 0.01]))
     cup = SceneGraph(make_graph([node], up=[0.0, -1.0, 0.0]))[1]
     assert cup.height_m == pytest.approx(2.0)
@@ -107,7 +98,7 @@ def test_heights_follow_the_up_direction() -> None:
     assert cup.footprint.low == pytest.approx(2.0 - cup.size_m[2] / 2, abs=1e-3)
 
 
-def test_a_file_of_version_1_is_read(room: SceneGraph, tmp_path: Path) -> None:
+def test_a_file_of_version_1_is_read(room, tmp_path):
     assert room.message.schema.version == 1
     assert len(room) == 34
     (cup,) = room.on("dining table", "cup")
@@ -120,7 +111,7 @@ def test_a_file_of_version_1_is_read(room: SceneGraph, tmp_path: Path) -> None:
         SceneGraph.load(tmp_path / "nowhere.json")
 
 
-def test_the_client_of_files_needs_no_ros() -> None:
+def test_the_client_of_files_needs_no_ros():
     code = (
         "import sys; sys.modules['rclpy'] = None\n"
         "import deworldsg_ros.client as c; c.SceneGraph\n"
@@ -144,11 +135,11 @@ def test_the_client_of_files_needs_no_ros() -> None:
         ("glass", "wine glass", True),
     ],
 )
-def test_names_of_classes(asked: str, label: str, same: bool) -> None:
+def test_names_of_classes(asked, label, same):
     assert is_class(asked, label) == same
 
 
-def test_names_of_predicates_and_odds() -> None:
+def test_names_of_predicates_and_odds():
     assert "standing on" in predicate_names("on")
     assert predicate_names("standing on") == {"standing on"}
     odds = ["none", "1 : 99", "1 : 1", "3 : 1", "certain"]
@@ -159,7 +150,7 @@ def test_names_of_predicates_and_odds() -> None:
 
 
 @pytest.fixture(scope="module", params=["boxes", "some boxes"])
-def graph(request: pytest.FixtureRequest) -> SceneGraph:
+def graph(request):
     """120 objects in 6 m x 6 m, 300 relations; some objects without a box, some without a class."""
     rng = np.random.default_rng(3)
     nodes = []
@@ -184,7 +175,7 @@ def graph(request: pytest.FixtureRequest) -> SceneGraph:
 
 @pytest.mark.parametrize("label", [None, "cup", "tables", "elephant"])
 @pytest.mark.parametrize("least", [None, 0.0, 0.2, 0.5])
-def test_objects(graph: SceneGraph, label: str | None, least: float | None) -> None:
+def test_objects(graph, label, least):
     expected = {item.id for item in graph if _fits(item, label, least)}
     assert set(ids(graph.objects(label, min_probability=least))) == expected
     for near in ((0.5, -1.0, 0.2), graph[7], graph[9]):
@@ -194,7 +185,7 @@ def test_objects(graph: SceneGraph, label: str | None, least: float | None) -> N
             assert ids(found) == [i for gap, i in by_hand if within is None or gap <= within]
 
 
-def test_neighbours(graph: SceneGraph) -> None:
+def test_neighbours(graph):
     for item in list(graph)[:20]:
         gaps = sorted(
             (gap_m(item.footprint, other.footprint), other.id) for other in graph if other != item
@@ -206,7 +197,7 @@ def test_neighbours(graph: SceneGraph) -> None:
 
 
 @pytest.mark.parametrize("predicate", [None, "on", "near"])
-def test_relations(graph: SceneGraph, predicate: str | None) -> None:
+def test_relations(graph, predicate):
     everything = graph.relations(None, predicate)
     of_each = [relation for i in range(1, 121) for relation in graph.relations(i, predicate)]
     for subject, object_ in itertools.product([None, "cup", "table", 5, 9, 124], repeat=2):
@@ -218,8 +209,8 @@ def test_relations(graph: SceneGraph, predicate: str | None) -> None:
         assert all(relation in everything or relation in of_each for relation in found)
 
 
-def test_words(graph: SceneGraph) -> None:
-    def answers(question: str) -> set[int]:
+def test_words(graph):
+    def answers(question):
         return {answer.item.id for answer in ask(graph, question).found}
 
     assert answers("cup on table") and answers("cup near anything")

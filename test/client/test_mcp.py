@@ -1,14 +1,10 @@
 """The MCP server, asked by the package's own client in a process of its own; and its tools."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import math
 import os
 import sys
-from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -23,7 +19,7 @@ TOOLS = {
 }  # fmt: skip
 
 
-def test_an_agent_asks_over_stdio(demo_out: Path) -> None:
+def test_an_agent_asks_over_stdio(demo_out):
     mcp = pytest.importorskip("mcp")
     if not hasattr(mcp, "Client"):
         pytest.skip("mcp is older than version 2")
@@ -33,10 +29,10 @@ def test_an_agent_asks_over_stdio(demo_out: Path) -> None:
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])},
     )
 
-    async def talk() -> None:
+    async def talk():
         async with mcp.Client(server) as client:
 
-            async def ask(name: str, **arguments: Any) -> dict[str, Any]:
+            async def ask(name, **arguments):
                 result = await client.call_tool(name, arguments)
                 assert not result.is_error, result.content
                 return json.loads(result.content[0].text)
@@ -60,7 +56,7 @@ def test_an_agent_asks_over_stdio(demo_out: Path) -> None:
     asyncio.run(asyncio.wait_for(talk(), 90))
 
 
-def test_changes_are_told_from_the_first_question_on(room: SceneGraph) -> None:
+def test_changes_are_told_from_the_first_question_on(room):
     later = msgspec.structs.replace(
         room.message,
         nodes=room.message.nodes[1:],
@@ -77,7 +73,7 @@ def test_changes_are_told_from_the_first_question_on(room: SceneGraph) -> None:
     assert "note" in tools.what_changed(1000.0)
 
 
-def test_empty_and_unknown_arguments(room: SceneGraph) -> None:
+def test_empty_and_unknown_arguments(room):
     tools = GraphTools(lambda: room)
     assert tools.get_object_context("elephant")
     with pytest.raises(ClientError, match="an id or a class"):
@@ -92,7 +88,7 @@ def test_empty_and_unknown_arguments(room: SceneGraph) -> None:
             tools.what_changed(seconds)
 
 
-def test_a_file_is_read_again_when_it_changes(demo_out: Path, room: SceneGraph) -> None:
+def test_a_file_is_read_again_when_it_changes(demo_out, room):
     watched = WatchedFile(demo_out)
     first = watched()
     assert watched() is first

@@ -1,10 +1,8 @@
 """Questions in words."""
 
-from __future__ import annotations
-
 import pytest
 
-from deworldsg_ros.client import ClientError, SceneGraph
+from deworldsg_ros.client import ClientError
 from deworldsg_ros.client.questions import Condition, Pattern, Since, ask, parse
 
 ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
@@ -32,7 +30,7 @@ ON_TABLE, NEAR_CUP = Condition("on", "table"), Condition("near", "cup")
         ("what changed?", Since(None, False)),
     ],
 )
-def test_patterns(question: str, meaning: object) -> None:
+def test_patterns(question, meaning):
     assert parse(question, ["eating"]) == meaning
 
 
@@ -52,13 +50,13 @@ def test_patterns(question: str, meaning: object) -> None:
         ("what changed since yesterday", "10 s ago"),
     ],
 )
-def test_questions_that_cannot_be_read(question: str, words: str) -> None:
+def test_questions_that_cannot_be_read(question, words):
     with pytest.raises(ClientError) as refusal:
         parse(question)
     assert words in str(refusal.value)
 
 
-def test_answers_carry_odds_evidence_and_doubt(room: SceneGraph) -> None:
+def test_answers_carry_odds_evidence_and_doubt(room):
     first, *_ = ask(room, "cup on dining table").found
     assert first.item.name == "cup #13"
     assert first.is_sure
@@ -76,7 +74,7 @@ def test_answers_carry_odds_evidence_and_doubt(room: SceneGraph) -> None:
     assert nothing.found == () and nothing.notes
 
 
-def test_distances_and_times(room: SceneGraph) -> None:
+def test_distances_and_times(room):
     assert len(ask(room, "chair within 0.5 m of dining table").found) >= 3
     close = ask(room, "anything near (1.67, -0.5, 0.45) within 20 cm").found
     assert [answer.item.label for answer in close] == ["remote", "cup"][: len(close)]

@@ -32,7 +32,7 @@ def filtered(
     nodes = [
         item
         for item in graph.nodes
-        if abs(item.box.center_m[0] - region.center[0]) <= region.radius_m  # type: ignore[union-attr]
+        if abs(item.box.center_m[0] - region.center[0]) <= region.radius_m
         and (not wanted or item.label in wanted)
     ]
     ids = {item.id for item in nodes}
@@ -53,7 +53,7 @@ def sessions(seed: int) -> Iterator[tuple[Any, wire.SceneGraphMessage]]:
 
 @pytest.mark.parametrize("region", [HERE, CUPS])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_client_of_the_part_has_the_filtered_graph(seed: int, region: Region) -> None:
+def test_a_client_of_the_part_has_the_filtered_graph(seed, region):
     part, log, client = RegionPart(region), ChangeLog(), GraphReplica()
     rng, published = random.Random(seed), 0
     for message, whole in sessions(seed):
@@ -75,8 +75,8 @@ def test_a_client_of_the_part_has_the_filtered_graph(seed: int, region: Region) 
     assert 20 < published < 72
 
 
-def test_what_happens_outside_is_not_told() -> None:
-    def graph(sequence: int, x: float, probability: float) -> wire.SceneGraphMessage:
+def test_what_happens_outside_is_not_told():
+    def graph(sequence, x, probability):
         nodes = [node(1, 0.0), node(2, 1.0), node(3, x)]
         edges = [make_edge(1, 2), make_edge(1, 3, probability=probability)]
         return make_graph(nodes, edges, sequence=sequence, session="s")
@@ -96,7 +96,7 @@ def test_what_happens_outside_is_not_told() -> None:
     assert (entered.session, entered.sequence) == (first.session, 2)
 
 
-def test_nowhere_and_a_region_without_objects() -> None:
+def test_nowhere_and_a_region_without_objects():
     part = RegionPart(Region(None, 5.0))
     assert part.message() is None
     part.add(make_graph([node(1, 0.0)]))

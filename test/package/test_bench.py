@@ -1,17 +1,13 @@
 """`python -m bench`: each benchmark has a process of its own, and may fail alone."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import inspect
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
-from bench import results
 from bench.__main__ import main, run_all
 from bench.entries import ENTRIES, Entry
 from bench.figures import Figure, Setup, in_turn
@@ -20,9 +16,7 @@ from bench.figures import Figure, Setup, in_turn
 QUICK = ("lifting", "merging_search")
 
 
-def test_the_quickest_benchmarks_write_their_figures(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_quickest_benchmarks_write_their_figures(tmp_path, monkeypatch):
     out = tmp_path / "figures.json"
     monkeypatch.setattr(sys, "argv", ["bench", "--quick", "--json", str(out), "--only", *QUICK])
     with pytest.raises(SystemExit) as end:
@@ -37,7 +31,7 @@ def test_the_quickest_benchmarks_write_their_figures(
         assert figure["reference"] and figure["ratio"] > 1
 
 
-def test_a_benchmark_that_fails_leaves_the_others_their_figures() -> None:
+def test_a_benchmark_that_fails_leaves_the_others_their_figures():
     failing = Entry("failing", "bench.entries:NO_SUCH_FUNCTION", limit_s=60, takes_s=1)
     slow = Entry("slow", "time:sleep", limit_s=0.01, takes_s=1)
     report = run_all([failing, slow, ENTRIES["lifting"]], Setup(quick=True))
@@ -47,7 +41,7 @@ def test_a_benchmark_that_fails_leaves_the_others_their_figures() -> None:
 
 
 @pytest.mark.slow
-def test_the_kitchen_and_the_step_write_their_figures(tmp_path: Path, root_dir: Path) -> None:
+def test_the_kitchen_and_the_step_write_their_figures(tmp_path, root_dir):
     (tmp_path / "redkitchen").symlink_to(root_dir / "bags" / "demo_room")
     entries = [ENTRIES["kitchen"], ENTRIES["step"]]
     report = run_all(entries, Setup(tmp_path, quick=True))
@@ -57,7 +51,7 @@ def test_the_kitchen_and_the_step_write_their_figures(tmp_path: Path, root_dir: 
     assert all(figure["value"] > 0 for figure in report["figures"])
 
 
-def test_every_entry_names_a_function_of_a_setup() -> None:
+def test_every_entry_names_a_function_of_a_setup():
     for entry in ENTRIES.values():
         module, _, name = entry.function.partition(":")
         function = getattr(importlib.import_module(module), name)
@@ -75,36 +69,13 @@ def test_every_entry_names_a_function_of_a_setup() -> None:
         ({"target": 3.0, "ratio": 2.0, "ratio_target": 2.5}, False),
     ],
 )
-def test_a_figure_reaches_its_target_or_not(changes: dict[str, float], reached: bool) -> None:
+def test_a_figure_reaches_its_target_or_not(changes, reached):
     figure = dataclasses.replace(Figure("time", 3.0, "ms", target=2.5), **changes)
     assert figure.reached is reached
 
 
-def test_two_calls_in_turn_are_compared_pair_by_pair() -> None:
+def test_two_calls_in_turn_are_compared_pair_by_pair():
     # A clock that gives each call its time: ours 1 and 3 s, the reference 2 and 12 s.
     ticks = iter([0.0, 1.0, 3.0, 10.0, 13.0, 25.0])
     paired = in_turn(lambda: None, lambda: None, 2, lambda: next(ticks))
     assert (paired.ours_ms, paired.reference_ms, paired.ratio) == (2000.0, 7000.0, 3.0)
-
-
-def test_the_tables_of_results_come_from_their_runs(root_dir: Path) -> None:
-    """A table without a run stays, and so does the text around the tables."""
-    text = (
-        "A\n<!-- table: methods -->\nold\n<!-- end -->\nB\n<!-- table: poses -->\nold\n<!-- end -->"
-    )
-    row = {name: 0.5 for _, name, _, _ in results.COLUMNS} | {"name": "fross", "failed": {}}
-    reports = {
-        "rooms": {"rows": [row]},
-        "rooms_flip": {"rows": [row | {"complete_edge_precision": None}]},
-    }
-    made = results.page(text, reports, "abc")
-    assert made.startswith(
-        "A\n<!-- table: methods -->\n```\n# commit abc\ndeworldsg evaluate table main"
-    )
-    assert "| a tenth of the labels is wrong | FROSS | 50.0 | 50.0 |" in made
-    assert "| 0 | – | 50.0 |" in made
-    assert made.endswith("<!-- end -->\nB\n<!-- table: poses -->\nold\n<!-- end -->")
-    assert results.page(made, reports, "abc") == made
-    places = results.PLACE.findall(results.PAGE.read_text(encoding="utf-8"))
-    assert set(places) <= set(results.TABLES)
-    assert {name for runs in results.TABLES.values() for name in runs} == set(results.RUNS)

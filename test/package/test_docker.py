@@ -22,9 +22,7 @@ def instructions(root: Path, name: str) -> list[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_has_known_instructions_no_rights_of_root_and_the_entry_point(
-    root_dir: Path, name: str
-) -> None:
+def test_a_file_has_known_instructions_no_rights_of_root_and_the_entry_point(root_dir, name):
     listed = instructions(root_dir, name)
     of_kind: dict[str, list[str]] = {
         kind: [arguments for keyword, arguments in listed if keyword == kind] for kind in KNOWN
@@ -45,7 +43,7 @@ def test_a_file_has_known_instructions_no_rights_of_root_and_the_entry_point(
     assert "bash docker/entrypoint.sh true" in of_kind["RUN"]
 
 
-def test_the_context_has_all_that_is_installed(root_dir: Path) -> None:
+def test_the_context_has_all_that_is_installed(root_dir):
     lines = (root_dir / ".dockerignore").read_text(encoding="utf-8").splitlines()
     kept = {line[1:] for line in lines if line.startswith("!")}
     assert all((root_dir / name).exists() for name in kept)
@@ -56,7 +54,7 @@ def test_the_context_has_all_that_is_installed(root_dir: Path) -> None:
     assert installed | {"docker", "locks", "scripts"} == kept
 
 
-def test_the_entry_point_runs_a_command_in_the_environment(root_dir: Path, tmp_path: Path) -> None:
+def test_the_entry_point_runs_a_command_in_the_environment(root_dir, tmp_path):
     (tmp_path / "docker").mkdir()
     (tmp_path / "scripts").mkdir()
     entry = shutil.copy(root_dir / "docker" / "entrypoint.sh", tmp_path / "docker")

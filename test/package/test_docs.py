@@ -88,13 +88,13 @@ def defined_in(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_links_and_named_source_files_of_a_page_exist(page: str) -> None:
+def test_links_and_named_source_files_of_a_page_exist(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     assert broken_links(ROOT / page, text) == []
     assert missing_files(text) == []
 
 
-def test_pages_named_in_code_exist() -> None:
+def test_pages_named_in_code_exist():
     missing = {
         f"{path}: {name}"
         for path in tracked()
@@ -105,7 +105,7 @@ def test_pages_named_in_code_exist() -> None:
     assert missing == set()
 
 
-def test_functions_of_the_equations_exist_where_the_table_says() -> None:
+def test_functions_of_the_equations_exist_where_the_table_says():
     text = (DEV / "method.md").read_text(encoding="utf-8")
     cells = [[CODE.findall(cell) for cell in line.strip("|").split("|")]
              for line in text.splitlines() if re.match(r"\| *\d+ *\|", line)]  # fmt: skip
@@ -116,7 +116,7 @@ def test_functions_of_the_equations_exist_where_the_table_says() -> None:
         assert all((ROOT / test).is_file() for test in tests)
 
 
-def test_the_page_of_the_architecture_names_functions_and_every_folder() -> None:
+def test_the_page_of_the_architecture_names_functions_and_every_folder():
     page = (DEV / "architecture.md").read_text(encoding="utf-8")
     steps = STEP.findall(page)
     assert len(steps) >= 20
@@ -139,5 +139,5 @@ def test_the_page_of_the_architecture_names_functions_and_every_folder() -> None
         ("`lifting/no_such.py` and `no_such.py`", ["lifting/no_such.py", "no_such.py"]),
     ],
 )
-def test_what_is_broken_or_missing_is_found(text: str, broken: list[str]) -> None:
+def test_what_is_broken_or_missing_is_found(text, broken):
     assert broken_links(DEV / "page.md", text) + missing_files(text) == broken

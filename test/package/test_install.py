@@ -95,9 +95,7 @@ BUILDERS = {"pip": install_with_pip, "colcon": install_with_colcon}
 
 
 @pytest.fixture(scope="module", params=sorted(BUILDERS))
-def install(
-    request: pytest.FixtureRequest, root_dir: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Install:
+def install(request, root_dir, tmp_path_factory):
     """The package, installed in one of the two ways."""
     folder = tmp_path_factory.mktemp(request.param)
     prefix = BUILDERS[request.param](copy_sources(root_dir, folder / "source"), folder)
@@ -106,7 +104,7 @@ def install(
 
 
 @pytest.fixture()
-def sourced(install: Install, monkeypatch: pytest.MonkeyPatch) -> Install:
+def sourced(install, monkeypatch):
     """The installation, with this process as a shell in which it is sourced."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", install.environment()["AMENT_PREFIX_PATH"])
     return install
@@ -121,7 +119,7 @@ def files_below(folder: Path) -> set[str]:
     }
 
 
-def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_dir: Path) -> None:
+def test_the_share_folder_has_the_files_of_the_checkout(sourced, root_dir):
     assert get_package_prefix(PACKAGE) == str(sourced.prefix)
     assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
     share = Path(get_package_share_directory(PACKAGE))
@@ -137,7 +135,7 @@ def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_d
     assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
 
 
-def test_ros2_run_finds_each_executable_once(sourced: Install) -> None:
+def test_ros2_run_finds_each_executable_once(sourced):
     folder = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
     assert {path.name for path in folder.iterdir()} == EXECUTABLES
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
@@ -145,7 +143,7 @@ def test_ros2_run_finds_each_executable_once(sourced: Install) -> None:
 
 
 @pytest.mark.parametrize("executable", sorted(EXECUTABLES))
-def test_executable_starts_its_node(install: Install, tmp_path: Path, executable: str) -> None:
+def test_executable_starts_its_node(install, tmp_path, executable):
     """A configuration that cannot be used ends a node at start-up, with status 2 and the reason."""
     command = (install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such:=1")
     done = run(*command, cwd=tmp_path, env=install.environment())
@@ -153,9 +151,7 @@ def test_executable_starts_its_node(install: Install, tmp_path: Path, executable
     assert "no_such" in done.stdout
 
 
-def test_the_package_is_complete_and_its_command_runs(
-    install: Install, root_dir: Path, tmp_path: Path
-) -> None:
+def test_the_package_is_complete_and_its_command_runs(install, root_dir, tmp_path):
     installed = files_below(install.site / PACKAGE)
     assert files_below(root_dir / PACKAGE) <= installed
     assert any(name.endswith(".onnx") for name in installed)
@@ -166,12 +162,10 @@ def test_the_package_is_complete_and_its_command_runs(
 
 
 @pytest.mark.parametrize("prefix_has_python", [True, False])
-def test_executable_prefers_the_python_of_its_prefix(
-    root_dir: Path, tmp_path: Path, prefix_has_python: bool
-) -> None:
+def test_executable_prefers_the_python_of_its_prefix(root_dir, tmp_path, prefix_has_python):
     """`.venv/lib/deworldsg_ros/graph_node` works where .venv is not activated."""
 
-    def fake_python(folder: Path, name: str) -> None:
+    def fake_python(folder, name):
         folder.mkdir(parents=True)
         (folder / "python3").write_text(f'#!/bin/sh\necho {name} "$2"\n')
         (folder / "python3").chmod(0o755)

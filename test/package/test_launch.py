@@ -43,7 +43,7 @@ CLASSES = {
 
 
 @pytest.fixture(autouse=True)
-def launch_classes(monkeypatch: pytest.MonkeyPatch) -> None:
+def launch_classes(monkeypatch):
     """Test doubles of the modules launch and launch_ros."""
     for path, names in CLASSES.items():
         module = ModuleType(path)
@@ -61,7 +61,7 @@ def described(path: Path) -> dict[str, list[Kept]]:
     return found
 
 
-def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_dir: Path) -> None:
+def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_dir):
     found = described(root_dir / "launch" / "deworldsg.launch.py")
     nodes = found["Node"]
     assert {
@@ -99,7 +99,7 @@ def test_nodes_have_the_parameter_file_remappings_conditions_and_respawn(root_di
     }
 
 
-def test_realsense_passes_the_topics_of_the_camera(root_dir: Path) -> None:
+def test_realsense_passes_the_topics_of_the_camera(root_dir):
     found = described(root_dir / "launch" / "realsense.launch.py")
     (camera,), (include,) = found["DeclareLaunchArgument"], found["IncludeLaunchDescription"]
     passed = dict(include.kwargs["launch_arguments"])

@@ -5,19 +5,16 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import msgspec
-import numpy as np
 import pytest
 from support.recordings import write_seven_scenes
 from support.sequences import write_room
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.evaluation.edge_measures import ReferenceScene
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.runner import ScanTask, evaluate_scan
 from deworldsg_ros.evaluation.scoring import ProtocolOptions
@@ -27,7 +24,7 @@ NAMES = ("captures", "capture", "replay")
 
 
 @pytest.fixture(scope="module")
-def lab(root_dir: Path) -> Iterator[SimpleNamespace]:
+def lab(root_dir):
     """The modules of the tool."""
     path = list(sys.path)
     sys.path.insert(0, str(root_dir / "tools" / "merging_lab"))
@@ -47,9 +44,7 @@ def captured(lab: Any, source: Path, folder: Path, *arguments: str) -> list[str]
 @pytest.mark.parametrize(
     ("kind", "faults", "seen"), [("clean", Faults(), 3), ("label", Faults(label=0.1), 2)]
 )
-def test_the_replay_of_a_capture_is_the_graph_of_the_evaluation(
-    lab: Any, tmp_path: Path, kind: str, faults: Faults, seen: int
-) -> None:
+def test_the_replay_of_a_capture_is_the_graph_of_the_evaluation(lab, tmp_path, kind, faults, seen):
     rooms, out = write_room(tmp_path / "rooms", frames=6), tmp_path / "out"
     names = captured(lab, rooms, tmp_path / "cap", "--kinds", kind)
     assert names == [f"room_0.{kind}.pkl"]
@@ -66,9 +61,7 @@ def test_the_replay_of_a_capture_is_the_graph_of_the_evaluation(
     assert score.seen == seen
 
 
-def test_a_row_is_printed_and_written_for_each_capture(
-    lab: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_row_is_printed_and_written_for_each_capture(lab, tmp_path, capsys):
     rooms, folder = write_room(tmp_path / "rooms", frames=6), tmp_path / "cap"
     for _ in range(2):  # the second time they are there
         names = captured(lab, rooms, folder, "--kinds", "clean,flip", "--every", "2")
@@ -87,28 +80,3 @@ def test_a_row_is_printed_and_written_for_each_capture(
     assert shown.count(" 3 in no published node ") == 6
     assert "0 nodes" in shown
     assert json.loads(numbers.read_text())["room_0.clean.every2"]["found"] == 0
-
-
-def node(existence: float | None, label: str, x: float) -> SimpleNamespace:
-    stated = {} if existence is None else {"existence": existence}
-    return SimpleNamespace(label=label, mean_m=[x, 0.0, 0.0], **stated)
-
-
-@pytest.mark.parametrize(
-    ("nodes", "expected"),
-    [
-        ([], []),
-        ([node(None, "cup", 0)], []),
-        ([node(0.4, "cup", 0), node(0.9, "cup", 0.1)], [(0.9, True), (0.4, False)]),
-        ([node(0.7, "cup", 2), node(0.6, "book", 0)], [(0.7, False), (0.6, False)]),
-    ],
-    ids=["empty", "no field", "the surest is the first", "elsewhere or wrong"],
-)
-def test_existence_is_compared_with_the_first_node_of_an_object(
-    lab: Any, nodes: list[Any], expected: list[tuple[float, bool]]
-) -> None:
-    half = np.full((1, 3), 0.2)
-    reference = ReferenceScene([1], ["cup"], -half, half, np.zeros((1, 3)), frozenset(), exact=True)
-    beliefs = lab.replay.existence_beliefs(nodes, reference)
-    assert [tuple(belief) for belief in beliefs] == expected
-    assert bool(lab.replay.calibration_lines(beliefs)) == bool(expected)

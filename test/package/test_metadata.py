@@ -37,13 +37,11 @@ def requirements(root: Path, *extras: str) -> dict[str, str]:
 
 
 @pytest.fixture
-def manifest(root_dir: Path) -> ElementTree.Element:
+def manifest(root_dir):
     return ElementTree.parse(root_dir / "package.xml").getroot()
 
 
-def test_versions_descriptions_and_licences_agree(
-    root_dir: Path, manifest: ElementTree.Element
-) -> None:
+def test_versions_descriptions_and_licences_agree(root_dir, manifest):
     texts = {
         name: (root_dir / name).read_text(encoding="utf-8")
         for name in ("CITATION.cff", "CHANGELOG.md", "pyproject.toml", "setup.py")
@@ -58,9 +56,7 @@ def test_versions_descriptions_and_licences_agree(
     assert 'license="Apache-2.0"' in texts["setup.py"]
 
 
-def test_package_xml_declares_every_ros_package_that_is_imported(
-    root_dir: Path, manifest: ElementTree.Element
-) -> None:
+def test_package_xml_declares_every_ros_package_that_is_imported(root_dir, manifest):
     assert manifest.findtext("name") == "deworldsg_ros"
     assert manifest.findtext("export/build_type") == "ament_python"
     declared = {element.text for element in manifest.findall("exec_depend")}
@@ -80,7 +76,7 @@ def imported_modules(root: Path) -> set[str]:
     return imported
 
 
-def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
+def test_every_imported_library_is_a_requirement(root_dir):
     extras = ("models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
@@ -94,7 +90,7 @@ def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
 @pytest.mark.parametrize(
     "name", ["default.yaml", "paper.yaml", "paper_rules.yaml", "released.yaml"]
 )
-def test_a_shipped_configuration_contains_only_changed_values(root_dir: Path, name: str) -> None:
+def test_a_shipped_configuration_contains_only_changed_values(root_dir, name):
     path = root_dir / "config" / name
     content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     content.pop("use_sim_time", None)
@@ -105,7 +101,7 @@ def test_a_shipped_configuration_contains_only_changed_values(root_dir: Path, na
             assert loaded[section][field] == value != default[section][field], (section, field)
 
 
-def test_run_time_requirements_are_bounded_and_without_torch(root_dir: Path) -> None:
+def test_run_time_requirements_are_bounded_and_without_torch(root_dir):
     lines = requirements(root_dir)
     assert {"numpy", "scipy", "rosbags"} <= set(lines)
     assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in lines.values())
@@ -114,7 +110,7 @@ def test_run_time_requirements_are_bounded_and_without_torch(root_dir: Path) -> 
         requirements(root_dir, "no-such-extra")
 
 
-def test_metadata_of_the_installed_package_names_the_requirements(root_dir: Path) -> None:
+def test_metadata_of_the_installed_package_names_the_requirements(root_dir):
     if "VIRTUAL_ENV" not in os.environ:
         pytest.skip("deworldsg_ros is installed where scripts/test runs the tests")
     assert version("deworldsg_ros") == deworldsg_ros.__version__

@@ -7,7 +7,6 @@ shows that each quotation stands in it.
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -75,34 +74,24 @@ BEHAVIOUR = [
 
 
 @pytest.fixture(scope="module")
-def configurations(root_dir: Path) -> dict[str, Config]:
+def configurations(root_dir):
     loaded = {name: load_config(root_dir / "config" / name) for name in EVERYWHERE[:-1]}
     return {**loaded, "built in": Config()}
 
 
 @pytest.mark.parametrize(("place", "words", "option", "printed", "files"), OPTIONS)
-def test_an_option_has_the_printed_value(
-    configurations: dict[str, Config],
-    *,
-    place: str,
-    words: str,
-    option: str,
-    printed: float,
-    files: tuple[str, ...],
-) -> None:
+def test_an_option_has_the_printed_value(configurations, *, place, words, option, printed, files):
     section, field = option.split(".")
     values = {name: getattr(getattr(configurations[name], section), field) for name in files}
     assert values == dict.fromkeys(files, printed), place
 
 
 @pytest.mark.parametrize(("place", "words", "value", "printed"), CONSTANTS)
-def test_a_constant_has_the_printed_value(
-    place: str, words: str, value: float, printed: float
-) -> None:
+def test_a_constant_has_the_printed_value(place, words, value, printed):
     assert value == printed, place
 
 
-def test_the_numbers_stand_in_the_paper(shared_dir: Path) -> None:
+def test_the_numbers_stand_in_the_paper(shared_dir):
     text = (shared_dir / "paper" / "deworldsg.tex").read_text(encoding="utf-8")
     text = re.sub(r"[\s{}~]|\\,", "", text)
     for _, words, *_ in [*OPTIONS, *CONSTANTS, *BEHAVIOUR]:
@@ -131,13 +120,13 @@ def kept(*arguments: Any, **options: float) -> int:
 
 
 @pytest.mark.parametrize(("step_m", "count"), [(0.1005, 400), (0.1015, 399)])
-def test_eq_1_keeps_a_pixel_within_5_percent_and_a_millimetre(step_m: float, count: int) -> None:
+def test_eq_1_keeps_a_pixel_within_5_percent_and_a_millimetre(step_m, count):
     depth_m = np.full((20, 20), 2.0)  # 0.05 x 2 m + 1e-3 m = 0.101 m
     depth_m[10, 10] += step_m
     assert kept(depth_m, gamma_base_m=10.0) == count
 
 
-def test_eq_1_takes_the_median_of_3_by_3_pixels() -> None:
+def test_eq_1_takes_the_median_of_3_by_3_pixels():
     """The corners of a square of 3 x 3 pixels have 4 of 9 neighbours in it, its edges 6."""
     depth_m = np.full((20, 20), 2.0)
     depth_m[8:11, 8:11] += 0.5
@@ -154,40 +143,40 @@ def test_eq_1_takes_the_median_of_3_by_3_pixels() -> None:
         (3.0, 0.062, False),
     ],
 )
-def test_eq_2_splits_depths_at_the_printed_gaps(depth_m: float, gap_m: float, whole: bool) -> None:
+def test_eq_2_splits_depths_at_the_printed_gaps(depth_m, gap_m, whole):
     image_m = np.full((20, 20), depth_m)
     image_m[15:] += gap_m
     assert kept(image_m) == (400 if whole else 300)
 
 
 @pytest.mark.parametrize(("gap_m", "whole"), [(0.08, True), (0.098, True), (0.102, False)])
-def test_eq_2_splits_depths_at_10_times_the_median_step(gap_m: float, whole: bool) -> None:
+def test_eq_2_splits_depths_at_10_times_the_median_step(gap_m, whole):
     image_m = 2.0 + 0.01 * np.arange(100.0).reshape(10, 10)  # α median(Δz) = 10 x 0.01 m
     image_m[9:] += gap_m - 0.01
     assert kept(image_m) == (100 if whole else 90)
 
 
 @pytest.mark.parametrize(("pixels", "count"), [(9, 0), (10, 10)])
-def test_an_object_of_less_than_10_pixels_is_dropped(pixels: int, count: int) -> None:
+def test_an_object_of_less_than_10_pixels_is_dropped(pixels, count):
     mask = np.zeros((4, 5), bool)
     mask.flat[:pixels] = True
     assert kept(np.full((4, 5), 2.0), mask) == count
 
 
-def test_eq_4_divides_by_one_less_than_the_number_of_points() -> None:
+def test_eq_4_divides_by_one_less_than_the_number_of_points():
     local = lifted(np.full((4, 5), 2.0), focal_px=2.0)
     x_m = np.tile(np.arange(5.0), 4)  # 2 m / 2 px
     expected = ((x_m - x_m.mean()) ** 2).sum() / 19 + LiftingConfig().covariance_ridge_m2
     assert local.covariances_world[0, 0, 0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_eq_6_compares_the_hellinger_distance_with_0_7(configurations: dict[str, Config]) -> None:
+def test_eq_6_compares_the_hellinger_distance_with_0_7(configurations):
     threshold = configurations["paper.yaml"].merging.hellinger_threshold
     # HD < δ if and only if BD < -ln(1 - δ²).
     assert bhattacharyya_bound(threshold) == pytest.approx(0.6733445532637656, abs=1e-12)
 
 
-def test_eq_8_halves_the_distance_in_the_image_and_compares_with_0_45() -> None:
+def test_eq_8_halves_the_distance_in_the_image_and_compares_with_0_45():
     boxes = np.array([[0.0, 0.0, 0.0, 0.0], [30.0, 40.0, 30.0, 40.0]])  # one diagonal apart
     depths_m = np.array([2.0, 2.0])
     assert geometric_costs(boxes, depths_m, 30, 40)[0, 1] == 0.5
@@ -200,7 +189,7 @@ def test_eq_8_halves_the_distance_in_the_image_and_compares_with_0_45() -> None:
 
 
 @pytest.mark.models
-def test_the_probe_has_two_fully_connected_layers() -> None:
+def test_the_probe_has_two_fully_connected_layers():
     torch = pytest.importorskip("torch")
     from deworldsg_ros.checkpoints.probe_network import PUBLISHED_BACKBONE, build_network
 

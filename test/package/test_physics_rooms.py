@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ SIZE = (6.0, 6.0, 2.5)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def tool(root_dir: Path) -> Iterator[None]:
+def tool(root_dir):
     """The modules of the tool on the path."""
     folder = str(root_dir / "tools" / "physics_rooms")
     sys.path.insert(0, folder)
@@ -48,14 +46,6 @@ def table() -> Any:
     return at(Item("table", "furn", [top, *legs], [Material((0.5,) * 3)]), (0, 0, 0), "world")
 
 
-def cube(label: str, *place: float) -> Any:
-    return block(label, "small", place, (0.05, 0.05, 0.05))  # type: ignore[arg-type]
-
-
-def bottle(x: float) -> Any:
-    return block("bottle", "small", (x, 0, 0.745), (0.02, 0.02, 0.1))
-
-
 def judge(items: list[Any]) -> Any:
     """The truth of some items, after they have settled."""
     from physics_room.simulate import simulate
@@ -70,13 +60,7 @@ def judge(items: list[Any]) -> Any:
 
 def stack() -> list[Any]:
     book = block("book", "small", (0, 0, 0.745), (0.1, 0.13, 0.015))
-    return [table(), book, cube("box", 0, 0, 0.78)]
-
-
-def seat_under_the_table() -> list[Any]:
-    """The boxes overlap, and nothing carries anything."""
-    chair = block("chair", "furn", (0, -0.7, 0), (0.2, 0.2, 0.22))
-    return [table(), chair, cube("box", 0, -0.7, 0.445)]
+    return [table(), book, block("box", "small", (0, 0, 0.78), (0.05, 0.05, 0.05))]
 
 
 def beside(space: float) -> list[Any]:
@@ -93,34 +77,26 @@ def screen(x: float) -> list[Any]:
     ("scene", "relations"),
     [
         (stack, {(2, 1): "on", (3, 2): "on"}),
-        (seat_under_the_table, {(1, 2): "with", (2, 1): "near", (3, 2): "on", (3, 1): None}),
-        # It falls off.
-        (lambda: [table(), cube("box", 0.69, 0, 0.76)], {(1, 2): "near", (2, 1): "near"}),
         (lambda: beside(0.02), {(1, 2): "against", (2, 1): None}),
         (lambda: beside(0.12), {(1, 2): "near", (2, 1): "near"}),
         (lambda: beside(0.7), {(1, 2): None, (2, 1): None}),
         (lambda: screen(0.0), {(2, 1): "above", (1, 2): "under"}),
         (lambda: screen(1.8), {(2, 1): None, (1, 2): None}),
-        # A third thing between two keeps them from being near.
-        (
-            lambda: [table(), *map(bottle, (-0.06, 0, 0.06))],
-            {(2, 3): "near", (3, 4): "near", (2, 4): None},
-        ),
     ],
 )
-def test_relations_of_what_has_settled(scene: Any, relations: dict[tuple, str | None]) -> None:
+def test_relations_of_what_has_settled(scene, relations):
     found = judge(scene()).relations
     assert {pair: found.get(pair) for pair in relations} == relations
 
 
-def test_a_thing_falls_with_all_that_carries_it() -> None:
+def test_a_thing_falls_with_all_that_carries_it():
     physics = judge(stack()).physics
     assert [physics[i]["falls_without"] for i in (2, 3)] == [[1], [1, 2]]
     (support,) = physics[3]["supports"]
     assert (support["id"], support["normal"][2]) == (2, pytest.approx(1.0, abs=0.01))
 
 
-def test_the_same_seed_gives_the_same_room() -> None:
+def test_the_same_seed_gives_the_same_room():
     from physics_room.layout import build_room
 
     first, second = (build_room(np.random.default_rng(3)).items for _ in range(2))

@@ -1,12 +1,9 @@
 """The pages for users build strictly, and the site loads nothing from elsewhere."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -21,9 +18,7 @@ FETCHED = re.compile(
 
 @pytest.mark.slow
 @pytest.mark.timeout(180)
-def test_the_site_has_all_pages_builds_strictly_and_fetches_nothing(
-    root_dir: Path, tmp_path: Path
-) -> None:
+def test_the_site_has_all_pages_builds_strictly_and_fetches_nothing(root_dir, tmp_path):
     pytest.importorskip("mkdocs", reason="pip install 'deworldsg_ros[docs]'")
     text = (root_dir / "mkdocs.yml").read_text(encoding="utf-8")
     pages = [page for entry in yaml.safe_load(text)["nav"] for page in entry.values()]

@@ -20,7 +20,7 @@ SECRET = b"root:x:0:0:secret"
 
 
 @pytest.fixture
-def secret(tmp_path: Path) -> Path:
+def secret(tmp_path):
     path = tmp_path / "secret.png"
     path.write_bytes(SECRET)
     return path

@@ -50,9 +50,7 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("program", PROGRAMS)
 @pytest.mark.parametrize("place", ["folder", "folder, other name", "salvaged", "file"])
-def test_a_database_that_computes_its_rows_is_refused(
-    tmp_path: Path, program: str, place: str
-) -> None:
+def test_a_database_that_computes_its_rows_is_refused(tmp_path, program, place):
     bag = write_bag(tmp_path / "bag", camera_items(2), "sqlite3")
     file = bag / "bag.db3"
     with sqlite3.connect(file) as database:
@@ -69,7 +67,7 @@ def test_a_database_that_computes_its_rows_is_refused(
 
 
 @pytest.mark.parametrize("name", ["a#1.db3", "new?mode=rwc&x=.db3", "..%2Foutside%2Foutside.db3"])
-def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
+def test_a_database_is_the_file_of_its_name(tmp_path, name):
     write_bag(tmp_path / "outside", camera_items(1), "sqlite3")
     bag = write_bag(tmp_path / "bag", camera_items(COUNT), "sqlite3")
     bag = bag.rename(tmp_path / "50%2Fb #1?mode=rwc&x=")
@@ -86,9 +84,7 @@ def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
 # --- zstd ------------------------------------------------------------------------------------
 
 
-def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path, monkeypatch):
     bag = text_bag(tmp_path / "bag", "sqlite3", CompressionMode.FILE, [1, 2, 3])
     assert [message.log_time_ns for message in read_bag(bag)[0]] == [1, 2, 3]
     monkeypatch.setattr(storage, "MIN_FILE_BYTES", 1_000_000)
@@ -97,9 +93,7 @@ def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
 
 
 @pytest.mark.parametrize("plugin", ["mcap", "sqlite3"])
-def test_a_compressed_message_unpacks_to_a_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugin: str
-) -> None:
+def test_a_compressed_message_unpacks_to_a_limit(tmp_path, monkeypatch, plugin):
     bag = text_bag(tmp_path / "bag", plugin, CompressionMode.MESSAGE, [1, 2])
     whole, _ = read_bag(bag)
     assert [len(message.data) for message in whole] == [600_009] * 2
@@ -111,9 +105,7 @@ def test_a_compressed_message_unpacks_to_a_limit(
     assert messages == [] and "unpacks to more than" in losses[0]
 
 
-def test_chunks_that_overlap_in_time_are_few(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_that_overlap_in_time_are_few(tmp_path, monkeypatch):
     orders = {"a": list(range(12)), "b": [0, 9, 1, 8, 2, 7, 3, 6]}
     one_by_one, overlapping = (
         text_bag(tmp_path / name, "mcap", CompressionMode.STORAGE, times)
@@ -127,7 +119,7 @@ def test_chunks_that_overlap_in_time_are_few(
             read_bag(path)
 
 
-def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_records_of_a_chunk_end_it(tmp_path, monkeypatch):
     monkeypatch.setattr(storage._Tables, "take", None)  # no record is looked at
     size = 9 * 1000
     packed = storage.zstd.compress(bytes(size))
@@ -153,9 +145,7 @@ INFO = "/camera/color/camera_info"
     [(DEPTH, CAMERA_INFO), ("/camera/pose", CAMERA_INFO), (INFO, POSE_STAMPED),
      (RGB, POSE_STAMPED), (RGB, STRING)],
 )  # fmt: skip
-def test_a_topic_of_two_types_is_read_by_one(
-    tmp_path: Path, plugin: str, has_metadata: bool, topic: str, other: str
-) -> None:
+def test_a_topic_of_two_types_is_read_by_one(tmp_path, plugin, has_metadata, topic, other):
     items = camera_items(COUNT)
     messages = {msgtype: message for _, msgtype, _, message in items}
     messages[STRING] = typestore().types[STRING](data="x" * 50)

@@ -34,7 +34,7 @@ OPTIONS = (".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff")
 
 
 @pytest.mark.parametrize("text", YAML)
-def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
+def test_yaml_is_bounded_and_has_one_error(tmp_path, text):
     content = text.encode(errors="surrogateescape")
     with pytest.raises(ValueError, match=r"\w"):
         parse_yaml(content)
@@ -47,13 +47,13 @@ def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
     ("reader", "text"),
     [*((parse_any_json, text) for text in JSON), *((stamp_ns_from_text, text) for text in STAMPS)],
 )
-def test_json_and_stamps_have_one_error(reader, text: str) -> None:
+def test_json_and_stamps_have_one_error(reader, text):
     with pytest.raises(ValueError):
         reader(text.encode() if reader is parse_any_json else text)
 
 
 @pytest.mark.parametrize("value", OPTIONS)
-def test_options_are_finite_numbers(value: str) -> None:
+def test_options_are_finite_numbers(value):
     with pytest.raises(ConfigurationError, match="--set"):
         effective_config(None, [f"inputs.max_depth_m={value}"])
 
@@ -62,12 +62,12 @@ def test_options_are_finite_numbers(value: str) -> None:
     ("pattern", "name"),
     [(COLOR_NAME, "frame-000001.color.jpg"), (FRAME_NAME, "frame-000001.pose.txt")],
 )
-def test_a_line_feed_ends_no_file_name(pattern, name: str) -> None:
+def test_a_line_feed_ends_no_file_name(pattern, name):
     assert pattern.match(name)
     assert not pattern.match(f"{name}\n")
 
 
-def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
+def test_the_size_of_an_image_is_known_before_it_is_decoded():
     content = b"\x89PNG\r\n\x1a\n"
     for kind, data in (
         (b"IHDR", struct.pack(">IIBBBBB", 65535, 65535, 8, 0, 0, 0, 0)),
@@ -82,7 +82,7 @@ def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
             decode(other, cv2.IMREAD_UNCHANGED)
 
 
-def test_a_jpeg_has_a_bounded_number_of_scans() -> None:
+def test_a_jpeg_has_a_bounded_number_of_scans():
     pixels = np.full((64, 64, 3), 128, np.uint8)
     content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     assert content.count(SCAN) == 10 and decode(content, cv2.IMREAD_COLOR).shape == (64, 64, 3)
@@ -114,14 +114,14 @@ def in_itself() -> list:
     ],
     ids=["shared lists", "itself", "large memo", "many classes"],
 )
-def test_predictions_without_end_are_refused(tmp_path: Path, content: bytes, words: str) -> None:
+def test_predictions_without_end_are_refused(tmp_path, content, words):
     path = tmp_path / "predictions.json"
     path.write_bytes(content)
     with pytest.raises(EvaluationError, match=words):
         read_predictions(path) if content[:1] == b"{" else load_pickle(content, "x.pkl")
 
 
-def test_chunks_unpack_to_what_they_declare() -> None:
+def test_chunks_unpack_to_what_they_declare():
     bound_decompression()
     packed = lz4.frame.compress(bytes(1 << 24))
     assert decompress("lz4", packed, 1 << 24) == bytes(1 << 24)
@@ -130,7 +130,7 @@ def test_chunks_unpack_to_what_they_declare() -> None:
             decompress("lz4", packed, size)
 
 
-def test_only_regular_files_of_a_size_are_read(tmp_path: Path) -> None:
+def test_only_regular_files_of_a_size_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "large").write_bytes(bytes(9))
     (tmp_path / "good").write_bytes(b"12345678")

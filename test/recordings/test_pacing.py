@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deworldsg_ros.recordings.replaying import MAX_UNDECIDED, Pace, Window
+from deworldsg_ros.recordings.replaying import Pace, Window
 from deworldsg_ros.recordings.source import Role
 
 NEEDS = (Role.DEPTH, Role.POSE)
@@ -75,14 +75,6 @@ def test_a_frame_is_in_flight_once_every_stream_passed_its_stamp():
     made.add_result(4)
     made.passed(Role.CAMERA_INFO, 9)
     assert made.in_flight == 0
-    made.close()
-    assert made.in_flight == 2
-
-
-def test_undecided_frames_are_bounded_and_a_result_ends_them():
-    made = window(4, MAX_UNDECIDED + 2, NEEDS)
-    assert made.in_flight == 2
-    made.add_result(MAX_UNDECIDED)
     made.close()
     assert made.in_flight == 2
 

@@ -1,7 +1,5 @@
 """Raw messages of whole, split and damaged bags."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import struct

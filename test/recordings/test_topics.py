@@ -1,7 +1,5 @@
 """Which topic is which."""
 
-from __future__ import annotations
-
 import pytest
 
 from deworldsg_ros.recordings.bags.storage import Topic

@@ -79,7 +79,7 @@ def expected(message: wire.SceneGraphMessage) -> tuple[list[list[object]], list[
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_database_is_the_graph_after_every_commit(tmp_path: Path, seed: int) -> None:
+def test_the_database_is_the_graph_after_every_commit(tmp_path, seed):
     graphs, rng = random_session(seed, 25), random.Random(seed)
     with StoreWriter(tmp_path) as writer:
         for current, update in zip(graphs[1:], updates_of(graphs)):
@@ -102,7 +102,7 @@ def test_the_database_is_the_graph_after_every_commit(tmp_path: Path, seed: int)
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-def test_where_everything_was_at_each_time(tmp_path: Path, at_once: bool) -> None:
+def test_where_everything_was_at_each_time(tmp_path, at_once):
     graphs = random_session(7, 30)
     with StoreWriter(tmp_path) as writer:
         for update in updates_of(graphs):
@@ -119,7 +119,7 @@ def test_where_everything_was_at_each_time(tmp_path: Path, at_once: bool) -> Non
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_joined_updates_have_the_effect_of_all(tmp_path: Path, seed: int) -> None:
+def test_joined_updates_have_the_effect_of_all(tmp_path, seed):
     graphs = random_session(seed, 24)
     one_by_one = updates_of(graphs)
     messages = [*one_by_one[:8], graphs[8], *one_by_one[8:]]
@@ -134,7 +134,7 @@ def test_joined_updates_have_the_effect_of_all(tmp_path: Path, seed: int) -> Non
     assert content(Store(tmp_path)) == expected(graphs[-1])
 
 
-def test_where_the_cup_was(tmp_path: Path) -> None:
+def test_where_the_cup_was(tmp_path):
     store = written(
         tmp_path,
         graph(1, 100.0, [node(1, x=0.0), node(2, "dining table")], [make_edge(1, 2)]),
@@ -143,7 +143,7 @@ def test_where_the_cup_was(tmp_path: Path) -> None:
         graph(4, 130.0, [node(2, "desk")]),
     )
 
-    def cups(seconds: float) -> list[float]:
+    def cups(seconds):
         return [stay.position_m[0] for stay in store.at(round(seconds * SECOND), "cup")]
 
     assert [cups(s) for s in (99, 100, 119, 120, 129, 130)] == [[], [0.0], [0.0], [2.0], [2.0], []]
@@ -152,7 +152,7 @@ def test_where_the_cup_was(tmp_path: Path) -> None:
     assert store.ask("MATCH (s:Stay) RETURN count(*)").rows == [[4]]
 
 
-def test_a_new_session_replaces_the_graph_and_keeps_the_history(tmp_path: Path) -> None:
+def test_a_new_session_replaces_the_graph_and_keeps_the_history(tmp_path):
     begun = [graph(n, 20.0 * n, [node(1, "bowl")] * n, session="b") for n in (0, 1)]
     messages = [graph(5, 10.0, [node(1), node(2)], [make_edge(1, 2)], "a"), *updates_of(begun)]
     store = written(tmp_path, *messages)
@@ -163,7 +163,7 @@ def test_a_new_session_replaces_the_graph_and_keeps_the_history(tmp_path: Path) 
     assert [(s.node, s.label) for s in store.at(20 * SECOND)] == [(1, "bowl")]
 
 
-def test_what_does_not_fit_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_refused_and_changes_nothing(tmp_path):
     graphs = random_session(1, 5)
     first, second, third, *_ = updates_of(graphs)
     other = msgspec.structs.replace(second, session="other")
@@ -183,7 +183,7 @@ def test_what_does_not_fit_is_refused_and_changes_nothing(tmp_path: Path) -> Non
     assert content(Store(tmp_path))[1] == [[1, 1, "on", 0.8]]
 
 
-def test_strings_are_values_wherever_they_come_from(tmp_path: Path) -> None:
+def test_strings_are_values_wherever_they_come_from(tmp_path):
     nodes = [node(i, label) for i, label in enumerate(HOSTILE, 1)]
     edges = [make_edge(1, i, label) for i, label in enumerate(HOSTILE, 1)]
     one_by_one = [graph(1, 1.0, []), graph(2, 2.0, nodes[::-1], edges)]
@@ -230,7 +230,7 @@ LOADED = "LOAD FROM 'FILE' (file_format='csv', header=false) RETURN *"
         ("INSTALL httpfs", ""),
     ],
 )
-def test_what_is_no_question_is_refused(tmp_path: Path, cypher: str, problem: str) -> None:
+def test_what_is_no_question_is_refused(tmp_path, cypher, problem):
     store = written(tmp_path / "store", graph(1, 1.0, [node(1)]))
     file = tmp_path / "mine.csv"
     file.write_text("a secret\n")
@@ -241,7 +241,7 @@ def test_what_is_no_question_is_refused(tmp_path: Path, cypher: str, problem: st
     assert len(content(store)[0]) == 1
 
 
-def test_strings_names_and_comments_of_a_question_are_free(tmp_path: Path) -> None:
+def test_strings_names_and_comments_of_a_question_are_free(tmp_path):
     ask = written(tmp_path, graph(1, 1.0, [node(1, "load; // it")])).ask
     found = ask("match (o:Object) where o.label = 'load; // it' return o.id AS `copy`;")
     assert (found.columns, found.rows) == (["copy"], [[1]])
@@ -249,7 +249,7 @@ def test_strings_names_and_comments_of_a_question_are_free(tmp_path: Path) -> No
     assert ask(cypher).rows == [["it's /* ", 1]]
 
 
-def test_a_damaged_database_is_made_anew(tmp_path: Path) -> None:
+def test_a_damaged_database_is_made_anew(tmp_path):
     message = graph(1, 1.0, [node(1), node(2)], [make_edge(1, 2)])
     written(tmp_path, message)
     database = tmp_path / DATABASE_FILE
@@ -261,7 +261,7 @@ def test_a_damaged_database_is_made_anew(tmp_path: Path) -> None:
     assert content(Store(tmp_path)) == expected(message)
 
 
-def test_a_line_that_was_cut_off_is_dropped_and_a_damaged_one_is_named(tmp_path: Path) -> None:
+def test_a_line_that_was_cut_off_is_dropped_and_a_damaged_one_is_named(tmp_path):
     graphs = random_session(3, 4)
     *first, last = updates_of(graphs)
     written(tmp_path, *first)
@@ -279,7 +279,7 @@ def test_a_line_that_was_cut_off_is_dropped_and_a_damaged_one_is_named(tmp_path:
         StoreWriter(tmp_path).rebuild()
 
 
-def test_one_writer_at_a_time_and_readers_meanwhile(tmp_path: Path) -> None:
+def test_one_writer_at_a_time_and_readers_meanwhile(tmp_path):
     with StoreWriter(tmp_path) as writer:
         writer.add(graph(1, 1.0, [node(1)]))
         writer.commit()
@@ -290,7 +290,7 @@ def test_one_writer_at_a_time_and_readers_meanwhile(tmp_path: Path) -> None:
     assert len(content(Store(tmp_path))[0]) == 2
 
 
-def test_no_store_and_no_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_store_and_no_extra(tmp_path, monkeypatch):
     with pytest.raises(StoreError, match="deworldsg store add"):
         Store(tmp_path / "missing")
     (tmp_path / "file").write_text("")
@@ -317,9 +317,7 @@ with StoreWriter(Path(sys.argv[1])) as writer:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("attempt", range(6))
-def test_a_killed_writer_leaves_every_message_and_a_store_that_opens(
-    tmp_path: Path, root_dir: Path, attempt: int
-) -> None:
+def test_a_killed_writer_leaves_every_message_and_a_store_that_opens(tmp_path, root_dir, attempt):
     graphs = random_session(5, 400)
     paths = os.pathsep.join([str(root_dir), str(root_dir / "test"), *sys.path])
     process = subprocess.Popen(
@@ -354,11 +352,11 @@ NEWEST = 1_700_000_000 * SECOND
         ("2023-11-14T23:13:20+01:00", 1_700_000_000),
     ],
 )
-def test_times(text: str, seconds: float) -> None:
+def test_times(text, seconds):
     assert time_ns_from_text(text, NEWEST) == round(seconds * SECOND)
 
 
-def test_times_of_the_newest_day() -> None:
+def test_times_of_the_newest_day():
     at_ten = time_ns_from_text("10:00", NEWEST)
     assert time.localtime(at_ten // SECOND)[3:5] == (10, 0)
     assert abs(at_ten - NEWEST) < 24 * 3600 * SECOND
@@ -366,12 +364,12 @@ def test_times_of_the_newest_day() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "soon", "25:00", "1e400", "1..2", "99999999999", "5 y ago"])
-def test_no_time(text: str) -> None:
+def test_no_time(text):
     with pytest.raises(StoreError, match="10:00"):
         time_ns_from_text(text, NEWEST)
 
 
-def test_the_commands(tmp_path: Path) -> None:
+def test_the_commands(tmp_path):
     file, store = tmp_path / "graph.json", tmp_path / "store"
     file.write_text(json.dumps(json.loads(wire.encode(graph(1, 100.0, [node(1)]))), indent=2))
     assert printed("store", "add", store, file) == f"1 message added to {store}\n"

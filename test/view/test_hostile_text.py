@@ -49,7 +49,7 @@ def is_text(printed_text: str) -> bool:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> str:
+def plain(tmp_path_factory):
     """The page of a graph of usual names."""
     path = tmp_path_factory.mktemp("plain") / "graph.html"
     page.write(graph_of("cup"), path)

@@ -1,7 +1,5 @@
 """The files for RViz and Foxglove name the topics that exist, with the QoS of their publishers."""
 
-from __future__ import annotations
-
 import json
 
 import yaml

@@ -31,7 +31,7 @@ def write(kind: str, root: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["7scenes", "tum", "rooms", "replica", "3rscan"])
-def test_a_folder_is_recognised_and_its_bag_has_the_same_frames(tmp_path: Path, kind: str) -> None:
+def test_a_folder_is_recognised_and_its_bag_has_the_same_frames(tmp_path, kind):
     folder = write(kind, tmp_path)
     assert detect_kind(folder) == kind
     if (folder / "sequence").exists():
@@ -71,9 +71,7 @@ def test_a_folder_is_recognised_and_its_bag_has_the_same_frames(tmp_path: Path, 
         ("3rscan", "sequence/frame-000003.depth.pgm", "P5 no image", "decode_failed"),
     ],
 )
-def test_a_lost_file_costs_its_frame_and_is_counted(
-    tmp_path: Path, kind: str, file: str, content: str | None, reason: str
-) -> None:
+def test_a_lost_file_costs_its_frame_and_is_counted(tmp_path, kind, file, content, reason):
     folder = write(kind, tmp_path)
     (folder / file).unlink()
     if content is not None:
@@ -103,9 +101,7 @@ def test_a_lost_file_costs_its_frame_and_is_counted(
         ("3rscan", "sequence/_info.txt", "OLD m_colorWidth = 95", "expected 95x64"),
     ],
 )
-def test_a_folder_that_cannot_be_read_is_refused_by_file(
-    tmp_path: Path, kind: str, file: str, content: str | None, words: str
-) -> None:
+def test_a_folder_that_cannot_be_read_is_refused_by_file(tmp_path, kind, file, content, words):
     folder = write(kind, tmp_path)
     text = (folder / file).read_text()
     (folder / file).unlink()
@@ -115,7 +111,7 @@ def test_a_folder_that_cannot_be_read_is_refused_by_file(
         open_recording(folder, kind=kind)
 
 
-def test_folders_of_several_recordings_and_unknown_choices_are_refused(tmp_path: Path) -> None:
+def test_folders_of_several_recordings_and_unknown_choices_are_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"room_0.*data/room_0"):
         open_source(write_room(tmp_path / "rooms"))
     for name in ("seq-01", "seq-02"):

@@ -1,9 +1,5 @@
 """3RScan, ReplicaSSG and rendered rooms: frames that are read, turned and resampled."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -27,17 +23,17 @@ from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion
 from deworldsg_ros.scene.errors import RecordingError
 
 
-def test_frames_of_a_room(tmp_path: Path) -> None:
+def test_frames_of_a_room(tmp_path):
     recording = open_recording(write_room(tmp_path) / "data" / "room_0")
     for number, frame in enumerate(recording.frames()):
         assert frame.intrinsics == CAMERA
         assert (np.rint(frame.depth_m * 1000) == depth_mm()).all()
         assert frame.T_world_camera[0, 3] == 0.01 * number
         assert frame.stamp_ns == 10**9 + number * 10**8
-        assert recording.source.frame_numbers[frame.stamp_ns] == number  # type: ignore[attr-defined]
+        assert recording.source.frame_numbers[frame.stamp_ns] == number
 
 
-def test_images_poses_and_intrinsics_of_3rscan_are_rotated(tmp_path: Path) -> None:
+def test_images_poses_and_intrinsics_of_3rscan_are_rotated(tmp_path):
     frame = next(open_recording(write_sequence(tmp_path / "data" / "a")).frames())
     assert frame.rgb.shape == (WIDTH, HEIGHT, 3)
     assert frame.intrinsics == Intrinsics(
@@ -54,7 +50,7 @@ def test_images_poses_and_intrinsics_of_3rscan_are_rotated(tmp_path: Path) -> No
     v=st.floats(0, HEIGHT - 1),
     quat=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 0.3),
 )
-def test_a_rotated_camera_sees_the_same_points(u: float, v: float, quat: tuple) -> None:
+def test_a_rotated_camera_sees_the_same_points(u, v, quat):
     T = pose_from_quaternion(np.array([1.0, 2.0, 3.0]), np.array(quat) / np.linalg.norm(quat))
     turned = rotated_intrinsics(CAMERA)
     ray = np.array([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, 1.0])
@@ -63,7 +59,7 @@ def test_a_rotated_camera_sees_the_same_points(u: float, v: float, quat: tuple) 
     np.testing.assert_allclose(T[:3, :3] @ ray, rotated_pose(T)[:3, :3] @ turned_ray, atol=1e-12)
 
 
-def test_depth_of_a_smaller_image_is_resampled_to_the_colour_image(tmp_path: Path) -> None:
+def test_depth_of_a_smaller_image_is_resampled_to_the_colour_image(tmp_path):
     small = Intrinsics(40.0, 40.0, 23.5, 15.5, WIDTH // 2, HEIGHT // 2)
     (tmp_path / "ReplicaSSG").mkdir()
     folder = tmp_path / "data" / "a"
@@ -79,9 +75,9 @@ def test_depth_of_a_smaller_image_is_resampled_to_the_colour_image(tmp_path: Pat
     assert resample(image + 1, narrow, CAMERA)[0, 0] == 0
 
 
-def test_depth_source_of_3rscan(tmp_path: Path) -> None:
+def test_depth_source_of_3rscan(tmp_path):
     folder = write_sequence(tmp_path / "data" / "a", 1)
-    assert open_source(folder).topics["depth"].name == "frame-*.depth.pgm"  # type: ignore[index]
+    assert open_source(folder).topics["depth"].name == "frame-*.depth.pgm"
     with pytest.raises(RecordingError, match="--depth-source"):
         open_source(folder, options=DatasetOptions(depth_source="rendered"))
     rendered = np.full((HEIGHT, WIDTH), 1500, np.uint16)

@@ -1,7 +1,5 @@
 """7-Scenes folders: registered, and as Microsoft distributes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """TUM RGB-D folders."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.recordings import STEP_NS, TUM_T0_NS, pose, rgb_pixels, write_tum

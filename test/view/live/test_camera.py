@@ -1,7 +1,5 @@
 """Masks on the image, the best photo of each object, the way of the camera, parts of a frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import permutations
 
