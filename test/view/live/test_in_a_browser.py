@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from support.browser import browser, opened_page
-from support.view import make_edge, make_graph, make_node
+from support.view import make_edge, make_graph, make_node, updates_of
 
 from deworldsg_ros.view.colours import class_colours, to_rgb
 
@@ -163,6 +163,20 @@ def test_filters_take_objects_and_relations_out_of_the_drawing(chromium):
         screen.draws("dining table", "cup")
         least_relation.press("End")
         screen.says("shown: 2 objects, 0 relations")
+
+
+def test_updates_are_drawn_and_the_slider_shows_an_older_graph(chromium):
+    whole = msgspec.structs.replace(cup_and_table(), sequence=2)
+    first = make_graph(whole.nodes[:1])
+    with shown(chromium, first) as screen:
+        screen.draws("dining table")
+        assert screen.viewer.apply(*updates_of([first, whole]))
+        screen.draws("dining table", "cup")
+        screen.page.get_by_role("slider").first.press("Home")
+        screen.says("1 object, 0 relations")
+        screen.draws("dining table")
+        screen.page.get_by_role("button", name="Back to the newest").click()
+        screen.draws("dining table", "cup")
 
 
 def test_everything_is_in_view_in_a_dark_page_and_on_a_phone(chromium):
