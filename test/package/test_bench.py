@@ -10,7 +10,7 @@ import pytest
 
 from bench.__main__ import main, run_all
 from bench.entries import ENTRIES, Entry
-from bench.figures import Figure, Setup, in_turn
+from bench.figures import Figure, Setup
 
 # The quickest, without data.
 QUICK = ("lifting", "merging_search")
@@ -72,10 +72,3 @@ def test_every_entry_names_a_function_of_a_setup():
 def test_a_figure_reaches_its_target_or_not(changes, reached):
     figure = dataclasses.replace(Figure("time", 3.0, "ms", target=2.5), **changes)
     assert figure.reached is reached
-
-
-def test_two_calls_in_turn_are_compared_pair_by_pair():
-    # A clock that gives each call its time: ours 1 and 3 s, the reference 2 and 12 s.
-    ticks = iter([0.0, 1.0, 3.0, 10.0, 13.0, 25.0])
-    paired = in_turn(lambda: None, lambda: None, 2, lambda: next(ticks))
-    assert (paired.ours_ms, paired.reference_ms, paired.ratio) == (2000.0, 7000.0, 3.0)

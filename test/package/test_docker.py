@@ -55,15 +55,10 @@ def test_the_context_has_all_that_is_installed(root_dir):
 
 
 def test_the_entry_point_runs_a_command_in_the_environment(root_dir, tmp_path):
-    (tmp_path / "docker").mkdir()
-    (tmp_path / "scripts").mkdir()
+    for name in ("docker", "scripts"):
+        (tmp_path / name).mkdir()
     entry = shutil.copy(root_dir / "docker" / "entrypoint.sh", tmp_path / "docker")
-    stub = 'bootstrap() { export PROFILE="$1"; }\n'
-    (tmp_path / "scripts" / "bootstrap.sh").write_text(stub, encoding="utf-8")
-    done = subprocess.run(
-        ["bash", entry, "sh", "-c", 'echo "$PROFILE $1"; exit 7', "x", "a b"],
-        capture_output=True,
-        text=True,
-        timeout=20,
-    )
+    (tmp_path / "scripts" / "bootstrap.sh").write_text('bootstrap() { export PROFILE="$1"; }\n')
+    command = ["bash", entry, "sh", "-c", 'echo "$PROFILE $1"; exit 7', "x", "a b"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     assert (done.returncode, done.stdout) == (7, "run a b\n")
