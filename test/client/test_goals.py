@@ -107,32 +107,10 @@ def standing(center, size, heading_rad: float):
     return footprint(center, size, turn, UP)
 
 
-@pytest.mark.parametrize(
-    ("width", "other", "gap"),
-    [
-        (0, (2, 0, 0), 2.0),
-        (1, (2, 0, 0), 1.5),
-        (1, (2, 1, 0), 1.0),
-        (1, (0.8, 1, 0), 0.0),
-        (1, (0, 0, 0), 0.0),
-        (1, (0.2, 1, math.pi / 2), 0.0),
-        (1, (2, 1, math.pi / 2), 1.5),
-    ],
-)
-def test_gaps_of_boxes_without_depth(width, other, gap):
-    x, other_width, heading = other
-    first = standing((0, 0, 0), (width, 0, 1), 0)
-    second = standing((x, 0, 0), (other_width, 0, 1), heading)
-    assert gap_m(first, second) == pytest.approx(gap)
-    for point, expected in ((3.0, 3.0 - width / 2), (0.2, max(0.2 - width / 2, 0.0))):
-        assert point_gaps_m(np.array([point, 0.0]), first.corners[None])[0] == pytest.approx(
-            expected
-        )
-
-
 angles = st.floats(-3.2, 3.2)
 places = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
-sizes = st.tuples(st.floats(0.05, 2), st.floats(0.05, 2), st.floats(0.05, 2))
+lengths = st.floats(0.05, 2) | st.just(0.0)
+sizes = st.tuples(lengths, lengths, lengths)
 
 
 @given(places, sizes, angles, places, sizes, angles)

@@ -52,7 +52,7 @@ def test_an_empty_graph_answers_nothing():
         graph.objects(within=1.0)
 
 
-def test_relations_from_both_ends(small):
+def test_relations_from_both_ends_and_paths(small):
     assert [i.text for i in small.relations("cup", "on")] == ["cup #1 standing on dining table #2"]
     assert small.relations("cup", "lying on") == []
     assert ids(small.on("table")) == [1]
@@ -61,18 +61,11 @@ def test_relations_from_both_ends(small):
     assert (near.subject.id, near.object.id, near.probability) == (3, 2, 0.8)
     assert near.unrelated == pytest.approx(0.2)
     assert len(small.relations(predicate="near")) == len(small.relations_of("chair")) == 1
+    assert [(i.subject.id, i.object.id) for i in small.path("cup", "chair")] == [(1, 2), (2, 3)]
+    assert small.path("cup", "shelf") == []
     # With an edge from the chair that says "under", the symmetric one is the table's.
     edges = [*small.message.edges, make_edge(3, 2, "under", 0.3)]
     assert SceneGraph(make_graph(small.message.nodes, edges)).relations("chair", "near") == []
-
-
-def test_neighbours_and_paths(small):
-    neighbours = small.neighbours("table", within=1.0)
-    assert [item.id for item, _ in neighbours] == [1, 3]
-    assert neighbours[0][1] == 0.0
-    assert 0.3 < neighbours[1][1] < 0.6
-    assert [(i.subject.id, i.object.id) for i in small.path("cup", "chair")] == [(1, 2), (2, 3)]
-    assert small.path("cup", "shelf") == []
 
 
 def test_objects_are_frozen_and_tell_everything(small):

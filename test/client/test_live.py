@@ -60,8 +60,9 @@ class Robot:
 
 def test_a_client_follows_the_graph_and_closes_a_gap_by_itself():
     steps = growing(6)
-    with peer("robot") as me, SceneGraphClient() as client:
-        robot = Robot(me)
+    with peer("robot") as me, SceneGraphClient("/robot_1/") as client:
+        Robot(me).latch(graph(7, "a", "graph", "of", "another", "robot"))
+        robot = Robot(me, "/robot_1")
         seen: list[list[str]] = []
         threads = set()
         client.on_change(lambda now, changes: threads.add(threading.get_ident()))
@@ -89,17 +90,6 @@ def test_a_client_follows_the_graph_and_closes_a_gap_by_itself():
         assert seen[1] == ["added book #3 at 2.00 0.00 0.00"]
         assert len(seen[2]) == 2
         assert threads.isdisjoint({threading.get_ident()})
-
-
-def test_two_robots_in_two_namespaces():
-    with (
-        peer("robots") as me,
-        SceneGraphClient("/robot_1") as one,
-        SceneGraphClient("/robot_2/") as two,
-    ):
-        Robot(me, "/robot_1").latch(graph(1, "cup"))
-        Robot(me, "/robot_2").latch(graph(7, "table", "cup"))
-        assert (len(one.wait(1, LIMIT_S)), len(two.wait(7, LIMIT_S))) == (1, 2)
 
 
 def test_without_a_graph_the_reason_is_told():

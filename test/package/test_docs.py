@@ -1,14 +1,17 @@
-"""Documentation names only files, headings and functions that exist."""
+"""Documentation names only what exists, and its site builds strictly and loads nothing."""
 
 from __future__ import annotations
 
 import ast
+import os
 import re
 import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "deworldsg_ros"
@@ -25,6 +28,14 @@ CODE = re.compile(r"`([^`\n]+)`")
 SOURCE_PATH = re.compile(r"[\w./-]+\.(?:py|yaml|yml|sh|toml|md)")
 PAGE_IN_CODE = re.compile(r"\b(?:docs|bench|bags)/[\w/-]+\.md")
 STEP = re.compile(r"^\| [^|]+ \| `(\w+)` \| `([\w/]+\.py)` \|$", re.MULTILINE)
+
+
+# What a browser fetches by itself; links that a reader clicks are not in it.
+FETCHED = re.compile(
+    r"<(?:script|img|iframe)[^>]*\bsrc=[\"']?https?://|"
+    r"<link[^>]*rel=[\"']?(?:stylesheet|preconnect|preload|icon)[\"']?[^>]*https?://|"
+    r"@import url\(http"
+)
 
 
 @cache
@@ -138,3 +149,23 @@ def test_the_page_of_the_architecture_names_functions_and_every_folder():
 )
 def test_what_is_broken_or_missing_is_found(text, broken):
     assert broken_links(DEV / "page.md", text) + missing_files(text) == broken
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+def test_the_site_has_all_pages_builds_strictly_and_fetches_nothing(root_dir, tmp_path):
+    pytest.importorskip("mkdocs", reason="pip install 'deworldsg_ros[docs]'")
+    text = (root_dir / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = [page for entry in yaml.safe_load(text)["nav"] for page in entry.values()]
+    assert len(pages) == 8
+    assert set(pages) == {path.name for path in (root_dir / "docs").glob("*.md")}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=root_dir, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    built = list(tmp_path.rglob("*.html"))
+    assert len(built) >= 8
+    for path in built:
+        assert not FETCHED.search(path.read_text(encoding="utf-8")), path
+    # A moving picture that a phone can load.
+    assert (tmp_path / "images" / "growing.webp").stat().st_size < 1_500_000

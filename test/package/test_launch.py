@@ -27,29 +27,27 @@ class Kept:
         self.kwargs = kwargs
 
 
-CLASSES = {
-    "launch": ("LaunchDescription",),
-    "launch.actions": (
-        *("DeclareLaunchArgument", "IncludeLaunchDescription", "SetEnvironmentVariable"),
-    ),
-    "launch.conditions": ("IfCondition", "UnlessCondition"),
-    "launch.launch_description_sources": ("PythonLaunchDescriptionSource",),
-    "launch.substitutions": ("EnvironmentVariable", "LaunchConfiguration", "PathJoinSubstitution"),
-    "launch_ros": (),
-    "launch_ros.actions": ("Node",),
-    "launch_ros.parameter_descriptions": ("ParameterValue",),
-    "launch_ros.substitutions": ("FindPackageShare",),
-}
+class Doubles(ModuleType):
+    """Any class of a module of launch, as a test double."""
+
+    def __getattr__(self, name):
+        if name.startswith("_"):
+            raise AttributeError(name)
+        setattr(self, name, type(name, (Kept,), {}))
+        return getattr(self, name)
+
+
+MODULES = (
+    *("launch", "launch.actions", "launch.conditions", "launch.launch_description_sources"),
+    *("launch.substitutions", "launch_ros", "launch_ros.actions"),
+    *("launch_ros.parameter_descriptions", "launch_ros.substitutions"),
+)
 
 
 @pytest.fixture(autouse=True)
-def launch_classes(monkeypatch):
-    """Test doubles of the modules launch and launch_ros."""
-    for path, names in CLASSES.items():
-        module = ModuleType(path)
-        for name in names:
-            setattr(module, name, type(name, (Kept,), {}))
-        monkeypatch.setitem(sys.modules, path, module)
+def launch_doubles(monkeypatch):
+    for name in MODULES:
+        monkeypatch.setitem(sys.modules, name, Doubles(name))
 
 
 def described(path: Path) -> dict[str, list[Kept]]:

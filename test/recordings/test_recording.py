@@ -174,15 +174,6 @@ def test_tf_that_does_not_connect_the_camera_drops_frames_with_a_reason(tmp_path
 # --- what is left out --------------------------------------------------------------------------
 
 
-def test_frames_without_depth_are_dropped_and_counted(tmp_path):
-    items = camera_items(COUNT)
-    kept = [item for item in items if not (item[2] == stamp_ns(2) and "depth" in item[0])]
-    frames, recording = frames_of(write_bag(tmp_path / "bag", kept))
-    assert [frame.stamp_ns for frame in frames] == [stamp_ns(i) for i in range(COUNT) if i != 2]
-    assert recording.drops["no_depth"] == 1
-    assert "depth" in recording.reasons["no_depth"]
-
-
 @pytest.mark.parametrize("topic", ["/odom", "/camera/color/camera_info"])
 def test_a_message_that_cannot_be_decoded_is_counted(tmp_path, topic):
     items = robot_items()

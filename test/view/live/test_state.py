@@ -10,7 +10,7 @@ from deworldsg_ros.client.objects import relation_of, scene_object
 from deworldsg_ros.scene.arrays import shared_areas
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.view.live.details import in_words, object_html, uncertainty
-from deworldsg_ros.view.live.drawing import Filter, Label, ObjectTable
+from deworldsg_ros.view.live.drawing import Filter, Label
 from deworldsg_ros.view.live.scene import (
     ANCHORS,
     FRAME_PX,
@@ -102,19 +102,6 @@ def test_a_selected_object_is_emphasised_and_forgotten_when_it_goes():
     assert max(drawing.labels, key=lambda label: label.weight).key == "object 1"
     follow(state, nodes, nodes[1:])
     assert state.selected is None
-
-
-def test_only_changed_objects_are_computed_again(monkeypatch):
-    computed, put = [], ObjectTable._put
-    monkeypatch.setattr(
-        ObjectTable, "_put", lambda self, item: (computed.append(item.id), put(self, item))
-    )
-    nodes = [node(index) for index in range(1, 50)]
-    state, _ = state_of(nodes)
-    assert len(computed) == 49
-    computed.clear()
-    follow(state, nodes, [*nodes[:-1], node(49, "bowl")])
-    assert computed == [49]
 
 
 def test_surface_points_have_the_colours_of_their_classes():
