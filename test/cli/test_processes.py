@@ -46,16 +46,6 @@ def test_sigint_ends_a_process_and_sigkill_one_that_ignores_it(tmp_path, monkeyp
     assert end_all([]) == {}
 
 
-def test_the_log_contains_both_outputs_but_not_what_the_parent_reads(tmp_path):
-    process = start(tmp_path, "import sys; print('out'); print('1\\n2\\n3', file=sys.stderr)")
-    assert process.wait(20) == 0
-    assert sorted(process.log.read_text().split()) == ["1", "2", "3", "out"]
-    assert len(process.last_lines(3).splitlines()) == 3
-    teller = start(tmp_path, "print('hello')", "teller", read_output=True)
-    assert teller.output.read() == b"hello\n"
-    assert (teller.wait(20), teller.log.read_text()) == (0, "")
-
-
 @pytest.mark.parametrize("given", [{}, {"ROS_DOMAIN_ID": "77"}])
 def test_the_demo_has_its_own_domain_unless_one_is_set(monkeypatch, given):
     for name in (

@@ -16,7 +16,7 @@ from support.view import box_at, make_edge, make_graph, make_node
 from deworldsg_ros.client import ClientError, SceneGraph
 from deworldsg_ros.client.boxes import gap_m
 from deworldsg_ros.client.graph import _fits, distance_m
-from deworldsg_ros.client.objects import is_class, odds_of, predicate_names
+from deworldsg_ros.client.objects import is_class
 from deworldsg_ros.client.questions import ask
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire import messages as wire
@@ -130,13 +130,6 @@ def test_the_client_of_files_needs_no_ros():
 )
 def test_names_of_classes(asked, label, same):
     assert is_class(asked, label) == same
-
-
-def test_names_of_predicates_and_odds():
-    assert "standing on" in predicate_names("on")
-    assert predicate_names("standing on") == {"standing on"}
-    odds = ["none", "1 : 99", "1 : 1", "3 : 1", "certain"]
-    assert [odds_of(probability) for probability in (0.0, 0.01, 0.5, 0.75, 1.0)] == odds
 
 
 # --- the index ---------------------------------------------------------------------------------

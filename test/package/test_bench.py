@@ -1,6 +1,5 @@
 """`python -m bench`: each benchmark has a process of its own, and may fail alone."""
 
-import dataclasses
 import importlib
 import inspect
 import json
@@ -10,7 +9,7 @@ import pytest
 
 from bench.__main__ import main, run_all
 from bench.entries import ENTRIES, Entry
-from bench.figures import Figure, Setup
+from bench.figures import Setup
 
 # The quickest, without data.
 QUICK = ("lifting", "merging_search")
@@ -57,18 +56,3 @@ def test_every_entry_names_a_function_of_a_setup():
         function = getattr(importlib.import_module(module), name)
         assert list(inspect.signature(function).parameters) == ["setup"], entry
     assert sum(entry.takes_s for entry in ENTRIES.values()) < 600
-
-
-@pytest.mark.parametrize(
-    ("changes", "reached"),
-    [
-        ({}, False),
-        ({"target": 3.0}, True),
-        ({"more_is_better": True}, True),
-        ({"target": None}, None),
-        ({"target": 3.0, "ratio": 2.0, "ratio_target": 2.5}, False),
-    ],
-)
-def test_a_figure_reaches_its_target_or_not(changes, reached):
-    figure = dataclasses.replace(Figure("time", 3.0, "ms", target=2.5), **changes)
-    assert figure.reached is reached

@@ -204,15 +204,6 @@ def test_up_direction_decides_where_the_picture_shows_an_object(tmp_path):
     assert height_of_the_lamp((0, -1, 0)) < 0.5 < height_of_the_lamp((0, 1, 0))
 
 
-def test_picture_shows_the_camera_path_and_is_repeatable(tmp_path):
-    room = make_room(12)
-    path = np.column_stack([np.linspace(-3, 3, 50), np.full(50, -3.5), np.full(50, 1.5)])
-    a, b = (drawn(room, tmp_path / "graph.png", camera_path_world=path) for _ in range(2))
-    without = drawn(room, tmp_path / "graph.png")
-    np.testing.assert_array_equal(a, b)
-    assert a.shape != without.shape or (a != without).any()
-
-
 def embedded(path):
     """The text of a page, and its content."""
     text = path.read_text(encoding="utf-8")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from support.browser import browser, opened_page
+from support.browser import browser, opened_page, pixels_of
 from support.view import SAVED, make_edge, make_graph, make_node
 
 from deworldsg_ros.client import SceneGraph
@@ -34,8 +32,7 @@ def url_of(graph: wire.SceneGraphMessage, folder: Path) -> str:
 def pixels(shown: Any) -> np.ndarray:
     """The 3D view (H, W, 3)."""
     shown.wait_for_timeout(300)
-    picture = Image.open(io.BytesIO(shown.locator("#view").screenshot())).convert("RGB")
-    return np.asarray(picture).astype(int)
+    return pixels_of(shown.locator("#view").screenshot())
 
 
 def drawn(image: np.ndarray) -> float:

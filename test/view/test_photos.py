@@ -39,16 +39,6 @@ def test_a_photo_shows_its_object_in_the_middle():
     assert np.abs(photo[:4, :4].astype(int) - GREEN).max() < 20
 
 
-def test_the_best_of_several_frames_is_taken():
-    far = frame()
-    far.T_world_camera[2, 3] = -1.0
-    far.depth_m[far.depth_m < 3] = 3.0
-    near = frame()
-    near.rgb[30:50, 50:70] = (10, 10, 250)
-    (photo,) = photos_of(make_graph([patch()]), [far, near], 64).values()
-    assert photo[32, 32, 2] > 200
-
-
 @pytest.mark.parametrize(
     ("node", "depth_m", "x_m"),
     [

@@ -1,16 +1,14 @@
 """The servers of the page and for Foxglove: where they listen, and that they go on."""
 
-import json
 import socket
-import struct
 import threading
-import time
 from contextlib import closing, nullcontext
 from types import SimpleNamespace
 from unittest.mock import DEFAULT, create_autospec
 
 import numpy as np
 import pytest
+from support.foxglove_client import FoxgloveClient
 from support.view import make_edge, make_graph, make_node, updates_of
 
 viser = pytest.importorskip("viser", reason="needs the extra view: viser")
@@ -18,7 +16,7 @@ viser = pytest.importorskip("viser", reason="needs the extra view: viser")
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402  after the guard
 from deworldsg_ros.view.live import sources  # noqa: E402
 from deworldsg_ros.view.live.camera import CameraView  # noqa: E402
-from deworldsg_ros.view.live.server import LogOnce, Viewer  # noqa: E402
+from deworldsg_ros.view.live.server import Viewer  # noqa: E402
 
 LIMIT_S = 30.0
 HERE, PORT = "127.0.0.1", 8580
@@ -87,14 +85,6 @@ def test_a_step_of_the_page_that_fails_is_told_and_the_page_goes_on(monkeypatch)
     assert [type(error) for error in errors[:2]] == [ValueError, RuntimeError]
 
 
-def test_without_a_listener_the_log_has_the_first_error_of_each_type(caplog):
-    log = LogOnce()
-    for error in (ValueError("a"), ValueError("b"), KeyError("c")):
-        log(error)
-    logged = [repr(record.exc_info[1]) for record in caplog.records]
-    assert logged == ["ValueError('a')", "KeyError('c')"]
-
-
 # --- where they listen -------------------------------------------------------------------------
 
 
@@ -129,34 +119,6 @@ def test_an_address_of_another_machine_is_refused(host):
 # --- Foxglove, with a WebSocket client ---------------------------------------------------------
 
 
-class Client:
-    """A client that subscribes to everything, and keeps the messages of each topic."""
-
-    def __init__(self, connect, url):
-        protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
-        self.socket = connect(url, subprotocols=protocols, max_size=None)
-        self.topics, self.received = {}, {}
-
-    def expect(self, topic, text):
-        """Wait until a message of a topic contains a text."""
-        end_s = time.monotonic() + LIMIT_S
-        while text not in b"".join(self.received.get(topic, [])):
-            assert time.monotonic() < end_s, (topic, text, self.received.keys())
-            self._take(self.socket.recv(timeout=LIMIT_S))
-
-    def _take(self, message):
-        if isinstance(message, bytes):
-            if message[0] == 1:  # message data: opcode, subscription, time, payload
-                (subscription,) = struct.unpack_from("<I", message, 1)
-                self.received.setdefault(self.topics[subscription], []).append(message[13:])
-            return
-        content = json.loads(message)
-        for channel in content.get("channels", []) if content["op"] == "advertise" else []:
-            self.topics[channel["id"]] = channel["topic"]
-            subscription = {"id": channel["id"], "channelId": channel["id"]}
-            self.socket.send(json.dumps({"op": "subscribe", "subscriptions": [subscription]}))
-
-
 def test_a_late_client_of_foxglove_gets_the_whole_graph_and_then_the_updates():
     pytest.importorskip("foxglove", reason="needs foxglove-sdk")
     websockets = pytest.importorskip("websockets.sync.client", reason="needs websockets")
@@ -168,7 +130,7 @@ def test_a_late_client_of_foxglove_gets_the_whole_graph_and_then_the_updates():
     after = make_graph([table, make_node(2, "teapot", (0, 0, 1)), vase], edges, sequence=2)
     with closing(module.FoxgloveServer(HERE, 0)) as server:
         server.reset(before)
-        client = Client(websockets.connect, server.url)
+        client = FoxgloveClient(websockets.connect, server.url)
         with closing(client.socket):
             client.expect(module.OBJECTS, b"cup 2")
             client.expect(module.RELATIONS, b"relation 2 1")
