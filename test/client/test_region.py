@@ -94,16 +94,3 @@ def test_what_happens_outside_is_not_told():
     entered = part.message()
     assert entered is not None and len(entered.nodes) == 3 and len(entered.edges) == 2
     assert (entered.session, entered.sequence) == (first.session, 2)
-
-
-def test_nowhere_and_a_region_without_objects():
-    part = RegionPart(Region(None, 5.0))
-    assert part.message() is None
-    part.add(make_graph([node(1, 0.0)]))
-    empty = part.message()
-    assert empty is not None and empty.nodes == [] and empty.frame_id == "map"
-    part.move(Region((50.0, 0.0, 0.0), 5.0))
-    assert part.message() is None
-    part.move(HERE)
-    found = part.message()
-    assert found is not None and len(found.nodes) == 1

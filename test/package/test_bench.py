@@ -39,17 +39,6 @@ def test_a_benchmark_that_fails_leaves_the_others_their_figures():
     assert {figure["benchmark"] for figure in report["figures"]} == {"lifting"}
 
 
-@pytest.mark.slow
-def test_the_kitchen_and_the_step_write_their_figures(tmp_path, root_dir):
-    (tmp_path / "redkitchen").symlink_to(root_dir / "bags" / "demo_room")
-    entries = [ENTRIES["kitchen"], ENTRIES["step"]]
-    report = run_all(entries, Setup(tmp_path, quick=True))
-    assert not [done for done in report["benchmarks"].values() if "error" in done]
-    names = {figure["name"] for figure in report["figures"]}
-    assert {"kitchen_run", "kitchen_processor", "kitchen_lifting", "step_300_nodes"} <= names
-    assert all(figure["value"] > 0 for figure in report["figures"])
-
-
 def test_every_entry_names_a_function_of_a_setup():
     for entry in ENTRIES.values():
         module, _, name = entry.function.partition(":")

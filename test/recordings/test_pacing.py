@@ -34,17 +34,6 @@ def window(size: int, published: int, needs: tuple[Role, ...] = ()) -> Window:
     return made
 
 
-def test_a_result_ends_the_frames_before_it_and_zero_is_no_limit():
-    made = window(3, 3)
-    assert made.is_full
-    made.add_result(2)
-    assert (made.in_flight, made.is_full, made.results) == (1, False, 1)
-    made.give_up()
-    assert (made.in_flight, made.given_up) == (0, 1)
-    assert not window(1, 0).is_full
-    assert not window(0, 1000).is_full
-
-
 @pytest.mark.parametrize(
     ("published", "answers", "in_flight"),
     [

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -145,6 +146,12 @@ class Screen:
         self.page.mouse.click(*place.tolist())
 
 
+def free_port() -> int:
+    """A port of this machine on which nobody listens."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as holder:
+        return int(holder.getsockname()[1])
+
+
 @contextmanager
 def shown_viewer(
     of: Any, graph: Any, labels: list[str], width: int = 900, height: int = 600
@@ -152,7 +159,7 @@ def shown_viewer(
     """The page of a live viewer of a graph with these classes."""
     from deworldsg_ros.view.live.server import Viewer
 
-    with closing(Viewer("127.0.0.1", 8380, "")) as viewer:
+    with closing(Viewer("127.0.0.1", free_port(), "")) as viewer:
         viewer.reset(graph)
         with opened_page(of, viewer.url, width, height) as page:
             page.set_default_timeout(1000 * LIMIT_S)

@@ -8,18 +8,8 @@ import numpy as np
 import pytest
 from support.merging import local_graph
 
-from deworldsg_ros.view.live import camera as camera_module
-from deworldsg_ros.view.live.camera import (
-    MOST_WAITING,
-    PARTS,
-    BestViews,
-    CameraView,
-    FrameJoiner,
-    Shot,
-    Shots,
-    view_of,
-    with_masks,
-)
+from deworldsg_ros.view.live import camera
+from deworldsg_ros.view.live.camera import view_of  # as it is before a fixture replaces it
 from deworldsg_ros.view.live.state import LiveState
 from deworldsg_ros.wire import messages as wire
 
@@ -48,22 +38,23 @@ def view(*objects, stamp_ns=1):
 
 def test_masks_have_the_colours_of_their_nodes():
     shown = view(((100, 100, 300, 300), 7, 9), ((400, 100, 500, 200), 8, 9))
-    image = with_masks(shown, {7: "#00ff00"})
-    assert image is not None and image.shape[1] == camera_module.SHOWN_WIDTH_PX
-    scale = camera_module.SHOWN_WIDTH_PX / WIDTH
+    image = camera.with_masks(shown, {7: "#00ff00"})
+    assert image is not None and image.shape[1] == camera.SHOWN_WIDTH_PX
+    scale = camera.SHOWN_WIDTH_PX / WIDTH
     known, unknown, outside = (
         image[round(y * scale), round(x * scale)] for x, y in ((200, 200), (450, 150), (20, 20))
     )
     assert known[1] > 100 and known[0] < 150, "green over red"
     assert unknown.tolist() != [200, 30, 30] and abs(int(unknown[1]) - int(unknown[2])) < 20
     assert outside.tolist() == [90, 90, 90]
-    assert with_masks(CameraView(1, np.eye(4)), {}) is None
-    plain = with_masks(CameraView(1, np.eye(4), np.full((48, 64, 3), 5, np.uint8)), {})
+    assert camera.with_masks(camera.CameraView(1, np.eye(4)), {}) is None
+    image = np.full((48, 64, 3), 5, np.uint8)
+    plain = camera.with_masks(camera.CameraView(1, np.eye(4), image), {})
     assert plain is not None and (plain == 5).all()
 
 
 def test_the_photo_with_the_most_mask_pixels_stays():
-    crops = BestViews()
+    crops = camera.BestViews()
     for stamp_ns, (side, pixels) in enumerate([(100, 500), (200, 2000), (50, 100)], start=1):
         box = (100, 100, 100 + side, 100 + side)
         crops.add(view((box, 7, pixels), stamp_ns=stamp_ns))
@@ -77,14 +68,14 @@ def test_the_photo_with_the_most_mask_pixels_stays():
 
 @pytest.mark.parametrize("box", [(0, 100, 200, 300), (440, 100, 640, 300), (100, 280, 300, 480)])
 def test_a_whole_object_is_preferred_to_a_larger_part(box):
-    crops = BestViews()
+    crops = camera.BestViews()
     crops.add(view(((100, 100, 200, 200), 7, 900), stamp_ns=1))
     crops.add(view((box, 7, 2000), stamp_ns=2))
     assert crops[7] is not None and crops[7].stamp_ns == 1
 
 
 def test_photos_are_bounded_and_follow_merges():
-    crops = BestViews(most=2)
+    crops = camera.BestViews(most=2)
     for node_id in (1, 2, 3):
         crops.add(view(((100, 100, 200, 200), node_id, 100 * node_id)))
     assert len(crops) == 2 and crops[1] is None
@@ -93,10 +84,10 @@ def test_photos_are_bounded_and_follow_merges():
 
 
 def test_the_way_is_kept_and_only_the_newest_images(monkeypatch):
-    monkeypatch.setattr(camera_module, "MOST_IMAGES", 3)
-    shots = Shots()
+    monkeypatch.setattr(camera, "MOST_IMAGES", 3)
+    shots = camera.Shots()
     for stamp_ns in range(6):
-        shots.add(Shot(stamp_ns, np.eye(4), 1.0, 1.0, b"image"))
+        shots.add(camera.Shot(stamp_ns, np.eye(4), 1.0, 1.0, b"image"))
     assert [bool(shot.image) for shot in shots.until(None)] == [False] * 3 + [True] * 3
     assert [shot.stamp_ns for shot in shots.until(2)] == [0, 1, 2]
 
@@ -111,7 +102,7 @@ def test_points_of_the_frames_stand_in_for_those_of_the_graph():
 # --- parts of a frame that come in any order become one view -----------------------------------
 
 
-def send(joiner, stamp_ns, parts=PARTS, now_s=0.0, decoded=None):
+def send(joiner, stamp_ns, parts=camera.PARTS, now_s=0.0, decoded=None):
     """The view that the last of these parts completes."""
     decoded = [] if decoded is None else decoded
 
@@ -127,28 +118,28 @@ def send(joiner, stamp_ns, parts=PARTS, now_s=0.0, decoded=None):
 @pytest.fixture(autouse=True)
 def plain_views(monkeypatch):
     """The joined view is just its parts."""
-    monkeypatch.setattr(camera_module, "view_of", lambda *parts: parts)
+    monkeypatch.setattr(camera, "view_of", lambda *parts: parts)
 
 
 def test_the_order_of_the_parts_does_not_matter_and_frames_are_not_mixed():
-    for parts in permutations(PARTS):
-        joined = send(FrameJoiner(0.0), 5, parts)
+    for parts in permutations(camera.PARTS):
+        joined = send(camera.FrameJoiner(0.0), 5, parts)
         assert joined == ("local", "node_ids", "rgb", "instances")
-    joiner = FrameJoiner(0.0)
-    assert send(joiner, 1, PARTS[:3]) is None
-    assert send(joiner, 2, PARTS[3:]) is None
+    joiner = camera.FrameJoiner(0.0)
+    assert send(joiner, 1, camera.PARTS[:3]) is None
+    assert send(joiner, 2, camera.PARTS[3:]) is None
 
 
 def test_early_frames_are_left_out_undecoded():
-    joiner, decoded = FrameJoiner(0.15), []
+    joiner, decoded = camera.FrameJoiner(0.15), []
     assert send(joiner, 1, now_s=10.0)
     assert send(joiner, 2, now_s=10.1, decoded=decoded) is None and decoded == []
     assert send(joiner, 3, now_s=10.2)
 
 
 def test_frames_that_stay_incomplete_are_forgotten():
-    joiner = FrameJoiner(0.0)
-    for stamp_ns in range(MOST_WAITING + 5):
+    joiner = camera.FrameJoiner(0.0)
+    for stamp_ns in range(camera.MOST_WAITING + 5):
         joiner.add("rgb", stamp_ns, lambda: "rgb", 0.0)
-    assert send(joiner, 0, PARTS[1:]) is None
-    assert send(joiner, MOST_WAITING + 4, PARTS[1:])
+    assert send(joiner, 0, camera.PARTS[1:]) is None
+    assert send(joiner, camera.MOST_WAITING + 4, camera.PARTS[1:])

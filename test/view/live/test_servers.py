@@ -8,6 +8,7 @@ from unittest.mock import DEFAULT, create_autospec
 
 import numpy as np
 import pytest
+from support.browser import free_port
 from support.foxglove_client import FoxgloveClient
 from support.view import make_edge, make_graph, make_node, updates_of
 
@@ -19,7 +20,7 @@ from deworldsg_ros.view.live.camera import CameraView  # noqa: E402
 from deworldsg_ros.view.live.server import Viewer  # noqa: E402
 
 LIMIT_S = 30.0
-HERE, PORT = "127.0.0.1", 8580
+HERE = "127.0.0.1"
 
 
 class Browser:
@@ -54,7 +55,7 @@ def cups(count):
 @pytest.mark.parametrize("size", [(800, 0), (0, 600), (0, 0), (80, 80), (300, 20), (1, 1)])
 def test_small_windows_are_no_errors_and_others_get_their_labels(size, monkeypatch):
     errors, small, usual = [], Browser(*size), Browser()
-    with closing(Viewer(HERE, PORT, "", errors.append)) as viewer:
+    with closing(Viewer(HERE, free_port(), "", errors.append)) as viewer:
         monkeypatch.setattr(viewer._server, "get_clients", lambda: {1: small, 2: usual})
         viewer.reset(cups(2))
         assert usual.drawn.wait(LIMIT_S)
@@ -66,7 +67,7 @@ def test_a_step_of_the_page_that_fails_is_told_and_the_page_goes_on(monkeypatch)
     errors, told = [], threading.Event()
     broken, usual = Browser(), Browser()
     broken.scene.add_label.side_effect = RuntimeError("the browser has gone")
-    with closing(Viewer(HERE, PORT, "", errors.append)) as viewer:
+    with closing(Viewer(HERE, free_port(), "", errors.append)) as viewer:
         show = viewer._scene.show
 
         def fail_once(*arguments):

@@ -9,17 +9,9 @@ from support.view import box_at, make_edge, make_graph, make_node, random_graphs
 from deworldsg_ros.client.objects import relation_of, scene_object
 from deworldsg_ros.scene.arrays import shared_areas
 from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.view.live import scene
 from deworldsg_ros.view.live.details import in_words, object_html, uncertainty
 from deworldsg_ros.view.live.drawing import Filter, Label
-from deworldsg_ros.view.live.scene import (
-    ANCHORS,
-    FRAME_PX,
-    HEIGHT_PX,
-    LETTER_PX,
-    Camera,
-    overview,
-    place,
-)
 from deworldsg_ros.view.live.state import BLOCK, History, LiveState
 from deworldsg_ros.wire import messages as wire
 
@@ -117,16 +109,6 @@ def test_surface_points_have_the_colours_of_their_classes():
 # --- the past ----------------------------------------------------------------------------------
 
 
-def test_the_slider_shows_the_past_while_updates_arrive():
-    state, _ = state_of([node(1)])
-    state.moment = 0
-    drawing = follow(state, [node(1)], [node(1), node(2)], stamp=wire.Stamp(sec=5, nanosec=5))
-    assert drawing.ids.tolist() == [1]
-    assert "2.0 s before the newest" in state.summary(drawing)[-1]
-    state.moment = None
-    assert sorted(state.draw().ids.tolist()) == [1, 2]
-
-
 @pytest.mark.parametrize("count", [1, 7, BLOCK, 4 * BLOCK])
 def test_each_moment_is_the_graph_of_its_update_and_the_oldest_are_forgotten(count):
     graphs = random_graphs(count, count, ["cup"], [0.0, 1.0])
@@ -157,15 +139,17 @@ def test_a_gap_in_the_history_is_refused_and_a_snapshot_closes_it():
 # --- labels and the camera ---------------------------------------------------------------------
 
 # Looks along +y, z is up: x right, y down is -z.
-AHEAD = Camera(np.zeros(3), np.array([np.sqrt(0.5), -np.sqrt(0.5), 0, 0]), np.pi / 2, 800.0, 600.0)
+QUAT = np.sqrt([0.5, 0.5, 0, 0]) * [1, -1, 0, 0]
+AHEAD = scene.Camera(np.zeros(3), QUAT, np.pi / 2, 800.0, 600.0)
 
 
 def boxes_of(placed):
-    shifts = {name: np.array((x, y)) for name, x, y in ANCHORS}
+    shifts = {name: np.array((x, y)) for name, x, y in scene.ANCHORS}
     boxes = []
     for item in placed:
         (point,), _ = AHEAD.project(item.label.position[None])
-        half = np.array((FRAME_PX + LETTER_PX * len(item.label.text), HEIGHT_PX)) / 2
+        width = scene.FRAME_PX + scene.LETTER_PX * len(item.label.text)
+        half = np.array((width, scene.HEIGHT_PX)) / 2
         centre = point + shifts[item.anchor] * half
         boxes.append(np.concatenate([centre - half, centre + half]))
     return np.array(boxes).reshape(-1, 4)
@@ -176,7 +160,7 @@ def test_labels_do_not_overlap(count):
     rng = np.random.default_rng(count)
     positions = rng.uniform((-2, 1, -1), (2, 6, 1), (count, 3))
     labels = [Label(f"{i}", f"object {i}", p, float(i)) for i, p in enumerate(positions)]
-    placed = place(labels, AHEAD, 60)
+    placed = scene.place(labels, AHEAD, 60)
     assert len(placed) <= 60 and bool(placed) == bool(count)
     shared = shared_areas(boxes_of(placed), boxes_of(placed))
     assert np.abs(shared - np.diag(np.diag(shared))).sum() == pytest.approx(0.0, abs=1e-6)
@@ -185,7 +169,7 @@ def test_labels_do_not_overlap(count):
 def test_the_heavier_labels_have_the_first_choice_and_none_is_behind_the_camera():
     def placed_at(y):
         labels = [Label(f"{i}", "a chair", np.array([0.0, y, 0.0]), float(i)) for i in range(6)]
-        return [(item.label.key, item.anchor) for item in place(labels, AHEAD, 60)]
+        return [(item.label.key, item.anchor) for item in scene.place(labels, AHEAD, 60)]
 
     assert placed_at(3.0) == [("5", "bottom-center"), ("4", "top-center")]
     assert placed_at(-3.0) == []
@@ -194,7 +178,7 @@ def test_the_heavier_labels_have_the_first_choice_and_none_is_behind_the_camera(
 @pytest.mark.parametrize("aspect", [0.46, 1.6])
 def test_the_overview_shows_all_corners(aspect):
     low, high = np.array([-3.0, -2.0, 0.0]), np.array([4.0, 1.0, 2.5])
-    position, target = overview(low, high, np.eye(3), 0.85, aspect)
+    position, target = scene.overview(low, high, np.eye(3), 0.85, aspect)
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, [0, 0, 1.0])
     right /= np.linalg.norm(right)
