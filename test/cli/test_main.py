@@ -107,15 +107,6 @@ def test_info_of_recordings_that_lack_something(folder):
     assert "lost:" in printed("info", file)
 
 
-def test_info_takes_the_options_of_run(folder):
-    items = [item for item in camera_items(1, compressed=False) if "info" not in item[0]]
-    write_bag(folder / "bag", [(topic.replace("depth", "range"), *rest) for topic, *rest in items])
-    assert "no depth topic" in refusal("info", "bag", *GIVEN)
-    shown = printed("info", "bag", "--depth", "/camera/range/image_raw", *GIVEN)
-    assert "1 RGB image\n" in shown
-    assert re.search(r"/camera/range/image_raw .* depth", shown)
-
-
 def test_the_printed_configuration_reads_back_equal_and_describes_each_option(folder):
     assert effective_config(None) == Config()
     config = effective_config(None, ["lifting.tau=0.1", "output.include_surface_points=true"])

@@ -11,7 +11,6 @@ from support.view import SAVED, make_graph, make_node
 from deworldsg_ros.client import ClientError, SceneGraph, changes, combine
 from deworldsg_ros.client.combine import Known, align
 from deworldsg_ros.client.objects import SceneObject
-from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.scene.camera import rigid_motion, rotation_angle_deg
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire import messages as wire
@@ -100,18 +99,6 @@ def test_graphs_of_different_rooms_are_not_merged(room):
             combine.combine(room, SceneGraph(message), T)
     with pytest.raises(RefusedInput):
         combine.combine(room, room, np.ones((4, 4)))
-
-
-def test_a_merge_with_itself_changes_only_the_counts(room):
-    combined = combine.combine(room, room, np.eye(4))
-    whole = SceneGraph(wire.decode(wire.encode(combined.message), wire.SceneGraphMessage))
-    assert not whole.changes_since(room)
-    for now, before in zip(whole, room):
-        assert now.observations == 2 * before.observations
-        assert now.mean_m == pytest.approx(before.mean_m, abs=1e-3)
-        assert np.allclose(now.covariance_m2, before.covariance_m2, atol=1e-4)
-        assert now.probability == pytest.approx(before.probability, abs=1e-3)
-        assert 50 <= len(surface_points(now.state)) <= 120
 
 
 def test_sums_of_a_merge_are_those_that_a_message_may_have():

@@ -81,15 +81,6 @@ def test_a_goal_as_a_message_for_nav2(corner):
     assert goal.to_dict()["pose"]["orientation"]["w"] == round(message.pose.orientation.w, 5)
 
 
-def test_a_goal_with_y_down():
-    half = math.sqrt(0.5)  # third axis of the box along -y
-    box = wire.GravityBox([0.0, 0.0, 0.5], [0.1, 0.2, 0.3], [half, 0.0, 0.0, half])
-    graph = graph_of(make_node(1, "cup", (0, 0, 0.5), box=box), up=[0.0, -1.0, 0.0])
-    goal = graph.goal_near("cup", 1.0)
-    assert goal.position_m[1] == pytest.approx(0.15)
-    assert np.hypot(goal.position_m[0], goal.position_m[2] - 0.5) > 1.0
-
-
 @pytest.mark.parametrize("size", [(0, 0, 0), (0.4, 0, 0.3), (0, 0, 0.3), (0.4, 0.1, 0)])
 @pytest.mark.parametrize("others", [0, 1, 3])
 def test_a_goal_near_objects_without_width(size, others):

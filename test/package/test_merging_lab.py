@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,22 +60,11 @@ def test_the_replay_of_a_capture_is_the_graph_of_the_evaluation(lab, tmp_path, k
     assert score.seen == seen
 
 
-def test_a_row_is_printed_and_written_for_each_capture(lab, tmp_path, capsys):
-    rooms, folder = write_room(tmp_path / "rooms", frames=6), tmp_path / "cap"
-    for _ in range(2):  # the second time they are there
-        names = captured(lab, rooms, folder, "--kinds", "clean,flip", "--every", "2")
-        assert names == ["room_0.clean.every2.pkl", "room_0.flip.every2.pkl"]
+def test_a_recording_without_annotation_has_a_line_of_labels(lab, tmp_path, capsys):
     kitchen = write_seven_scenes(tmp_path / "kitchen", 3)
     options = ("--min-score", "0.2", "--settings", "perception.threads=1")
-    assert "kitchen.backend-0.2.pkl" in captured(lab, kitchen, folder, *options)
+    assert captured(lab, kitchen, tmp_path / "cap", *options) == ["kitchen.backend-0.2.pkl"]
     with pytest.raises(SystemExit, match="kind bleed"):
-        captured(lab, kitchen, folder, "--kinds", "bleed")
-    capsys.readouterr()
-    numbers = tmp_path / "numbers.json"
-    command = f"{folder} --missed --json {numbers} --settings output.min_existence=0.9"
-    lab.replay.main(command.split())
-    shown = capsys.readouterr().out
-    # Three frames are too few for a node: all detections of an object went to a tentative one.
-    assert shown.count(" 3 in no published node ") == 6
-    assert "0 nodes" in shown
-    assert json.loads(numbers.read_text())["room_0.clean.every2"]["found"] == 0
+        captured(lab, kitchen, tmp_path / "cap", "--kinds", "bleed")
+    lab.replay.main([str(tmp_path / "cap")])
+    assert "0 nodes" in capsys.readouterr().out

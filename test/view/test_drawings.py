@@ -20,7 +20,6 @@ from deworldsg_ros.view.colours import (
     class_colours,
     drawable_edges,
     predicate_colours,
-    view_axes,
 )
 from deworldsg_ros.view.markers import markers, pair_id
 from deworldsg_ros.view.picture import place
@@ -30,19 +29,6 @@ BACKGROUND_BGR = (247, 250, 251)
 MOST_BYTES = 1.5e6
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-@pytest.mark.parametrize(
-    ("up", "right", "forward"),
-    [
-        ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-        ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
-        ((0, 2, 0), (1, 0, 0), (0, 0, -1)),
-        ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    ],
-)
-def test_view_axes_of_usual_world_frames(up, right, forward):
-    np.testing.assert_allclose(view_axes(up)[:2], [right, forward], atol=1e-12)
 
 
 def test_a_new_label_changes_no_class_colour_and_near_is_grey():

@@ -141,12 +141,3 @@ def test_a_wall_is_displaced_by_its_disparity_on_the_grid_of_the_colour_camera()
     rows, columns = np.nonzero(out)
     assert np.ptp(columns) + 1 == 20
     assert np.ptp(rows) + 1 in (15, 16)
-
-
-def test_the_nearest_surface_in_a_pixel_wins():
-    depth = np.zeros((30, 40), np.uint16)
-    depth[10, 20] = 1000  # moves by 5 columns
-    depth[10, 17] = 2500  # moves by 2, to the same place
-    out = register_depth(depth, CAMERA, CAMERA, moved(-0.1))
-    assert out[10, 15] == 1000
-    assert np.count_nonzero(out) == 1

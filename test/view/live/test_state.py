@@ -175,21 +175,6 @@ def test_the_heavier_labels_have_the_first_choice_and_none_is_behind_the_camera(
     assert placed_at(-3.0) == []
 
 
-@pytest.mark.parametrize("aspect", [0.46, 1.6])
-def test_the_overview_shows_all_corners(aspect):
-    low, high = np.array([-3.0, -2.0, 0.0]), np.array([4.0, 1.0, 2.5])
-    position, target = scene.overview(low, high, np.eye(3), 0.85, aspect)
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0, 0, 1.0])
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(forward, right), forward])
-    corners = np.array(np.meshgrid(*zip(low, high))).reshape(3, -1).T
-    x, y, z = axes @ (corners - position).T
-    assert (z > 0).all()
-    assert (np.abs(y / z) < np.tan(0.85 / 2)).all()
-    assert (np.abs(x / z) < aspect * np.tan(0.85 / 2)).all()
-
-
 # --- details of an object ----------------------------------------------------------------------
 
 
