@@ -1,7 +1,5 @@
 """`deworldsg demo`: four node processes over DDS give the same graph as one process."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

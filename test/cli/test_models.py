@@ -1,7 +1,5 @@
 """`deworldsg models get`, `list` and `inspect`, against a hub on this machine."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

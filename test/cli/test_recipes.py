@@ -1,7 +1,5 @@
 """The recipes of docs/dev/models.md with small networks of random weights from a local hub."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

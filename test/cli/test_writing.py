@@ -1,7 +1,5 @@
 """Results are complete and of one run, whatever happens while they are written."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import time

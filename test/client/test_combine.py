@@ -1,7 +1,5 @@
 """Two graphs in one: the transform between them, their common objects, and their sum."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The commands that ask, compare, merge and edit graphs."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

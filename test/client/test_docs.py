@@ -1,7 +1,5 @@
 """Every code block of README.md's client and of the page "use the graph" runs."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Poses from which an object is in view, free directions, explanations and changes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Questions to a graph; with the index they are answered as by a look at every object."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import subprocess

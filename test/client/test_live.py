@@ -1,7 +1,5 @@
 """The live client over DDS: the first graph, updates, a gap, changes, the end."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

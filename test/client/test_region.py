@@ -1,7 +1,5 @@
 """The part of a graph in a region is what a filter by hand gives."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """What can be said of the Dockerfiles without Docker: form, files, rights, shell."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

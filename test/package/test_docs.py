@@ -1,7 +1,5 @@
 """Documentation names only what exists, and its site builds strictly and loads nothing."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

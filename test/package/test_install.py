@@ -1,7 +1,5 @@
 """Both ways to install, each into an empty folder, and what a ROS 2 user then finds there."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -5,8 +5,6 @@ arguments, replace their classes. These tests show the arguments of the launch f
 show that ROS 2 accepts them.
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 from collections import defaultdict

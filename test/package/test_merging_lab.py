@@ -1,7 +1,5 @@
 """tools/merging_lab: a replay of captured local graphs equals the evaluation of the frames."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Package metadata that stands in more than one file agrees."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The expected values are literals here, with their place in the paper. A test wit
 shows that each quotation stands in it.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

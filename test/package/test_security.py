@@ -1,7 +1,5 @@
 """No weights that can contain code, no server that strangers can reach."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """No path of a data set, a bag or an index leaves its folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

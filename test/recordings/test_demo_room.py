@@ -1,7 +1,5 @@
 """The recording that the project ships holds what bags/README.md says it holds."""
 
-from __future__ import annotations
-
 import json
 import lzma
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """A bag is data: it runs no program, fills no memory, and no file of it leads to another."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from pathlib import Path

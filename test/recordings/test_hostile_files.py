@@ -1,7 +1,5 @@
 """Sizes, depths, numbers and text of files from outside are checked before work is done."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import struct

@@ -1,7 +1,5 @@
 """Pace and window of a replay, without a clock."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """The store: what the database says is what the messages say, whatever happens."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Names come from models and files: every output shows them as text, whatever they contain."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

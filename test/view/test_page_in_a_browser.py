@@ -1,7 +1,5 @@
 """The page of a graph in a real browser: what is drawn, and what clicks, keys and filters do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Photos of objects, cut from the frames that show them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

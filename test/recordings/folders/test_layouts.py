@@ -1,7 +1,5 @@
 """Folders of all data sets, then TUM, 3RScan, ReplicaSSG and rendered rooms."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """PLY files: refusals, and rows that are read as declared."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -54,7 +54,7 @@ def test_filters_take_objects_and_relations_out_of_the_drawing(chromium):
         screen.says("shown: 2 objects, 2 relations")
         screen.page.get_by_label("beside (1)").uncheck()
         screen.says("shown: 2 objects, 1 relation (beside is hidden)")
-        screen.open("Predicates", "Classes")
+        screen.open("Classes")
         screen.page.get_by_label("dining table (1)").uncheck()
         screen.draws("cup")
         screen.page.get_by_label("dining table (1)").check()
