@@ -45,7 +45,8 @@ class Backend:
         if part in self.faults:
             self.faults[part].work()
         if self.failing == part:
-            raise RuntimeError(f"CUDA out of memory in the {part.replace("_", " ")}")
+            name = part.replace("_", " ")
+            raise RuntimeError(f"CUDA out of memory in the {name}")
 
     def detect(self, rgb, score_threshold):
         self._work("detector")
