@@ -141,7 +141,7 @@ class SurfaceMerging:
         records = self._records
         slots, on_nodes, covered = records.map.overlaps(cells)
         # If the frame shows enough of a node, its visible part counts, and not the whole node.
-        covered = with_seen(covered, slots, view.covered, view.slots)
+        covered = with_seen(covered, slots, view)
         if graph.edits.deleted:
             reject_deleted(graph, local, graph.nodes.ids[slots].tolist(), on_nodes)
         return match(

@@ -98,18 +98,13 @@ def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
     return T_camera_world, depth_mm, instances, intrinsics
 
 
-@kernel
-def with_seen(covered: Float64, slots: Int64, seen: Float64, seen_slots: Int64) -> Float64:
-    """Fractions (n, k) of some nodes, from those (n, m) of a view where the view has the node."""
-    result = covered.copy()
-    for column in range(len(slots)):
-        place = 0
-        while place < len(seen_slots) and seen_slots[place] != slots[column]:
-            place += 1
-        for index in range(len(seen) if place < len(seen_slots) else 0):
-            if not np.isnan(seen[index, place]):
-                result[index, column] = seen[index, place]
-    return result
+def with_seen(covered: Float64, slots: Int64, view: View) -> Float64:
+    """Fractions (n, k) of some nodes, from the view where it knows the node."""
+    if not len(view.slots):
+        return covered
+    places = view.slots.searchsorted(slots).clip(max=len(view.slots) - 1)
+    seen = view.covered[:, places]
+    return np.where((view.slots[places] == slots) & ~np.isnan(seen), seen, covered)
 
 
 @kernel

@@ -398,7 +398,6 @@ def pair_features(
         there[17] = _inside(of_one, other)
         there[18] = _inside(of_other, one)
         there[19] = _distance(one, other, of_one, of_other)
-        there[20] = _mahalanobis(one, other)
         # The opposite direction, without what `_contact` writes.
         for place in (0, 1, 2, 3, 19, 20):
             back[place] = there[place]
@@ -414,7 +413,7 @@ def pair_features(
 
 @kernel
 def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
-    """Features 0 to 5 and 21 to 35: sizes, gaps and heights of the bounds."""
+    """Features 0 to 5 and 20 to 35: sizes, gaps and heights of the bounds, and their distance."""
     overlap_x = min(one.high[0], other.high[0]) - max(one.low[0], other.low[0])
     overlap_y = min(one.high[1], other.high[1]) - max(one.low[1], other.low[1])
     gap_x, gap_y = max(0.0, -overlap_x), max(0.0, -overlap_y)
@@ -438,11 +437,7 @@ def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
     out[33] = out[27] - out[30]
     out[34] = math.log(float(one.count))
     out[35] = math.log(float(other.count))
-
-
-@kernel
-def _mahalanobis(one: Any, other: Any) -> float:
-    """Distance of the means in standard deviations of both objects."""
+    # The distance of the means in standard deviations of both objects.
     offset = one.mean - other.mean
     s = one.covariance + other.covariance
     for axis in range(3):
@@ -456,7 +451,7 @@ def _mahalanobis(one: Any, other: Any) -> float:
     x = offset[0] / l00
     y = (offset[1] - l10 * x) / l11
     z = (offset[2] - l20 * x - l21 * y) / l22
-    return math.sqrt(x * x + y * y + z * z)
+    out[20] = math.sqrt(x * x + y * y + z * z)
 
 
 @kernel
