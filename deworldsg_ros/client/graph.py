@@ -114,14 +114,105 @@ def _radius_m(node: wire.NodeState) -> float:
     return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
 
 
-# --- The objects and relations of a graph at one moment.
+# --- The graph as a networkx graph.
+
+
+def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
+    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
+
+    Attributes are numbers and strings only, so that every writer of networkx takes them.
+
+    Raises:
+        ClientError: without the package networkx.
+    """
+    try:
+        import networkx
+    except ImportError as error:
+        raise ClientError("networkx is not installed: pip install networkx") from error
+    graph = networkx.MultiDiGraph()
+    for item in objects:
+        x, y, z = item.position_m
+        length, width, height = item.size_m
+        graph.add_node(
+            item.id,
+            label=item.label,
+            probability=round(item.probability, 4),
+            observations=item.observations,
+            x=x,
+            y=y,
+            z=z,
+            length=length,
+            width=width,
+            height=height,
+        )
+    for relation in relations:
+        graph.add_edge(
+            relation.subject.id,
+            relation.object.id,
+            key=relation.predicate,
+            predicate=relation.predicate,
+            probability=round(relation.probability, 4),
+            provenance=relation.provenance,
+            observations=relation.observations,
+        )
+    return graph
+
+
+# --- The most probable chain of relations between two objects.
+
+
+def cheapest_chain(
+    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
+) -> list[wire.EdgeState]:
+    """The edges of the chain with the largest product of probabilities; [] if there is none.
+
+    Edges are used in both directions.
+    """
+    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
+    for (a, b), edge in edges.items():
+        # Of two equal chains, the shorter one.
+        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
+        links.setdefault(a, []).append((cost, b, edge))
+        links.setdefault(b, []).append((cost, a, edge))
+    costs = {first: 0.0}
+    came: dict[int, tuple[int, wire.EdgeState]] = {}
+    waiting = [(0.0, first)]
+    while waiting:
+        cost, node = heapq.heappop(waiting)
+        for step, other, edge in links.get(node, ()):
+            if cost + step < costs.get(other, math.inf):
+                costs[other], came[other] = cost + step, (node, edge)
+                heapq.heappush(waiting, (cost + step, other))
+    chain: list[wire.EdgeState] = []
+    while last != first and last in came:
+        last, edge = came[last]
+        chain.insert(0, edge)
+    return chain
+
+
+# --- A scene graph to ask: from a file, or as a client copied it from the topics.
 
 # What an argument of a question may be: an object, its id, or the name of a class.
 Which = SceneObject | int | str
 
 
-class GraphContent:
-    """Finds objects and relations; see `SceneGraph`."""
+class SceneGraph:
+    """A graph at one moment, for questions. It never changes.
+
+    All positions are in the world frame `frame_id`, in metres.
+
+    Args:
+        message: of `/scene_graph`, or of a file.
+        seen: from which frames its objects and relations come, for `explain`.
+
+    Attributes:
+        message: the message.
+        frame_id: the world frame.
+        stamp_ns: time of the newest frame.
+        sequence: number of the update.
+        up: unit vector against gravity; +z if the message does not tell it.
+        space: the space that the camera has seen as free, for `goal_near`; None = not known.
+    """
 
     def __init__(self, message: wire.SceneGraphMessage, seen: Iterable[SeenFrames] = ()) -> None:
         self.message = message
@@ -135,6 +226,20 @@ class GraphContent:
         self._nodes = {node.id: node for node in message.nodes}
         self._edges = {(edge.subject, edge.object): edge for edge in message.edges}
         self._made: dict[int, SceneObject] = {}
+
+    @classmethod
+    def load(cls, path: str | Path) -> SceneGraph:
+        """The graph of a file, or of the folder of a run, with its frames and its seen space if
+        they are beside it.
+
+        Raises:
+            RefusedInput: if the file is missing or contains no scene graph.
+        """
+        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
+        message = read_graph(file)
+        graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
+        graph.space = read_space(file)
+        return graph
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -275,178 +380,6 @@ class GraphContent:
         """The message of a directed edge; None = there is none."""
         return self._edges.get((subject_id, object_id))
 
-    def _candidates(
-        self,
-        label: str | None,
-        near: Point | SceneObject | None,
-        within: float | None,
-        min_probability: float | None,
-    ) -> Iterable[int]:
-        """The ids of all objects that `objects` may find, and of some others."""
-        if near is not None and within is not None:
-            if not isinstance(near, SceneObject):
-                return self._index.around(near, within)
-            reach_m = within + float(np.linalg.norm(near.size_m)) / 2 + 1e-6
-            return self._index.around(near.position_m, reach_m)
-        if label is None:
-            return self._nodes
-        if min_probability is None:
-            return self._index.called(label)
-        return self._index.perhaps(label) if min_probability > 0 else self._nodes
-
-    def _pairs(self, subject: Which | None, object: Which | None) -> Iterable[tuple[int, int]]:
-        """The relations from or to what is asked for, and some others."""
-        which = object if subject is None else subject
-        if which is None:
-            return self._edges
-        if isinstance(which, str):
-            return self._index.touching(self._index.called(which))
-        return self._index.touching([which if isinstance(which, int) else which.id])
-
-    @cached_property
-    def _index(self) -> GraphIndex:
-        return GraphIndex(self._nodes, self._edges)
-
-    def _chooser(self, which: Which | None) -> Callable[[SceneObject], bool]:
-        if which is None:
-            return lambda item: True
-        if isinstance(which, str):
-            return lambda item: is_class(which, item.label)
-        node_id = which if isinstance(which, int) else which.id
-        return lambda item: item.id == node_id
-
-
-def _fits(item: SceneObject, label: str | None, least: float | None) -> bool:
-    if label is None:
-        return least is None or item.probability >= least
-    if least is None:
-        return is_class(label, item.label)
-    return item.probability_of(label) >= least
-
-
-def _chance(label: str) -> Callable[[SceneObject], float]:
-    return lambda item: item.probability_of(label)
-
-
-def distance_m(item: SceneObject, near: Point | SceneObject) -> float:
-    """Distance of a box from a point, or from another box."""
-    if isinstance(near, SceneObject):
-        return gap_m(item.footprint, near.footprint)
-    point = footprint(near, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), item.up)
-    return gap_m(item.footprint, point)
-
-
-# --- The graph as a networkx graph.
-
-
-def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
-    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
-
-    Attributes are numbers and strings only, so that every writer of networkx takes them.
-
-    Raises:
-        ClientError: without the package networkx.
-    """
-    try:
-        import networkx
-    except ImportError as error:
-        raise ClientError("networkx is not installed: pip install networkx") from error
-    graph = networkx.MultiDiGraph()
-    for item in objects:
-        x, y, z = item.position_m
-        length, width, height = item.size_m
-        graph.add_node(
-            item.id,
-            label=item.label,
-            probability=round(item.probability, 4),
-            observations=item.observations,
-            x=x,
-            y=y,
-            z=z,
-            length=length,
-            width=width,
-            height=height,
-        )
-    for relation in relations:
-        graph.add_edge(
-            relation.subject.id,
-            relation.object.id,
-            key=relation.predicate,
-            predicate=relation.predicate,
-            probability=round(relation.probability, 4),
-            provenance=relation.provenance,
-            observations=relation.observations,
-        )
-    return graph
-
-
-# --- The most probable chain of relations between two objects.
-
-
-def cheapest_chain(
-    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
-) -> list[wire.EdgeState]:
-    """The edges of the chain with the largest product of probabilities; [] if there is none.
-
-    Edges are used in both directions.
-    """
-    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
-    for (a, b), edge in edges.items():
-        # Of two equal chains, the shorter one.
-        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
-        links.setdefault(a, []).append((cost, b, edge))
-        links.setdefault(b, []).append((cost, a, edge))
-    costs = {first: 0.0}
-    came: dict[int, tuple[int, wire.EdgeState]] = {}
-    waiting = [(0.0, first)]
-    while waiting:
-        cost, node = heapq.heappop(waiting)
-        for step, other, edge in links.get(node, ()):
-            if cost + step < costs.get(other, math.inf):
-                costs[other], came[other] = cost + step, (node, edge)
-                heapq.heappush(waiting, (cost + step, other))
-    chain: list[wire.EdgeState] = []
-    while last != first and last in came:
-        last, edge = came[last]
-        chain.insert(0, edge)
-    return chain
-
-
-# --- A scene graph to ask: from a file, or as a client copied it from the topics.
-
-
-class SceneGraph(GraphContent):
-    """A graph at one moment, for questions. It never changes.
-
-    All positions are in the world frame `frame_id`, in metres.
-
-    Args:
-        message: of `/scene_graph`, or of a file.
-        seen: from which frames its objects and relations come, for `explain`.
-
-    Attributes:
-        message: the message.
-        frame_id: the world frame.
-        stamp_ns: time of the newest frame.
-        sequence: number of the update.
-        up: unit vector against gravity; +z if the message does not tell it.
-        space: the space that the camera has seen as free, for `goal_near`; None = not known.
-    """
-
-    @classmethod
-    def load(cls, path: str | Path) -> SceneGraph:
-        """The graph of a file, or of the folder of a run, with its frames and its seen space if
-        they are beside it.
-
-        Raises:
-            RefusedInput: if the file is missing or contains no scene graph.
-        """
-        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
-        message = read_graph(file)
-        graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
-        graph.space = read_space(file)
-        return graph
-
     def on(self, support: Which, label: str | None = None) -> list[SceneObject]:
         """Objects that are on another one with a probability of at least one half."""
         found = self.relations(label, "on", support, min_probability=0.5)
@@ -521,3 +454,63 @@ class SceneGraph(GraphContent):
         if isinstance(mine, str) and isinstance(theirs, str):
             return mine == theirs and self.sequence >= other.sequence
         return False
+
+    def _candidates(
+        self,
+        label: str | None,
+        near: Point | SceneObject | None,
+        within: float | None,
+        min_probability: float | None,
+    ) -> Iterable[int]:
+        """The ids of all objects that `objects` may find, and of some others."""
+        if near is not None and within is not None:
+            if not isinstance(near, SceneObject):
+                return self._index.around(near, within)
+            reach_m = within + float(np.linalg.norm(near.size_m)) / 2 + 1e-6
+            return self._index.around(near.position_m, reach_m)
+        if label is None:
+            return self._nodes
+        if min_probability is None:
+            return self._index.called(label)
+        return self._index.perhaps(label) if min_probability > 0 else self._nodes
+
+    def _pairs(self, subject: Which | None, object: Which | None) -> Iterable[tuple[int, int]]:
+        """The relations from or to what is asked for, and some others."""
+        which = object if subject is None else subject
+        if which is None:
+            return self._edges
+        if isinstance(which, str):
+            return self._index.touching(self._index.called(which))
+        return self._index.touching([which if isinstance(which, int) else which.id])
+
+    @cached_property
+    def _index(self) -> GraphIndex:
+        return GraphIndex(self._nodes, self._edges)
+
+    def _chooser(self, which: Which | None) -> Callable[[SceneObject], bool]:
+        if which is None:
+            return lambda item: True
+        if isinstance(which, str):
+            return lambda item: is_class(which, item.label)
+        node_id = which if isinstance(which, int) else which.id
+        return lambda item: item.id == node_id
+
+
+def _fits(item: SceneObject, label: str | None, least: float | None) -> bool:
+    if label is None:
+        return least is None or item.probability >= least
+    if least is None:
+        return is_class(label, item.label)
+    return item.probability_of(label) >= least
+
+
+def _chance(label: str) -> Callable[[SceneObject], float]:
+    return lambda item: item.probability_of(label)
+
+
+def distance_m(item: SceneObject, near: Point | SceneObject) -> float:
+    """Distance of a box from a point, or from another box."""
+    if isinstance(near, SceneObject):
+        return gap_m(item.footprint, near.footprint)
+    point = footprint(near, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), item.up)
+    return gap_m(item.footprint, point)
