@@ -217,7 +217,6 @@ def warm_up(config: Config, *parts: str) -> None:
     for part in parts or KERNEL_PARTS:
         if part == "merging":
             build_merging(config.merging, config.output.min_existence).warm_up()
-            SeenSpace().warm_up()
         elif part == "drift" and config.merging.association == "surface":
             Drift().warm_up()
         elif part == "pairs":

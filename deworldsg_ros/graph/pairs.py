@@ -237,7 +237,7 @@ class PairStore:
             votes: (k, R).
         """
         rows = self.ensure(shown)
-        _show(self.rows, rows)
+        np.add.at(self.rows["shown"], rows, 1)
         counted = votes.any(axis=1)
         if counted.any():
             self._sum(self._votes, "votes", voted[counted], votes[counted])
@@ -366,12 +366,15 @@ class PairStore:
         )
         for (row, end), place in zip(new, sums.take(len(new))):
             places[row, end] = place
-        _add(sums.rows, places[rows, ends], values)
+        np.add.at(sums.rows, places[rows, ends], values)
 
     def _see(
         self, rows: Int64, ends: Int64, stamp_ns: int, frames: int, neighbour_frames: int
     ) -> None:
-        _see(self.rows, rows, ends, stamp_ns, frames, neighbour_frames)
+        at = rows, ends
+        np.add.at(self.rows["frames"], at, frames)
+        np.add.at(self.rows["neighbour_frames"], at, neighbour_frames)
+        np.maximum.at(self.rows["last_seen_ns"], at, stamp_ns)
         for changes in self._watchers:
             changes.edges.update(rows.tolist())
 
@@ -440,38 +443,6 @@ class PairStore:
         while len(self.firsts) < count:
             self.firsts = np.concatenate([self.firsts, np.zeros_like(self.firsts)])
             self._degrees = np.concatenate([self._degrees, np.zeros_like(self._degrees)])
-
-
-@kernel
-def _show(pairs: NDArray[Any], rows: Int64) -> None:
-    """Count a frame that showed pairs."""
-    for row in rows:
-        pairs[row].shown += 1
-
-
-@kernel
-def _see(
-    pairs: NDArray[Any],
-    rows: Int64,
-    ends: Int64,
-    stamp_ns: int,
-    frames: int,
-    neighbour_frames: int,
-) -> None:
-    """Add frames to directions (m,) of pairs (m,)."""
-    for index in range(len(rows)):
-        pair, end = pairs[rows[index]], ends[index]
-        pair.frames[end] += frames
-        pair.neighbour_frames[end] += neighbour_frames
-        pair.last_seen_ns[end] = max(pair.last_seen_ns[end], stamp_ns)
-
-
-@kernel
-def _add(sums: NDArray[Any], rows: Int32, values: Float64) -> None:
-    """Add values (m, R) to rows (m,) of sums."""
-    for index in range(len(rows)):
-        for place in range(values.shape[1]):
-            sums[rows[index], place] += values[index, place]
 
 
 @kernel

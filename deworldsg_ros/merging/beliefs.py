@@ -201,18 +201,15 @@ def prior(fates: Int64) -> float:
     return OFFSET + FATES * math.log(fates[1] / fates[0])
 
 
-@kernel
 def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) -> None:
     """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
 
     A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
     """
-    for index in range(len(slots)):
-        record, probability = records[slots[index]], known[index]
-        is_error = probability < 1.0 - SETTLED and record.missed_since > CLEAR_MISS
-        if not record.is_settled and (probability > SETTLED or is_error):
-            record.is_settled = True
-            fates[0 if is_error else 1] += 1
+    is_error = (known < 1.0 - SETTLED) & (records["missed_since"][slots] > CLEAR_MISS)
+    is_new = ~records["is_settled"][slots] & ((known > SETTLED) | is_error)
+    records["is_settled"][slots[is_new]] = True
+    fates += np.bincount(~is_error[is_new], minlength=2)
 
 
 def frame_weight(step_ns: int | None) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
+from deworldsg_ros.relations.paper import entropy_nats
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
@@ -191,15 +192,11 @@ class PredicateNames(NamedTuple):
         return cls(relation_of_predicates(predicates), canonical_predicates(predicates), with_index)
 
 
-@kernel
 def related_pairs(beliefs: NDArray[Any], rows: Int64) -> Bool:
     """Whether pairs (k,) may be related, or have votes beyond the physical relations; (k,) bool."""
-    related = np.empty(len(rows), np.bool_)
-    for index in range(len(rows)):
-        belief = beliefs[rows[index]]
-        free = min(belief.relations[0, NONE], belief.relations[1, NONE])
-        related[index] = free < 1.0 - MIN_RELATED or belief.other_votes >= MIN_OTHER_VOTES
-    return related
+    free = beliefs["relations"][:, :, NONE][rows].min(axis=1)
+    related: Bool = free < 1.0 - MIN_RELATED
+    return related | (beliefs["other_votes"][rows] >= MIN_OTHER_VOTES)
 
 
 @kernel
@@ -265,25 +262,15 @@ def predicate_probabilities(
     return result, voted
 
 
-@kernel
 def uncertain(probabilities: Float64, threshold_nats: float) -> Bool:
     """Whether the entropies of distributions (k, 2, R), scaled to sum to one, exceed a threshold.
 
     Returns:
         (k, 2) bool; false where a sum is zero.
     """
-    result = np.zeros(probabilities.shape[:2], np.bool_)
-    for row in range(len(probabilities)):
-        for end in range(2):
-            total = 0.0
-            for value in probabilities[row, end]:
-                total += value
-            entropy = 0.0
-            for value in probabilities[row, end]:
-                if value > 0.0:
-                    entropy -= value / total * math.log(value / total)
-            result[row, end] = total > 0.0 and entropy > threshold_nats
-    return result
+    totals = probabilities.sum(axis=2, keepdims=True)
+    exceeds: Bool = entropy_nats(probabilities / np.maximum(totals, 1e-300)) > threshold_nats
+    return exceeds
 
 
 @kernel
