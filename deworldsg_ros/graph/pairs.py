@@ -366,7 +366,7 @@ class PairStore:
         )
         for (row, end), place in zip(new, sums.take(len(new))):
             places[row, end] = place
-        np.add.at(sums.rows, places[rows, ends], values)
+        _add(sums.rows, places[rows, ends], values)
 
     def _see(
         self, rows: Int64, ends: Int64, stamp_ns: int, frames: int, neighbour_frames: int
@@ -443,6 +443,14 @@ class PairStore:
         while len(self.firsts) < count:
             self.firsts = np.concatenate([self.firsts, np.zeros_like(self.firsts)])
             self._degrees = np.concatenate([self._degrees, np.zeros_like(self._degrees)])
+
+
+@kernel
+def _add(sums: NDArray[Any], rows: Int32, values: Float64) -> None:
+    """Add values (m, R) to rows (m,) of sums."""
+    for index in range(len(rows)):
+        for place in range(values.shape[1]):
+            sums[rows[index], place] += values[index, place]
 
 
 @kernel
