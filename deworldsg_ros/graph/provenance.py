@@ -126,10 +126,10 @@ class SeenSpace:
 
     def _has(self, pose: Float64) -> bool:
         """Whether a pose (4, 4) differs little from that of a view."""
-        steps_m = np.linalg.norm(self.poses[:, :3, 3] - pose[:3, 3], axis=1)
         # The trace of the rotation between both is 1 + 2 cos(angle).
-        traces = (self.poses[:, :3, :3] * pose[:3, :3]).sum(axis=(1, 2))
-        return bool(np.any((steps_m < MOVED_M) & (traces >= LEAST_TRACE)))
+        traces = self.poses[:, :3, :3].reshape(-1, 9) @ pose[:3, :3].ravel()
+        steps_m = self.poses[traces >= LEAST_TRACE, :3, 3] - pose[:3, 3]
+        return bool(((steps_m**2).sum(axis=1) < MOVED_M**2).any())
 
 
 def space_path(graph_path: Path) -> Path:

@@ -610,15 +610,26 @@ class EdgeBeliefs:
             )
 
 
+@kernel
 def _counted(slots: Int64, means_world: Float64) -> tuple[Bool, Int64]:
     """Whether (n, n) frames count for each two rows: two nodes (-1 = none) that are close.
 
     Also the slots (k, 2) of these pairs of rows.
     """
-    apart_m = means_world[:, None] - means_world
-    close = (apart_m**2).sum(axis=2) < MAX_DISTANCE_M**2
-    close &= (slots[:, None] != slots) & (slots >= 0) & (slots[:, None] >= 0)
-    return close, slots[np.argwhere(np.triu(close))]
+    size = len(slots)
+    close, shown = np.zeros((size, size), np.bool_), np.empty((size * size // 2, 2), np.int64)
+    count = 0
+    for a in range(size):
+        for b in range(a + 1, size):
+            squared_m2 = 0.0
+            for axis in range(3):
+                squared_m2 += (means_world[a, axis] - means_world[b, axis]) ** 2
+            live = slots[a] >= 0 and slots[b] >= 0 and slots[a] != slots[b]
+            if live and squared_m2 < MAX_DISTANCE_M**2:
+                close[a, b] = close[b, a] = True
+                shown[count, 0], shown[count, 1] = slots[a], slots[b]
+                count += 1
+    return close, shown[:count].copy()
 
 
 def _limits(table: PairTable, begun: bool) -> tuple[int, int]:
@@ -642,6 +653,7 @@ def warm_up(config: Config) -> None:
     for pair in ((1, 2), (2, 3), (3, 1)):
         graph.add_votes(*pair, np.array([[30.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]))
     beliefs.refresh()
+    _counted(np.array([1, 2]), np.zeros((2, 3)))
     graph.move_node(2, np.array([[1.0, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
     beliefs.refresh()
     graph.remove_node(1)

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.relations.paper import entropy_nats
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.vocabulary import PREDICATES, plain
 
@@ -262,15 +261,25 @@ def predicate_probabilities(
     return result, voted
 
 
+@kernel
 def uncertain(probabilities: Float64, threshold_nats: float) -> Bool:
     """Whether the entropies of distributions (k, 2, R), scaled to sum to one, exceed a threshold.
 
     Returns:
         (k, 2) bool; false where a sum is zero.
     """
-    totals = probabilities.sum(axis=2, keepdims=True)
-    exceeds: Bool = entropy_nats(probabilities / np.maximum(totals, 1e-300)) > threshold_nats
-    return exceeds
+    result = np.zeros(probabilities.shape[:2], np.bool_)
+    for row in range(len(probabilities)):
+        for end in range(2):
+            total = 0.0
+            for value in probabilities[row, end]:
+                total += value
+            entropy = 0.0
+            for value in probabilities[row, end]:
+                if value > 0.0:
+                    entropy -= value / total * math.log(value / total)
+            result[row, end] = total > 0.0 and entropy > threshold_nats
+    return result
 
 
 @kernel
