@@ -277,7 +277,21 @@ def observe_existence(
             continue
         has_moved = step_m > max(STILL_M, LOOK_RAD * distance_m)
         if has_moved or stamp_ns - record.look_ns > LOOK_NS:
-            _end_look(record, counts, step_m > STILL_M)
+            # Add the present look to those that have ended, and begin a new one.
+            found, missed = _look(record, counts)
+            record.looks += found
+            record.missed += missed
+            record.missed_since += missed
+            look = record.look_weight * min(MAX_WEIGHT, record.shown)
+            record.pending[record.visibility] += look
+            if record.detected > 0:
+                # Misses count for the rates if a detection follows: before, it may be no object.
+                counts[record.visibility, 1] += look
+                for visibility in range(len(counts)):
+                    counts[visibility, 0] += record.pending[visibility]
+                    record.pending[visibility] = 0.0
+            record.detected = record.shown = record.visibility = 0
+            record.look_weight = 1.0 if step_m > STILL_M else STILL_WEIGHT
             record.look_ns = stamp_ns
             for axis in range(3):
                 record.camera_world[axis] = camera_world[axis]
@@ -292,25 +306,6 @@ def observe_existence(
             record.best_score = max(record.best_score, scores[index])
             record.last_ns = stamp_ns
             record.reach_m = max(record.reach_m, distance_m)
-
-
-@kernel
-def _end_look(record: Any, counts: Float64, camera_moves: bool) -> None:
-    """Add the present look to those that have ended, and begin a new one."""
-    found, missed = _look(record, counts)
-    record.looks += found
-    record.missed += missed
-    record.missed_since += missed
-    weight = record.look_weight * min(MAX_WEIGHT, record.shown)
-    record.pending[record.visibility] += weight
-    if record.detected > 0:
-        # Misses count for the rates if a detection follows: before that, it may be no object.
-        counts[record.visibility, 1] += weight
-        for visibility in range(len(counts)):
-            counts[visibility, 0] += record.pending[visibility]
-            record.pending[visibility] = 0.0
-    record.detected = record.shown = record.visibility = 0
-    record.look_weight = 1.0 if camera_moves else STILL_WEIGHT
 
 
 @kernel

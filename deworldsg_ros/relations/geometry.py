@@ -25,6 +25,8 @@ MARGIN_M = 0.06
 LAYER_M = 0.035
 # Points of a surface count for its height beside an object by exp(-(distance / this)²).
 SOFT_RADIUS_M = 0.15
+# Points of an object so near the bounds of the other one are compared, this many of them.
+NEAR_BOUNDS_M, NEAR_POINTS = 0.15, 48
 # Nodes in arrays of turned points at once, so that a whole map needs no large ones.
 TURNED_AT_ONCE = 256
 _NO_TURN = np.eye(3)
@@ -395,8 +397,11 @@ def pair_features(
         _contact(back, other, one, of_one)
         there[15] = _enclosure(one, of_other)
         there[16] = _enclosure(other, of_one)
-        there[17] = _inside(of_one, other)
-        there[18] = _inside(of_other, one)
+        # Fractions of the points inside the bounds of the other object.
+        inside_one = len(_near(of_one, other, 0.01, len(of_one)))
+        inside_other = len(_near(of_other, one, 0.01, len(of_other)))
+        there[17] = inside_one / max(1, len(of_one))
+        there[18] = inside_other / max(1, len(of_other))
         there[19] = _distance(one, other, of_one, of_other)
         # The opposite direction, without what `_contact` writes.
         for place in (0, 1, 2, 3, 19, 20):
@@ -538,32 +543,14 @@ def _enclosure(one: Any, points: Float32) -> float:
 
 
 @kernel
-def _within(point: Float32, shape: Any, margin_m: float) -> bool:
-    """Whether a point is inside the bounds of a shape, or at most a margin outside."""
-    within = True
-    for axis in range(3):
-        within &= shape.low[axis] - margin_m < point[axis] < shape.high[axis] + margin_m
-    return within
-
-
-@kernel
-def _inside(points: Float32, shape: Any) -> float:
-    """Fraction of points inside the bounds of a shape."""
-    inside = 0
-    for k in range(len(points)):
-        inside += int(_within(points[k], shape, 0.01))
-    fraction: float = inside / max(1, len(points))
-    return fraction
-
-
-@kernel
 def _distance(one: Any, other: Any, of_one: Float32, of_other: Float32) -> float:
     """Smallest distance of two points that are near the other's bounds; at most 1 m.
 
-    Only the first points near the other object are compared.
+    Only the first NEAR_POINTS points near the other object are compared.
     """
     best = 1.0
-    near_one, near_other = _near(of_one, other), _near(of_other, one)
+    near_one = _near(of_one, other, NEAR_BOUNDS_M, NEAR_POINTS)
+    near_other = _near(of_other, one, NEAR_BOUNDS_M, NEAR_POINTS)
     for i in near_one:
         for j in near_other:
             squared = 0.0
@@ -575,16 +562,18 @@ def _distance(one: Any, other: Any, of_one: Float32, of_other: Float32) -> float
 
 
 @kernel
-def _near(points: Float32, shape: Any) -> Int64:
-    """Indices of the first 48 points that are within 0.15 m of the bounds of a shape."""
-    found = np.empty(48, np.int64)
+def _near(points: Float32, shape: Any, margin_m: float, most: int) -> Int64:
+    """Indices of the first points that are in the bounds of a shape, or a margin outside."""
+    found = np.empty(most, np.int64)
     count = 0
     for k in range(len(points)):
-        if _within(points[k], shape, 0.15):
+        within = True
+        for axis in range(3):
+            value = points[k, axis]
+            within &= shape.low[axis] - margin_m < value < shape.high[axis] + margin_m
+        if within and count < most:
             found[count] = k
             count += 1
-            if count == len(found):
-                break
     return found[:count]
 
 
