@@ -263,15 +263,11 @@ def _spread(scene: Scene, slot: int, factor: float) -> None:
 def _beside(belief: Any, floor: float, together: float) -> float:
     """Probability that two objects stand side by side, on the floor or together on a support."""
     reach = SEAT_GAP_M if belief.with_[0] + belief.with_[1] > 0 else NEAR_FLOOR_M
-    floor *= _expit((reach - belief.gap_m) / NEAR_FLOOR_SPREAD_M)
-    together *= _expit((NEAR_SUPPORT_M - belief.gap_m) / NEAR_SUPPORT_SPREAD_M)
-    together *= _expit((NEAR_LEVEL_M - abs(belief.bottom_step_m)) / NEAR_LEVEL_SPREAD_M)
+    floor *= 1.0 / (1.0 + math.exp(-(reach - belief.gap_m) / NEAR_FLOOR_SPREAD_M))
+    step_m = abs(belief.bottom_step_m)
+    together *= 1.0 / (1.0 + math.exp(-(NEAR_SUPPORT_M - belief.gap_m) / NEAR_SUPPORT_SPREAD_M))
+    together *= 1.0 / (1.0 + math.exp(-(NEAR_LEVEL_M - step_m) / NEAR_LEVEL_SPREAD_M))
     return float(min(floor + together, 1.0))
-
-
-@kernel
-def _expit(value: float) -> float:
-    return 1.0 / (1.0 + math.exp(-value)) if value > -700.0 else 0.0
 
 
 @kernel
@@ -392,7 +388,8 @@ def relate(scene: Scene, slots: Int64, more: Int64) -> Int64:
         if belief.with_[0] + belief.with_[1] == 0 and belief.close[0] * belief.close[1] == 0:
             beside = 0.0
         beside = min(max(beside, 1.0 - NEAR_CERTAINTY), NEAR_CERTAINTY)
-        beside = _expit(math.log(beside / (1.0 - beside)) + belief.near_votes)
+        logit = math.log(beside / (1.0 - beside)) + belief.near_votes
+        beside = 1.0 / (1.0 + math.exp(-logit))
         is_new = False
         for end in range(2):
             now[end, NEAR] = states[0] * beside
