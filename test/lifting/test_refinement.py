@@ -14,9 +14,8 @@ from deworldsg_ros.lifting.refine import (
     masks_of,
     spatial_inliers,
     valid_depth,
-    valid_pixel_count,
 )
-from deworldsg_ros.lifting.stage import LiftingConstants
+from deworldsg_ros.lifting.stage import LiftingConstants, mask_pixels
 from deworldsg_ros.scene.camera import Intrinsics
 
 PAPER, PRINTED = LiftingConfig(), LiftingConstants()
@@ -216,4 +215,4 @@ def test_runs_of_the_masks(seed, height, width, ids):
         mask, runs = instances == k + 1, masks.runs_of(k)
         assert set(runs[:, 3].tolist()) <= {k} and (np.diff(runs[:, 0]) >= 0).all()
         assert masks.sizes[k] == mask.sum()
-        assert valid_pixel_count(depth, runs) == (mask & (depth > 0)).sum()
+        assert len(mask_pixels(depth, runs)) == (mask & (depth > 0)).sum()

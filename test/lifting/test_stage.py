@@ -278,7 +278,6 @@ def test_warm_up_compiles_everything_that_a_frame_needs():
     Lifting(LiftingConfig()).warm_up()
     entry_points = (
         refine._valid_depth,
-        refine._is_valid,
         refine._masks_of,
         refine._spatial_inliers,
         refine._dominant_layer,
