@@ -24,8 +24,12 @@ EVEN_RADIUS_M = 0.015
 OUTLIER_FACTOR = 2.0
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
-# Heading of a box: the smallest rectangle of this many directions over 90 degrees.
-DIRECTIONS = 45
+# Heading of a box: the smallest rectangle of these directions, over 90 degrees.
+_HEADINGS = 0.5 * math.pi * np.arange(45) / 45
+_COSINES = np.array([math.cos(heading) for heading in _HEADINGS])
+_SINES = np.array([math.sin(heading) for heading in _HEADINGS])
+# Bounds of all headings, in whole cache lines: across lines, they take up to twice the time.
+ALIGNED_HEADINGS = 48
 # Points of a box, the first ones: surfaces are stored in random order. 256 of 512 take a quarter of
 # the time and cost 0.2 cm of the median extent.
 MOST_POINTS = 256
@@ -37,6 +41,9 @@ LEAST_SPREAD_M = 1e-12
 # object keeps its thickness.
 POSITION_DECIMALS, VARIANCE_DECIMALS = 4, 7
 BOX_DECIMALS, QUATERNION_DECIMALS = 3, 4
+# Of mean, covariance, centre, size and quaternion.
+_DECIMALS = [POSITION_DECIMALS] * 3 + [VARIANCE_DECIMALS] * 9 + [BOX_DECIMALS] * 6
+_SCALES = 10.0 ** np.array([*_DECIMALS, *[QUATERNION_DECIMALS] * 4])
 # Points in messages are int16 millimetres.
 _MOST_MM = 32767
 
@@ -66,17 +73,29 @@ def extents_of(
         rows: (n,).
         up: unit vector against gravity.
     """
-    measured = _measure(points_world, counts, rows, *_frame_of(tuple(up)))
+    axes, quat_axes = _frame_of(tuple(up))
+    measured = np.empty((len(rows), 22))
+    for row, result in zip(rows, measured):
+        points = points_world[row, : counts[row]]
+        _even_moments(_columns(points), result[:12])
+        _box(_columns(points[:MOST_POINTS]), axes, quat_axes, result[12:])
     return [
         Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
-        for row in measured.tolist()
+        for row in _rounded(measured).tolist()
     ]
 
 
 def rounded_gaussians(means: Float64, covariances: Float64, rows: Int64) -> list[list[float]]:
     """Mean and covariance (12,) of some rows of (N, 3) and (N, 3, 3), as messages have them."""
-    found: list[list[float]] = _gaussians(means, covariances, rows).tolist()
+    gaussians = np.concatenate([means[rows], covariances[rows].reshape(-1, 9)], axis=1)
+    found: list[list[float]] = _rounded(gaussians).tolist()
     return found
+
+
+def _rounded(numbers: Float64) -> Float64:
+    """The first columns of (n, 22) as `rounded`, each with its decimals."""
+    scales = _SCALES[: numbers.shape[1]]
+    return np.asarray(np.rint(numbers * scales) / scales + 0.0)
 
 
 def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
@@ -91,9 +110,9 @@ def even_moments(points_world: Float32) -> tuple[Float64, Float64]:
         ValueError: without points, or for one that is not finite or out of reach.
     """
     _check_points(points_world)
-    means, covariances = np.empty(3), np.empty((3, 3))
-    _even_moments(np.ascontiguousarray(points_world.T, np.float64), means, covariances)
-    return means, covariances
+    moments = np.empty(12)
+    _even_moments(_columns(points_world), moments)
+    return moments[:3], moments[3:].reshape(3, 3)
 
 
 def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.GravityBox:
@@ -107,14 +126,12 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         ValueError: without points, or for one that is not finite or out of reach.
     """
     _check_points(points_world)
-    box = np.empty(3), np.empty(3), np.empty(4)
-    columns = np.ascontiguousarray(points_world[:MOST_POINTS].T, np.float64)
-    _box(columns, *_frame_of(tuple(up)), *box)
-    center, size, quat_xyzw = box
+    box = np.empty(10)
+    _box(_columns(points_world[:MOST_POINTS]), *_frame_of(tuple(up)), box)
     return wire.GravityBox(
-        rounded(center, BOX_DECIMALS),
-        rounded(size, BOX_DECIMALS),
-        rounded(quat_xyzw, QUATERNION_DECIMALS),
+        rounded(box[:3], BOX_DECIMALS),
+        rounded(box[3:6], BOX_DECIMALS),
+        rounded(box[6:], QUATERNION_DECIMALS),
     )
 
 
@@ -124,6 +141,11 @@ def _check_points(points_world: Float32 | Float64) -> None:
         raise ValueError("a surface without points: expected at least one")
     # Corners of a box around a Gaussian may lie outside of the limit of its mean.
     check_array("points", points_world, (len(points_world), 3), 4 * MAX_GRAPH_COORDINATE_M)
+
+
+def _columns(points: Float32 | Float64) -> Float64:
+    """Points (n, 3) as the kernels take them: (3, n) float64."""
+    return np.ascontiguousarray(points.T, np.float64)
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -167,57 +189,6 @@ def surface_points(node: wire.NodeState) -> Float64:
 
 
 @kernel
-def _measure(
-    points_world: Float32, counts: Int64, rows: Int64, axes: Float64, quat_axes: Float64
-) -> Float64:
-    """Mean, covariance, and centre, size and quaternion of the box of each row; rounded."""
-    result = np.empty((len(rows), 22), np.float64)
-    covariance = np.empty((3, 3), np.float64)
-    for index in range(len(rows)):
-        count = counts[rows[index]]
-        columns = np.empty((3, count), np.float64)
-        first = np.empty((3, min(count, MOST_POINTS)), np.float64)
-        for place in range(count):
-            for axis in range(3):
-                columns[axis, place] = points_world[rows[index], place, axis]
-                if place < MOST_POINTS:
-                    first[axis, place] = columns[axis, place]
-        row = result[index]
-        _even_moments(columns, row[:3], covariance)
-        _write_gaussian(row, row, covariance)
-        _box(first, axes, quat_axes, row[12:15], row[15:18], row[18:])
-        _round(row, 12, 18, BOX_DECIMALS)
-        _round(row, 18, 22, QUATERNION_DECIMALS)
-    return result
-
-
-@kernel
-def _gaussians(means: Float64, covariances: Float64, rows: Int64) -> Float64:
-    result = np.empty((len(rows), 12), np.float64)
-    for index in range(len(rows)):
-        _write_gaussian(result[index], means[rows[index]], covariances[rows[index]])
-    return result
-
-
-@kernel
-def _write_gaussian(row: Float64, mean: Float64, covariance: Float64) -> None:
-    for i in range(3):
-        row[i] = mean[i]
-        for j in range(3):
-            row[3 + 3 * i + j] = covariance[i, j]
-    _round(row, 0, 3, POSITION_DECIMALS)
-    _round(row, 3, 12, VARIANCE_DECIMALS)
-
-
-@kernel
-def _round(values: Float64, start: int, end: int, decimals: int) -> None:
-    """As `rounded`, in place."""
-    scale = 10.0**decimals
-    for index in range(start, end):
-        values[index] = np.rint(values[index] * scale) / scale + 0.0
-
-
-@kernel
 def _along_widest(columns: Float64) -> tuple[Float64, int]:
     """Points, columns (3, n), in the order of the coordinate that spreads most; and its axis."""
     count = columns.shape[1]
@@ -254,8 +225,8 @@ def _along_widest(columns: Float64) -> tuple[Float64, int]:
 
 
 @kernel
-def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
-    """See `even_moments`; columns (3, n), and the results are written."""
+def _even_moments(columns: Float64, moments: Float64) -> None:
+    """Write `even_moments` of columns (3, n): the mean and the covariance, (12,)."""
     ordered, widest = _along_widest(columns)
     x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
     count = len(along)
@@ -266,7 +237,12 @@ def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
             first += 1
         while last < count and along[last] - along[a] <= EVEN_RADIUS_M:
             last += 1
-        near = _count_near(x[first:last], y[first:last], z[first:last], x[a], y[a], z[a])
+        # The compiler makes vectors of this.
+        xs, ys, zs, near = x[first:last], y[first:last], z[first:last], 0
+        for b in range(len(xs)):
+            step_x, step_y, step_z = x[a] - xs[b], y[a] - ys[b], z[a] - zs[b]
+            squared = step_x * step_x + step_y * step_y + step_z * step_z
+            near += int(squared <= EVEN_RADIUS_M * EVEN_RADIUS_M)
         weights[a] = _EVEN_WEIGHTS[min(near, len(_EVEN_WEIGHTS) - 1)]
         total += weights[a]
     # One pass for all sums: the processor adds to them at the same time.
@@ -276,7 +252,6 @@ def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
         mean_x += weights[a] * x[a]
         mean_y += weights[a] * y[a]
         mean_z += weights[a] * z[a]
-    mean[0], mean[1], mean[2] = mean_x, mean_y, mean_z
     xx = yy = zz = EVEN_RADIUS_M**2 / 5
     xy = xz = yz = 0.0
     for a in range(count):
@@ -288,129 +263,59 @@ def _even_moments(columns: Float64, mean: Float64, covariance: Float64) -> None:
         yy += by_y * step_y
         yz += by_y * step_z
         zz += weights[a] * step_z * step_z
-    covariance[0, 0], covariance[1, 1], covariance[2, 2] = xx, yy, zz
-    covariance[0, 1] = covariance[1, 0] = xy
-    covariance[0, 2] = covariance[2, 0] = xz
-    covariance[1, 2] = covariance[2, 1] = yz
+    moments[0], moments[1], moments[2] = mean_x, mean_y, mean_z
+    moments[3], moments[7], moments[11] = xx, yy, zz
+    moments[4] = moments[6] = xy
+    moments[5] = moments[9] = xz
+    moments[8] = moments[10] = yz
 
 
 @kernel
-def _count_near(xs: Float64, ys: Float64, zs: Float64, x: float, y: float, z: float) -> int:
-    """Number of points within `EVEN_RADIUS_M` of a point. The compiler makes vectors of this."""
-    near = 0
-    for b in range(len(xs)):
-        step_x, step_y, step_z = x - xs[b], y - ys[b], z - zs[b]
-        squared = step_x * step_x + step_y * step_y + step_z * step_z
-        near += int(squared <= EVEN_RADIUS_M * EVEN_RADIUS_M)
-    return near
-
-
-@kernel
-def _box(
-    columns: Float64,
-    axes: Float64,
-    quat_axes: Float64,
-    center: Float64,
-    size: Float64,
-    quat_xyzw: Float64,
-) -> None:
-    """See `box_of`; points are columns (3, n) of the world frame, and the results are written."""
+def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
+    """Write `box_of` columns (3, n) of the world frame: centre, size and quaternion, (10,)."""
     upright = np.zeros(columns.shape, np.float64)
     for axis in range(3):
         for k in range(3):
             if axes[axis, k] != 0.0:
                 for place in range(columns.shape[1]):
                     upright[axis, place] += axes[axis, k] * columns[k, place]
-    corners = _outer(_without_outliers(upright))
-    best, heading = np.inf, 0.0
-    for step in range(DIRECTIONS):
-        angle = 0.5 * math.pi * step / DIRECTIONS
-        left, right, back, front = _bounds(corners, math.cos(angle), math.sin(angle))
-        area = (right - left) * (front - back)
+    kept = _without_outliers(upright)
+    # Vertical bounds, and horizontal ones along the axes of each heading.
+    low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
+    lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
+    for step in range(len(_HEADINGS)):
+        lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
+    for place in range(kept.shape[1]):
+        x, y, z = kept[0, place], kept[1, place], kept[2, place]
+        low, high = min(low, z), max(high, z)
+        # The compiler makes vectors of this.
+        for step in range(len(_HEADINGS)):
+            u = _COSINES[step] * x + _SINES[step] * y
+            v = _COSINES[step] * y - _SINES[step] * x
+            lefts[step], rights[step] = min(lefts[step], u), max(rights[step], u)
+            backs[step], fronts[step] = min(backs[step], v), max(fronts[step], v)
+    best, area = 0, np.inf
+    for step in range(len(_HEADINGS)):
+        found = (rights[step] - lefts[step]) * (fronts[step] - backs[step])
         # Ties go to the axes of the world.
-        if area < best - 1e-12:
-            best, heading = area, angle
-    cos, sin = math.cos(heading), math.sin(heading)
-    left, right, back, front = _bounds(corners, cos, sin)
-    low, high = corners[2, 0], corners[2, 0]
-    for place in range(1, corners.shape[1]):
-        low, high = min(low, corners[2, place]), max(high, corners[2, place])
-    size[0], size[1], size[2] = right - left, front - back, high - low
+        if found < area - 1e-12:
+            best, area = step, found
+    left, right, back, front = lefts[best], rights[best], backs[best], fronts[best]
+    box[3], box[4], box[5] = right - left, front - back, high - low
     u, v, w = (left + right) / 2, (back + front) / 2, (low + high) / 2
+    cos, sin = _COSINES[best], _SINES[best]
     for axis in range(3):
-        center[axis] = (
+        box[axis] = (
             (cos * u - sin * v) * axes[0, axis]
             + (sin * u + cos * v) * axes[1, axis]
             + w * axes[2, axis]
         )
     # The turn about the third axis, after the axes.
     qx, qy, qz, qw = quat_axes[0], quat_axes[1], quat_axes[2], quat_axes[3]
-    cos, sin = math.cos(heading / 2), math.sin(heading / 2)
+    cos, sin = math.cos(_HEADINGS[best] / 2), math.sin(_HEADINGS[best] / 2)
     sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
-    quat_xyzw[0], quat_xyzw[1] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
-    quat_xyzw[2], quat_xyzw[3] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)
-
-
-@kernel
-def _bounds(points: Float64, cos: float, sin: float) -> tuple[float, float, float, float]:
-    """Horizontal bounds of columns (3, n) along turned axes."""
-    left, right, back, front = np.inf, -np.inf, np.inf, -np.inf
-    for place in range(points.shape[1]):
-        x, y = points[0, place], points[1, place]
-        u, v = cos * x + sin * y, cos * y - sin * x
-        left, right = min(left, u), max(right, u)
-        back, front = min(back, v), max(front, v)
-    return left, right, back, front
-
-
-@kernel
-def _outer(points: Float64) -> Float64:
-    """The points, columns (3, n), that may be corners of the hull seen from above, or its ends.
-
-    Those inside the octagon of the outermost points in eight directions are left out.
-    """
-    count = points.shape[1]
-    x, y, z = points[0], points[1], points[2]
-    outermost = np.zeros(8, np.int64)
-    lowest = highest = 0
-    for place in range(count):
-        if z[place] < z[lowest]:
-            lowest = place
-        if z[place] > z[highest]:
-            highest = place
-        for side in range(8):
-            other = outermost[side]
-            if _reach(side, x[place], y[place]) > _reach(side, x[other], y[other]):
-                outermost[side] = place
-    kept = np.empty((3, count), np.float64)
-    size = 0
-    for place in range(count):
-        inside = True
-        for side in range(8):
-            a, b = outermost[side], outermost[(side + 1) % 8]
-            if a == b or not inside:
-                continue
-            cross = (x[b] - x[a]) * (y[place] - y[a]) - (y[b] - y[a]) * (x[place] - x[a])
-            inside = cross > 0.0
-        if not inside or place in (lowest, highest):
-            for axis in range(3):
-                kept[axis, size] = points[axis, place]
-            size += 1
-    return kept[:, :size]
-
-
-@kernel
-def _reach(side: int, x: float, y: float) -> float:
-    """How far a point lies in one of eight directions, counterclockwise from x."""
-    if side % 4 == 0:
-        reach = x
-    elif side % 4 == 1:
-        reach = x + y
-    elif side % 4 == 2:
-        reach = y
-    else:
-        reach = y - x
-    return reach if side < 4 else -reach
+    box[6], box[7] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
+    box[8], box[9] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)
 
 
 @kernel
@@ -440,14 +345,16 @@ def _without_outliers(columns: Float64) -> Float64:
                 other += step
         last[row] = sorted_partly[row] = near_3
     most = OUTLIER_FACTOR**2 * _median(sorted_partly)
-    kept = np.empty((3, count), np.float64)
     size = 0
+    for row in range(count):
+        size += int(last[row] <= most)
+    kept, place = np.empty((3, size), np.float64), 0
     for row in range(count):
         if last[row] <= most:
             for axis in range(3):
-                kept[axis, size] = ordered[axis, row]
-            size += 1
-    return kept[:, :size]
+                kept[axis, place] = ordered[axis, row]
+            place += 1
+    return kept
 
 
 @kernel
