@@ -22,6 +22,8 @@ EVEN_RADIUS_M = 0.015
 # median of that distance. Mixed pixels at depth edges lie apart from the surface. Chosen on the two
 # rendered rooms: 1.5 cuts corners off, 3 keeps mixed pixels.
 OUTLIER_FACTOR = 2.0
+# So few points have no outliers.
+FEW_POINTS = 6
 # Weights of points with these many points around.
 _EVEN_WEIGHTS = np.append(0.0, np.arange(1.0, 4097.0) ** -0.5)
 # Heading of a box: the smallest rectangle of these directions, over 90 degrees.
@@ -78,7 +80,7 @@ def extents_of(
     for row, result in zip(rows, measured):
         points = points_world[row, : counts[row]]
         _even_moments(_columns(points), result[:12])
-        _box(_columns(points[:MOST_POINTS]), axes, quat_axes, result[12:])
+        _box(_without_outliers(points[:MOST_POINTS], axes), axes, quat_axes, result[12:])
     return [
         Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
         for row in _rounded(measured).tolist()
@@ -126,8 +128,8 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         ValueError: without points, or for one that is not finite or out of reach.
     """
     _check_points(points_world)
-    box = np.empty(10)
-    _box(_columns(points_world[:MOST_POINTS]), *_frame_of(tuple(up)), box)
+    box, (axes, quat_axes) = np.empty(10), _frame_of(tuple(up))
+    _box(_without_outliers(points_world[:MOST_POINTS], axes), axes, quat_axes, box)
     return wire.GravityBox(
         rounded(box[:3], BOX_DECIMALS),
         rounded(box[3:6], BOX_DECIMALS),
@@ -146,6 +148,14 @@ def _check_points(points_world: Float32 | Float64) -> None:
 def _columns(points: Float32 | Float64) -> Float64:
     """Points (n, 3) as the kernels take them: (3, n) float64."""
     return np.ascontiguousarray(points.T, np.float64)
+
+
+def _without_outliers(points: Float32 | Float64, axes: Float64) -> Float64:
+    """The points, turned to axes (3, m), that have neighbours as close as the others have."""
+    upright, squared = _third_neighbours(_columns(points), axes)
+    ordered, middle = np.sort(squared), (len(squared) - 1) // 2
+    median = (ordered[middle] + ordered[len(squared) // 2]) / 2.0
+    return np.compress(squared <= OUTLIER_FACTOR**2 * median, upright, axis=1)
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -271,22 +281,50 @@ def _even_moments(columns: Float64, moments: Float64) -> None:
 
 
 @kernel
-def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
-    """Write `box_of` columns (3, n) of the world frame: centre, size and quaternion, (10,)."""
-    upright = np.zeros(columns.shape, np.float64)
+def _third_neighbours(columns: Float64, axes: Float64) -> tuple[Float64, Float64]:
+    """Columns (3, n), turned to axes, and their squared distances (n,) from the third neighbour.
+
+    Of few points, all distances are 0.
+    """
+    count = columns.shape[1]
+    upright, squared = np.zeros(columns.shape, np.float64), np.zeros(count, np.float64)
     for axis in range(3):
         for k in range(3):
             if axes[axis, k] != 0.0:
-                for place in range(columns.shape[1]):
+                for place in range(count):
                     upright[axis, place] += axes[axis, k] * columns[k, place]
-    kept = _without_outliers(upright)
+    ordered, widest = _along_widest(upright)
+    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
+    for row in range(count if count > FEW_POINTS else 0):
+        # Squared distances of the three nearest points so far. Without branches: on new points, no
+        # processor predicts them.
+        near_1 = near_2 = near_3 = np.inf
+        for step in (1, -1):
+            other = row + step
+            while 0 <= other < count:
+                apart = along[other] - along[row]
+                if apart * apart >= near_3:
+                    break
+                step_x, step_y, step_z = x[other] - x[row], y[other] - y[row], z[other] - z[row]
+                found = step_x * step_x + step_y * step_y + step_z * step_z
+                near_3 = min(near_3, max(near_2, found))
+                near_2 = min(near_2, max(near_1, found))
+                near_1 = min(near_1, found)
+                other += step
+        squared[row] = near_3
+    return ordered, squared
+
+
+@kernel
+def _box(upright: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
+    """Write the box around columns (3, n), turned to axes: centre, size and quaternion, (10,)."""
     # Vertical bounds, and horizontal ones along the axes of each heading.
     low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
     lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
     for step in range(len(_HEADINGS)):
         lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
-    for place in range(kept.shape[1]):
-        x, y, z = kept[0, place], kept[1, place], kept[2, place]
+    for place in range(upright.shape[1]):
+        x, y, z = upright[0, place], upright[1, place], upright[2, place]
         low, high = min(low, z), max(high, z)
         # The compiler makes vectors of this.
         for step in range(len(_HEADINGS)):
@@ -316,71 +354,3 @@ def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> N
     sign = -1.0 if qw * cos - qz * sin < 0 else 1.0
     box[6], box[7] = sign * (qx * cos + qy * sin), sign * (qy * cos - qx * sin)
     box[8], box[9] = sign * (qz * cos + qw * sin), sign * (qw * cos - qz * sin)
-
-
-@kernel
-def _without_outliers(columns: Float64) -> Float64:
-    """The points, columns (3, n), that have neighbours as close as the others have."""
-    count = columns.shape[1]
-    if count <= 6:
-        return columns
-    ordered, widest = _along_widest(columns)
-    x, y, z, along = ordered[0], ordered[1], ordered[2], ordered[widest]
-    last, sorted_partly = np.empty(count, np.float64), np.empty(count, np.float64)
-    for row in range(count):
-        # Squared distances of the three nearest points so far. Without branches: on new points, no
-        # processor predicts them.
-        near_1 = near_2 = near_3 = np.inf
-        for step in (1, -1):
-            other = row + step
-            while 0 <= other < count:
-                apart = along[other] - along[row]
-                if apart * apart >= near_3:
-                    break
-                step_x, step_y, step_z = x[other] - x[row], y[other] - y[row], z[other] - z[row]
-                squared = step_x * step_x + step_y * step_y + step_z * step_z
-                near_3 = min(near_3, max(near_2, squared))
-                near_2 = min(near_2, max(near_1, squared))
-                near_1 = min(near_1, squared)
-                other += step
-        last[row] = sorted_partly[row] = near_3
-    most = OUTLIER_FACTOR**2 * _median(sorted_partly)
-    size = 0
-    for row in range(count):
-        size += int(last[row] <= most)
-    kept, place = np.empty((3, size), np.float64), 0
-    for row in range(count):
-        if last[row] <= most:
-            for axis in range(3):
-                kept[axis, place] = ordered[axis, row]
-            place += 1
-    return kept
-
-
-@kernel
-def _median(values: Float64) -> float:
-    """Median; the values are moved (Hoare's selection)."""
-    low, high, middle = 0, len(values) - 1, len(values) // 2
-    while low < high:
-        pivot, left, right = values[(low + high) // 2], low, high
-        while left <= right:
-            while values[left] < pivot:
-                left += 1
-            while values[right] > pivot:
-                right -= 1
-            if left <= right:
-                values[left], values[right] = values[right], values[left]
-                left, right = left + 1, right - 1
-        if middle <= right:
-            high = right
-        elif middle >= left:
-            low = left
-        else:
-            high = low
-    median: float = values[middle]
-    if len(values) % 2 == 0:
-        before = values[0]
-        for place in range(1, middle):
-            before = max(before, values[place])
-        median = (before + median) / 2.0
-    return median

@@ -39,20 +39,10 @@ def valid_depth(depth_m: Float32) -> Float32:
     """
     image_m = read_only(depth_m, np.float32)
     # The bits of finite depths that are not negative are below those of infinity.
-    is_valid = image_m.view(np.uint32).max(initial=0) < 0x7F800000
-    return image_m if is_valid else read_only(_valid_depth(image_m))
-
-
-@kernel
-def _valid_depth(depth_m: Float32) -> Float32:
-    height, width = depth_m.shape
-    valid = np.empty((height, width), np.float32)
-    zero, infinity = np.float32(0), np.float32(np.inf)
-    for row in range(height):
-        for column in range(width):
-            depth = depth_m[row, column]
-            valid[row, column] = depth if (depth > zero) & (depth < infinity) else zero
-    return valid
+    bits, infinity = image_m.view(np.uint32), np.uint32(0x7F800000)
+    if bits.max(initial=0) < infinity:
+        return image_m
+    return read_only((bits * (bits < infinity)).view(np.float32))
 
 
 # --- Depth refinement in the spatial domain (Eq. 1).
@@ -153,13 +143,6 @@ def _masks_of(
 
 
 @kernel
-def _ordered(a: np.int32, b: np.int32, c: np.int32) -> tuple[np.int32, np.int32, np.int32]:
-    """Three numbers in ascending order."""
-    low, high = min(a, b), max(a, b)
-    return min(low, c), max(low, min(high, c)), max(high, c)
-
-
-@kernel
 def _spatial_inliers(
     depth_m: Float32, runs: Int32, tau: float, epsilon_m: float
 ) -> tuple[Int32, Int32, Float32]:
@@ -184,11 +167,12 @@ def _spatial_inliers(
         shift = first - (start - 1)
         low_here, middle_here, high_here = lows[shift:], middles[shift:], highs[shift:]
         for step in range(here.size):
-            low_here[step], middle_here[step], high_here[step] = _ordered(
-                np.float32(above[step]).view(np.int32),
-                np.float32(here[step]).view(np.int32),
-                np.float32(below[step]).view(np.int32),
-            )
+            a = np.float32(above[step]).view(np.int32)
+            b = np.float32(here[step]).view(np.int32)
+            c = np.float32(below[step]).view(np.int32)
+            low, high = min(a, b), max(a, b)
+            low_here[step], high_here[step] = min(low, c), max(high, c)
+            middle_here[step] = max(low, min(high, c))
         end_here = shift + here.size
         for rank in range(3):
             if shift:
@@ -200,9 +184,10 @@ def _spatial_inliers(
         run_m = depth_m[row, start:stop]
         for step in range(run_m.size):
             low = max(lows[step], max(lows[step + 1], lows[step + 2]))
-            _, middle, _ = _ordered(middles[step], middles[step + 1], middles[step + 2])
             high = min(highs[step], min(highs[step + 1], highs[step + 2]))
-            medians[step] = _ordered(low, middle, high)[1]
+            a, b, c = middles[step], middles[step + 1], middles[step + 2]
+            middle = max(min(a, b), min(max(a, b), c))
+            medians[step] = max(min(low, middle), min(max(low, middle), high))
         for step in range(run_m.size):
             depth = np.float64(run_m[step])
             median = np.float64(np.int32(medians[step]).view(np.float32))

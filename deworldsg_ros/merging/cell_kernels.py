@@ -416,21 +416,6 @@ def _meet(
 
 
 @kernel
-def rows_of(table: TableArrays, first: int) -> Int64:
-    """Rows of an owner from its first one on."""
-    nexts = table[7]
-    row, count = first, 0
-    while row >= 0:
-        row = nexts[row]
-        count += 1
-    rows, row = np.empty(count, np.int64), first
-    for index in range(count):
-        rows[index] = row
-        row = nexts[row]
-    return rows
-
-
-@kernel
 def rehash(table: TableArrays, used: int, larger: TableArrays, firsts: Int64) -> int:
     """Copy all rows with an owner to an empty table; returns their number.
 

@@ -337,8 +337,11 @@ class VoxelMap:
 
     def _rows_of(self, owner: int) -> Int64:
         """Rows of an owner."""
-        first = int(self._firsts[owner]) if owner < len(self._firsts) else -1
-        return cell_kernels.rows_of(self._table[:], first)
+        rows, row = [], int(self._firsts[owner]) if owner < len(self._firsts) else -1
+        while row >= 0:
+            rows.append(row)
+            row = int(self._table.nexts[row])
+        return np.array(rows, np.int64)
 
     def _rows_at(self, owners: Int64, sets: CellSets) -> tuple[Int64, Bool]:
         """Rows of the blocks of sets where the owner of the set has cells, and which blocks do."""

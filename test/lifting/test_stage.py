@@ -277,7 +277,6 @@ def test_inputs_of_another_size_or_range_are_refused(change, reason):
 def test_warm_up_compiles_everything_that_a_frame_needs():
     Lifting(LiftingConfig()).warm_up()
     entry_points = (
-        refine._valid_depth,
         refine._masks_of,
         refine._spatial_inliers,
         refine._dominant_layer,

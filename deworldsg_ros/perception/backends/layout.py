@@ -126,28 +126,26 @@ CANDIDATES_PER_POINT = 3
 
 
 @kernel
-def _is_inner(
-    depth_m: Float32, instances: UInt16, y: int, x: int, margin: int, step_m: float
-) -> bool:
+def _is_inner(depth_m: Float32, instances: UInt16, y: int, x: int, step_m: float) -> bool:
     """Whether a pixel lies inside its mask and on one surface with the pixels around it.
 
-    All pixels within `margin` have its label. Along the row and along the column, its depth is
+    All pixels within `BORDER_PX` have its label. Along the row and along the column, its depth is
     within `step_m` of the mean of the two pixels at that distance: on a plane, however slanted, it
     equals their mean. A neighbour without depth, or outside the image, does not count.
     """
     height, width = instances.shape
     label = instances[y, x]
-    for row in range(max(y - margin, 0), min(y + margin + 1, height)):
-        for column in range(max(x - margin, 0), min(x + margin + 1, width)):
+    for row in range(max(y - BORDER_PX, 0), min(y + BORDER_PX + 1, height)):
+        for column in range(max(x - BORDER_PX, 0), min(x + BORDER_PX + 1, width)):
             if instances[row, column] != label:
                 return False
     depth = depth_m[y, x]
-    if margin <= y < height - margin:
-        a, b = depth_m[y - margin, x], depth_m[y + margin, x]
+    if BORDER_PX <= y < height - BORDER_PX:
+        a, b = depth_m[y - BORDER_PX, x], depth_m[y + BORDER_PX, x]
         if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
             return False
-    if margin <= x < width - margin:
-        a, b = depth_m[y, x - margin], depth_m[y, x + margin]
+    if BORDER_PX <= x < width - BORDER_PX:
+        a, b = depth_m[y, x - BORDER_PX], depth_m[y, x + BORDER_PX]
         if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
             return False
     return True
@@ -188,7 +186,7 @@ def sample_pixels(
                 slot = ends[row] - quotas[row] + taken[row]
                 candidates[slot, 0], candidates[slot, 1] = y, x
                 step_m = SURFACE_STEP_M + SURFACE_STEP_PER_M * depth_m[y, x] ** 2
-                inner[slot] = _is_inner(depth_m, instances, y, x, BORDER_PX, step_m)
+                inner[slot] = _is_inner(depth_m, instances, y, x, step_m)
                 taken[row] += 1
             seen[row] += 1
     pixels = np.empty((count * most, 2), np.int64)
