@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 from deworldsg_ros.scene.camera import quaternion_from_rotation
 from deworldsg_ros.scene.checks import check_array
 from deworldsg_ros.scene.limits import MAX_GRAPH_COORDINATE_M
@@ -75,12 +75,11 @@ def extents_of(
         rows: (n,).
         up: unit vector against gravity.
     """
-    axes, quat_axes = _frame_of(tuple(up))
-    measured = np.empty((len(rows), 22))
-    for row, result in zip(rows, measured):
-        points = points_world[row, : counts[row]]
-        _even_moments(_columns(points), result[:12])
-        _box(_without_outliers(points[:MOST_POINTS], axes), axes, quat_axes, result[12:])
+    frame, measured = _frame_of(tuple(up)), np.empty((len(rows), 22))
+    for row, count, result in zip(rows.tolist(), counts[rows].tolist(), measured):
+        columns = _columns(points_world[row, :count])
+        _even_moments(columns, result[:12])
+        _box(columns, *frame, result[12:])
     return [
         Extent(row[:3], row[3:12], wire.GravityBox(row[12:15], row[15:18], row[18:]))
         for row in _rounded(measured).tolist()
@@ -128,8 +127,8 @@ def box_of(points_world: Float32 | Float64, up: Sequence[float]) -> wire.Gravity
         ValueError: without points, or for one that is not finite or out of reach.
     """
     _check_points(points_world)
-    box, (axes, quat_axes) = np.empty(10), _frame_of(tuple(up))
-    _box(_without_outliers(points_world[:MOST_POINTS], axes), axes, quat_axes, box)
+    box = np.empty(10)
+    _box(_columns(points_world[:MOST_POINTS]), *_frame_of(tuple(up)), box)
     return wire.GravityBox(
         rounded(box[:3], BOX_DECIMALS),
         rounded(box[3:6], BOX_DECIMALS),
@@ -150,12 +149,12 @@ def _columns(points: Float32 | Float64) -> Float64:
     return np.ascontiguousarray(points.T, np.float64)
 
 
-def _without_outliers(points: Float32 | Float64, axes: Float64) -> Float64:
-    """The points, turned to axes (3, m), that have neighbours as close as the others have."""
-    upright, squared = _third_neighbours(_columns(points), axes)
+def _box(columns: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
+    """Write `box_of` columns (3, n): centre, size and quaternion, (10,)."""
+    upright, squared = _third_neighbours(columns, axes)
     ordered, middle = np.sort(squared), (len(squared) - 1) // 2
     median = (ordered[middle] + ordered[len(squared) // 2]) / 2.0
-    return np.compress(squared <= OUTLIER_FACTOR**2 * median, upright, axis=1)
+    _box_around(upright, squared <= OUTLIER_FACTOR**2 * median, axes, quat_axes, box)
 
 
 def horizontal_axes(up: Sequence[float]) -> Float64:
@@ -282,12 +281,12 @@ def _even_moments(columns: Float64, moments: Float64) -> None:
 
 @kernel
 def _third_neighbours(columns: Float64, axes: Float64) -> tuple[Float64, Float64]:
-    """Columns (3, n), turned to axes, and their squared distances (n,) from the third neighbour.
+    """The first of columns (3, n), turned to axes, and squared distances from the third neighbour.
 
     Of few points, all distances are 0.
     """
-    count = columns.shape[1]
-    upright, squared = np.zeros(columns.shape, np.float64), np.zeros(count, np.float64)
+    count = min(columns.shape[1], MOST_POINTS)
+    upright, squared = np.zeros((3, count), np.float64), np.zeros(count, np.float64)
     for axis in range(3):
         for k in range(3):
             if axes[axis, k] != 0.0:
@@ -316,14 +315,18 @@ def _third_neighbours(columns: Float64, axes: Float64) -> tuple[Float64, Float64
 
 
 @kernel
-def _box(upright: Float64, axes: Float64, quat_axes: Float64, box: Float64) -> None:
-    """Write the box around columns (3, n), turned to axes: centre, size and quaternion, (10,)."""
+def _box_around(
+    upright: Float64, kept: Bool, axes: Float64, quat_axes: Float64, box: Float64
+) -> None:
+    """Write the box around those of columns (3, n), turned to axes, that are kept (n,)."""
     # Vertical bounds, and horizontal ones along the axes of each heading.
     low, high, bounds = np.inf, -np.inf, np.empty((4, ALIGNED_HEADINGS), np.float64)
     lefts, rights, backs, fronts = bounds[0], bounds[1], bounds[2], bounds[3]
     for step in range(len(_HEADINGS)):
         lefts[step], rights[step], backs[step], fronts[step] = np.inf, -np.inf, np.inf, -np.inf
     for place in range(upright.shape[1]):
+        if not kept[place]:
+            continue
         x, y, z = upright[0, place], upright[1, place], upright[2, place]
         low, high = min(low, z), max(high, z)
         # The compiler makes vectors of this.
