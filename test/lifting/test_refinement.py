@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from support.reference_lifting import kept_layer, reference_lift
 
 from deworldsg_ros.config import LiftingConfig
-from deworldsg_ros.lifting import refine
 from deworldsg_ros.lifting.refine import dominant_layer, masks_of, spatial_inliers, valid_depth
-from deworldsg_ros.lifting.stage import LiftingConstants
+from deworldsg_ros.lifting.stage import LiftingConstants, mask_pixels
 from deworldsg_ros.scene.camera import Intrinsics
 
 PAPER, PRINTED = LiftingConfig(), LiftingConstants()
@@ -126,4 +125,4 @@ def test_runs_of_the_masks(seed, height, width, ids):
         mask, runs = instances == k + 1, masks.runs_of(k)
         assert set(runs[:, 3].tolist()) <= {k} and (np.diff(runs[:, 0]) >= 0).all()
         assert masks.sizes[k] == mask.sum()
-        assert refine.valid_pixel_count(depth, runs) == (mask & (depth > 0)).sum()
+        assert len(mask_pixels(depth, runs)) == (mask & (depth > 0)).sum()

@@ -254,7 +254,7 @@ def test_boxes_may_overlap_leave_the_image_and_have_no_depth():
 
 def test_warm_up_compiles_everything_that_a_frame_needs():
     Lifting(LiftingConfig()).warm_up()
-    names = ("valid_depth", "is_valid", "masks_of", "spatial_inliers", "dominant_layer")
+    names = ("masks_of", "spatial_inliers", "dominant_layer")
     kernels = [*(getattr(refine, f"_{name}") for name in names), stage._estimate]
     # Other tests of this process may have compiled more.
     known = [len(kernel.signatures) for kernel in kernels]
