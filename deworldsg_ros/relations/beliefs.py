@@ -346,14 +346,18 @@ class RobustBeliefs:
     def _index(self, rows: Int64, open_: Bool, classes: Int64) -> None:
         """Note the class pairs whose prior may enter pairs."""
         beliefs = self._table.beliefs
-        if not open_.any() and not beliefs["open"][rows].any():
+        before = beliefs["open"][rows] > 0
+        may_enter = open_ | before
+        if not may_enter.any():
             return
-        same = (beliefs["open"][rows] == open_) & (beliefs["classes"][rows] == classes)
+        differ = (before != open_) | (beliefs["classes"][rows] != classes)
+        places = (differ.any(axis=1) & may_enter.any(axis=1)).nonzero()[0]
         beliefs["open"][rows], beliefs["classes"][rows] = open_, classes
-        for index, end in np.argwhere(open_ & ~same.all(axis=1, keepdims=True)).tolist():
+        for index in places.tolist():
             both = classes[index].tolist()
-            pair = both[end], both[1 - end]
-            self._by_classes.setdefault(pair, set()).add(int(rows[index]))
+            for end in open_[index].nonzero()[0].tolist():
+                pair = both[end], both[1 - end]
+                self._by_classes.setdefault(pair, set()).add(int(rows[index]))
 
     def _open_rows(self, classes: ClassPair) -> set[int]:
         """Rows of the pairs into which the prior of a class pair may enter."""

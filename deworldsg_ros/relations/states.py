@@ -193,8 +193,8 @@ class PredicateNames(NamedTuple):
 
 def related_pairs(beliefs: NDArray[Any], rows: Int64) -> Bool:
     """Whether pairs (k,) may be related, or have votes beyond the physical relations; (k,) bool."""
-    free = beliefs["relations"][:, :, NONE][rows].min(axis=1)
-    related: Bool = free < 1.0 - MIN_RELATED
+    there, back = beliefs["relations"][:, :, NONE][rows].T
+    related: Bool = np.minimum(there, back) < 1.0 - MIN_RELATED
     return related | (beliefs["other_votes"][rows] >= MIN_OTHER_VOTES)
 
 
