@@ -545,7 +545,7 @@ def compile_kernels(console: Console) -> None:
 
 
 def _compile(part: str) -> None:
-    # The compiler's objects live to its end. To look at them again and again takes 8 % of the time.
+    # The compiler's objects live to its end. To look at them again and again takes 8 % of the time,
+    # to free them after each part 6 % (and saves 0.1 of 0.7 GB).
     gc.disable()
     PARTS[part](Config())
-    gc.collect()  # 0.4 GB
