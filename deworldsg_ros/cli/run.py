@@ -508,9 +508,9 @@ def show_recording(
 PARTS: dict[str, Callable[[Config], object]] = {
     "merging": lambda config: warm_up(config, "merging"),
     "pairs": lambda config: warm_up(config, "pairs"),
+    "perception": lambda config: build_perception(config.perception),
     "lifting": lambda config: Lifting(config.lifting).warm_up(),
     "drift": lambda config: warm_up(config, "drift"),
-    "perception": lambda config: build_perception(config.perception),
 }
 
 
