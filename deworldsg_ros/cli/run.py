@@ -508,9 +508,9 @@ def show_recording(
 PARTS: dict[str, Callable[[Config], object]] = {
     "merging": lambda config: warm_up(config, "merging"),
     "pairs": lambda config: warm_up(config, "pairs"),
+    "perception": lambda config: build_perception(config.perception),
     "lifting": lambda config: Lifting(config.lifting).warm_up(),
     "drift": lambda config: warm_up(config, "drift"),
-    "perception": lambda config: build_perception(config.perception),
 }
 
 
@@ -545,7 +545,7 @@ def compile_kernels(console: Console) -> None:
 
 
 def _compile(part: str) -> None:
-    # The compiler's objects live to its end. To look at them again and again takes 8 % of the time.
+    # The compiler's objects live to its end. To look at them again and again takes 8 % of the time,
+    # to free them after each part 6 % (and saves 0.1 of 0.7 GB).
     gc.disable()
     PARTS[part](Config())
-    gc.collect()  # 0.4 GB
