@@ -42,6 +42,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
         builder.integrate(frame(stamp, *OBJECTS))
     builder.graph.add_visual(1, 2, np.ones(3), 10**8)
     builder.graph.add_visual(3, 2, np.ones(3), 10**8)
+    builder.graph.add_votes(1, 2, np.ones((2, 3)) / 3)
     path = tmp_path_factory.mktemp("map") / "good.map"
     write_map(builder, path)
     assert len(read_map(CONFIG, path).graph) == 3
@@ -119,7 +120,6 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "probabilities that sum to 2": changed("class_probabilities", put(0, 0.5)),
     "duplicate ids": changed("ids", put(1, 1)),
     "next_id below an id": header(next_id=2),
-    "a revision below that of a node": header(revision=0),
     "existence of 7": changed("existence", put(0, 7.0)),
     "no observations": changed("observations", put(0, 0)),
     "a weight of 0": changed("weights", put(0, 0.0)),
@@ -133,8 +133,10 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
     "edge logits of infinity": changed("edge_visual_logits", put((0, 0), np.inf)),
     "negative frames of an edge": changed("edge_counts", put((0, 0), -1)),
     "logits of an edge without frames": changed("edge_counts", put((0, 0), 0)),
-    "votes of NaN": changed("vote_counts", lambda a: a * np.nan if len(a) else np.ones((1, 2, 3))),
-    "more votes than frames": changed("vote_known", lambda a: a + [[0, 0, 1]]),
+    "votes of NaN": changed("vote_counts", put((0, 0, 0), np.nan)),
+    "more votes than frames": changed("vote_counts", put((0, 0, 0), 99.0)),
+    "votes that are not there": changed("vote_known", put((1, 1), 1)),
+    "votes with more columns": changed("vote_known", lambda a: np.tile(a, 2)),
     "a live node that was removed": lambda arrays: {**arrays, "successors": np.array([[1, 0]])},
     "a joint pair of one node": changed("merging.joint", put((0, 1), 1)),
     "two records of one node": field("node_id", 1, 1),

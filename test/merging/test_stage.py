@@ -18,8 +18,7 @@ from support.reference_merging import ReferenceMerging
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import PaperMerging
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
+from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import transform
 
 CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])
@@ -249,22 +248,3 @@ def test_an_empty_frame_is_remembered() -> None:
     assert ids == [[]]
     assert graph.nodes_of_frame(5) == []
     assert graph.nodes_of_frame(6) is None
-
-
-def test_another_vocabulary_or_frame_is_refused() -> None:
-    graph = SceneGraph(VOCABULARY, "world")
-    merging = PaperMerging(MergingConfig())
-    with pytest.raises(RefusedInput, match="expected 'world'") as refused:
-        merging.merge(graph, frame_of(1, frame_id="map"))
-    assert refused.value.reason == "wrong_frame"
-    other = local_graph(
-        1,
-        np.zeros((0, 3)),
-        np.zeros((0, 3, 3)),
-        np.zeros((0, 1)),
-        vocabulary=Vocabulary(("cup",), ("on",)),
-    )
-    with pytest.raises(RefusedInput) as refused:
-        merging.merge(graph, other)
-    assert refused.value.reason == "vocabulary_mismatch"
-    assert graph.revision == 0

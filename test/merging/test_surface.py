@@ -12,8 +12,6 @@ from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.surface_map import CELL_M
-from deworldsg_ros.scene.errors import RefusedInput
-from deworldsg_ros.scene.frame_graph import Vocabulary
 
 
 @pytest.fixture
@@ -213,16 +211,3 @@ def test_the_result_does_not_depend_on_the_world_frame() -> None:
         results.append((ids, means.copy()))
     assert results[0][0] == results[1][0] == [[1], [1, 2], [2, 1]]
     assert results[0][1] == pytest.approx(results[1][1], abs=1e-5)
-
-
-def test_a_refused_local_graph_changes_nothing(graph, merging) -> None:
-    merging.merge(graph, frame(0, (WHOLE, TABLE)))
-    revision = graph.revision
-    for changes, reason in (
-        ({"vocabulary": Vocabulary(("a", "b", "c", "d"), ("x", "y", "z"))}, "vocabulary_mismatch"),
-        ({"frame_id": "odom"}, "wrong_frame"),
-    ):
-        with pytest.raises(RefusedInput) as refused:
-            merging.merge(graph, frame(1, (WHOLE, TABLE), **changes))
-        assert refused.value.reason == reason
-    assert graph.revision == revision

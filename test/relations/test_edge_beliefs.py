@@ -27,14 +27,19 @@ from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
 from deworldsg_ros.graph import publication
-from deworldsg_ros.graph.pairs import ends_of, frame_votes
+from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import beliefs
-from deworldsg_ros.relations.beliefs import MAX_DISTANCE_M, EdgeBeliefs, PredictedPrior
+from deworldsg_ros.relations.beliefs import (
+    MAX_DISTANCE_M,
+    EdgeBeliefs,
+    PredictedPrior,
+    RobustBeliefs,
+    fuse_prior,
+)
 from deworldsg_ros.relations.pairs import PairTable
 from deworldsg_ros.relations.paper import Prior, entropy_nats, fuse_distributions
 from deworldsg_ros.relations.physics import load_physics_model
-from deworldsg_ros.relations.settled import RobustBeliefs, fuse_prior
 from deworldsg_ros.relations.states import DECIMALS, MIN_PROBABILITY
 from deworldsg_ros.scene.frame_graph import RelationEvidence, Relations
 from deworldsg_ros.wire import messages as wire
@@ -67,11 +72,12 @@ def beliefs_of(builder: GraphBuilder, of: Config) -> dict[tuple[int, int], np.nd
     prior: Prior = builder.prior
     if relations.world_model == "physics":
         prior = PredictedPrior(builder.graph.vocabulary)
-        prior.follow(table, table.changed_pairs)
+        prior.follow(table, table.changed_rows)
     found = RobustBeliefs(of, builder.graph, table).refresh(prior)
+    ids = builder.graph.pairs.rows["ids"][found.rows].tolist()
     return {
         pair[::step]: found.probabilities[index, end]
-        for index, pair in enumerate(map(ends_of, found.pairs))
+        for index, pair in enumerate(map(tuple, ids))
         for end, step in ((0, 1), (1, -1))
     }
 

@@ -63,13 +63,15 @@ def test_a_refused_local_graph_leaves_the_graph_as_it_was(config: Config) -> Non
     builder.update()
     good, before = hostile_local_graph(rng, 6 * 10**8), state_of(builder)
     other = Vocabulary(("a", "b", "c", "d"), VOCABULARY.predicates)
-    for change in (
-        {"stamp_ns": 5 * 10**8},
-        {"frame_id": "odom"},
-        {"vocabulary": other},
+    for change, reason in (
+        ({"stamp_ns": 5 * 10**8}, "out_of_order"),
+        ({"stamp_ns": 4 * 10**8}, "out_of_order"),
+        ({"frame_id": "odom"}, "wrong_frame"),
+        ({"vocabulary": other}, "vocabulary_mismatch"),
     ):
-        with pytest.raises(RefusedInput):
+        with pytest.raises(RefusedInput) as refused:
             builder.integrate(replace(good, **change))
+        assert refused.value.reason == reason
         assert state_of(builder) == before
         assert builder.update() is None
 

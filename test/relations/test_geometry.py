@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -17,54 +18,48 @@ from deworldsg_ros.relations.geometry import (
     SHAPE_POINTS,
     SOFT_RADIUS_M,
     TRIM_FRACTION,
-    NodeShapes,
+    centre_steps,
+    measure,
     pair_features,
     rotation_to_upright,
     upright,
 )
 from deworldsg_ros.relations.reach import REACH_M
+from deworldsg_ros.relations.states import SHAPE
 
 seeds = st.integers(0, 10_000)
 up_components = st.floats(-1, 1, allow_subnormal=False)
-# Features of heights over the floor alone.
-OVER_FLOOR = ("bottom_over_floor_m", "object_bottom_over_floor_m")
 
 
-class Clouds(NodeShapes):
-    """Shapes of clouds of points, with the ids 1, 2, … and the points (n, K, 3)."""
+class Clouds(NamedTuple):
+    """Clouds of points, in the upright frame, with their shapes."""
 
+    shapes: np.ndarray
     points: np.ndarray
 
+    def of(self, place: int) -> np.ndarray:
+        return self.points[place, : self.shapes["count"][place]].astype(float)
 
-def shapes_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> Clouds:
-    shapes = Clouds()
-    shapes.extend(range(1, len(clouds) + 1))
-    counts = np.array([len(points) for points in clouds], np.int64)
-    shapes.points = np.zeros((len(clouds), max(counts, default=0), 3), np.float32)
-    for row, points in enumerate(clouds):
-        shapes.points[row, : len(points)] = points
+
+def clouds_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> Clouds:
     R = np.eye(3) if R is None else R
-    rows = np.arange(len(clouds))
-    shapes.put(rows, shapes.points, counts, rows, R)
-    shapes.points = upright(shapes.points, R)
-    return shapes
+    counts = np.array([len(points) for points in clouds], np.int64)
+    shapes = np.zeros(len(clouds), SHAPE)
+    points = np.zeros((len(clouds), max(counts, default=0), 3), np.float32)
+    for place, cloud in enumerate(clouds):
+        points[place, : len(cloud)] = cloud
+    measure(shapes, np.arange(len(clouds)), points, counts, R)
+    return Clouds(shapes, upright(points, R))
 
 
-def features_of(shapes: Clouds, pairs: np.ndarray, floor_m: float = 0.0) -> np.ndarray:
+def features_of(clouds: Clouds, pairs: np.ndarray, floor_m: float = 0.0) -> np.ndarray:
     """Features (m, F) of ordered pairs; those of the opposite direction are compared as well."""
-    columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
     first, second = np.ascontiguousarray(pairs.T)
-    there, back = pair_features(first, second, *columns, shapes.points, floor_m)
-    again, reverse = pair_features(second, first, *columns, shapes.points, floor_m)
+    there, back = pair_features(first, second, *clouds, floor_m)
+    again, reverse = pair_features(second, first, *clouds, floor_m)
     np.testing.assert_allclose(back, again, atol=1e-12)
     np.testing.assert_allclose(there, reverse, atol=1e-12)
     return there
-
-
-def named(shapes: Clouds, floor_m: float = 0.0) -> dict[str, float]:
-    """Features of the first two shapes by name."""
-    row = features_of(shapes, np.array([[0, 1]]), floor_m)[0]
-    return dict(zip(FEATURES, row.tolist()))
 
 
 def every_pair(count: int) -> np.ndarray:
@@ -89,16 +84,17 @@ def random_clouds(seed: int, count: int = 4) -> list[np.ndarray]:
 # --- the reference -------------------------------------------------------------------------------
 
 
-def reference(shapes: Clouds, a: int, b: int, floor_m: float) -> dict[str, float]:
+def reference(clouds: Clouds, a: int, b: int, floor_m: float) -> dict[str, float]:
     """The features by name, a definition a line."""
-    (low_a, low_b), (high_a, high_b) = shapes.low[[a, b]], shapes.high[[a, b]]
-    points_a, points_b = (shapes.points[r, : shapes.counts[r]].astype(float) for r in (a, b))
+    shapes = clouds.shapes[[a, b]]
+    (low_a, low_b), (high_a, high_b) = shapes["low"], shapes["high"]
+    points_a, points_b = clouds.of(a), clouds.of(b)
     overlap = np.minimum(high_a, high_b) - np.maximum(low_a, low_b)
     footprints = [np.prod(np.maximum((high - low)[:2], 0.01)) for low, high in
                   ((low_a, high_a), (low_b, high_b))]  # fmt: skip
     shared = np.prod(np.maximum(overlap[:2], 0))
-    offset = shapes.means[a] - shapes.means[b]
-    spread = shapes.covariances[a] + shapes.covariances[b] + 1e-4 * np.eye(3)
+    offset = shapes["mean"][0] - shapes["mean"][1]
+    spread = shapes["covariance"].sum(axis=0) + 1e-4 * np.eye(3)
     sizes_a, sizes_b = log_sizes(low_a, high_a), log_sizes(low_b, high_b)
     return {
         "gap_m": float(np.hypot(*np.maximum(-overlap[:2], 0))),
@@ -170,8 +166,8 @@ def enclosure(low, high, points) -> float:
     beside = points[(points[:, 2] >= low[2] + 0.02) & (points[:, 2] <= high[2] + 0.1), :2] - middle
     reach = REACH_M / 2 + (high - low)[:2].max() / 2
     beside = beside[(beside**2).sum(axis=1) < reach**2]
-    turns = np.arctan2(beside[:, 1], beside[:, 0]) / (2 * np.pi) + 0.5
-    return len(set(np.minimum(8 - 1, (8 * turns).astype(int)).tolist())) / 8
+    x, y = beside.T
+    return len(set(zip(x >= 0, y >= 0, np.abs(y) >= np.abs(x)))) / 8
 
 
 def within(points, low, high, margin_m) -> np.ndarray:
@@ -189,89 +185,84 @@ def distance(points_a, points_b) -> float:
 @settings(max_examples=30, deadline=None)
 @given(seed=seeds)
 def test_features_equal_those_of_the_reference(seed: int) -> None:
-    shapes = shapes_of(*random_clouds(seed))
-    pairs = every_pair(len(shapes))
-    found = features_of(shapes, pairs, -0.7)
+    clouds = clouds_of(*random_clouds(seed))
+    pairs = every_pair(len(clouds.shapes))
+    found = features_of(clouds, pairs, -0.7)
     assert found.shape == (len(pairs), len(FEATURES))
     for (a, b), row in zip(pairs.tolist(), found):
-        expected = reference(shapes, a, b, -0.7)
+        expected = reference(clouds, a, b, -0.7)
         assert tuple(expected) == FEATURES
         for name, value in zip(FEATURES, row.tolist()):
             assert value == pytest.approx(expected[name], rel=1e-6, abs=1e-6), name
+    assert features_of(clouds, every_pair(0)).shape == (0, len(FEATURES))
+    middle = (clouds.shapes["low"] + clouds.shapes["high"])[:, :2] / 2
+    steps = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1)
+    np.testing.assert_allclose(centre_steps(clouds.shapes, *pairs.T), steps, rtol=1e-12)
 
 
-def test_no_pairs() -> None:
-    shapes = shapes_of(*random_clouds(0))
-    assert features_of(shapes, every_pair(0)).shape == (0, len(FEATURES))
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds)
-def test_features_do_not_depend_on_where_the_room_is(seed: int) -> None:
-    clouds = random_clouds(seed)
-    offset = np.random.default_rng(seed).integers(-3, 4, 3).astype(float)
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds, kind=st.sampled_from(["place", "north", "up"]))
+def test_features_do_not_depend_on_the_world_frame(seed: int, kind: str) -> None:
+    clouds, rng = random_clouds(seed), np.random.default_rng(seed)
     pairs = every_pair(len(clouds))
-    here = features_of(shapes_of(*clouds), pairs)
-    there = features_of(shapes_of(*(points + offset for points in clouds)), pairs, offset[2])
-    np.testing.assert_allclose(here, there, atol=1e-6)
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds, quarters=st.integers(1, 3))
-def test_features_do_not_depend_on_where_north_is(seed: int, quarters: int) -> None:
-    clouds = random_clouds(seed)
-    turn = np.linalg.matrix_power(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), quarters)
-    pairs = every_pair(len(clouds))
-    here = features_of(shapes_of(*clouds), pairs)
-    there = features_of(shapes_of(*(points @ turn.T for points in clouds)), pairs)
-    np.testing.assert_allclose(here, there, atol=1e-6)
-
-
-@settings(max_examples=10, deadline=None)
-@given(seed=seeds)
-def test_features_do_not_depend_on_which_axis_of_the_world_is_up(seed: int) -> None:
-    clouds = random_clouds(seed)
-    R = rotation_to_upright(np.array([0.0, 1.0, 0.0]))
-    pairs = every_pair(len(clouds))
-    here = features_of(shapes_of(*clouds), pairs)
-    there = features_of(shapes_of(*(points @ R for points in clouds), R=R), pairs)
+    here = features_of(clouds_of(*clouds), pairs)
+    if kind == "place":
+        offset = rng.integers(-3, 4, 3).astype(float)
+        there = features_of(clouds_of(*(points + offset for points in clouds)), pairs, offset[2])
+    elif kind == "north":
+        quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        turn = np.linalg.matrix_power(quarter, int(rng.integers(1, 4)))
+        there = features_of(clouds_of(*(points @ turn.T for points in clouds)), pairs)
+    else:
+        R = rotation_to_upright(np.array([0.0, 1.0, 0.0]))
+        there = features_of(clouds_of(*(points @ R for points in clouds), R=R), pairs)
     np.testing.assert_allclose(here, there, atol=1e-5)
 
 
-def cloud(*parts, seed: int = 0) -> np.ndarray:
-    return surface(parts, np.random.default_rng(seed))
+CUP_ON_TABLE = ([box(0.3, 0.1, 0.74, 0.09, 0.09, 0.1)], table(0, 0).parts)
+ORANGE_IN_BOWL = ([box(0.0, 0.0, 0.02, 0.07, 0.07, 0.07)], bowl(0.0, 0.0, 0.0).parts)
+BOTTLE_AND_FRIDGE = (
+    thing("bottle", 0.3, 0.25, 0.74, 0.075, 0.075, 0.3).parts,
+    thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76).parts,
+)
 
 
-def test_a_cup_on_a_table() -> None:
-    shapes = shapes_of(cloud(box(0.3, 0.1, 0.74, 0.09, 0.09, 0.1)), cloud(*table(0, 0).parts))
-    seen = named(shapes)
-    assert seen["gap_m"] == 0 and seen["covered"] == 1 and seen["covers"] < 0.02
-    assert seen["overlap_small_m"] == pytest.approx(0.09, abs=0.02)
-    assert abs(seen["bottom_to_surface_m"]) < 0.02
-    assert abs(seen["soft_bottom_to_surface_m"]) < 0.02
-    assert seen["higher"] == 0 and seen["ring_points"] > np.log(3)
-    assert seen["bottom_over_floor_m"] == pytest.approx(0.74, abs=0.02)
-    assert seen["bottom_over_top_m"] == pytest.approx(0, abs=0.02)
-    assert seen["inside"] < 0.3 and seen["enclosed"] == 0
-    assert seen["distance_m"] < 0.05
-
-
-def test_an_orange_in_a_bowl() -> None:
-    shapes = shapes_of(
-        cloud(box(0.0, 0.0, 0.02, 0.07, 0.07, 0.07)), cloud(*bowl(0.0, 0.0, 0.0).parts)
-    )
-    seen = named(shapes)
-    assert seen["enclosed"] == 1
-    assert seen["inside"] > 0.6 and seen["around"] < 0.1 and seen["covered"] == 1
-
-
-def test_a_bottle_far_from_a_refrigerator() -> None:
-    bottle = thing("bottle", 0.3, 0.25, 0.74, 0.075, 0.075, 0.3)
-    fridge = thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76)
-    seen = named(shapes_of(cloud(*bottle.parts), cloud(*fridge.parts)))
-    assert seen["gap_m"] == pytest.approx(2.73, abs=0.03) and seen["distance_m"] == 1.0
-    assert seen["covered"] == seen["ring"] == seen["inside"] == seen["enclosed"] == 0
-    assert seen["bottom_to_surface_m"] == 1.0 and seen["soft_bottom_to_surface_m"] == 0.3
+@pytest.mark.parametrize(
+    ("parts", "ranges"),
+    [
+        pytest.param(
+            CUP_ON_TABLE,
+            {
+                "gap_m": (0, 0), "covered": (1, 1), "covers": (0, 0.02),
+                "overlap_small_m": (0.07, 0.11), "bottom_to_surface_m": (-0.02, 0.02),
+                "soft_bottom_to_surface_m": (-0.02, 0.02), "higher": (0, 0),
+                "ring_points": (np.log(3), 9), "bottom_over_floor_m": (0.72, 0.76),
+                "bottom_over_top_m": (-0.02, 0.02), "inside": (0, 0.3), "enclosed": (0, 0),
+                "distance_m": (0, 0.05),
+            },
+            id="a cup on a table",
+        ),
+        pytest.param(
+            ORANGE_IN_BOWL,
+            {"enclosed": (1, 1), "inside": (0.6, 1), "around": (0, 0.1), "covered": (1, 1)},
+            id="an orange in a bowl",
+        ),
+        pytest.param(
+            BOTTLE_AND_FRIDGE,
+            {
+                "gap_m": (2.7, 2.76), "distance_m": (1, 1), "covered": (0, 0), "ring": (0, 0),
+                "inside": (0, 0), "enclosed": (0, 0), "bottom_to_surface_m": (1, 1),
+                "soft_bottom_to_surface_m": (0.3, 0.3),
+            },
+            id="a bottle far from a refrigerator",
+        ),
+    ],
+)  # fmt: skip
+def test_features_of_known_pairs(parts, ranges: dict[str, tuple[float, float]]) -> None:
+    clouds = clouds_of(*(surface(boxes, np.random.default_rng(0)) for boxes in parts))
+    seen = dict(zip(FEATURES, features_of(clouds, np.array([[0, 1]]))[0].tolist()))
+    for name, (least, most) in ranges.items():
+        assert least <= seen[name] <= most, name
 
 
 # --- shapes --------------------------------------------------------------------------------------
@@ -280,19 +271,14 @@ def test_a_bottle_far_from_a_refrigerator() -> None:
 @pytest.mark.parametrize("count", [0, 1, 7, 300, 700])
 def test_the_shape_of_points(count: int) -> None:
     points = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
-    shapes = shapes_of(points)
+    (shape,) = clouds_of(points).shapes
     used = points[:SHAPE_POINTS]
-    assert shapes.counts[0] == len(used)
-    np.testing.assert_array_equal(shapes.points[0, : len(used)], used)
-    if not count:
-        return
-    np.testing.assert_allclose(shapes.means[0], used.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(
-        shapes.covariances[0],
-        np.cov(used.T, bias=True).reshape(3, 3) if count > 1 else 0,
-        atol=1e-6,
-    )
-    assert (shapes.low[0] <= shapes.high[0]).all()
+    assert shape["count"] == len(used)
+    if count:
+        spread = np.cov(used.T, bias=True).reshape(3, 3) if count > 1 else 0
+        np.testing.assert_allclose(shape["mean"], used.mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(shape["covariance"], spread, atol=1e-6)
+        assert (shape["low"] <= shape["high"]).all()
 
 
 @settings(max_examples=20, deadline=None)
@@ -300,35 +286,30 @@ def test_the_shape_of_points(count: int) -> None:
 def test_bounds_of_an_even_surface_are_those_of_the_object(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = rng.uniform(0.1, 1.0, 3)
-    points = rng.uniform(-0.5, 0.5, (512, 3)) * size
-    shapes = shapes_of(points)
-    np.testing.assert_allclose(shapes.high[0, :2], size[:2] / 2, atol=0.03)
-    np.testing.assert_allclose(shapes.low[0, :2], -size[:2] / 2, atol=0.03)
-    assert -size[2] / 2 <= shapes.low[0, 2] <= shapes.high[0, 2] <= size[2] / 2
+    (shape,) = clouds_of(rng.uniform(-0.5, 0.5, (512, 3)) * size).shapes
+    np.testing.assert_allclose(shape["high"][:2], size[:2] / 2, atol=0.03)
+    np.testing.assert_allclose(shape["low"][:2], -size[:2] / 2, atol=0.03)
+    assert -size[2] / 2 <= shape["low"][2] <= shape["high"][2] <= size[2] / 2
 
 
 def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.2, 0.2, (500, 3))
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (500, 3))
     flying = points.copy()
     flying[: int(TRIM_FRACTION * 500) - 2] += [3.0, -2.0, 2.5]
-    clean, dirty = shapes_of(points), shapes_of(flying)
-    np.testing.assert_allclose(dirty.low, clean.low, atol=0.02)
-    np.testing.assert_allclose(dirty.high, clean.high, atol=0.02)
+    clean, dirty = clouds_of(points, flying).shapes
+    np.testing.assert_allclose(dirty["low"], clean["low"], atol=0.02)
+    np.testing.assert_allclose(dirty["high"], clean["high"], atol=0.02)
 
 
-def test_a_shape_that_is_put_again_forgets_the_old_one() -> None:
-    clouds = random_clouds(3)
-    shapes = shapes_of(clouds[0], clouds[1])
-    points = clouds[2].astype(np.float32)
-    row = np.array([0])
-    shapes.put(row, points[None], np.array([len(points)]), row, np.eye(3))
-    shapes.points = np.zeros((2, 50, 3), np.float32)
-    for row, cloud in enumerate((points, clouds[1])):
-        shapes.points[row, : len(cloud)] = cloud
-    fresh = shapes_of(clouds[2], clouds[1])
-    pairs = every_pair(2)
-    np.testing.assert_array_equal(features_of(shapes, pairs), features_of(fresh, pairs))
+def test_a_shape_that_is_measured_again_forgets_the_old_one() -> None:
+    one, other = (clouds_of(cloud) for cloud in random_clouds(3)[:2])
+    for shapes, points in (one, other):
+        for again, turn in ((other, np.eye(3)), (one, rotation_to_upright(np.ones(3)))):
+            counts = again.shapes["count"].copy()
+            measure(shapes, np.array([0]), again.points, counts, turn)
+            fresh = clouds_of(again.of(0), R=turn)
+            assert (shapes == fresh.shapes).all()
+        assert len(points)
 
 
 # --- the upright frame ---------------------------------------------------------------------------

@@ -1,0 +1,315 @@
+"""The embedded world model: its file, its inputs, the votes of frames, and what each is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import softmax
+
+from deworldsg_ros.config import RelationsConfig
+from deworldsg_ros.relations.geometry import FEATURES
+from deworldsg_ros.relations.paper import entropy_nats
+from deworldsg_ros.relations.physics import (
+    INPUT_COUNT,
+    MAX_FLOOR_LOGIT,
+    MAX_INPUT,
+    PATH,
+    PairInputs,
+    PhysicsModel,
+    VoteScales,
+    believed_logits,
+    floor_odds,
+    load_physics_model,
+    relation_counts,
+    vote_logits,
+)
+from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
+from deworldsg_ros.relations.states import (
+    ABOVE,
+    DIRECTED,
+    NEAR,
+    NONE,
+    ON,
+    RELATIONS_OF_STATE,
+    SHAPE,
+    STATE_COUNT,
+    UNDER,
+    relation_of_predicates,
+)
+from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.scene.vocabulary import (
+    COCO_CLASSES,
+    VISUAL_GENOME_CLASSES,
+    fixed_table,
+    kind_table,
+)
+
+seeds = st.integers(0, 10_000)
+MODEL = load_physics_model()
+Arrays = dict[str, np.ndarray]
+
+
+def shipped() -> Arrays:
+    return {field.name: getattr(MODEL, field.name) for field in fields(PhysicsModel)}
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+def test_the_shipped_file_loads_and_is_small(tmp_path: Path) -> None:
+    assert PATH.stat().st_size <= 2 * 1024 * 1024
+    assert all(np.isfinite(values).all() for values in shipped().values())
+    assert (MODEL.input_scales > 0).all()
+    assert 0 < MODEL.votes.even < 1 and MODEL.votes.slope > 0 and MODEL.votes.n_half > 0
+    assert load_physics_model() is MODEL
+    np.savez(tmp_path / "same.npz", **shipped())
+    copy = load_physics_model(tmp_path / "same.npz")
+    for name, values in shipped().items():
+        np.testing.assert_array_equal(getattr(copy, name), values)
+
+
+def test_it_is_the_default_world_model_and_needs_no_clips() -> None:
+    assert "physics" in WORLD_MODELS and RelationsConfig().world_model == "physics"
+    assert build_world_model(RelationsConfig(world_model="physics")) is None
+
+
+def write_array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        pytest.param(lambda path: None, id="missing"),
+        pytest.param(lambda path: path.mkdir(), id="folder"),
+        pytest.param(lambda path: path.write_bytes(b""), id="empty"),
+        pytest.param(lambda path: path.write_text("hello"), id="text"),
+        pytest.param(lambda path: path.write_bytes(PATH.read_bytes()[:20_000]), id="cut"),
+        pytest.param(write_array, id="array"),
+    ],
+)
+def test_a_file_that_is_no_model_is_named(tmp_path: Path, write: Callable[[Path], object]) -> None:
+    path = tmp_path / "other.npz"
+    write(path)
+    with pytest.raises(ConfigurationError, match=r"other\.npz"):
+        load_physics_model(path)
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(PhysicsModel)])
+@pytest.mark.parametrize("change", ["missing", "shorter", "flat", "text"])
+def test_a_model_of_another_shape_is_named(tmp_path: Path, name: str, change: str) -> None:
+    arrays = shipped()
+    if change == "missing":
+        del arrays[name]
+    elif change == "text":
+        arrays[name] = np.full(arrays[name].shape, "x")
+    else:
+        arrays[name] = arrays[name][..., :-1] if change == "shorter" else arrays[name].ravel()[:2]
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(ConfigurationError, match=r"other\.npz"):
+        load_physics_model(tmp_path / "other.npz")
+
+
+# --- the network ---------------------------------------------------------------------------------
+
+
+def random_inputs(seed: int, count: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return MODEL.input_means + MODEL.input_scales * rng.normal(0, 2, (count, INPUT_COUNT))
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_logits_are_the_mean_of_the_networks(count: int) -> None:
+    inputs = random_inputs(count, count)
+    inputs[:1] = MODEL.input_means + 1e9 * MODEL.input_scales  # far outside of the training
+    logits = MODEL.relation_logits(inputs)
+    assert logits.shape == (count, len(DIRECTED)) and logits.dtype == np.float64
+    x = np.clip((inputs - MODEL.input_means) / MODEL.input_scales, -MAX_INPUT, MAX_INPUT)
+    members = []
+    for member in range(len(MODEL.weights_1)):
+        hidden = np.maximum(x @ MODEL.weights_1[member] + MODEL.biases_1[member], 0)
+        hidden = np.maximum(hidden @ MODEL.weights_2[member] + MODEL.biases_2[member], 0)
+        members.append(hidden @ MODEL.weights_3[member] + MODEL.biases_3[member])
+    np.testing.assert_allclose(logits, np.mean(members, axis=0), rtol=1e-3, atol=1e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_the_states_of_a_swapped_pair_are_swapped(seed: int) -> None:
+    there, back = random_inputs(seed, 4), random_inputs(seed + 1, 4)
+    one, other = MODEL.state_logits(there, back), MODEL.state_logits(back, there)
+    assert one.shape == (4, STATE_COUNT) and (one[:, 0] == 0).all()
+    np.testing.assert_array_equal(other[:, 1::2], one[:, 2::2])
+    np.testing.assert_array_equal(other[:, 2::2], one[:, 1::2])
+
+
+@pytest.mark.parametrize("classes", [COCO_CLASSES, VISUAL_GENOME_CLASSES, ("cup",)])
+@pytest.mark.parametrize("count", [0, 3])
+def test_inputs(classes: tuple[str, ...], count: int) -> None:
+    rng = np.random.default_rng(count)
+    probabilities = rng.dirichlet(np.ones(len(classes)), 4)
+    observations = np.array([1, 5, 20, 400])
+    features = rng.normal(size=(count, len(FEATURES)))
+    subjects, objects = np.array([0, 1, 3])[:count], np.array([2, 0, 1])[:count]
+    made = PairInputs(classes).make(features, probabilities, observations, subjects, objects)
+    assert made.shape == (count, INPUT_COUNT) and np.isfinite(made).all()
+    kinds, fixed = kind_table(classes), fixed_table(classes)
+    for row, (a, b) in enumerate(zip(subjects.tolist(), objects.tolist())):
+        p, q = probabilities[a], probabilities[b]
+        expected = [
+            *features[row],
+            *(p @ kinds),
+            *(q @ kinds),
+            sum(p[i] * q[j] for i, j in np.argwhere(fixed)),
+            sum(q[i] * p[j] for i, j in np.argwhere(fixed)),
+            sum(p * q),
+            *entropy_nats(np.array([p, q])),
+            *np.log(observations[[a, b]]),
+        ]
+        np.testing.assert_allclose(made[row], expected, atol=1e-12)
+
+
+def test_what_stands_on_the_floor() -> None:
+    """Objects of 0.8 m, and a floor at 1 m."""
+    bottoms = np.array([0.0, 0.03, 0.2, 0.74, 1.5, -0.2, 0.0])
+    shapes = np.zeros(len(bottoms), SHAPE)
+    shapes["low"][:, 2], shapes["high"][:, 2] = bottoms + 1.0, bottoms + 1.8
+    shapes["count"], shapes["floor_odds"] = [9] * 6 + [0], 7.0
+    floor_odds(shapes, np.arange(1, len(shapes)), 1.0, MODEL.floor)
+    assert shapes["floor_odds"][0] == 7.0  # it was not asked for
+    floor_odds(shapes, np.arange(1), 1.0, MODEL.floor)
+    offset, by_bottom, by_height = MODEL.floor
+    logits = offset + by_bottom * np.abs(bottoms) + by_height * np.log(0.81)
+    expected = np.exp(np.clip(logits, -MAX_FLOOR_LOGIT, MAX_FLOOR_LOGIT)) * (shapes["count"] > 0)
+    np.testing.assert_allclose(shapes["floor_odds"], expected, rtol=1e-12)
+    assert (np.diff(expected[:5]) < 0).all() and expected[0] > 1.0 > expected[3]
+
+
+# --- the evidence of votes -----------------------------------------------------------------------
+
+SCALES = VoteScales(slope=1.2, n_half=3.0, floor=0.05, even=0.2)
+
+
+def evidence_of(votes: float, frames: float, scales: VoteScales = SCALES) -> float:
+    """The formula of the module's comment."""
+    if not frames:
+        return 0.0
+    told = math.log((votes / frames + scales.floor) / (scales.even + scales.floor))
+    return frames / (frames + scales.n_half) * scales.slope * told
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds, count=st.integers(0, 5))
+def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    frames = rng.integers(0, 30, count)
+    counts = rng.dirichlet(np.ones(NONE + 1), (count, 2))[..., :NONE] * frames[:, None, None]
+    logits, near = vote_logits(counts, frames, SCALES)
+    assert logits.shape == (count, STATE_COUNT) and (logits[:, 0] == 0).all()
+    for row, n in enumerate(frames.tolist()):
+        for state in range(1, STATE_COUNT):
+            votes = [
+                counts[row, end, relation]
+                for end, relation in enumerate(RELATIONS_OF_STATE[state].tolist())
+                if relation != NONE
+            ]
+            expected = evidence_of(sum(votes) / len(votes), n)
+            assert logits[row, state] == pytest.approx(expected, abs=1e-12)
+        expected = evidence_of(counts[row, :, NEAR].mean(), n)
+        assert near[row] == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("scales", [SCALES, MODEL.votes])
+def test_evidence_grows_with_the_fraction_and_saturates_with_the_frames(scales) -> None:
+    def near(fractions: np.ndarray, frames: list[int]) -> np.ndarray:
+        counts = np.zeros((len(frames), 2, NONE))
+        counts[:, :, NEAR] = (fractions * frames)[:, None]
+        return vote_logits(counts, np.array(frames), scales)[1]
+
+    fractions = np.linspace(0, 1, 21)
+    for frames in (1, 5, 100):
+        values = near(fractions, [frames] * 21)
+        assert (np.diff(values) > 0).all() and values[0] < 0 < values[-1]
+        assert near(np.array([scales.even]), [frames]) == pytest.approx(0)
+    for fraction in (0.0, 0.9):
+        values = np.abs(near(np.full(6, fraction), [1, 2, 4, 8, 1000, 10**6]))
+        assert (np.diff(values) > 0).all()
+        assert values[-1] - values[-2] < 0.01 * values[-1]
+
+
+def test_above_and_under_are_one_state() -> None:
+    """Half of the frames said that A is above B, the other half that B is under A."""
+    counts = np.zeros((1, 2, NONE))
+    counts[0, 0, ABOVE] = counts[0, 1, UNDER] = 5.0
+    (states,), _ = vote_logits(counts, np.array([10]), SCALES)
+    assert states.argmax() == 1 + 2 * DIRECTED.index(ABOVE)
+    counts = np.zeros((1, 2, NONE))
+    counts[0, 1, ON] = 9.0
+    assert vote_logits(counts, np.array([10]), SCALES)[0].argmax() == 2
+
+
+@pytest.mark.parametrize("count", [0, 3])
+@pytest.mark.parametrize("others", ["riding", "on"])
+def test_votes_are_summed_by_relation(count: int, others: str) -> None:
+    predicates = ("on", "standing on", others, "near", "with", "under")
+    votes = np.random.default_rng(1).uniform(0, 3, (count, 2, len(predicates))).astype(np.float32)
+    counts, most = relation_counts(votes, relation_of_predicates(predicates))
+    assert counts.shape == (count, 2, NONE)
+    beyond = votes[:, :, 2]
+    on = votes[:, :, 0] + votes[:, :, 1] + (beyond if others == "on" else 0)
+    np.testing.assert_allclose(counts[:, :, ON], on, rtol=1e-6)
+    np.testing.assert_allclose(counts[:, :, NEAR], votes[:, :, 3] + votes[:, :, 4], rtol=1e-6)
+    np.testing.assert_allclose(counts[:, :, UNDER], votes[:, :, 5])
+    expected = beyond.max(axis=1) if others == "riding" else np.zeros(count)
+    np.testing.assert_allclose(most, expected)
+
+
+# --- both sources --------------------------------------------------------------------------------
+
+
+def prior_of(model: PhysicsModel) -> np.ndarray:
+    return softmax(np.concatenate([[0.0], np.repeat(model.prior, 2)]))
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_without_any_source_the_prior_is_believed(count: int) -> None:
+    zeros = np.zeros((count, STATE_COUNT))
+    believed = softmax(believed_logits(MODEL, zeros, zeros, np.zeros(count, bool)), axis=1)
+    np.testing.assert_allclose(believed, np.tile(prior_of(MODEL), (count, 1)), atol=1e-9)
+    assert (believed[:, 0] > 0.5).all()  # most pairs are not related
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds, scale=st.sampled_from([1.0, 30.0, 1000.0]))
+def test_geometry_never_excludes_a_state(seed: int, scale: float) -> None:
+    geometry = np.random.default_rng(seed).normal(0, scale, (6, STATE_COUNT))
+    geometry[:, 0] = 0
+    for model in (MODEL, replace(MODEL, source_weights=np.array([2.0, 1.0, 0.3]))):
+        by_geometry, _, broken = model.source_weights
+        logits = believed_logits(model, geometry, np.zeros((6, STATE_COUNT)), np.zeros(6, bool))
+        believed, prior = softmax(logits, axis=1), prior_of(model)
+        assert 0 < broken < 0.5 and (believed >= broken * prior * (1 - 1e-9)).all()
+        sound = softmax(by_geometry * geometry, axis=1)
+        np.testing.assert_allclose(believed, (1 - broken) * sound + broken * prior, atol=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=seeds)
+def test_votes_add_to_the_logits_and_independent_ones_by_their_weight(seed: int) -> None:
+    assert MODEL.source_weights[1] > 1
+    rng = np.random.default_rng(seed)
+    geometry, votes = rng.normal(0, 3, (2, 4, STATE_COUNT))
+    geometry[:, 0] = votes[:, 0] = 0
+    independent = np.array([True, False, True, False])
+    without = believed_logits(MODEL, geometry, np.zeros_like(votes), independent)
+    added = believed_logits(MODEL, geometry, votes, independent) - without
+    np.testing.assert_allclose(added[1::2], votes[1::2])
+    np.testing.assert_allclose(added[::2], MODEL.source_weights[1] * votes[::2])
