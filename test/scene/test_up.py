@@ -40,25 +40,20 @@ def test_a_restored_estimator_continues_equally(seed: int, before: int, after: i
     whole, again = UpEstimator(), UpEstimator()
     for pose in seen[:before]:
         whole.observe(pose)
+    for pose in poses(seed + 1, 3):  # this is forgotten
+        again.observe(pose)
     state = whole.state()
     kept = state.copy()
     again.restore(state)
-    np.testing.assert_array_equal(again.up_world(), whole.up_world())
-    for pose in seen[before:]:
-        whole.observe(pose)
-        again.observe(pose)
-    np.testing.assert_array_equal(again.up_world(), whole.up_world())
-    np.testing.assert_array_equal(again.state(), whole.state())
+    for pose in [None, *seen[before:]]:
+        if pose is not None:
+            whole.observe(pose)
+            again.observe(pose)
+        np.testing.assert_array_equal(again.up_world(), whole.up_world())
+        np.testing.assert_array_equal(again.state(), whole.state())
     np.testing.assert_array_equal(state, kept)  # the state itself is not changed
-
-
-def test_a_restored_estimator_forgets_what_it_saw() -> None:
-    fresh, used = UpEstimator(), UpEstimator()
-    for pose in poses(1, 5):
-        used.observe(pose)
-    used.restore(fresh.state())
-    np.testing.assert_array_equal(used.state(), fresh.state())
-    np.testing.assert_array_equal(used.up_world(), [0, 0, 1])
+    if not seen:
+        np.testing.assert_array_equal(whole.up_world(), [0, 0, 1])
 
 
 def test_up_is_found_from_level_cameras() -> None:
@@ -85,7 +80,7 @@ def test_another_state_is_refused(state: np.ndarray) -> None:
     estimator = UpEstimator()
     estimator.observe(np.eye(4))
     before = estimator.state()
-    with pytest.raises(ValueError, match="state of the up direction"):
+    with pytest.raises(ValueError, match="up direction"):
         estimator.restore(state)
     np.testing.assert_array_equal(estimator.state(), before)
 
@@ -99,5 +94,5 @@ def test_a_named_axis_is_used_as_given(axis: str, up: list[int]) -> None:
 
 
 def test_an_unknown_axis_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="world_up 'x': expected auto, z, y, -y"):
+    with pytest.raises(ConfigurationError, match="world_up 'x'"):
         UpEstimator("x")
