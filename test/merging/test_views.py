@@ -1,4 +1,4 @@
-"""What a frame shows of nodes: visibility, points seen through, and coverage by masks."""
+"""What a frame shows of nodes: which are in view, what is visible, seen through, and covered."""
 
 from __future__ import annotations
 
@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from support.gaussians import moments
-from support.merging import seeds
+from support.merging import random_pose, seeds
 from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
 
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.views import (
+    BALL_DEVIATIONS,
     FULL,
     HALF,
     NOT_VISIBLE,
     QUARTER,
     SAMPLED_POINTS,
+    FrameArrays,
+    NodeGrid,
     View,
     frame_arrays,
     see,
@@ -121,3 +124,57 @@ def test_the_coverage_of_a_hidden_node_is_unknown() -> None:
     assert np.isnan(of_two_masks(halves(), hidden).covered).all()
     assert np.isnan(of_two_masks(replace(halves(), instances=None), BOARD).covered).all()
     assert of_two_masks(None, BOARD).covered.shape == (2, 0)
+
+
+# --- the nodes that a frame may show -------------------------------------------------------------
+
+# Margin of the comparison with sampled points of a ball, metres.
+SMALL_M = 0.02
+
+
+def shows(frame: FrameArrays, mean: np.ndarray, radius: float, rng: np.random.Generator) -> bool:
+    """Whether any of many points of a ball is in the image, before its farthest depth."""
+    T, depth_mm, _, (fx, fy, cx, cy) = frame
+    steps = rng.normal(size=(500, 3))
+    steps *= max(radius - SMALL_M, 0.0) / np.linalg.norm(steps, axis=1, keepdims=True)
+    points = (mean + np.concatenate((steps, np.zeros((1, 3))))) @ T[:3, :3].T + T[:3, 3]
+    x, y, z = points[points[:, 2] > 0.1].T
+    u, v = fx * x / z + cx, fy * y / z + cy
+    height, width = depth_mm.shape
+    inside = (u > 0) & (v > 0) & (u < width) & (v < height) & (z < 0.001 * depth_mm.max())
+    return bool(inside.any())
+
+
+@given(seeds)
+@settings(max_examples=40, deadline=None)
+def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    grid, known = NodeGrid(), {}
+    for _ in range(12):
+        count = int(rng.integers(0, 30))
+        slots = rng.choice(150, count, replace=False)
+        means, bounds = rng.uniform(-12, 12, (150, 3)), rng.uniform(0.01, 0.6, 150) ** 2
+        grid.put(slots, means, bounds)
+        known.update({slot: (means[slot], BALL_DEVIATIONS * bounds[slot] ** 0.5) for slot in slots})
+        for slot in rng.choice(200, 10).tolist():
+            grid.remove(slot)
+            known.pop(slot, None)
+    wall = depth_grid(background_m=rng.uniform(0.5, 9.0))
+    seen = frame_arrays(invert_pose(random_pose(rng)), wall)
+    found = grid.in_view(seen).tolist()
+    assert len(found) == len(set(found)) and set(found) <= known.keys()
+    for slot, (mean, radius) in known.items():
+        assert slot in found or not shows(seen, mean, radius, rng)
+
+
+def test_nodes_elsewhere_are_not_compared() -> None:
+    grid, seen = NodeGrid(), frame_arrays(np.eye(4), depth_grid(background_m=3.0))
+    assert grid.in_view(seen).tolist() == []
+    slots, means = np.array([3, 5, 7, 9]), np.zeros((10, 3))
+    means[slots] = [[0, 0, 2], [50, 0, 2], [0, 0, 30], [0, 0, -30]]
+    grid.put(slots, means, np.full(10, 0.01))
+    assert grid.in_view(seen).tolist() == [3]
+    grid.remove(3)
+    means[5] = [0, 0, 2]
+    grid.put(slots[1:2], means, np.full(10, 0.01))
+    assert grid.in_view(seen).tolist() == [5]
