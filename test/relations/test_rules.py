@@ -35,7 +35,6 @@ from deworldsg_ros.relations.states import (
     RELATIONS_OF_STATE,
     SHAPE,
     STATE_COUNT,
-    SUPPORTS,
 )
 
 seeds = st.integers(0, 10_000)
@@ -103,12 +102,6 @@ def one_at_most(probabilities: list[float]) -> list[float]:
     ]
 
 
-def test_the_states_in_which_an_object_is_carried() -> None:
-    for state, (there, back) in enumerate(RELATIONS_OF_STATE.tolist()):
-        assert CARRIED_FIRST[state] == (there in SUPPORTS)
-        assert CARRIED_SECOND[state] == (back in SUPPORTS)
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     seed=seeds,
@@ -125,13 +118,11 @@ def test_the_kernel_equals_the_reference(
     np.testing.assert_array_equal(states, before)
     for one, other in zip(found, reference_support(states, pairs, floor_odds)):
         np.testing.assert_allclose(one, other, atol=1e-6)
-    after, kept, on_floor = found
+    after, kept, _ = found
     assert circle_of(kept, pairs) is None
     for values in found:
         assert (values >= -1e-12).all() and (values <= 1 + 1e-9).all()
     np.testing.assert_allclose(after.sum(axis=1), 1, atol=1e-6)
-    for item in range(count):
-        assert sum(supports_of(after, pairs, item).values()) + on_floor[item] <= 1 + 2e-6
     # Within the supports of one direction, and within the rest, the shares stay.
     for group in (CARRIED_FIRST, CARRIED_SECOND, REST):
         shares = states[:, group] / states[:, group].sum(axis=1, keepdims=True)
