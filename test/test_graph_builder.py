@@ -1,7 +1,5 @@
 """The published graph: what it says depends on no history, and updates are what differs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Frames of the worst values that a message may have leave a graph whole, published and saved."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path

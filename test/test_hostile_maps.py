@@ -1,7 +1,5 @@
 """A map is data from outside: whatever it contains, it is refused with one error or is whole."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A graph that continues from a map equals one that never stopped."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

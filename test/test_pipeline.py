@@ -1,7 +1,5 @@
 """The four stages composed: frames in, one consistent graph and its updates out."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Corrections of poses: the part of the graph that was built on them moves along, and no other."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The global graph: ids, nodes in slots, merges, remembered frames, and its messages of nodes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """A graph that is saved and read is the same, and goes on alike; other files are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

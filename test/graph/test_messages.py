@@ -1,7 +1,5 @@
 """Messages of nodes: distributions, boxes against gravity, surface points, and what waits."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import pytest

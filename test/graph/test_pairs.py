@@ -1,7 +1,5 @@
 """Pairs of nodes against plain dicts: evidence of edges, votes, rows, lists, and watchers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The frames behind nodes and edges, and the space seen as free; in maps and beside graphs."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path
@@ -13,22 +11,11 @@ from support.surfaces import CAMERA, CUP, HERE, TABLE, slab, view
 
 from deworldsg_ros.client import SceneGraph as AskedGraph
 from deworldsg_ros.config import Config, InputsConfig, OutputConfig
-from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph import graph_files, provenance
 from deworldsg_ros.graph.edits import MergeNodes
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph.pairs import frame_votes
-from deworldsg_ros.graph.provenance import (
-    CLEAREST,
-    MAX_VIEWS,
-    PRUNE_FRAMES,
-    FrameMemory,
-    SeenSpace,
-    path_beside,
-    space_path,
-    write_seen,
-    write_space,
-)
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
 from deworldsg_ros.scene.camera import Intrinsics
@@ -41,7 +28,7 @@ CONFIG = Config(output=OutputConfig(min_existence=0.0), inputs=InputsConfig(worl
 # --- the frames behind nodes and edges -----------------------------------------------------------
 
 
-class Memory(FrameMemory):
+class Memory(provenance.FrameMemory):
     """The frames of a graph of some nodes."""
 
     def __init__(self, count: int) -> None:
@@ -85,13 +72,13 @@ def test_frames_follow_merges_and_removals_and_do_not_grow() -> None:
     assert memory.spans() == [(1, 0, 1, 2), (1, 2, 1, 2), (2, 0, 1, 2)]
     graph.remove_node(2)
     assert memory.spans() == [(1, 0, 1, 2)]
-    for stamp_ns in range(3, 3 * PRUNE_FRAMES):
+    for stamp_ns in range(3, 3 * provenance.PRUNE_FRAMES):
         new_id = graph.add_node(np.zeros(3), np.eye(3), np.full(4, 0.25), stamp_ns)
         memory.see(stamp_ns, 0.9, [1, new_id])
         graph.remove_node(new_id)
-        assert len(memory._seen) <= 2 * PRUNE_FRAMES + 1
+        assert len(memory._seen) <= 2 * provenance.PRUNE_FRAMES + 1
     (node,) = memory.all(graph)
-    assert len(node.clearest) == CLEAREST
+    assert len(node.clearest) == provenance.CLEAREST
 
 
 def test_a_removed_row_and_faint_votes_are_not_noted() -> None:
@@ -116,7 +103,7 @@ def test_explain_names_the_frames_of_a_saved_graph(tmp_path, table_and_cup) -> N
     assert AskedGraph.load(tmp_path).explain(1).values["frames"] is None
     stamp_ns = wire.ns_from_stamp(message.stamp)
     seen = table_and_cup.frames.all(table_and_cup.graph)
-    write_seen(path, stamp_ns, seen)
+    provenance.write_seen(path, stamp_ns, seen)
     found = AskedGraph.load(tmp_path).explain(1)
     assert found.lines[1] == (
         "frames: first 0.100, last 0.500, clearest 0.100 (cup 76%), 0.200 (cup 76%), "
@@ -124,9 +111,9 @@ def test_explain_names_the_frames_of_a_saved_graph(tmp_path, table_and_cup) -> N
     )
     assert found.values["frames"]["clearest"][0]["stamp_ns"] == 10**8
     # The file of another graph, or a damaged one, is not used.
-    write_seen(path, stamp_ns + 1, seen)
+    provenance.write_seen(path, stamp_ns + 1, seen)
     assert AskedGraph.load(tmp_path).frames(1) is None
-    path_beside(path).write_text("{")
+    provenance.path_beside(path).write_text("{")
     assert AskedGraph.load(tmp_path).frames(1) is None
 
 
@@ -134,7 +121,7 @@ def test_a_merged_object_has_the_frames_of_both(table_and_cup) -> None:
     (merged,) = table_and_cup.edit(MergeNodes([1, 2])).nodes
     found = table_and_cup.frames.all(table_and_cup.graph)
     seen = {item.node: item for item in found if not item.other}
-    assert seen[merged].first_ns == 10**8 and len(seen[merged].clearest) == CLEAREST
+    assert seen[merged].first_ns == 10**8 and len(seen[merged].clearest) == provenance.CLEAREST
 
 
 # --- the space that was seen ---------------------------------------------------------------------
@@ -157,7 +144,7 @@ def frame(
 
 
 def test_points_before_the_wall_are_free_and_views_that_disagree_are_counted() -> None:
-    space = SeenSpace()
+    space = provenance.SeenSpace()
     assert [answer.any() for answer in space.look(np.zeros((1, 3)))] == [False, False]
     space.note(frame(1))
     points = np.array([[1.5, 0, 1], [3.0, 0, 1], [4, 0, 1], [-1, 0, 1], [1.5, 2, 1], [0.05, 0, 1]])
@@ -172,7 +159,7 @@ def test_points_before_the_wall_are_free_and_views_that_disagree_are_counted() -
 
 
 def test_only_different_views_are_kept_and_no_more_than_some() -> None:
-    space = SeenSpace()
+    space = provenance.SeenSpace()
     for stamp_ns in range(50):
         space.note(frame(stamp_ns, x_m=0.004 * stamp_ns))
     assert len(space) == 1
@@ -184,9 +171,9 @@ def test_only_different_views_are_kept_and_no_more_than_some() -> None:
     T[1, 3] = 10.0
     space.move(T, 60)  # a correction moves the views since then
     assert space.poses[:, 1, 3].tolist() == [0.0, 10.0]
-    for stamp_ns in range(100, 100 + MAX_VIEWS):
+    for stamp_ns in range(100, 100 + provenance.MAX_VIEWS):
         space.note(frame(stamp_ns, x_m=float(stamp_ns)))
-    assert len(space) == MAX_VIEWS and space.stamps_ns[0] == 100
+    assert len(space) == provenance.MAX_VIEWS and space.stamps_ns[0] == 100
     assert space.depths_mm.nbytes < 1.3e6
     # Another camera begins again.
     camera = Intrinsics(150.0, 150.0, 159.5, 119.5, 320, 240)
@@ -229,14 +216,14 @@ def test_maps_and_saved_graphs_have_both(tmp_path: Path, walk: GraphBuilder) -> 
     assert len(kept) == 5 and all(one[name].tobytes() == other[name].tobytes() for name in kept)
     path = write_graph(tmp_path, walk.full())
     assert AskedGraph.load(tmp_path).goal_near("cup").seen_free is None
-    write_space(path, walk.space)
+    provenance.write_space(path, walk.space)
     assert AskedGraph.load(tmp_path).goal_near("cup").seen_free > 0.0
-    space_path(path).write_bytes(b"no archive")
+    provenance.space_path(path).write_bytes(b"no archive")
     assert AskedGraph.load(tmp_path).space is None
     arrays = graph_files.read(map_path)
     for name, wrong, says in (
         ("view_poses", np.zeros((2, 4, 4)), "view_poses"),
-        ("view_depths_mm", np.zeros((MAX_VIEWS + 1, 2, 2), np.uint16), "view_depths_mm"),
+        ("view_depths_mm", np.zeros((provenance.MAX_VIEWS + 1, 2, 2), np.uint16), "view_depths_mm"),
         ("view_cameras", np.full((len(walk.space), 4), np.nan), "view_cameras"),
         ("seen_frames", np.zeros(3, np.uint8), "JSON"),
     ):

@@ -1,7 +1,5 @@
 """Is a node an object, and of which class: against their definitions, and over a walk."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """An operator's edits hold for later frames, and undo brings back what was before."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.merging import VOCABULARY

@@ -1,7 +1,5 @@
 """The paper's rule (Eq. 5 to 7): the search against np.linalg, the rule against a reference."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings

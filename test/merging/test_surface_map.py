@@ -1,7 +1,5 @@
 """The surface map against plain sets of cells; cells that most frames show as something else go."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The surface rule: partial views, flipping labels, adjacent objects, absent and moved ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

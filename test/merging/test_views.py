@@ -1,7 +1,5 @@
 """What a frame shows of nodes: which are in view, what is visible, seen through, and covered."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -12,20 +10,7 @@ from support.merging import random_pose, seeds
 from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
 
 from deworldsg_ros.graph.nodes import NodeTable
-from deworldsg_ros.merging.views import (
-    BALL_DEVIATIONS,
-    FULL,
-    HALF,
-    NOT_VISIBLE,
-    QUARTER,
-    SAMPLED_POINTS,
-    FrameArrays,
-    NodeGrid,
-    View,
-    frame_arrays,
-    see,
-    see_nothing,
-)
+from deworldsg_ros.merging import views
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
@@ -43,32 +28,33 @@ def table_of(*surfaces: np.ndarray, capacity: int = 512) -> NodeTable:
     return nodes
 
 
-def see_all(nodes: NodeTable, local: LocalGraph) -> View:
+def see_all(nodes: NodeTable, local: LocalGraph) -> views.View:
     if local.depth_grid is None:
-        return see_nothing(local)
-    arrays = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
-    return see(nodes, np.arange(len(nodes)), local, arrays)
+        return views.see_nothing(local)
+    arrays = views.frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
+    return views.see(nodes, np.arange(len(nodes)), local, arrays)
 
 
 def view_of(points: np.ndarray, background_m: float = WALL_M) -> tuple[bool, int]:
     """Whether a wall's frame sees through a node of these points, and how much is visible."""
     local = frame(1, depth_grid=depth_grid(background_m=background_m))
-    view = see_all(table_of(points, capacity=SAMPLED_POINTS), local)
+    view = see_all(table_of(points, capacity=views.SAMPLED_POINTS), local)
     return bool(view.through[0]), int(view.visibilities[0])
 
 
 @pytest.mark.parametrize(
     ("z_m", "through", "visibility"),
-    [(0.7, True, NOT_VISIBLE), (1.0, False, FULL), (1.5, False, NOT_VISIBLE)],
+    [(0.7, True, views.NOT_VISIBLE), (1.0, False, views.FULL), (1.5, False, views.NOT_VISIBLE)],
 )
 def test_points_before_on_and_behind_the_measured_depth(z_m, through, visibility) -> None:
     points = np.stack([np.linspace(-0.2, 0.2, 10), np.zeros(10), np.full(10, z_m)], axis=1)
     assert view_of(points) == (through, visibility)
-    assert view_of(points[:0]) == (False, NOT_VISIBLE)
+    assert view_of(points[:0]) == (False, views.NOT_VISIBLE)
 
 
 @pytest.mark.parametrize(
-    ("left_m", "visibility"), [(-1.0, FULL), (-1.7, HALF), (-2.4, QUARTER), (-2.8, NOT_VISIBLE)]
+    ("left_m", "visibility"),
+    [(-1.0, views.FULL), (-1.7, views.HALF), (-2.4, views.QUARTER), (-2.8, views.NOT_VISIBLE)],
 )
 def test_visibility_of_a_node_cut_by_the_image_border(left_m, visibility) -> None:
     # The image ends at 1.07 m to the left.
@@ -76,7 +62,10 @@ def test_visibility_of_a_node_cut_by_the_image_border(left_m, visibility) -> Non
     points = np.stack([x_m, np.zeros(40), np.full(40, WALL_M)], axis=1)
     assert view_of(points) == (False, visibility)
     # Nearer to the camera, the image ends sooner.
-    assert view_of(points, background_m=3.0) == (visibility in (HALF, FULL), NOT_VISIBLE)
+    assert view_of(points, background_m=3.0) == (
+        visibility in (views.HALF, views.FULL),
+        views.NOT_VISIBLE,
+    )
 
 
 @given(seeds)
@@ -102,7 +91,7 @@ def halves() -> DepthGrid:
     return replace(depth_grid(), instances=instances)
 
 
-def of_two_masks(grid: DepthGrid | None, *surfaces: np.ndarray) -> View:
+def of_two_masks(grid: DepthGrid | None, *surfaces: np.ndarray) -> views.View:
     local: LocalGraph = frame(1, (LEFT, CUP), (BOARD, CUP), depth_grid=grid)
     return see_all(table_of(*surfaces), local)
 
@@ -132,7 +121,9 @@ def test_the_coverage_of_a_hidden_node_is_unknown() -> None:
 SMALL_M = 0.02
 
 
-def shows(frame: FrameArrays, mean: np.ndarray, radius: float, rng: np.random.Generator) -> bool:
+def shows(
+    frame: views.FrameArrays, mean: np.ndarray, radius: float, rng: np.random.Generator
+) -> bool:
     """Whether any of many points of a ball is in the image, before its farthest depth."""
     T, depth_mm, _, (fx, fy, cx, cy) = frame
     steps = rng.normal(size=(500, 3))
@@ -149,18 +140,20 @@ def shows(frame: FrameArrays, mean: np.ndarray, radius: float, rng: np.random.Ge
 @settings(max_examples=40, deadline=None)
 def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    grid, known = NodeGrid(), {}
+    grid, known = views.NodeGrid(), {}
     for _ in range(12):
         count = int(rng.integers(0, 30))
         slots = rng.choice(150, count, replace=False)
         means, bounds = rng.uniform(-12, 12, (150, 3)), rng.uniform(0.01, 0.6, 150) ** 2
         grid.put(slots, means, bounds)
-        known.update({slot: (means[slot], BALL_DEVIATIONS * bounds[slot] ** 0.5) for slot in slots})
+        known.update(
+            {slot: (means[slot], views.BALL_DEVIATIONS * bounds[slot] ** 0.5) for slot in slots}
+        )
         for slot in rng.choice(200, 10).tolist():
             grid.remove(slot)
             known.pop(slot, None)
     wall = depth_grid(background_m=rng.uniform(0.5, 9.0))
-    seen = frame_arrays(invert_pose(random_pose(rng)), wall)
+    seen = views.frame_arrays(invert_pose(random_pose(rng)), wall)
     found = grid.in_view(seen).tolist()
     assert len(found) == len(set(found)) and set(found) <= known.keys()
     for slot, (mean, radius) in known.items():
@@ -168,7 +161,7 @@ def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
 
 
 def test_nodes_elsewhere_are_not_compared() -> None:
-    grid, seen = NodeGrid(), frame_arrays(np.eye(4), depth_grid(background_m=3.0))
+    grid, seen = views.NodeGrid(), views.frame_arrays(np.eye(4), depth_grid(background_m=3.0))
     assert grid.in_view(seen).tolist() == []
     slots, means = np.array([3, 5, 7, 9]), np.zeros((10, 3))
     means[slots] = [[0, 0, 2], [50, 0, 2], [0, 0, 30], [0, 0, -30]]

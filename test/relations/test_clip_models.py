@@ -1,7 +1,5 @@
 """V-JEPA 2 and DINOv2 from checkpoints in the real format, and what they see of a clip."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The choice of clips: uncertain pairs, each once, within the budget; every lost clip counted."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Frames, windows, union boxes and crops; and the queue of clips, ordered only by the policy."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The beliefs of edges: is a pair related at all, and by what; and their messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import msgspec

@@ -1,7 +1,5 @@
 """Shapes of nodes and features of pairs, against slow and obvious references."""
 
-from __future__ import annotations
-
 import itertools
 from typing import NamedTuple
 
@@ -11,19 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.room_nodes import bowl, box, surface, table, thing
 
-from deworldsg_ros.relations.geometry import (
-    FEATURES,
-    LAYER_M,
-    MARGIN_M,
-    SHAPE_POINTS,
-    SOFT_RADIUS_M,
-    TRIM_FRACTION,
-    centre_steps,
-    measure,
-    pair_features,
-    rotation_to_upright,
-    upright,
-)
+from deworldsg_ros.relations import geometry
 from deworldsg_ros.relations.reach import REACH_M
 from deworldsg_ros.relations.states import SHAPE
 
@@ -48,15 +34,15 @@ def clouds_of(*clouds: np.ndarray, R: np.ndarray | None = None) -> Clouds:
     points = np.zeros((len(clouds), max(counts, default=0), 3), np.float32)
     for place, cloud in enumerate(clouds):
         points[place, : len(cloud)] = cloud
-    measure(shapes, np.arange(len(clouds)), points, counts, R)
-    return Clouds(shapes, upright(points, R))
+    geometry.measure(shapes, np.arange(len(clouds)), points, counts, R)
+    return Clouds(shapes, geometry.upright(points, R))
 
 
 def features_of(clouds: Clouds, pairs: np.ndarray, floor_m: float = 0.0) -> np.ndarray:
     """Features (m, F) of ordered pairs; those of the opposite direction are compared as well."""
     first, second = np.ascontiguousarray(pairs.T)
-    there, back = pair_features(first, second, *clouds, floor_m)
-    again, reverse = pair_features(second, first, *clouds, floor_m)
+    there, back = geometry.pair_features(first, second, *clouds, floor_m)
+    again, reverse = geometry.pair_features(second, first, *clouds, floor_m)
     np.testing.assert_allclose(back, again, atol=1e-12)
     np.testing.assert_allclose(there, reverse, atol=1e-12)
     return there
@@ -134,14 +120,14 @@ def log_sizes(low, high) -> list[float]:
 
 def contact(low, high, low_b, high_b, points) -> dict[str, float]:
     """The points of an object around the bottom of a subject (low, high)."""
-    corner, size = low[:2] - MARGIN_M, (high - low)[:2] + 2 * MARGIN_M
+    corner, size = low[:2] - geometry.MARGIN_M, (high - low)[:2] + 2 * geometry.MARGIN_M
     z, bottom = points[:, 2], low[2]
     off = np.maximum(np.maximum(corner - points[:, :2], points[:, :2] - corner - size), 0)
-    radii = (off**2).sum(axis=1) / SOFT_RADIUS_M**2
+    radii = (off**2).sum(axis=1) / geometry.SOFT_RADIUS_M**2
     weights = np.where(radii < 9.0, np.exp(-radii), 0.0)
     weights *= (bottom - z > -0.05) & (bottom - z < 0.3)
     around = (off == 0).all(axis=1)
-    layer = around & (np.abs(z - bottom) < LAYER_M)
+    layer = around & (np.abs(z - bottom) < geometry.LAYER_M)
     below = z[around & (z < bottom + 0.025)]
     cells = np.minimum(7, (8 * (points[layer, :2] - corner) / size).astype(int))
     area_b = np.prod(np.maximum((high_b - low_b)[:2], 0.01))
@@ -157,7 +143,7 @@ def contact(low, high, low_b, high_b, points) -> dict[str, float]:
             (weights * (bottom - z)).sum() / weights.sum() if weights.sum() > 1e-3 else 0.3
         ),
         "soft_points": np.log(1 + weights.sum()),
-        "level_fraction": (np.abs(z - bottom) < LAYER_M).mean(),
+        "level_fraction": (np.abs(z - bottom) < geometry.LAYER_M).mean(),
     }
 
 
@@ -188,16 +174,16 @@ def test_features_equal_those_of_the_reference(seed: int) -> None:
     clouds = clouds_of(*random_clouds(seed))
     pairs = every_pair(len(clouds.shapes))
     found = features_of(clouds, pairs, -0.7)
-    assert found.shape == (len(pairs), len(FEATURES))
+    assert found.shape == (len(pairs), len(geometry.FEATURES))
     for (a, b), row in zip(pairs.tolist(), found):
         expected = reference(clouds, a, b, -0.7)
-        assert tuple(expected) == FEATURES
-        for name, value in zip(FEATURES, row.tolist()):
+        assert tuple(expected) == geometry.FEATURES
+        for name, value in zip(geometry.FEATURES, row.tolist()):
             assert value == pytest.approx(expected[name], rel=1e-6, abs=1e-6), name
-    assert features_of(clouds, every_pair(0)).shape == (0, len(FEATURES))
+    assert features_of(clouds, every_pair(0)).shape == (0, len(geometry.FEATURES))
     middle = (clouds.shapes["low"] + clouds.shapes["high"])[:, :2] / 2
     steps = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=1)
-    np.testing.assert_allclose(centre_steps(clouds.shapes, *pairs.T), steps, rtol=1e-12)
+    np.testing.assert_allclose(geometry.centre_steps(clouds.shapes, *pairs.T), steps, rtol=1e-12)
 
 
 @settings(max_examples=40, deadline=None)
@@ -214,7 +200,7 @@ def test_features_do_not_depend_on_the_world_frame(seed: int, kind: str) -> None
         turn = np.linalg.matrix_power(quarter, int(rng.integers(1, 4)))
         there = features_of(clouds_of(*(points @ turn.T for points in clouds)), pairs)
     else:
-        R = rotation_to_upright(np.array([0.0, 1.0, 0.0]))
+        R = geometry.rotation_to_upright(np.array([0.0, 1.0, 0.0]))
         there = features_of(clouds_of(*(points @ R for points in clouds), R=R), pairs)
     np.testing.assert_allclose(here, there, atol=1e-5)
 
@@ -260,7 +246,7 @@ BOTTLE_AND_FRIDGE = (
 )  # fmt: skip
 def test_features_of_known_pairs(parts, ranges: dict[str, tuple[float, float]]) -> None:
     clouds = clouds_of(*(surface(boxes, np.random.default_rng(0)) for boxes in parts))
-    seen = dict(zip(FEATURES, features_of(clouds, np.array([[0, 1]]))[0].tolist()))
+    seen = dict(zip(geometry.FEATURES, features_of(clouds, np.array([[0, 1]]))[0].tolist()))
     for name, (least, most) in ranges.items():
         assert least <= seen[name] <= most, name
 
@@ -272,7 +258,7 @@ def test_features_of_known_pairs(parts, ranges: dict[str, tuple[float, float]]) 
 def test_the_shape_of_points(count: int) -> None:
     points = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
     (shape,) = clouds_of(points).shapes
-    used = points[:SHAPE_POINTS]
+    used = points[: geometry.SHAPE_POINTS]
     assert shape["count"] == len(used)
     if count:
         spread = np.cov(used.T, bias=True).reshape(3, 3) if count > 1 else 0
@@ -295,7 +281,7 @@ def test_bounds_of_an_even_surface_are_those_of_the_object(seed: int) -> None:
 def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (500, 3))
     flying = points.copy()
-    flying[: int(TRIM_FRACTION * 500) - 2] += [3.0, -2.0, 2.5]
+    flying[: int(geometry.TRIM_FRACTION * 500) - 2] += [3.0, -2.0, 2.5]
     clean, dirty = clouds_of(points, flying).shapes
     np.testing.assert_allclose(dirty["low"], clean["low"], atol=0.02)
     np.testing.assert_allclose(dirty["high"], clean["high"], atol=0.02)
@@ -304,9 +290,9 @@ def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
 def test_a_shape_that_is_measured_again_forgets_the_old_one() -> None:
     one, other = (clouds_of(cloud) for cloud in random_clouds(3)[:2])
     for shapes, points in (one, other):
-        for again, turn in ((other, np.eye(3)), (one, rotation_to_upright(np.ones(3)))):
+        for again, turn in ((other, np.eye(3)), (one, geometry.rotation_to_upright(np.ones(3)))):
             counts = again.shapes["count"].copy()
-            measure(shapes, np.array([0]), again.points, counts, turn)
+            geometry.measure(shapes, np.array([0]), again.points, counts, turn)
             fresh = clouds_of(again.of(0), R=turn)
             assert (shapes == fresh.shapes).all()
         assert len(points)
@@ -322,7 +308,7 @@ def test_the_upright_frame_is_a_rotation_that_makes_up_z(up: tuple[float, float,
     length = np.linalg.norm(up_world)
     if length < 1e-3:
         return
-    R = rotation_to_upright(up_world)
+    R = geometry.rotation_to_upright(up_world)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(R) == pytest.approx(1)
     np.testing.assert_allclose(R @ up_world / length, [0, 0, 1], atol=0.02)
@@ -335,11 +321,13 @@ def test_the_upright_frame_is_a_rotation_that_makes_up_z(up: tuple[float, float,
 @pytest.mark.parametrize("up", [(0, 0, -1), (1e-9, 0, -1), (0.01, -0.01, -1), (0, 0.1, -1)])
 def test_a_world_whose_z_axis_points_down(up: tuple[float, float, float]) -> None:
     up_world = np.array(up) / np.linalg.norm(up)
-    R = rotation_to_upright(up_world)
+    R = geometry.rotation_to_upright(up_world)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
     assert np.linalg.det(R) == pytest.approx(1)
     np.testing.assert_allclose(R @ up_world, [0, 0, 1], atol=0.02)
 
 
 def test_a_world_whose_z_axis_points_up_is_upright() -> None:
-    np.testing.assert_array_equal(rotation_to_upright(np.array([0.0, 0.0, 2.0])), np.eye(3))
+    np.testing.assert_array_equal(
+        geometry.rotation_to_upright(np.array([0.0, 0.0, 2.0])), np.eye(3)
+    )

@@ -1,7 +1,5 @@
 """The graph in memory and its published copy give the same answers."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec

@@ -1,7 +1,5 @@
 """The table of pairs, kept up to date, against a table made anew; the floor, and the prior."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Eq. 8 to 10, the prior of class pairs, and bounded logits, against obvious references."""
 
-from __future__ import annotations
-
 import math
 
 import msgspec
@@ -14,19 +12,7 @@ from support.relations import fuse_edge, mean_of, provenances
 
 from deworldsg_ros.config import Config, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
-from deworldsg_ros.relations.paper import (
-    OUTLIER_RATE,
-    PROVENANCES,
-    ClassPairPrior,
-    PriorState,
-    bounded_logits,
-    entropy_nats,
-    fuse_distributions,
-    fuse_edges,
-    geometric_costs,
-    neighbour_pairs,
-    visual_distribution,
-)
+from deworldsg_ros.relations import paper
 from deworldsg_ros.scene.errors import RefusedInput
 
 seeds = st.integers(0, 10_000)
@@ -51,7 +37,7 @@ def test_neighbours_are_those_of_the_loop_over_all_pairs(count: int, seed: int) 
             cost += abs(depths[i] - depths[j])
             if i != j and cost < 0.45:
                 expected[i, j] = cost
-    pairs, costs = neighbour_pairs(boxes, depths, WIDTH, HEIGHT, 0.45)
+    pairs, costs = paper.neighbour_pairs(boxes, depths, WIDTH, HEIGHT, 0.45)
     assert pairs.shape == (len(pairs), 2) and pairs.dtype == np.int64
     assert [tuple(pair) for pair in pairs.tolist()] == sorted(expected)
     np.testing.assert_allclose(costs, [expected[key] for key in sorted(expected)], rtol=1e-12)
@@ -59,10 +45,10 @@ def test_neighbours_are_those_of_the_loop_over_all_pairs(count: int, seed: int) 
 
 def test_costs_of_known_pairs_and_a_strict_threshold() -> None:
     corners = np.array([[0.0, 0, 0, 0], [WIDTH, HEIGHT, WIDTH, HEIGHT]])
-    assert geometric_costs(corners, np.array([1.0, 1.0]), WIDTH, HEIGHT)[0, 1] == 0.5
+    assert paper.geometric_costs(corners, np.array([1.0, 1.0]), WIDTH, HEIGHT)[0, 1] == 0.5
     one_place = np.zeros((2, 4)), np.array([1.0, 1.5]), WIDTH, HEIGHT
-    assert len(neighbour_pairs(*one_place, 0.5)[0]) == 0
-    assert len(neighbour_pairs(*one_place, np.nextafter(0.5, 1))[0]) == 2
+    assert len(paper.neighbour_pairs(*one_place, 0.5)[0]) == 0
+    assert len(paper.neighbour_pairs(*one_place, np.nextafter(0.5, 1))[0]) == 2
 
 
 # --- the visual distribution (Eq. 9) and its entropy ---------------------------------------------
@@ -71,10 +57,10 @@ def test_costs_of_known_pairs_and_a_strict_threshold() -> None:
 @pytest.mark.parametrize("scale", [0.0, 1.0, 1e3, 1e6])
 def test_visual_distribution_is_stable(scale: float) -> None:
     logits = scale * np.array([[1.0, -1.0, 0.5], [-1.0, -1.0, -1.0]])
-    distribution = visual_distribution(logits)
+    distribution = paper.visual_distribution(logits)
     assert np.isfinite(distribution).all() and (distribution[1] == 1 / 3).all()
     np.testing.assert_allclose(distribution.sum(axis=1), 1.0)
-    np.testing.assert_allclose(visual_distribution(logits + 500), distribution, atol=1e-10)
+    np.testing.assert_allclose(paper.visual_distribution(logits + 500), distribution, atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +68,7 @@ def test_visual_distribution_is_stable(scale: float) -> None:
     [([1.0, 0, 0], 0.0), ([0.5, 0.5, 0], math.log(2)), ([0.25] * 4, math.log(4))],
 )
 def test_entropy_in_nats(distribution: list[float], wanted: float) -> None:
-    assert entropy_nats(np.array(distribution)) == pytest.approx(wanted, abs=1e-15)
+    assert paper.entropy_nats(np.array(distribution)) == pytest.approx(wanted, abs=1e-15)
 
 
 # --- fusion under uncertainty (Eq. 10) -----------------------------------------------------------
@@ -119,10 +105,10 @@ def reference(logits, prior, alpha: float, threshold: float):
 )
 def test_fused_edges_equal_the_reference(seed, predicates, alpha, threshold) -> None:
     edges = random_edges(seed, predicates=predicates)
-    fused = fuse_edges(*edges, alpha, threshold)
+    fused = paper.fuse_edges(*edges, alpha, threshold)
     order = np.random.default_rng(seed).permutation(predicates)
     logits, seen, priors, told = edges
-    permuted = fuse_edges(logits[:, order], seen, priors[:, order], told, alpha, threshold)
+    permuted = paper.fuse_edges(logits[:, order], seen, priors[:, order], told, alpha, threshold)
     np.testing.assert_allclose(permuted.probabilities, fused.probabilities[:, order], rtol=1e-9)
     for row in range(len(seen)):
         args = (logits[row] if seen[row] else None, priors[row] if told[row] else None)
@@ -141,17 +127,17 @@ def test_fused_edges_equal_the_reference(seed, predicates, alpha, threshold) -> 
 
 def test_every_provenance_occurs_and_no_edges() -> None:
     logits, *more = random_edges(0, edges=60)
-    fused = fuse_edges(0.3 * logits, *more, 0.5, 1.0)
+    fused = paper.fuse_edges(0.3 * logits, *more, 0.5, 1.0)
     known = [name for name, known in zip(provenances(fused), fused.known) if known]
-    assert set(known) == set(PROVENANCES)
-    none = fuse_edges(np.zeros((0, 3)), [], np.zeros((0, 3)), [], 0.5, 1)
+    assert set(known) == set(paper.PROVENANCES)
+    none = paper.fuse_edges(np.zeros((0, 3)), [], np.zeros((0, 3)), [], 0.5, 1)
     assert len(none.known) == 0 and none.probabilities.shape == (0, 3)
 
 
 def test_the_gate_is_strict_at_the_threshold() -> None:
     logits, prior = np.array([0.3, 0.1, -0.2]), np.array([0.7, 0.2, 0.1])
-    visual = visual_distribution(logits)
-    entropy = float(entropy_nats(visual))
+    visual = paper.visual_distribution(logits)
+    entropy = float(paper.entropy_nats(visual))
     assert fuse_edge(logits, prior, 0.5, entropy).provenance == "visual"
     edge = fuse_edge(logits, prior, 0.5, math.nextafter(entropy, 0))
     assert edge.provenance == "fused"
@@ -164,7 +150,7 @@ def test_the_gate_is_strict_at_the_threshold() -> None:
 
 def test_more_alpha_means_more_prior() -> None:
     visual, prior = np.full(3, 1 / 3), np.array([1.0, 0, 0])
-    first = [fuse_distributions(visual, prior, np.array(a))[0] for a in (0.0, 0.5, 1.0, 10.0)]
+    first = [paper.fuse_distributions(visual, prior, np.array(a))[0] for a in (0.0, 0.5, 1.0, 10.0)]
     assert first == sorted(first) and first[0] == pytest.approx(1 / 3) and first[-1] < 1
 
 
@@ -179,8 +165,8 @@ def random_predictions(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.integers(0, CLASSES, (count, 2)), rng.dirichlet(np.ones(PREDICATES), count)
 
 
-def prior_of(*predictions: tuple[np.ndarray, np.ndarray]) -> ClassPairPrior:
-    prior = ClassPairPrior(CLASSES, PREDICATES)
+def prior_of(*predictions: tuple[np.ndarray, np.ndarray]) -> paper.ClassPairPrior:
+    prior = paper.ClassPairPrior(CLASSES, PREDICATES)
     for classes, values in predictions:
         prior.update(np.array(classes), np.array(values))
     return prior
@@ -211,7 +197,7 @@ def test_the_prior_is_the_mean_in_any_order_and_any_portions(count, seed, portio
 def test_saved_and_loaded_the_prior_is_the_same_and_goes_on() -> None:
     prior = prior_of(random_predictions(30, 5))
     saved = msgspec.json.encode(prior.to_state())
-    loaded = ClassPairPrior.from_state(msgspec.json.decode(saved, type=PriorState))
+    loaded = paper.ClassPairPrior.from_state(msgspec.json.decode(saved, type=paper.PriorState))
     for _ in range(2):
         assert (loaded.lookup(EVERY)[0] == prior.lookup(EVERY)[0]).all()
         assert loaded.to_state() == prior.to_state()
@@ -248,7 +234,7 @@ def test_an_invalid_prediction_is_refused_and_changes_nothing(classes, predictio
 )
 def test_a_saved_state_that_does_not_fit_is_refused(change: dict[str, list]) -> None:
     with pytest.raises(ValueError):
-        ClassPairPrior.from_state(msgspec.structs.replace(prior_of(ONE).to_state(), **change))
+        paper.ClassPairPrior.from_state(msgspec.structs.replace(prior_of(ONE).to_state(), **change))
 
 
 def test_sums_that_differ_from_one_by_float32_rounding_are_normalised() -> None:
@@ -263,25 +249,25 @@ def test_sums_that_differ_from_one_by_float32_rounding_are_normalised() -> None:
 @given(seeds, st.sampled_from([0.01, 0.1, 0.5, 0.9]), st.sampled_from([1.0, 1e3, 1e300]))
 def test_bounded_logits_are_those_of_a_mixture(seed: int, rate: float, scale: float) -> None:
     logits = np.random.default_rng(seed).normal(0, 4, (3, 6))
-    for row, values in zip(logits.tolist(), bounded_logits(logits, rate).tolist()):
+    for row, values in zip(logits.tolist(), paper.bounded_logits(logits, rate).tolist()):
         shares = [math.exp(value) for value in row]
         for value, share in zip(values, shares):
             told = (1 - rate) * share / sum(shares)
             assert value == pytest.approx(math.log(told + rate / 6), abs=1e-12)
-    values = bounded_logits(scale * logits[:1], rate)
+    values = paper.bounded_logits(scale * logits[:1], rate)
     bound = math.log(1 + 6 * (1 - rate) / rate)
     assert np.isfinite(values).all() and np.ptp(values) <= bound * (1 + 1e-12)
     for shape in ((0, 5), (3, 0)):
-        assert bounded_logits(np.zeros(shape), rate).shape == shape
+        assert paper.bounded_logits(np.zeros(shape), rate).shape == shape
 
 
 def test_one_confident_wrong_frame_does_not_outweigh_two_right_ones() -> None:
     frames = np.array([[13.8, -13.8, -13.8], [-1.0, 2.0, -1.0], [-1.0, 2.0, -1.0]])
     assert frames.sum(axis=0).argmax() == 0
-    assert bounded_logits(frames, 0.1).sum(axis=0).argmax() == 1
+    assert paper.bounded_logits(frames, 0.1).sum(axis=0).argmax() == 1
 
 
-@pytest.mark.parametrize(("edge_belief", "rate"), [("paper", None), ("robust", OUTLIER_RATE)])
+@pytest.mark.parametrize(("edge_belief", "rate"), [("paper", None), ("robust", paper.OUTLIER_RATE)])
 def test_the_option_chooses_the_logits_that_are_summed(edge_belief: str, rate: float) -> None:
     logits = np.random.default_rng(0).normal(0, 5, (2, 3))
     seen = np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), np.full((2, 4), 0.25)
@@ -289,6 +275,6 @@ def test_the_option_chooses_the_logits_that_are_summed(edge_belief: str, rate: f
     config = Config(relations=RelationsConfig(edge_belief=edge_belief))
     builder = GraphBuilder(config, merging.VOCABULARY, "world")
     a, b = builder.integrate(local)
-    expected = logits if rate is None else bounded_logits(logits, rate)
+    expected = logits if rate is None else paper.bounded_logits(logits, rate)
     assert (builder.graph.edges[a, b].visual_logits == expected[0]).all()
     assert (builder.graph.edges[b, a].visual_logits == expected[1]).all()

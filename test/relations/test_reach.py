@@ -1,7 +1,5 @@
 """The grid that finds objects in reach, against brute force."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable
 
@@ -10,17 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deworldsg_ros.relations.reach import (
-    BESIDE_REACH_M,
-    CELL_M,
-    MAX_CELLS,
-    MIN_SHAPE_POINTS,
-    OVER_REACH_M,
-    REACH_M,
-    ReachGrid,
-    in_reach,
-    pairs_in_reach,
-)
+from deworldsg_ros.relations import reach
 from deworldsg_ros.relations.states import SHAPE
 
 seeds = st.integers(0, 10_000)
@@ -34,10 +22,10 @@ def shapes_of(low: np.ndarray, high: np.ndarray, counts: np.ndarray | int = 99) 
 
 def are_in_reach(a: np.void, b: np.void) -> bool:
     gap = np.maximum(a["low"], b["low"]) - np.minimum(a["high"], b["high"])
-    over = (gap[:2] <= BESIDE_REACH_M).all()
-    solid = min(a["count"], b["count"]) >= MIN_SHAPE_POINTS
-    level_m = OVER_REACH_M if over else BESIDE_REACH_M
-    return bool(solid and (gap[:2] <= REACH_M).all() and gap[2] <= level_m)
+    over = (gap[:2] <= reach.BESIDE_REACH_M).all()
+    solid = min(a["count"], b["count"]) >= reach.MIN_SHAPE_POINTS
+    level_m = reach.OVER_REACH_M if over else reach.BESIDE_REACH_M
+    return bool(solid and (gap[:2] <= reach.REACH_M).all() and gap[2] <= level_m)
 
 
 def brute_force(items: Iterable[int], shapes: np.ndarray) -> set[frozenset[int]]:
@@ -50,13 +38,13 @@ def brute_force(items: Iterable[int], shapes: np.ndarray) -> set[frozenset[int]]
 def test_pairs_in_reach_are_those_of_brute_force(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     low = rng.uniform(-1.5, 1.5, (count, 3))
-    counts = rng.integers(MIN_SHAPE_POINTS - 2, 3 * MIN_SHAPE_POINTS, count)
+    counts = rng.integers(reach.MIN_SHAPE_POINTS - 2, 3 * reach.MIN_SHAPE_POINTS, count)
     shapes = shapes_of(low, low + rng.uniform(0, 0.6, (count, 3)), counts)
-    found, expected = pairs_in_reach(shapes), brute_force(range(count), shapes)
+    found, expected = reach.pairs_in_reach(shapes), brute_force(range(count), shapes)
     assert found.shape == (len(expected), 2)
     assert {frozenset(pair) for pair in found.tolist()} == expected
     every = np.array(list(itertools.permutations(range(count), 2)), np.int64).reshape(-1, 2)
-    assert in_reach(every, shapes).tolist() == [are_in_reach(*shapes[pair]) for pair in every]
+    assert reach.in_reach(every, shapes).tolist() == [are_in_reach(*shapes[pair]) for pair in every]
 
 
 @settings(max_examples=30, deadline=None)
@@ -66,7 +54,7 @@ def test_a_grid_that_follows_finds_all_pairs(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 150
     shapes = shapes_of(np.zeros((count, 3)), np.zeros((count, 3)))
-    grid, items = ReachGrid(), set()
+    grid, items = reach.ReachGrid(), set()
     grid.remove(7)  # not known: nothing happens
     for _ in range(400):
         item = int(rng.integers(count))
@@ -74,7 +62,9 @@ def test_a_grid_that_follows_finds_all_pairs(seed: int) -> None:
             grid.remove(item)
             items.remove(item)
         else:
-            size = rng.choice([0.3, 3.0, 2.0 * CELL_M * MAX_CELLS**0.5], p=[0.8, 0.18, 0.02])
+            size = rng.choice(
+                [0.3, 3.0, 2.0 * reach.CELL_M * reach.MAX_CELLS**0.5], p=[0.8, 0.18, 0.02]
+            )
             shapes["low"][item] = rng.uniform(-15, 15, 3)
             shapes["high"][item] = shapes["low"][item] + rng.uniform(0, size, 3)
             grid.put(item, shapes["low"][item], shapes["high"][item])
@@ -101,4 +91,4 @@ def test_a_grid_that_follows_finds_all_pairs(seed: int) -> None:
 def test_how_far_related_objects_may_be_apart(offset, reached: bool) -> None:
     """Two cubes of 0.1 m."""
     low = np.array([[0.0, 0, 0], offset])
-    assert len(pairs_in_reach(shapes_of(low, low + 0.1))) == int(reached)
+    assert len(reach.pairs_in_reach(shapes_of(low, low + 0.1))) == int(reached)

@@ -1,7 +1,5 @@
 """What relations of different pairs exclude, against slow references and hand-made cases."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -13,20 +11,7 @@ from support.reference_rules import REST, circle_of, near_probabilities
 from support.reference_rules import one_support as reference_support
 
 from deworldsg_ros.graph.pairs import PAIR, link
-from deworldsg_ros.relations.rules import (
-    CARRIED_FIRST,
-    CARRIED_SECOND,
-    MOST,
-    NEAR_CERTAINTY,
-    NEAR_FLOOR_M,
-    NEAR_LEVEL_M,
-    NEAR_SUPPORT_M,
-    SEAT_GAP_M,
-    Scene,
-    one_support,
-    settle,
-    take_in,
-)
+from deworldsg_ros.relations import rules
 from deworldsg_ros.relations.states import (
     BELIEF,
     MIN_OTHER_VOTES,
@@ -62,9 +47,9 @@ def in_circles(seed: int, count: int) -> Room:
     return states, pairs, floor_odds * 1e-3
 
 
-def scene_of(pairs: np.ndarray, count: int) -> Scene:
+def scene_of(pairs: np.ndarray, count: int) -> rules.Scene:
     """Objects and their pairs, without a belief."""
-    scene = Scene(
+    scene = rules.Scene(
         np.zeros(count, SHAPE),
         np.zeros(count, np.int32),
         np.zeros(len(pairs), PAIR),
@@ -83,7 +68,7 @@ def supports_of(states: np.ndarray, pairs: np.ndarray, item: int) -> dict[int, f
     found = {}
     for (first, second), row in zip(pairs.tolist(), states):
         if item in (first, second):
-            carried = CARRIED_FIRST if item == first else CARRIED_SECOND
+            carried = rules.CARRIED_FIRST if item == first else rules.CARRIED_SECOND
             found[second if item == first else first] = float(row[carried].sum())
     return found
 
@@ -114,7 +99,7 @@ def test_the_kernel_equals_the_reference(
 ) -> None:
     states, pairs, floor_odds = in_circles(seed, count) if circles else room(seed, count, scale)
     before = states.copy()
-    found = one_support(states, pairs, floor_odds)
+    found = rules.one_support(states, pairs, floor_odds)
     np.testing.assert_array_equal(states, before)
     for one, other in zip(found, reference_support(states, pairs, floor_odds)):
         np.testing.assert_allclose(one, other, atol=1e-6)
@@ -124,7 +109,7 @@ def test_the_kernel_equals_the_reference(
         assert (values >= -1e-12).all() and (values <= 1 + 1e-9).all()
     np.testing.assert_allclose(after.sum(axis=1), 1, atol=1e-6)
     # Within the supports of one direction, and within the rest, the shares stay.
-    for group in (CARRIED_FIRST, CARRIED_SECOND, REST):
+    for group in (rules.CARRIED_FIRST, rules.CARRIED_SECOND, REST):
         shares = states[:, group] / states[:, group].sum(axis=1, keepdims=True)
         total = after[:, group].sum(axis=1, keepdims=True)
         np.testing.assert_allclose(after[:, group], shares * total, atol=1e-6)
@@ -139,7 +124,7 @@ def test_the_supports_of_an_object_are_events_of_which_one_at_most_holds(
     states, pairs, floor_odds = room(seed, count, scale=1.0)
     states[:, ~REST] *= 0.5
     states /= states.sum(axis=1, keepdims=True)
-    after, _, on_floor = one_support(states, pairs, floor_odds)
+    after, _, on_floor = rules.one_support(states, pairs, floor_odds)
     for item in range(count):
         before = supports_of(states, pairs, item)
         floor = floor_odds[item] / (1 + floor_odds[item])
@@ -156,7 +141,7 @@ def test_of_a_circle_the_weakest_support_goes() -> None:
     states[1, 1] = 0.99  # 1 on 2
     states[2, 2] = 0.9  # 2 on 0
     states[:, 0] = 1 - states[:, 1:].sum(axis=1)
-    after, kept, _ = one_support(states, pairs, np.zeros(3))
+    after, kept, _ = rules.one_support(states, pairs, np.zeros(3))
     assert kept[0, 0] > 0.9 and kept[1, 0] > 0.9
     assert 0.3 < kept[2, 1] < 0.5 and after[2, 0] > 0.5
 
@@ -173,7 +158,7 @@ def test_of_a_circle_the_weakest_support_goes() -> None:
 def test_supports_share_an_object(on, pairs, floor_odds, kept, on_floor) -> None:
     states = np.zeros((len(pairs), STATE_COUNT))
     states[:, 1], states[:, 0] = on, 1.0 - on
-    _, found, stands = one_support(states, np.array(pairs), np.array(floor_odds))
+    _, found, stands = rules.one_support(states, np.array(pairs), np.array(floor_odds))
     np.testing.assert_allclose(found[:, 0], kept, atol=1e-6)
     np.testing.assert_allclose(stands, on_floor, atol=1e-6)
 
@@ -182,7 +167,7 @@ def test_supports_share_an_object(on, pairs, floor_odds, kept, on_floor) -> None
 
 ON_ONE_TABLE = {(0, 2): 1.0, (1, 2): 1.0}
 # A definition that does not hold has this probability at most.
-LEAST = 1.0 - NEAR_CERTAINTY + 1e-6
+LEAST = 1.0 - rules.NEAR_CERTAINTY + 1e-6
 
 
 def near(
@@ -204,7 +189,7 @@ def near(
     beliefs = scene.beliefs
     beliefs["live"] = True
     for row, pair in enumerate(pairs):
-        on = [min(carried.get(ends, 0.0), MOST) for ends in (pair, pair[::-1])]
+        on = [min(carried.get(ends, 0.0), rules.MOST) for ends in (pair, pair[::-1])]
         beliefs["carried"][row] = on
         beliefs["states"][row, 1:3] = on
         beliefs["states"][row, 0] = unrelated * (1.0 - sum(on))
@@ -213,7 +198,7 @@ def near(
         beliefs["bottom_step_m"][row] = steps
         beliefs["centre_step_m"][row] = (centres or {}).get(pair, 0.0)
         beliefs["with_"][row, 0] = pair in seats
-    settle(scene, np.arange(count))
+    rules.settle(scene, np.arange(count))
     found = beliefs["relations"][:, :, NEAR]
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     return dict(zip(pairs, found[:, 0].tolist()))
@@ -223,22 +208,22 @@ def near(
     ("gap_m", "step_m", "on_one_table", "expected"),
     [
         (0.0, 0.0, False, 1.0),
-        (NEAR_FLOOR_M, 0.0, False, 0.5),
+        (rules.NEAR_FLOOR_M, 0.0, False, 0.5),
         (0.8, 0.0, False, 0.0),
         (np.inf, 0.0, False, 0.0),
         (0.0, 0.0, True, 1.0),
-        (NEAR_SUPPORT_M, 0.0, True, 0.5),
+        (rules.NEAR_SUPPORT_M, 0.0, True, 0.5),
         (0.2, 0.0, True, 0.0),
         # Books on two shelves of one bookcase are not near.
-        (0.0, -NEAR_LEVEL_M, True, 0.5),
-        (0.0, NEAR_LEVEL_M, True, 0.5),
-        (0.0, 3 * NEAR_LEVEL_M, True, 0.0),
+        (0.0, -rules.NEAR_LEVEL_M, True, 0.5),
+        (0.0, rules.NEAR_LEVEL_M, True, 0.5),
+        (0.0, 3 * rules.NEAR_LEVEL_M, True, 0.0),
     ],
 )
 def test_near_on_the_floor_and_on_one_support(gap_m, step_m, on_one_table, expected) -> None:
     more = {"floor": 0.0, "carried": ON_ONE_TABLE} if on_one_table else {}
     found = near({(0, 1): gap_m}, 3, steps=step_m, **more)
-    assert found[0, 1] == pytest.approx(NEAR_CERTAINTY * expected, abs=0.035)
+    assert found[0, 1] == pytest.approx(rules.NEAR_CERTAINTY * expected, abs=0.035)
 
 
 def test_near_needs_one_floor_or_one_support() -> None:
@@ -249,7 +234,7 @@ def test_near_needs_one_floor_or_one_support() -> None:
     together = near({(0, 1): 0.05}, 3, floor=0.0, carried=ON_ONE_TABLE)
     assert together[0, 1] > 0.9 and max(together[0, 2], together[1, 2]) < LEAST
     half = near({(0, 1): 0.0}, 3, floor=0.0, carried={(0, 2): 0.8, (1, 2): 0.7})
-    assert half[0, 1] == pytest.approx(0.56 * NEAR_CERTAINTY, abs=0.02)
+    assert half[0, 1] == pytest.approx(0.56 * rules.NEAR_CERTAINTY, abs=0.02)
 
 
 def test_near_are_the_two_nearest_neighbours() -> None:
@@ -286,8 +271,8 @@ def test_a_seat_is_with_its_table_whatever_else_is_near() -> None:
     gaps = {(0, 1): 0.05, (0, 2): 0.05, (0, 3): 0.2, (0, 4): 0.2}
     found = near(gaps, 5, seats=((0, 3), (0, 4)))
     assert min(found.values()) > 0.9
-    far = near({(0, 1): SEAT_GAP_M + 0.2}, 2, seats=((0, 1),))
-    assert far[0, 1] < 0.05 < near({(0, 1): SEAT_GAP_M}, 2, seats=((0, 1),))[0, 1]
+    far = near({(0, 1): rules.SEAT_GAP_M + 0.2}, 2, seats=((0, 1),))
+    assert far[0, 1] < 0.05 < near({(0, 1): rules.SEAT_GAP_M}, 2, seats=((0, 1),))[0, 1]
 
 
 # --- all rules, around what changed --------------------------------------------------------------
@@ -320,7 +305,7 @@ class Followed:
         self.near_logits[rows] = rng.choice([-1.0, 0.0, 0.7], count)
         self.worth[rows] = rng.choice([1.0, 2.5], count)
         evidence = (self.logits, self.votes, self.near_logits, self.worth)
-        take_in(self.scene, rows, *(values[rows] for values in evidence))
+        rules.take_in(self.scene, rows, *(values[rows] for values in evidence))
 
     def settle(self, rows: np.ndarray) -> np.ndarray:
         """As `RobustBeliefs` does; returns the rows whose relations changed."""
@@ -328,7 +313,7 @@ class Followed:
         for circle in self.circles:
             if circle & set(slots.tolist()):
                 slots = np.union1d(slots, np.array(sorted(circle)))
-        cut, changed = settle(self.scene, slots)
+        cut, changed = rules.settle(self.scene, slots)
         for place in cut.tolist():
             # More objects than those of the circle do no harm.
             self.circles.append(set(range(len(self.scene.shapes))))
@@ -348,10 +333,10 @@ class Followed:
         live = told | (beliefs["other_votes"] >= MIN_OTHER_VOTES) | ~apart
         tables, seats = (shapes["seating"][self.pairs, kind] > 0 for kind in range(2))
         with_ = (tables & seats[:, ::-1]).any(axis=1) & beliefs["judged"]
-        with_ &= beliefs["gap_m"] <= SEAT_GAP_M
+        with_ &= beliefs["gap_m"] <= rules.SEAT_GAP_M
         steps = (beliefs[name] for name in ("gap_m", "bottom_step_m", "centre_step_m"))
         near = near_probabilities(self.pairs, kept, on_floor, *steps, states[:, 0], with_)
-        near = np.clip(near, 1.0 - NEAR_CERTAINTY, NEAR_CERTAINTY)
+        near = np.clip(near, 1.0 - rules.NEAR_CERTAINTY, rules.NEAR_CERTAINTY)
         near = expit(logit(near) + self.worth * self.near_logits)
         relations = np.zeros((len(self.pairs), 2, NONE + 1))
         for end in (0, 1):

@@ -4,8 +4,6 @@ Each room is a few objects of COCO classes with sampled surfaces. An edge is sai
 has a probability of at least 0.5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Stage d: pairs at once, clips in a thread of their own, every lost clip counted."""
 
-from __future__ import annotations
-
 import re
 import threading
 from contextlib import contextmanager

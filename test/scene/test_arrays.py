@@ -1,7 +1,5 @@
 """Areas and overlaps of boxes, against a raster; and a softmax with the bits of scipy's."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import special

@@ -1,22 +1,12 @@
 """Intrinsics, poses and RGB-D frames: round trips and refusals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import random_pose, seeds
 
-from deworldsg_ros.scene.camera import (
-    Intrinsics,
-    RgbdFrame,
-    check_pose,
-    interpolate_pose,
-    invert_pose,
-    pose_from_quaternion,
-    quaternion_from_rotation,
-)
+from deworldsg_ros.scene import camera
 from deworldsg_ros.scene.errors import RefusedInput
 
 GOOD = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
@@ -26,77 +16,77 @@ NAN, INF = float("nan"), float("inf")
 @pytest.mark.parametrize("shape", [(0,), (5,), (2, 3)])
 def test_projection_is_the_inverse_of_back_projection(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
-    camera = Intrinsics(**GOOD)
-    assert camera.matrix.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
+    pinhole = camera.Intrinsics(**GOOD)
+    assert pinhole.matrix.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
     u, v, z = rng.uniform(0, 640, shape), rng.uniform(0, 480, shape), rng.uniform(0.1, 9, shape)
-    points = camera.back_project(u, v, z)
+    points = pinhole.back_project(u, v, z)
     assert points.shape == (*shape, 3)
     homogeneous = np.stack([u, v, np.ones(shape)], axis=-1)
-    expected = z[..., None] * (homogeneous @ np.linalg.inv(camera.matrix).T)
+    expected = z[..., None] * (homogeneous @ np.linalg.inv(pinhole.matrix).T)
     np.testing.assert_allclose(points, expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(camera.project(points), np.stack([u, v], axis=-1), rtol=1e-12)
+    np.testing.assert_allclose(pinhole.project(points), np.stack([u, v], axis=-1), rtol=1e-12)
 
 
 @given(seeds, st.floats(0, 1))
 def test_poses_there_and_back(seed: int, fraction: float) -> None:
     rng = np.random.default_rng(seed)
     T, T_b = random_pose(rng), random_pose(rng)
-    check_pose(T)
-    np.testing.assert_allclose(invert_pose(T) @ T, np.eye(4), atol=1e-12)
-    quat = quaternion_from_rotation(T[:3, :3])
+    camera.check_pose(T)
+    np.testing.assert_allclose(camera.invert_pose(T) @ T, np.eye(4), atol=1e-12)
+    quat = camera.quaternion_from_rotation(T[:3, :3])
     assert quat[3] >= 0 and np.linalg.norm(quat) == pytest.approx(1)
     # A quaternion and its negative are one rotation; a little off unit is forgiven.
     for same in (quat, -1.004 * quat):
-        np.testing.assert_allclose(pose_from_quaternion(T[:3, 3], same), T, atol=1e-12)
-    np.testing.assert_allclose(interpolate_pose(T, T_b, 0.0), T, atol=1e-9)
-    np.testing.assert_allclose(interpolate_pose(T, T_b, 1.0), T_b, atol=1e-9)
-    np.testing.assert_allclose(interpolate_pose(T, T, fraction), T, atol=1e-9)
-    between = interpolate_pose(T, T_b, fraction)
-    check_pose(between)
-    np.testing.assert_allclose(between, interpolate_pose(T_b, T, 1.0 - fraction), atol=1e-7)
+        np.testing.assert_allclose(camera.pose_from_quaternion(T[:3, 3], same), T, atol=1e-12)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T_b, 0.0), T, atol=1e-9)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T_b, 1.0), T_b, atol=1e-9)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T, fraction), T, atol=1e-9)
+    between = camera.interpolate_pose(T, T_b, fraction)
+    camera.check_pose(between)
+    np.testing.assert_allclose(between, camera.interpolate_pose(T_b, T, 1.0 - fraction), atol=1e-7)
 
 
 @pytest.mark.parametrize("axis", [None, 0, 1, 2])
 def test_half_turns(axis: int | None) -> None:
     quat = np.eye(4)[3 if axis is None else axis]
     diagonal = np.ones(3) if axis is None else np.where(np.arange(3) == axis, 1.0, -1.0)
-    T = pose_from_quaternion(np.zeros(3), quat)
+    T = camera.pose_from_quaternion(np.zeros(3), quat)
     np.testing.assert_allclose(T[:3, :3], np.diag(diagonal), atol=1e-15)
-    assert abs(quaternion_from_rotation(np.diag(diagonal)) @ quat) == pytest.approx(1)
+    assert abs(camera.quaternion_from_rotation(np.diag(diagonal)) @ quat) == pytest.approx(1)
 
 
 def quaternion(*values: float, x: float = 0.0) -> None:
-    pose_from_quaternion(np.array([x, 0.0, 0.0]), np.array(values))
+    camera.pose_from_quaternion(np.array([x, 0.0, 0.0]), np.array(values))
 
 
-def rgbd(**changes: object) -> RgbdFrame:
+def rgbd(**changes: object) -> camera.RgbdFrame:
     parts = {
         "stamp_ns": 1,
         "rgb": np.zeros((480, 640, 3), np.uint8),
         "depth_m": np.zeros((480, 640), np.float32),
-        "intrinsics": Intrinsics(**GOOD),
+        "intrinsics": camera.Intrinsics(**GOOD),
         "T_world_camera": np.eye(4),
     }
-    return RgbdFrame(**{**parts, **changes})
+    return camera.RgbdFrame(**{**parts, **changes})
 
 
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
-        (lambda: Intrinsics(**{**GOOD, "fx": 0.0}), "invalid_intrinsics"),
-        (lambda: Intrinsics(**{**GOOD, "fy": -1.0}), "invalid_intrinsics"),
-        (lambda: Intrinsics(**{**GOOD, "fx": NAN}), "invalid_intrinsics"),
-        (lambda: Intrinsics(**{**GOOD, "cx": INF}), "invalid_intrinsics"),
-        (lambda: Intrinsics(**{**GOOD, "width": 0}), "invalid_intrinsics"),
-        (lambda: Intrinsics(**{**GOOD, "height": -3}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fx": 0.0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fy": -1.0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fx": NAN}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "cx": INF}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "width": 0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "height": -3}), "invalid_intrinsics"),
         (lambda: quaternion(0, 0, 0, 0), "invalid_pose"),
         (lambda: quaternion(0, 0, 0, 1.1), "invalid_pose"),
         (lambda: quaternion(0, 0, NAN, 1), "invalid_pose"),
         (lambda: quaternion(0, 0, 0, 1, x=INF), "invalid_pose"),
-        (lambda: check_pose(np.eye(3)), "invalid_pose"),
-        (lambda: check_pose(np.full((4, 4), NAN)), "invalid_pose"),
-        (lambda: check_pose(np.diag([2.0, 1, 1, 1])), "invalid_pose"),
-        (lambda: check_pose(np.diag([-1.0, 1, 1, 1])), "invalid_pose"),
+        (lambda: camera.check_pose(np.eye(3)), "invalid_pose"),
+        (lambda: camera.check_pose(np.full((4, 4), NAN)), "invalid_pose"),
+        (lambda: camera.check_pose(np.diag([2.0, 1, 1, 1])), "invalid_pose"),
+        (lambda: camera.check_pose(np.diag([-1.0, 1, 1, 1])), "invalid_pose"),
         (lambda: rgbd(rgb=np.zeros((240, 320, 3), np.uint8)), "grid_mismatch"),
         (lambda: rgbd(rgb=np.zeros((480, 640), np.uint8)), "grid_mismatch"),
         (lambda: rgbd(depth_m=np.zeros((480, 320), np.float32)), "grid_mismatch"),

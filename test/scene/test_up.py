@@ -1,7 +1,5 @@
 """The up direction of the world, and its state in a map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Kinds of classes by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Copies of a graph that follow its updates: gaps, sessions, late starts, and rare questions."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import msgspec

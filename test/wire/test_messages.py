@@ -1,7 +1,5 @@
 """Messages: both ways without the loss of a bit, as msg_schemas/ says; and what is refused."""
 
-from __future__ import annotations
-
 import base64
 import importlib.util
 import json
