@@ -4,7 +4,6 @@ import os
 import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -197,21 +196,3 @@ def test_a_lock_is_held_once_and_a_dead_process_holds_none(tmp_path):
     with files.FileLock(path):
         pass
     assert names(tmp_path) == []
-
-
-def test_only_one_of_many_gets_the_lock(tmp_path):
-    inside = most = 0
-    guard = threading.Lock()
-
-    def take(_: int) -> None:
-        nonlocal inside, most
-        with suppress(BlockingIOError), files.FileLock(tmp_path / "a.map"):
-            with guard:
-                inside += 1
-                most = max(most, inside)
-            with guard:
-                inside -= 1
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(take, range(400)))
-    assert most == 1 and names(tmp_path) == []

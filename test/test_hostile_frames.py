@@ -156,14 +156,3 @@ def test_the_largest_sums_of_logits_are_published_and_saved(config: Config, tmp_
     check_map(builder, config, tmp_path / "a.map")
     with pytest.raises(ValueError, match="logits"):
         Relations(pairs[:1], logits[:1] * 1.1, np.ones(1))
-
-
-def test_a_map_has_the_errors_that_frames_may_have(tmp_path: Path) -> None:
-    """Poses with a few decimals, and a clock that starts again."""
-    config, local = CONFIGS["all nodes"], some(4)
-    builder = GraphBuilder(config, VOCABULARY, "map")
-    for stamp_ns in 8 * [1, LATEST_NS]:
-        pose = np.diag([1.00049, 1.00049, 1.00049, 1.0])
-        builder.integrate(replace(local, stamp_ns=stamp_ns, T_world_camera=pose))
-    assert len(builder.graph) >= 3
-    check_map(builder, config, tmp_path / "a.map")

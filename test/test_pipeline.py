@@ -90,15 +90,6 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
         assert told[predicate] == pytest.approx(value, abs=1e-4)
 
 
-def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
-    sure = Pipeline(PAPER, Scripted())
-    asked = Pipeline(ASKING, Scripted())
-    for index in range(3):
-        sure.process(frame(index))
-        asked.process(frame(index))
-    assert asked.graph().edges == sure.graph().edges
-
-
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
     # Without a graph the reasoner encodes every clip; so must the pipeline.
     every_clip = msgspec.structs.replace(ASKING.relations, max_clips_per_s=0.0)
@@ -164,18 +155,6 @@ def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
         Pipeline(PAPER, Scripted()).graph()
 
 
-def test_nodes_are_published_from_the_chosen_probability_on() -> None:
-    def published(min_existence: float) -> list[wire.NodeState]:
-        pipeline = Pipeline(Config(output=OutputConfig(min_existence=min_existence)), Scripted())
-        pipeline.process(frame(0))
-        assert pipeline.builder is not None
-        assert sum(pipeline.builder.hidden.values()) == 3 - len(pipeline.graph().nodes)
-        return pipeline.graph().nodes
-
-    assert len(published(0.0)) == 3 and published(1.0) == []
-    assert all(0.0 < node.existence < 1.0 for node in published(0.0))
-
-
 def test_the_paper_differs_from_the_default_in_these_options() -> None:
     assert load_config(CONFIGURATIONS / "default.yaml") == Config()
     default, paper = (msgspec.to_builtins(config) for config in (Config(), PAPER))
@@ -207,14 +186,6 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 def threads_ahead() -> list[str]:
     return [t.name for t in threading.enumerate() if "_ahead" in t.name]
-
-
-@pytest.mark.parametrize("count", [0, 1, 20])
-def test_all_items_come_in_order(count: int) -> None:
-    assert list(read_ahead(iter(range(count)), 2)) == list(range(count))
-    results = [(item, future.result()) for item, future in apply_ahead(str, range(count), 3)]
-    assert results == [(item, str(item)) for item in range(count)]
-    assert threads_ahead() == []
 
 
 def test_reading_is_in_another_thread_and_bounded() -> None:
@@ -251,24 +222,6 @@ def test_errors_come_with_their_items() -> None:
         (item, future.exception()) for item, future in apply_ahead((4).__floordiv__, [0, 2], 2)
     ]
     assert isinstance(found[0][1], ZeroDivisionError) and found[1] == (2, None)
-
-
-def test_the_function_runs_for_several_items_at_the_same_time_and_not_for_all() -> None:
-    together = threading.Barrier(2, timeout=5)
-    started: list[int] = []
-
-    def meet(item: int) -> int:
-        started.append(item)
-        together.wait()
-        return item
-
-    pairs = apply_ahead(meet, range(40), 2)
-    assert next(pairs)[1].result(timeout=5) == 0
-    # Of four items that were handed over at most, none is left without its partner.
-    wait_until(lambda: len(started) == 4)
-    time.sleep(0.05)
-    assert sorted(started) == [0, 1, 2, 3]
-    pairs.close()
 
 
 def test_an_interrupt_of_the_consumer_ends_all_threads() -> None:

@@ -97,17 +97,6 @@ def shift(x_m: float) -> np.ndarray:
     return T
 
 
-def test_a_node_seen_before_and_after_stays() -> None:
-    builder = builder_of("paper")
-    for stamp_ns in (1 * S, 5 * S):
-        builder.integrate(slab_at(stamp_ns, 0.0))
-    builder.integrate(slab_at(6 * S, 3.0))
-    assert builder.apply_correction(shift(0.5), 4 * S) == [2]
-    means = {node_id: node.mean_m[0] for node_id, node in states(builder).items()}
-    assert means[1] == pytest.approx(0.0, abs=0.05)
-    assert means[2] == pytest.approx(means[1] + 3.5)
-
-
 @pytest.mark.parametrize("association", ["paper", "surface"])
 def test_after_the_correction_the_object_is_matched_at_its_new_position(association: str) -> None:
     builder, T = builder_of(association), shift(2.0)

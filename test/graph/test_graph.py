@@ -9,7 +9,6 @@ from support.merging import (
     random_classes,
     random_covariances,
     seeds,
-    set_confirmed,
 )
 from support.node_states import node_states
 
@@ -224,15 +223,3 @@ def test_unchanged_nodes_keep_their_message() -> None:
     assert list(third) == [1, 3]
     assert third[1].observations == 3
     assert third[3] is first[3]
-
-
-def test_hidden_nodes_have_no_message() -> None:
-    graph = graph_of(1)
-    for x in (5.0, 9.0):
-        graph.add_node(np.array([x, 0, 0]), np.eye(3), SURE, 3, confirmed=False)
-    assert list(node_states(graph, 2)) == [1]
-    set_confirmed(graph, 3, True)
-    assert list(node_states(graph, 2)) == [1, 3]
-    assert node_states(graph, 2)[3].confirmed
-    assert graph.merge_nodes(2, 3) == 2  # a confirmed node stays confirmed
-    assert list(node_states(graph, 2)) == [1, 2]

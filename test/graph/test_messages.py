@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import VOCABULARY
 from support.node_states import node_states
-from support.room_nodes import room, table, thing
 
 from deworldsg_ros.graph.extent import (
     box_of,
@@ -122,23 +121,6 @@ def test_extents_of_known_nodes_may_wait(points: np.ndarray) -> None:
     assert all(state.mean_m[0] > before[i].mean_m[0] + 0.9 for i, state in states.states.items())
 
 
-def test_a_symmetric_relation_is_sent_once() -> None:
-    builder, ids = room(
-        {
-            "table": table(0.0, 0.0),
-            "cup": thing("cup", -0.05, 0.0, 0.74, 0.08, 0.08, 0.1),
-            "bowl": thing("bowl", 0.1, 0.0, 0.74, 0.1, 0.1, 0.08),
-        }
-    )
-    edges = builder.full().edges
-    near = [edge for edge in edges if edge.predicate == "near"]
-    assert [(edge.subject, edge.object) for edge in near] == [(ids["cup"], ids["bowl"])]
-    assert near[0].mutual is True
-    on = [edge for edge in edges if edge.predicate == "on"]
-    assert {edge.subject for edge in on} == {ids["cup"], ids["bowl"]}
-    assert all(edge.mutual is msgspec.UNSET for edge in on)
-
-
 # --- boxes and moments of surfaces ---------------------------------------------------------------
 
 
@@ -165,13 +147,6 @@ def test_a_box_is_found_in_every_world(up, heading) -> None:
     assert rotation[:, 2] == pytest.approx(np.array(up) / np.linalg.norm(up), abs=1e-3)
     inside = np.abs((points - box.center_m) @ rotation) <= np.array(box.size_m) / 2 + 2e-3
     assert inside.all(axis=1).mean() > 0.98
-
-
-def test_stray_points_do_not_grow_a_box() -> None:
-    rng = np.random.default_rng(2)
-    points = shell(rng, 500, np.array([0.3, 0.3, 0.3]))
-    stray = rng.uniform(-1, 1, (10, 3)) + [2.0, 0.0, 0.0]
-    assert max(box_of(np.concatenate([points, stray]), Z).size_m) < 0.5
 
 
 def test_few_points_and_points_at_nearly_one_place_have_a_box() -> None:
@@ -207,16 +182,6 @@ def test_even_moments_lean_less_to_where_points_are_dense() -> None:
     assert np.sqrt(covariance[1, 1]) == pytest.approx(0.4 / 12**0.5, rel=0.1)
     assert np.array_equal(covariance, covariance.T)
     assert np.linalg.eigvalsh(covariance).min() > 0
-
-
-def test_even_moments_move_with_the_world_frame() -> None:
-    rng = np.random.default_rng(9)
-    points = rng.uniform(-0.2, 0.2, (300, 3)) * (1, 1, 0.1)
-    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    mean, covariance = even_moments(points.astype(np.float32))
-    moved = even_moments((points @ rotation.T + (1, 2, 3)).astype(np.float32))
-    assert np.allclose(moved[0], rotation @ mean + (1, 2, 3), atol=1e-3)
-    assert np.allclose(moved[1], rotation @ covariance @ rotation.T, atol=1e-4)
 
 
 # --- surface points as bytes ---------------------------------------------------------------------

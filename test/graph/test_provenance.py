@@ -12,7 +12,6 @@ from support.surfaces import CAMERA, CUP, HERE, TABLE, slab, view
 from deworldsg_ros.client import SceneGraph as AskedGraph
 from deworldsg_ros.config import Config, InputsConfig, OutputConfig
 from deworldsg_ros.graph import graph_files, provenance
-from deworldsg_ros.graph.edits import MergeNodes
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph.pairs import frame_votes
@@ -81,13 +80,6 @@ def test_frames_follow_merges_and_removals_and_do_not_grow() -> None:
     assert len(node.clearest) == provenance.CLEAREST
 
 
-def test_a_removed_row_and_faint_votes_are_not_noted() -> None:
-    memory = Memory(2)
-    memory.see(1, 0.5, [0, 2], -9.0)
-    memory.see(1, 0.5, [1, 2], -9.0)
-    assert memory.spans() == [(1, 0, 1, 1), (2, 0, 1, 1)]
-
-
 @pytest.fixture
 def table_and_cup() -> GraphBuilder:
     builder = GraphBuilder(CONFIG, VOCABULARY, "world")
@@ -115,13 +107,6 @@ def test_explain_names_the_frames_of_a_saved_graph(tmp_path, table_and_cup) -> N
     assert AskedGraph.load(tmp_path).frames(1) is None
     provenance.path_beside(path).write_text("{")
     assert AskedGraph.load(tmp_path).frames(1) is None
-
-
-def test_a_merged_object_has_the_frames_of_both(table_and_cup) -> None:
-    (merged,) = table_and_cup.edit(MergeNodes([1, 2])).nodes
-    found = table_and_cup.frames.all(table_and_cup.graph)
-    seen = {item.node: item for item in found if not item.other}
-    assert seen[merged].first_ns == 10**8 and len(seen[merged].clearest) == provenance.CLEAREST
 
 
 # --- the space that was seen ---------------------------------------------------------------------

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec import UNSET
 from support.merging import VOCABULARY
 from support.node_states import node_states
 from support.surfaces import CUP, HERE, depth_grid, frame
@@ -13,7 +12,7 @@ from support.surfaces import CUP, HERE, depth_grid, frame
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import SceneGraph
-from deworldsg_ros.merging import PaperMerging, SurfaceMerging, beliefs
+from deworldsg_ros.merging import SurfaceMerging, beliefs
 from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import FULL, HALF, QUARTER
 
@@ -85,22 +84,6 @@ def test_one_frame_of_many_is_not_enough() -> None:
     assert walk.published == [1] and walk.hidden == {}
 
 
-def test_scores_and_looks_from_different_positions_add_up() -> None:
-    """Scores of 0.2 are far below the usual threshold of a detector."""
-    moving, still, sure = (Walk(frames_per_s=1.0) for _ in range(3))
-    moving.see(3, score=0.2)
-    still.see(3, score=0.2, step_m=0.0)
-    assert moving.existence > still.existence + 0.1
-    still.see(10, score=0.2, step_m=0.0)
-    assert still.published == moving.published == [1]
-    found = []
-    for score in (0.3, 0.6, 0.9):
-        sure = Walk(frames_per_s=1.0)
-        sure.see(score=score)
-        found.append(sure.existence)
-    assert found == sorted(found) and found[2] > found[0] + 0.1
-
-
 def test_the_reader_chooses_the_threshold() -> None:
     cautious, open_ = Walk(min_existence=0.95), Walk(min_existence=0.0)
     for walk in (cautious, open_):
@@ -148,18 +131,6 @@ def test_misses_that_are_no_evidence_change_nothing(frames: int, changes: dict) 
     assert walk.existence == before
 
 
-def test_a_detection_that_lasted_a_moment_is_soon_hidden() -> None:
-    """Two nodes with as many detections; those of one are more than a second apart."""
-    moment, longer = Walk(), Walk()
-    for walk in (moment, longer):
-        walk.see(4)
-        walk.stamp_ns += 2 * 10**9 if walk is longer else 0
-        walk.see(2)
-        assert walk.published == [1]
-        walk.miss(40)
-    assert moment.published == [] and longer.published == [1]
-
-
 def test_an_improbable_node_is_forgotten() -> None:
     walk = Walk()
     walk.miss()
@@ -169,20 +140,6 @@ def test_an_improbable_node_is_forgotten() -> None:
     walk.stamp_ns += 11 * 10**9
     walk.miss(step_m=5.0)
     assert len(walk.graph) == 0
-
-
-def test_the_message_of_a_node_changes_with_its_rounded_existence_only() -> None:
-    walk = Walk()
-    walk.see(60)
-    walk.miss(step_m=0.0)
-    before = node_states(walk.graph, 1)[1]
-    walk.miss(step_m=0.0)
-    after = node_states(walk.graph, 1)[1]
-    assert after is before or after.existence != before.existence
-    # The rule of the paper does not estimate it.
-    graph, merging = SceneGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
-    merging.merge(graph, frame(1, (HERE, CUP), scores=np.array([0.01])))
-    assert node_states(graph, 1)[1].existence is UNSET and merging.hidden(graph) == {}
 
 
 def test_a_loaded_node_is_published(tmp_path: Path) -> None:
@@ -356,13 +313,6 @@ def random_errors(seed: int) -> list[int]:
 )
 def test_the_name_that_returns_wins(labels: list[int]) -> None:
     assert named(frames_of(labels), frames_per_s=20.0).argmax() == 3
-
-
-def test_many_frames_are_surer_and_two_equal_spells_leave_doubt() -> None:
-    few, many = named(frames_of([3] * 2)), named(frames_of([3] * 300))
-    assert many[3] > few[3] + 0.2 and many[3] > 0.85
-    classes = named(frames_of([3] * 10 + [5] * 10))
-    assert 0.2 < classes[3] < 0.8 and 0.2 < classes[5] < 0.8
 
 
 def filtered(frames: list[np.ndarray], step_s: float) -> np.ndarray:

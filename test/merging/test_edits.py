@@ -290,18 +290,3 @@ def test_what_was_said_of_a_part_holds_when_the_other_part_goes(tmp_path):
     assert list(read_map(Config(), tmp_path / "room.map").graph.edits.labels) == [right]
     room.builder.graph.remove_node(right)  # an object that goes takes its edits with it
     assert not room.builder.graph.edits
-
-
-def test_a_map_keeps_what_was_said_of_the_part_that_is_left(tmp_path):
-    builder = GraphBuilder(Config(), VOCABULARY, "world")
-    for stamp in range(1, 9):
-        builder.integrate(view(stamp, (LONG, TABLE)))
-    (whole,) = [node.id for node in builder.full().nodes]
-    builder.edit(SetLabel(whole, "bench"))
-    builder.edit(SplitNode(whole))
-    for stamp in range(9, 40):
-        builder.integrate(view(stamp, (RIGHT, TABLE)))
-    assert [node.label for node in builder.full().nodes] == ["bench"]
-    write_map(builder, tmp_path / "room.map")
-    again = read_map(Config(), tmp_path / "room.map")
-    assert [node.label for node in again.full().nodes] == ["bench"]

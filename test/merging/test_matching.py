@@ -184,15 +184,3 @@ def test_a_node_that_overlaps_two_separate_nodes_merges_with_one_only() -> None:
     assert pair in {(1, 2), (1, 3)}
     evidence.merge(*pair)
     assert evidence.next_merge() is None
-
-
-@given(seeds)
-@settings(max_examples=20)
-def test_evidence_continues_from_its_balances(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    evidence, restored = matching.JointEvidence(), matching.JointEvidence()
-    for _ in range(30):
-        slots = rng.permutation(6)[: rng.integers(1, 5)].tolist()
-        add_frame(evidence, slots, [*slots, 6], rng.integers(0, 2, (len(slots), len(slots) + 1)))
-    restored.restore(evidence.balances)
-    assert restored.balances == evidence.balances

@@ -10,7 +10,6 @@ from support.merging import (
     random_classes,
     random_covariances,
     random_local_graphs,
-    random_pose,
     seeds,
 )
 from support.reference_merging import ReferenceMerging, class_distance, may_merge
@@ -28,10 +27,7 @@ from deworldsg_ros.merging.paper_rule import (
 )
 from deworldsg_ros.scene.frame_graph import LocalGraph
 from deworldsg_ros.scene.gaussian import (
-    bhattacharyya_distance,
-    eigenvalue_bound,
     hellinger_distance,
-    transform,
 )
 
 # --- the nearest node (Eq. 5 and 6) --------------------------------------------------------------
@@ -97,19 +93,6 @@ def test_the_warm_up_compiles_the_only_signature() -> None:
     assert list(_nearest.signatures) == compiled
 
 
-@given(seeds)
-def test_the_bounds_of_the_prefilter_hold(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    a, b = random_covariances(rng, 2)
-    d = rng.normal(0, 1, 3)
-    distance = bhattacharyya_distance(d, a, np.zeros(3), b)
-    bound = d @ d / (4 * (eigenvalue_bound(a) + eigenvalue_bound(b)))
-    assert bound <= distance * (1 + 1e-9) + 1e-12
-    assert d @ np.linalg.solve((a + b) / 2, d) / 8 <= distance + 1e-9
-    for threshold in (0.1, 0.5, 0.99):
-        assert np.sqrt(1 - np.exp(-bhattacharyya_bound(threshold))) == pytest.approx(threshold)
-
-
 # --- the rule ------------------------------------------------------------------------------------
 
 CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])
@@ -172,25 +155,6 @@ def test_the_rule_equals_the_reference(seed: int) -> None:
     assert (nodes.first_seen_ns <= nodes.last_seen_ns).all()
     for local, row_ids in zip(frames, ids):
         assert graph.nodes_of_frame(local.stamp_ns) == [graph.resolve(item) for item in row_ids]
-
-
-@given(seeds)
-@settings(max_examples=30)
-def test_the_result_does_not_depend_on_the_world_frame(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    frames = random_local_graphs(rng, 8)
-    reference_of(frames, 1e-6)
-    T, moved_frames = random_pose(rng), []
-    for local in frames:
-        moved = transform(local.means_world, local.covariances_world, T)
-        moved_frames.append(local_graph(local.stamp_ns, *moved, local.class_probabilities))
-    (graph, ids), (moved, moved_ids) = merge_all(frames), merge_all(moved_frames)
-    assert moved_ids == ids
-    nodes, slots = graph.nodes, graph.nodes.slots
-    assert moved.nodes.slot_of == nodes.slot_of
-    means, covariances = transform(nodes.means[slots], nodes.covariances[slots], T)
-    np.testing.assert_allclose(moved.nodes.means[slots], means, atol=1e-9)
-    np.testing.assert_allclose(moved.nodes.covariances[slots], covariances, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -187,24 +187,6 @@ def test_observations_are_weighted_by_pixels(scene) -> None:
     assert scene.graph.nodes.observations.tolist() == [2]
 
 
-def test_the_result_does_not_depend_on_the_world_frame() -> None:
-    rng = np.random.default_rng(3)
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    shift = np.array([10.0, -4.0, 2.0])
-    views = [
-        [(LEFT, TABLE)],
-        [(WHOLE, TABLE), (ON_TABLE, CUP)],
-        [(ON_TABLE, CHAIR), (RIGHT, TABLE)],
-    ]
-    here, there = Scene(), Scene()
-    for objects in views:
-        moved = [((points @ rotation.T + shift).astype("f4"), kind) for points, kind in objects]
-        assert here.see(*objects) == there.see(*moved)
-    means = (there.graph.nodes.means - shift) @ rotation
-    assert means == pytest.approx(here.graph.nodes.means, abs=1e-5) and len(means) == 2
-
-
 # --- absent and moved objects --------------------------------------------------------------------
 
 THERE = slab((-0.4, -0.1, 0.7), (0.08, 0.08, 0.06))

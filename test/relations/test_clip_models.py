@@ -166,20 +166,6 @@ def test_what_is_no_such_checkpoint_is_refused(tmp_path, write, message):
         clip_models.load_vjepa2(config_of("vjepa2", tmp_path))
 
 
-@pytest.mark.parametrize(
-    "path, message",
-    [
-        ("", "relations.world_model_path is empty"),
-        ("/no/such/folder", "there is no such folder"),
-        ("nobody/no-such-model", "run `hf download nobody/no-such-model`"),
-    ],
-)
-def test_a_missing_checkpoint_is_one_sentence(path, message):
-    with pytest.raises(ConfigurationError, match=message) as refusal:
-        clip_models.load_vjepa2(config_of("vjepa2", path))
-    assert "\n" not in str(refusal.value)
-
-
 def test_a_checkpoint_without_the_unused_predictor_is_accepted(checkpoints, tmp_path):
     rewrite(tmp_path, lambda name: not name.startswith("predictor."))
     identity = load("vjepa2", checkpoints["vjepa2"]).identity

@@ -137,19 +137,6 @@ def test_the_clip_of_a_tentative_pair_is_cut_before_its_frames_leave():
     assert (late.requests[0].clip == early.requests[0].clip).all()
 
 
-def test_clips_are_ranked_by_the_current_nodes():
-    """A merge may turn a queued pair into one that was encoded already."""
-    graph = of_pair()
-    stage = watching(graph)
-    assert encoded_clips(stage, 1) == [1]
-    graph.labels.update({3: "cup"})
-    graph.observations[3] = 3
-    graph.rows, graph.tentative = [1, 3], {3}
-    assert encoded_clips(stage, 2) == [0]
-    graph.rows = [1, 2]  # merged
-    assert stage.drain() == [] and stage.counters().dropped == {"already_encoded": 1}
-
-
 def test_every_clip_is_encoded_without_a_graph_and_without_a_budget():
     graph = of_pair()
     graph.newest_ns = None

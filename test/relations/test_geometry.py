@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from support.room_nodes import bowl, box, surface, table, thing
 
 from deworldsg_ros.relations import geometry
 from deworldsg_ros.relations.reach import REACH_M
@@ -205,52 +204,6 @@ def test_features_do_not_depend_on_the_world_frame(seed: int, kind: str) -> None
     np.testing.assert_allclose(here, there, atol=1e-5)
 
 
-CUP_ON_TABLE = ([box(0.3, 0.1, 0.74, 0.09, 0.09, 0.1)], table(0, 0).parts)
-ORANGE_IN_BOWL = ([box(0.0, 0.0, 0.02, 0.07, 0.07, 0.07)], bowl(0.0, 0.0, 0.0).parts)
-BOTTLE_AND_FRIDGE = (
-    thing("bottle", 0.3, 0.25, 0.74, 0.075, 0.075, 0.3).parts,
-    thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76).parts,
-)
-
-
-@pytest.mark.parametrize(
-    ("parts", "ranges"),
-    [
-        pytest.param(
-            CUP_ON_TABLE,
-            {
-                "gap_m": (0, 0), "covered": (1, 1), "covers": (0, 0.02),
-                "overlap_small_m": (0.07, 0.11), "bottom_to_surface_m": (-0.02, 0.02),
-                "soft_bottom_to_surface_m": (-0.02, 0.02), "higher": (0, 0),
-                "ring_points": (np.log(3), 9), "bottom_over_floor_m": (0.72, 0.76),
-                "bottom_over_top_m": (-0.02, 0.02), "inside": (0, 0.3), "enclosed": (0, 0),
-                "distance_m": (0, 0.05),
-            },
-            id="a cup on a table",
-        ),
-        pytest.param(
-            ORANGE_IN_BOWL,
-            {"enclosed": (1, 1), "inside": (0.6, 1), "around": (0, 0.1), "covered": (1, 1)},
-            id="an orange in a bowl",
-        ),
-        pytest.param(
-            BOTTLE_AND_FRIDGE,
-            {
-                "gap_m": (2.7, 2.76), "distance_m": (1, 1), "covered": (0, 0), "ring": (0, 0),
-                "inside": (0, 0), "enclosed": (0, 0), "bottom_to_surface_m": (1, 1),
-                "soft_bottom_to_surface_m": (0.3, 0.3),
-            },
-            id="a bottle far from a refrigerator",
-        ),
-    ],
-)  # fmt: skip
-def test_features_of_known_pairs(parts, ranges: dict[str, tuple[float, float]]) -> None:
-    clouds = clouds_of(*(surface(boxes, np.random.default_rng(0)) for boxes in parts))
-    seen = dict(zip(geometry.FEATURES, features_of(clouds, np.array([[0, 1]]))[0].tolist()))
-    for name, (least, most) in ranges.items():
-        assert least <= seen[name] <= most, name
-
-
 # --- shapes --------------------------------------------------------------------------------------
 
 
@@ -265,17 +218,6 @@ def test_the_shape_of_points(count: int) -> None:
         np.testing.assert_allclose(shape["mean"], used.mean(axis=0), atol=1e-6)
         np.testing.assert_allclose(shape["covariance"], spread, atol=1e-6)
         assert (shape["low"] <= shape["high"]).all()
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=seeds)
-def test_bounds_of_an_even_surface_are_those_of_the_object(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    size = rng.uniform(0.1, 1.0, 3)
-    (shape,) = clouds_of(rng.uniform(-0.5, 0.5, (512, 3)) * size).shapes
-    np.testing.assert_allclose(shape["high"][:2], size[:2] / 2, atol=0.03)
-    np.testing.assert_allclose(shape["low"][:2], -size[:2] / 2, atol=0.03)
-    assert -size[2] / 2 <= shape["low"][2] <= shape["high"][2] <= size[2] / 2
 
 
 def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
@@ -303,7 +245,11 @@ def test_a_shape_that_is_measured_again_forgets_the_old_one() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.tuples(up_components, up_components, up_components))
-def test_the_upright_frame_is_a_rotation_that_makes_up_z(up: tuple[float, float, float]) -> None:
+@example((0.0, 0.0, 2.0))
+@example((0.0, 0.0, -1.0))
+@example((1e-9, 0.0, -1.0))
+@example((0.01, -0.01, -1.0))
+def test_the_upright_frame_is_the_smallest_rotation_that_makes_up_z(up) -> None:
     up_world = np.array(up)
     length = np.linalg.norm(up_world)
     if length < 1e-3:
@@ -314,20 +260,5 @@ def test_the_upright_frame_is_a_rotation_that_makes_up_z(up: tuple[float, float,
     np.testing.assert_allclose(R @ up_world / length, [0, 0, 1], atol=0.02)
     if up_world[2] / length > -0.9999:
         np.testing.assert_allclose(R @ up_world / length, [0, 0, 1], atol=1e-9)
-        # It is the smallest one: its angle is that between up and z.
+        # Its angle is that between up and z.
         assert (np.trace(R) - 1) / 2 == pytest.approx(up_world[2] / length, abs=1e-9)
-
-
-@pytest.mark.parametrize("up", [(0, 0, -1), (1e-9, 0, -1), (0.01, -0.01, -1), (0, 0.1, -1)])
-def test_a_world_whose_z_axis_points_down(up: tuple[float, float, float]) -> None:
-    up_world = np.array(up) / np.linalg.norm(up)
-    R = geometry.rotation_to_upright(up_world)
-    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(R) == pytest.approx(1)
-    np.testing.assert_allclose(R @ up_world, [0, 0, 1], atol=0.02)
-
-
-def test_a_world_whose_z_axis_points_up_is_upright() -> None:
-    np.testing.assert_array_equal(
-        geometry.rotation_to_upright(np.array([0.0, 0.0, 2.0])), np.eye(3)
-    )

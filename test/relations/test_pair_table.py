@@ -291,24 +291,6 @@ def test_nodes_with_few_points_are_not_judged(geometry: bool) -> None:
     assert len(predicted_prior(followed)) <= geometry
 
 
-def test_another_up_direction_turns_all_pairs() -> None:
-    """A world whose y axis is up: the same room, turned."""
-    builder, ids = things_room()
-    followed = Followed(builder.graph)
-    upright = dict(followed.refresh())
-    lying = dict(followed.refresh(np.array([0.0, 1.0, 0.0])))
-    assert any(abs(lying[pair]["gap_m"] - told["gap_m"]) > 0.05 for pair, told in upright.items())
-    turn = np.eye(4)
-    turn[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # z to y
-    for node_id in ids:
-        builder.graph.move_node(node_id, turn)
-    again = followed.refresh(np.array([0.0, 1.0, 0.0]))
-    assert again.keys() == upright.keys()
-    for pair, told in upright.items():
-        assert again[pair]["gap_m"] == pytest.approx(told["gap_m"], abs=0.01)
-        np.testing.assert_allclose(again[pair]["state_logits"], told["state_logits"], atol=1.0)
-
-
 def test_a_large_graph_turns_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pairs, "NEW_A_CALL", 4)
     followed = Followed(things_room(len(THINGS))[0].graph)
@@ -378,30 +360,7 @@ def test_a_prior_that_follows_is_that_of_all_pairs() -> None:
     assert len(prior) >= 3
 
 
-def test_cups_on_the_table_are_a_prior_of_cups_and_tables() -> None:
-    followed = small_room()[0]
-    followed.refresh()
-    names = VOCABULARY.classes
-    cup, dining_table = names.index("cup"), names.index("dining table")
-    priors, has_prior = predicted_prior(followed).lookup(
-        np.array([[cup, dining_table], [dining_table, cup]])
-    )
-    assert has_prior.tolist() == [True, False]
-    assert VOCABULARY.predicates[int(priors[0].argmax())] == "on"
-    # The model abstains on the chair beside the table: it says that they are not related.
-    assert len(predicted_prior(followed)) == 1
-
-
 # --- the floor -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("floor", [-1.36, 0.0, 0.5])
-def test_the_floor_is_where_the_lowest_objects_stand(floor: float) -> None:
-    bottoms = [floor] * 3 + [floor + 0.7] * 8
-    assert floor_height(bottoms) == pytest.approx(floor, abs=FLOOR_STEP_M / 2 + 1e-6)
-    # One node of many reaches below it.
-    below = [floor - 1.5] + [floor] * 20 + [floor + 0.7] * 20
-    assert floor_height(below) == pytest.approx(floor, abs=FLOOR_STEP_M / 2 + 1e-6)
 
 
 @settings(max_examples=50, deadline=None)

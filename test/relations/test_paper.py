@@ -125,15 +125,6 @@ def test_fused_edges_equal_the_reference(seed, predicates, alpha, threshold) -> 
         assert edge.entropy_nats == fused.entropies_nats[row]
 
 
-def test_every_provenance_occurs_and_no_edges() -> None:
-    logits, *more = random_edges(0, edges=60)
-    fused = paper.fuse_edges(0.3 * logits, *more, 0.5, 1.0)
-    known = [name for name, known in zip(provenances(fused), fused.known) if known]
-    assert set(known) == set(paper.PROVENANCES)
-    none = paper.fuse_edges(np.zeros((0, 3)), [], np.zeros((0, 3)), [], 0.5, 1)
-    assert len(none.known) == 0 and none.probabilities.shape == (0, 3)
-
-
 def test_the_gate_is_strict_at_the_threshold() -> None:
     logits, prior = np.array([0.3, 0.1, -0.2]), np.array([0.7, 0.2, 0.1])
     visual = paper.visual_distribution(logits)
@@ -146,12 +137,6 @@ def test_the_gate_is_strict_at_the_threshold() -> None:
     assert fuse_edge(None, np.array([0.9, 0.1]), 0.5, 1.0) is None
     certain = fuse_edge(np.array([9.0, 0, 0, 0]), np.array([0, 0, 0, 1.0]), 100.0, 1.0)
     assert certain.provenance == "visual" and certain.probabilities.argmax() == 0
-
-
-def test_more_alpha_means_more_prior() -> None:
-    visual, prior = np.full(3, 1 / 3), np.array([1.0, 0, 0])
-    first = [paper.fuse_distributions(visual, prior, np.array(a))[0] for a in (0.0, 0.5, 1.0, 10.0)]
-    assert first == sorted(first) and first[0] == pytest.approx(1 / 3) and first[-1] < 1
 
 
 # --- the prior of class pairs --------------------------------------------------------------------
@@ -259,12 +244,6 @@ def test_bounded_logits_are_those_of_a_mixture(seed: int, rate: float, scale: fl
     assert np.isfinite(values).all() and np.ptp(values) <= bound * (1 + 1e-12)
     for shape in ((0, 5), (3, 0)):
         assert paper.bounded_logits(np.zeros(shape), rate).shape == shape
-
-
-def test_one_confident_wrong_frame_does_not_outweigh_two_right_ones() -> None:
-    frames = np.array([[13.8, -13.8, -13.8], [-1.0, 2.0, -1.0], [-1.0, 2.0, -1.0]])
-    assert frames.sum(axis=0).argmax() == 0
-    assert paper.bounded_logits(frames, 0.1).sum(axis=0).argmax() == 1
 
 
 @pytest.mark.parametrize(("edge_belief", "rate"), [("paper", None), ("robust", paper.OUTLIER_RATE)])

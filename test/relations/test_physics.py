@@ -11,13 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import softmax
 
-from deworldsg_ros.config import RelationsConfig
 from deworldsg_ros.relations import physics
 from deworldsg_ros.relations.geometry import FEATURES
 from deworldsg_ros.relations.paper import entropy_nats
-from deworldsg_ros.relations.registry import WORLD_MODELS, build_world_model
 from deworldsg_ros.relations.states import (
-    ABOVE,
     DIRECTED,
     NEAR,
     NONE,
@@ -58,11 +55,6 @@ def test_the_shipped_file_loads_and_is_small(tmp_path: Path) -> None:
     copy = physics.load_physics_model(tmp_path / "same.npz")
     for name, values in shipped().items():
         np.testing.assert_array_equal(getattr(copy, name), values)
-
-
-def test_it_is_the_default_world_model_and_needs_no_clips() -> None:
-    assert "physics" in WORLD_MODELS and RelationsConfig().world_model == "physics"
-    assert build_world_model(RelationsConfig(world_model="physics")) is None
 
 
 def write_array(path: Path) -> None:
@@ -216,35 +208,6 @@ def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
             assert logits[row, state] == pytest.approx(expected, abs=1e-12)
         expected = evidence_of(counts[row, :, NEAR].mean(), n)
         assert near[row] == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize("scales", [SCALES, MODEL.votes])
-def test_evidence_grows_with_the_fraction_and_saturates_with_the_frames(scales) -> None:
-    def near(fractions: np.ndarray, frames: list[int]) -> np.ndarray:
-        counts = np.zeros((len(frames), 2, NONE))
-        counts[:, :, NEAR] = (fractions * frames)[:, None]
-        return physics.vote_logits(counts, np.array(frames), scales)[1]
-
-    fractions = np.linspace(0, 1, 21)
-    for frames in (1, 5, 100):
-        values = near(fractions, [frames] * 21)
-        assert (np.diff(values) > 0).all() and values[0] < 0 < values[-1]
-        assert near(np.array([scales.even]), [frames]) == pytest.approx(0)
-    for fraction in (0.0, 0.9):
-        values = np.abs(near(np.full(6, fraction), [1, 2, 4, 8, 1000, 10**6]))
-        assert (np.diff(values) > 0).all()
-        assert values[-1] - values[-2] < 0.01 * values[-1]
-
-
-def test_above_and_under_are_one_state() -> None:
-    """Half of the frames said that A is above B, the other half that B is under A."""
-    counts = np.zeros((1, 2, NONE))
-    counts[0, 0, ABOVE] = counts[0, 1, UNDER] = 5.0
-    (states,), _ = physics.vote_logits(counts, np.array([10]), SCALES)
-    assert states.argmax() == 1 + 2 * DIRECTED.index(ABOVE)
-    counts = np.zeros((1, 2, NONE))
-    counts[0, 1, ON] = 9.0
-    assert physics.vote_logits(counts, np.array([10]), SCALES)[0].argmax() == 2
 
 
 @pytest.mark.parametrize("count", [0, 3])

@@ -146,23 +146,6 @@ def test_of_a_circle_the_weakest_support_goes() -> None:
     assert 0.3 < kept[2, 1] < 0.5 and after[2, 0] > 0.5
 
 
-@pytest.mark.parametrize(
-    ("on", "pairs", "floor_odds", "kept", "on_floor"),
-    [
-        pytest.param(
-            0.98, [[0, 1], [0, 2]], [0.0, 1e9, 1e9], 49 / 99, [0, 1, 1], id="two good supports"
-        ),
-        pytest.param(0.8, [[0, 1]], [400.0, 1.0], 4 / 405, [400 / 405, 0.5], id="on the floor"),
-    ],
-)
-def test_supports_share_an_object(on, pairs, floor_odds, kept, on_floor) -> None:
-    states = np.zeros((len(pairs), STATE_COUNT))
-    states[:, 1], states[:, 0] = on, 1.0 - on
-    _, found, stands = rules.one_support(states, np.array(pairs), np.array(floor_odds))
-    np.testing.assert_allclose(found[:, 0], kept, atol=1e-6)
-    np.testing.assert_allclose(stands, on_floor, atol=1e-6)
-
-
 # --- near ----------------------------------------------------------------------------------------
 
 ON_ONE_TABLE = {(0, 2): 1.0, (1, 2): 1.0}
@@ -224,17 +207,6 @@ def test_near_on_the_floor_and_on_one_support(gap_m, step_m, on_one_table, expec
     more = {"floor": 0.0, "carried": ON_ONE_TABLE} if on_one_table else {}
     found = near({(0, 1): gap_m}, 3, steps=step_m, **more)
     assert found[0, 1] == pytest.approx(rules.NEAR_CERTAINTY * expected, abs=0.035)
-
-
-def test_near_needs_one_floor_or_one_support() -> None:
-    assert near({}, 0) == near({}, 3) == {}
-    assert near({(0, 1): 0.05}, 2, floor=0.0)[0, 1] < LEAST
-    elsewhere = {(0, 2): 1.0, (1, 3): 1.0}
-    assert near({(0, 1): 0.05}, 4, floor=0.0, carried=elsewhere)[0, 1] < LEAST
-    together = near({(0, 1): 0.05}, 3, floor=0.0, carried=ON_ONE_TABLE)
-    assert together[0, 1] > 0.9 and max(together[0, 2], together[1, 2]) < LEAST
-    half = near({(0, 1): 0.0}, 3, floor=0.0, carried={(0, 2): 0.8, (1, 2): 0.7})
-    assert half[0, 1] == pytest.approx(0.56 * rules.NEAR_CERTAINTY, abs=0.02)
 
 
 def test_near_are_the_two_nearest_neighbours() -> None:

@@ -116,16 +116,6 @@ def test_frames_without_objects_are_in_the_clip_and_later_frames_are_not():
         assert (frame == picture(stamp)[10:41, 10:51]).all()
 
 
-def test_the_newest_clip_is_first_and_within_a_frame_the_nearest_pair():
-    stage = reasoner()
-    observe(stage, 1, 2, 3)
-    assert stamps_of(stage.drain()) == [3, 2, 1]
-    stage = reasoner(queue_size=100)
-    stage.observe(crowd_graph(1, 6), picture(1))
-    costs = [evidence.geo_costs[0] for evidence in stage.drain()]
-    assert len(costs) == 15 and costs == sorted(costs)
-
-
 def lose_the_oldest(stage):
     observe(stage, 1, 2, 3, 4)
     assert stage.counters().pending == 2
@@ -373,21 +363,6 @@ def request(seed=0, classes=((0, 1), (1, 0))):
     names = VOCABULARY.classes
     pairs = tuple(PairContext(BOX, BOX, s, o, names[s], names[o]) for s, o in classes)
     return ClipRequest(clip, pairs, VOCABULARY)
-
-
-def test_the_fake_depends_only_on_clip_classes_and_seed():
-    predicted = FakeWorldModel(16).predict(request())
-    for asked, shape in ((request(0), (2, 4)), (request(1, ((0, 0),)), (1, 4))):
-        found = FakeWorldModel(16).predict(asked)
-        assert found.shape == shape and (found > 0).all()
-        np.testing.assert_allclose(found.sum(axis=1), 1.0)
-    assert (predicted == FakeWorldModel(16).predict(request())).all()
-    assert not np.allclose(predicted[0], predicted[1])  # the other direction
-    assert not np.allclose(predicted, FakeWorldModel(16).predict(request(seed=1)))
-    assert not np.allclose(predicted, FakeWorldModel(16, seed=1).predict(request()))
-    # The class pair decides the most probable predicate.
-    predictions = [FakeWorldModel(16).predict(request(seed)) for seed in range(20)]
-    assert len({tuple(p.argmax(axis=1).tolist()) for p in predictions}) == 1
 
 
 def test_the_fake_gives_its_recorded_prediction():

@@ -196,10 +196,3 @@ def test_said_predicates(seed: int, count: int) -> None:
     for other in (states.said_predicates(probabilities.copy(), sources + 1, SYMMETRIC)[0],
                   states.said_predicates(probabilities + 1e-3, sources, SYMMETRIC)[0]):  # fmt: skip
         assert (other[said != 0] != said[said != 0]).all()
-
-
-@pytest.mark.parametrize(("there", "back", "is_mutual"), [(0.8, 0.8, True), (0.8, 0.7, False)])
-def test_a_symmetric_predicate_is_said_once(there: float, back: float, is_mutual: bool) -> None:
-    probabilities = np.array([[[0.0, there, 0.0, 0.0], [0.0, back, 0.0, 0.0]]])
-    said, mutual = states.said_predicates(probabilities, np.zeros((1, 2), np.int64), SYMMETRIC)
-    assert (said != 0).tolist() == [[True, not is_mutual]] and mutual.tolist() == [is_mutual]
