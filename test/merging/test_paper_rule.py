@@ -75,15 +75,6 @@ def test_the_kernel_equals_linalg(seed: int, delta_g: float, delta_c: float) -> 
         assert abs(values[0] - (values[1] if len(values) == 2 else delta_g)) < 1e-9
 
 
-@given(seeds)
-def test_an_equal_gaussian_is_at_distance_zero_so_the_smallest_id_wins(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    covariance, mean = random_covariances(rng, 1)[0], rng.normal(size=3)
-    ids = rng.permutation(np.arange(1, 11))
-    nodes = table_of(np.tile(mean, (10, 1)), np.tile(covariance, (10, 1, 1)), np.ones((10, 1)), ids)
-    assert nodes.ids[search(mean, covariance, np.ones(1), nodes, delta_g=1e-7)] == 1
-
-
 def test_the_warm_up_compiles_the_only_signature() -> None:
     warm_up()
     compiled = list(_nearest.signatures)

@@ -10,7 +10,6 @@ from support.relations import (
     RecordingModel,
     config,
     crowd_graph,
-    empty_graph,
     pair_graph,
     picture,
 )
@@ -119,22 +118,6 @@ def test_a_pair_is_encoded_once_and_again_after_twice_as_many_observations():
         counts += encoded_clips(stage, frame)
     assert [frame for frame, count in enumerate(counts, 3) if count] == [3, 6, 12, 24, 48, 96]
     assert stage.counters().dropped == {"already_encoded": 97 - 6}
-
-
-def test_the_clip_of_a_tentative_pair_is_cut_before_its_frames_leave():
-    early, late = RecordingModel(), RecordingModel()
-    assert encoded_clips(watching(of_pair(), early), 1) == [1]
-    graph = of_pair()
-    graph.tentative = {2}
-    stage = watching(graph, late)
-    assert encoded_clips(stage, 1) == [0]
-    for stamp in range(2, 40):  # more than the buffer holds
-        stage.observe(empty_graph(stamp), picture(stamp))
-    assert stage.drain() == [] and stage.counters().ready == 0
-    graph.tentative.clear()
-    (evidence,) = stage.drain()
-    assert evidence.stamp_ns == 1 and evidence.pairs.tolist() == [[0, 1], [1, 0]]
-    assert (late.requests[0].clip == early.requests[0].clip).all()
 
 
 def test_every_clip_is_encoded_without_a_graph_and_without_a_budget():

@@ -28,7 +28,6 @@ from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import beliefs
 from deworldsg_ros.relations.beliefs import (
     MAX_DISTANCE_M,
-    EdgeBeliefs,
     PredictedPrior,
     RobustBeliefs,
     fuse_prior,
@@ -403,22 +402,3 @@ def test_many_changes_are_told_in_several_updates() -> None:
     ]
     assert replica.edges == {(edge.subject, edge.object): edge for edge in whole.edges}
     assert builder.update() is None
-
-
-@pytest.mark.parametrize(
-    ("edge_belief", "world_model", "watchers"),
-    [("robust", "physics", 1), ("paper", "physics", 2), ("paper", "none", 1)],
-)
-def test_nobody_collects_nodes_for_a_rule_that_is_not_used(
-    edge_belief: str, world_model: str, watchers: int
-) -> None:
-    builder, (cup, _) = desk(edge_belief=edge_belief, world_model=world_model)
-    known = len(builder.graph._watchers)
-    of = config(edge_belief=edge_belief, world_model=world_model)
-    edges = EdgeBeliefs(of, builder.graph, builder.prior)
-    added = builder.graph._watchers[known:]
-    assert len(added) == watchers
-    edges.refresh()
-    builder.graph.move_node(cup, np.eye(4))
-    edges.refresh()
-    assert edges.waiting == 0 and not any(added)

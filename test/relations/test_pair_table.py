@@ -12,7 +12,6 @@ from support.room_nodes import (
     VOCABULARY,
     add_node,
     bowl,
-    box,
     chair,
     plant,
     room,
@@ -150,6 +149,9 @@ def change(builder: GraphBuilder, rng: np.random.Generator) -> None:
     item = THINGS[rng.integers(len(THINGS))]
     if kind == "add" or len(ids) < 4:
         node_id = add_node(builder, item, rng, frames=1)
+        if rng.integers(2):  # too few points, or just enough
+            slot, count = graph.nodes.slot(node_id), int(rng.integers(2 * MIN_SHAPE_POINTS))
+            graph.nodes.set_surface(slot, graph.nodes.surface(slot)[:count].copy())
         set_confirmed(graph, node_id, bool(rng.integers(3)))
         return
     one, other = rng.choice(ids, 2, replace=False).tolist()
@@ -229,38 +231,16 @@ def test_the_steps_of_the_up_direction() -> None:
         assert np.degrees(np.arccos(stepped @ up / np.linalg.norm(stepped))) < 0.5
 
 
-def test_hidden_nodes_take_no_part_and_hold_up_no_pair() -> None:
-    followed, builder, (cup, table_, chair_) = small_room()
-    graph = builder.graph
-    set_confirmed(graph, cup, False)
-    graph.add_votes(cup, chair_, None)
-    graph.add_votes(table_, chair_, None)
-    assert set(followed.refresh()) == {(table_, chair_)}
-    set_confirmed(graph, cup, True)  # its votes count from now on
-    assert set(followed.refresh()) == {(cup, table_), (cup, chair_), (table_, chair_)}
-    set_confirmed(graph, table_, False)
-    assert set(followed.refresh()) == {(cup, chair_)}
-    hidden = [add_node(builder, THINGS[5], np.random.default_rng(i), frames=1) for i in range(4)]
-    for node_id in hidden:
-        set_confirmed(graph, node_id, False)
-        graph.add_votes(node_id, chair_, None)
-    graph.add_votes(cup, chair_, None)
+def test_votes_on_hidden_nodes_hold_up_no_other_pair() -> None:
+    followed, builder, (cup, _, chair_) = small_room()
+    for seed in range(4):
+        hidden = add_node(builder, THINGS[5], np.random.default_rng(seed), frames=1)
+        set_confirmed(builder.graph, hidden, False)
+        builder.graph.add_votes(hidden, chair_, None)
+    followed.refresh()
+    builder.graph.add_votes(cup, chair_, None)
     followed.refresh(Z, 1)
     assert followed.table.pairs_waiting == 0
-
-
-def test_pairs_of_nodes_that_go_are_not_judged() -> None:
-    followed, builder, (cup, table_, chair_) = small_room()
-    followed.refresh()
-    for node_id in (cup, table_, chair_):
-        builder.graph.move_node(node_id, np.eye(4))
-    followed.refresh(Z, 0)
-    assert followed.table.pairs_waiting == 3
-    set_confirmed(builder.graph, cup, False)
-    assert set(followed.refresh(Z, 1)) == {(table_, chair_)}
-    assert followed.table.pairs_waiting == 0
-    set_confirmed(builder.graph, cup, True)
-    assert len(followed.refresh()) == 3
 
 
 def test_pairs_out_of_reach_are_not_related() -> None:
@@ -276,19 +256,6 @@ def test_pairs_out_of_reach_are_not_related() -> None:
     builder.graph.move_node(ids["cup"], moved(x=4.6))
     told = followed.refresh()
     assert set(told) == {apart} and np.isfinite(told[apart]["gap_m"])
-
-
-@pytest.mark.parametrize("geometry", [True, False])
-def test_nodes_with_few_points_are_not_judged(geometry: bool) -> None:
-    builder, ids = room({"table": TABLE})
-    points = surface([box(0, 0, 0.74, 0.1, 0.1, 0.1)], np.random.default_rng(0), 20)
-    for count in (0, MIN_SHAPE_POINTS - 1, MIN_SHAPE_POINTS):
-        builder.graph.add_node(np.zeros(3), np.eye(3), np.ones(80), 1, points[:count])
-    builder.graph.add_votes(3, ids["table"], np.ones((2, WIDTH)))  # too few points: frames alone
-    followed = Followed(builder.graph, geometry)
-    told = {pair: bool(item["judged"]) for pair, item in followed.refresh().items()}
-    assert told == ({(1, 4): True, (1, 3): False} if geometry else {(1, 3): False})
-    assert len(predicted_prior(followed)) <= geometry
 
 
 def test_a_large_graph_turns_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,7 +313,7 @@ def test_the_prior_is_the_mean_of_the_predictions_that_say_something() -> None:
 
 def test_a_prior_that_follows_is_that_of_all_pairs() -> None:
     rng, (builder, _) = np.random.default_rng(0), things_room(len(THINGS))
-    followed, prior = Followed(builder.graph), PredictedPrior(VOCABULARY)
+    followed, prior, most = Followed(builder.graph), PredictedPrior(VOCABULARY), 0
     for _ in range(30):
         change(builder, rng)
         followed.table.refresh(Z)
@@ -357,7 +324,8 @@ def test_a_prior_that_follows_is_that_of_all_pairs() -> None:
         pair_classes = np.array(sorted(fresh._sums), np.int64).reshape(-1, 2)
         for one, other in zip(prior.lookup(pair_classes), fresh.lookup(pair_classes)):
             np.testing.assert_array_equal(one, other)
-    assert len(prior) >= 3
+        most = max(most, len(prior))
+    assert most >= 3
 
 
 # --- the floor -----------------------------------------------------------------------------------

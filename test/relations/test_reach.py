@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Iterable
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -74,21 +73,3 @@ def test_a_grid_that_follows_finds_all_pairs(seed: int) -> None:
     assert set(found[:, 0].tolist()) <= set(changed.tolist())
     expected = {pair for pair in brute_force(items, shapes) if pair & set(changed.tolist())}
     assert {frozenset(pair) for pair in found.tolist()} == expected
-
-
-@pytest.mark.parametrize(
-    ("offset", "reached"),
-    [
-        ((0.0, 0.0, 0.0), True),
-        ((0.65, 0.0, 0.0), True),
-        ((0.75, 0.0, 0.0), False),
-        ((0.0, 0.0, 1.3), True),
-        ((0.0, 0.0, 1.5), False),
-        ((0.2, 0.0, 1.3), True),
-        ((0.3, 0.0, 1.3), False),
-    ],
-)
-def test_how_far_related_objects_may_be_apart(offset, reached: bool) -> None:
-    """Two cubes of 0.1 m."""
-    low = np.array([[0.0, 0, 0], offset])
-    assert len(reach.pairs_in_reach(shapes_of(low, low + 0.1))) == int(reached)

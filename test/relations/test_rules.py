@@ -134,18 +134,6 @@ def test_the_supports_of_an_object_are_events_of_which_one_at_most_holds(
         assert list(found.values()) == pytest.approx(expected[:-1], abs=1e-6)
 
 
-def test_of_a_circle_the_weakest_support_goes() -> None:
-    states = np.full((3, STATE_COUNT), 1e-4)
-    pairs = np.array([[0, 1], [1, 2], [0, 2]])
-    states[0, 1] = 0.95  # 0 on 1
-    states[1, 1] = 0.99  # 1 on 2
-    states[2, 2] = 0.9  # 2 on 0
-    states[:, 0] = 1 - states[:, 1:].sum(axis=1)
-    after, kept, _ = rules.one_support(states, pairs, np.zeros(3))
-    assert kept[0, 0] > 0.9 and kept[1, 0] > 0.9
-    assert 0.3 < kept[2, 1] < 0.5 and after[2, 0] > 0.5
-
-
 # --- near ----------------------------------------------------------------------------------------
 
 ON_ONE_TABLE = {(0, 2): 1.0, (1, 2): 1.0}

@@ -35,103 +35,89 @@ class Case(NamedTuple):
     wrong: list[Edge]
 
 
-def on_table(label: str, x: float, y: float, width: float, depth: float, height: float) -> Thing:
-    return thing(label, x, y, 0.74, width, depth, height)
+def case(name: str, true: str, wrong: str, **things: Thing) -> Case:
+    return Case(name, things, edges(true), edges(wrong))
 
 
-CUP = on_table("cup", 0.4, 0.1, 0.09, 0.09, 0.1)
+def on_table(label: str, x: float, y: float, *size: float) -> Thing:
+    return thing(label, x, y, 0.74, *size)
+
+
+TABLE = table(0, 0)
 BOTTLE = on_table("bottle", 0.3, 0.25, 0.075, 0.075, 0.3)
-FRIDGE = thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76)
 OVEN = thing("oven", 0.0, 0.0, 0.0, 0.6, 0.6, 0.86)
 
 CASES = [
-    Case(
+    case(
         "a chair under a table",
-        {"table": table(0, 0), "chair": chair(0, 0.45)},
-        [],
-        edges("chair on table, table on chair, chair under table"),
+        "",
+        "chair on table, table on chair, chair under table",
+        table=TABLE, chair=chair(0, 0.45),
     ),
-    Case(
+    case(
         "a bottle on a table, a chair beside it",
-        {"table": table(0, 0), "chair": chair(0.3, 0.5), "bottle": BOTTLE},
-        edges("bottle on table"),
-        edges("bottle on chair, bottle above chair"),
+        "bottle on table",
+        "bottle on chair, bottle above chair",
+        table=TABLE, chair=chair(0.3, 0.5), bottle=BOTTLE,
     ),
-    Case(
+    case(
         "a bottle 2.5 m from a refrigerator",
-        {"table": table(0, 0), "fridge": FRIDGE, "bottle": BOTTLE},
-        edges("bottle on table"),
-        edges("bottle against fridge, table against fridge"),
+        "bottle on table",
+        "bottle against fridge, table against fridge",
+        table=TABLE, fridge=thing("refrigerator", 3.4, 0.0, 0.0, 0.66, 0.7, 1.76), bottle=BOTTLE,
     ),
-    Case(
+    case(
         "a tv on the wall, 1.8 m from a table and higher",
-        {"table": table(0, 0), "tv": thing("tv", 0, 2.25, 1.0, 1.1, 0.06, 0.65)},
-        [],
-        edges("tv above table, tv on table, table under tv"),
+        "",
+        "tv above table, tv on table, table under tv",
+        table=TABLE, tv=thing("tv", 0, 2.25, 1.0, 1.1, 0.06, 0.65),
     ),
-    Case(
+    case(
         "a microwave on an oven",
-        {"oven": OVEN, "microwave": thing("microwave", 0, 0.05, 0.86, 0.5, 0.4, 0.29)},
-        edges("microwave on oven"),
-        edges("microwave above oven, oven on microwave, microwave in oven"),
+        "microwave on oven",
+        "microwave above oven, oven on microwave, microwave in oven",
+        oven=OVEN, microwave=thing("microwave", 0, 0.05, 0.86, 0.5, 0.4, 0.29),
     ),
-    Case(
+    case(
         "a microwave on a counter, beside an oven",
-        {
-            "counter": table(-0.87, 0, 1.1, 0.6, 0.9),
-            "oven": OVEN,
-            "microwave": thing("microwave", -0.6, 0.05, 0.9, 0.5, 0.4, 0.29),
-        },
-        edges("microwave on counter"),
-        edges("microwave on oven, microwave above oven"),
+        "microwave on counter",
+        "microwave on oven, microwave above oven",
+        counter=table(-0.87, 0, 1.1, 0.6, 0.9), oven=OVEN,
+        microwave=thing("microwave", -0.6, 0.05, 0.9, 0.5, 0.4, 0.29),
     ),
-    Case(
+    case(
         "a vase beside a plant on a table",
-        {
-            "table": table(0, 0),
-            "vase": on_table("vase", -0.2, 0, 0.14, 0.14, 0.26),
-            "plant": plant(0.05, 0, 0.74),
-        },
-        edges("vase on table, plant on table"),
-        edges(
-            "vase against plant, plant in vase, vase on plant, table against vase, "
-            "table against plant"
-        ),
+        "vase on table, plant on table",
+        "vase against plant, plant in vase, vase on plant, table against vase, table against plant",
+        table=TABLE, vase=on_table("vase", -0.2, 0, 0.14, 0.14, 0.26), plant=plant(0.05, 0, 0.74),
     ),
-    Case(
+    case(
         "a bowl on a counter, beside a refrigerator",
-        {
-            "counter": table(0, 0, 1.6, 0.6, 0.9),
-            "fridge": thing("refrigerator", 1.16, 0, 0, 0.66, 0.66, 1.76),
-            "bowl": bowl(0.6, 0, 0.9),
-        },
-        edges("bowl on counter"),
-        edges("bowl on fridge, bowl against fridge, bowl in fridge"),
+        "bowl on counter",
+        "bowl on fridge, bowl against fridge, bowl in fridge",
+        counter=table(0, 0, 1.6, 0.6, 0.9), bowl=bowl(0.6, 0, 0.9),
+        fridge=thing("refrigerator", 1.16, 0, 0, 0.66, 0.66, 1.76),
     ),
-    Case(
+    case(
         "a screen on a table",
-        {"table": table(0, 0), "screen": on_table("tv", 0, 0.1, 0.55, 0.12, 0.4)},
-        edges("screen on table"),
-        edges("table under screen, screen above table, table on screen"),
+        "screen on table",
+        "table under screen, screen above table, table on screen",
+        table=TABLE, screen=on_table("tv", 0, 0.1, 0.55, 0.12, 0.4),
     ),
-    Case(
+    case(
         "a cup on one of two tables",
-        {"table": table(0, 0), "other": table(0, 0.81), "cup": CUP},
-        edges("cup on table"),
-        edges("cup on other, table on other, cup above other"),
+        "cup on table",
+        "cup on other, table on other, cup above other",
+        table=TABLE, other=table(0, 0.81), cup=on_table("cup", 0.4, 0.1, 0.09, 0.09, 0.1),
     ),
-    Case(
+    case(
         "things side by side on a table",
-        {
-            "table": table(0, 0),
-            "cup": on_table("cup", 0.1, 0, 0.09, 0.09, 0.1),
-            "bowl": bowl(0.3, 0, 0.74),
-            "book": on_table("book", -0.2, 0, 0.2, 0.28, 0.03),
-        },
-        edges("cup on table, bowl on table, book on table"),
-        edges("cup on bowl, bowl on cup, cup on book, cup in bowl"),
+        "cup on table, bowl on table, book on table",
+        "cup on bowl, bowl on cup, cup on book, cup in bowl",
+        table=TABLE, cup=on_table("cup", 0.1, 0, 0.09, 0.09, 0.1), bowl=bowl(0.3, 0, 0.74),
+        book=on_table("book", -0.2, 0, 0.2, 0.28, 0.03),
     ),
-]
+]  # fmt: skip
 every_case = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 
 
