@@ -76,7 +76,7 @@ def figures(setup: Setup) -> list[Figure]:
     nodes = 300 if setup.quick else 4000
     size, edges = bytes_per_node(nodes)
     note = f"{POINTS} surface points, {edges:.1f} published edges a node, {nodes} nodes, RSS"
-    return [Figure("memory_per_node", size / 1e3, "kB", target=8, note=note)]
+    return [Figure("memory_per_node", size / 1e3, "kB", target=16, note=note)]
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace
 from deworldsg_ros.graph.publication import Publication
-from deworldsg_ros.merging.common import check_fits
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.stage import build_merging
 from deworldsg_ros.poses.drift import Drift
@@ -23,11 +22,10 @@ from deworldsg_ros.relations import beliefs
 from deworldsg_ros.relations.beliefs import EdgeBeliefs
 from deworldsg_ros.relations.paper import ClassPairPrior
 from deworldsg_ros.scene.arrays import Float64, softmax_weights
-from deworldsg_ros.scene.camera import check_pose, invert_pose
+from deworldsg_ros.scene.camera import UpEstimator, check_pose, invert_pose
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary
 from deworldsg_ros.scene.limits import RESTART_NS
-from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.wire import messages as wire
 
 # Parts of the kernels that take about equally long to compile.
@@ -118,7 +116,7 @@ class GraphBuilder:
                 f"local graph of {local.stamp_ns} ns came after that of {self._newest_ns} ns",
             )
         if self._drift is not None:
-            check_fits(self.graph, local)
+            self.graph.check_fits(local)
             local = self._drift.align(local)
         logits = local.relations.logits
         weights = softmax_weights(logits) if logits.size else None
@@ -219,7 +217,6 @@ def warm_up(config: Config, *parts: str) -> None:
     for part in parts or KERNEL_PARTS:
         if part == "merging":
             build_merging(config.merging, config.output.min_existence).warm_up()
-            SeenSpace().warm_up()
         elif part == "drift" and config.merging.association == "surface":
             Drift().warm_up()
         elif part == "pairs":

@@ -285,15 +285,11 @@ def graph_node(path: Path, **values: object) -> Iterator[tuple[Any, Callable[[],
 
     values |= {"map_path": str(path), "output.min_existence": 0.0, "merging.association": "paper"}
     parameters = [rclpy.parameter.Parameter(name, value=value) for name, value in values.items()]
-    at = Bench(GraphNode, {"deworldsg/local_graph": String}, parameter_overrides=parameters)
-
-    def send() -> None:
-        at.send(deworldsg__local_graph=local_graph(at.next_stamp()))
-
-    try:
-        yield at, lambda: works(at, send)
-    finally:
-        at.close()
+    with Bench(GraphNode, {"deworldsg/local_graph": String}, parameter_overrides=parameters) as at:
+        yield (
+            at,
+            lambda: works(at, lambda: at.send(deworldsg__local_graph=local_graph(at.next_stamp()))),
+        )
 
 
 def test_a_node_writes_checkpoints_and_counts_what_cannot_be_written(tmp_path):

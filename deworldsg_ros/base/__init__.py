@@ -1,1 +1,1 @@
-"""What every part of the package may use: files, text, kernels, times. It knows no scene."""
+"""Tools for every part of the package: files, text, kernels, times. It knows no scene."""

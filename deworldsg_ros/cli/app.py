@@ -14,7 +14,6 @@ from rich.text import Text
 from deworldsg_ros import __version__
 from deworldsg_ros.base.words import visible_lines
 from deworldsg_ros.cli import ask, probe, store
-from deworldsg_ros.cli import evaluate_commands as evaluate
 from deworldsg_ros.cli import models as models_command
 from deworldsg_ros.cli.configuration import (
     EXIT_FINDINGS,
@@ -41,6 +40,16 @@ from deworldsg_ros.cli.configuration import (
     Temporal,
     Timings,
 )
+from deworldsg_ros.cli.evaluate_options import (
+    DataOptions,
+    DetectionOptions,
+    JsonFile,
+    RunOptions,
+    ScoringOptions,
+    TableOptions,
+    with_option_groups,
+)
+from deworldsg_ros.cli.evaluate_options import OutFolder as EvaluationFolder
 from deworldsg_ros.recordings.bags.topics import TopicChoice
 from deworldsg_ros.recordings.folders.dataset import DatasetOptions, parse_intrinsics
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError
@@ -378,14 +387,74 @@ def show_config(config: ConfigFile = None, settings: Settings = None) -> None:
         typer.echo(described_yaml(effective_config(config, settings)), nl=False)
 
 
+@with_option_groups
+def evaluate_score(
+    data: DataOptions,
+    scoring: ScoringOptions,
+    predictions: Annotated[
+        Optional[Path],
+        typer.Option("--predictions", help="predictions of any method, .json or official .pkl"),
+    ] = None,
+    graphs: Annotated[
+        Optional[Path],
+        typer.Option("--graphs", help="folder with SCAN/scene_graph.json of an earlier run"),
+    ] = None,
+    out: Annotated[
+        Optional[Path], typer.Option("--out", help="folder for tables and plots")
+    ] = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Score predictions or scene graphs against annotations with the official protocol."""
+    from deworldsg_ros.cli.evaluate import score_files
+
+    score_files(data, scoring, predictions, graphs, out, json_file)
+
+
+@with_option_groups
+def evaluate_run(
+    data: DataOptions,
+    detections: DetectionOptions,
+    running: RunOptions,
+    scoring: ScoringOptions,
+    out: EvaluationFolder,
+    json_file: JsonFile = None,
+) -> None:
+    """Run the pipeline on every scan of a data set and score its graphs."""
+    from deworldsg_ros.cli.evaluate import run_scans
+
+    run_scans(data, detections, running, scoring, out, json_file)
+
+
+@with_option_groups
+def evaluate_table(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="TABLE", help="main, predictions, hard, pose, ablation, switches or runtime"
+        ),
+    ],
+    data: DataOptions,
+    detections: DetectionOptions,
+    running: RunOptions,
+    comparing: TableOptions,
+    scoring: ScoringOptions,
+    out: EvaluationFolder,
+    json_file: JsonFile = None,
+) -> None:
+    """Compare methods or configurations in a table, with the numbers of the paper."""
+    from deworldsg_ros.cli.evaluate import make_table
+
+    make_table(kind, data, detections, running, comparing, scoring, out, json_file)
+
+
 evaluation = typer.Typer(
     name="evaluate", help="Measure scene graphs against annotations.", no_args_is_help=True
 )
 # Short help: the list of commands cuts a longer first sentence.
 for parent, function, summary in (
-    (evaluation, evaluate.score, "Score predictions or scene graphs of earlier runs."),
-    (evaluation, evaluate.run, "Run the pipeline on every scan and score its graphs."),
-    (evaluation, evaluate.table, "Compare methods or configurations in a table."),
+    (evaluation, evaluate_score, "Score predictions or scene graphs of earlier runs."),
+    (evaluation, evaluate_run, "Run the pipeline on every scan and score its graphs."),
+    (evaluation, evaluate_table, "Compare methods or configurations in a table."),
     (app, ask.query, "Ask a scene graph in words."),
     (app, ask.goal, "Print a pose from which an object is in view."),
     (app, ask.explain, "Explain an object, a relation or a class."),
@@ -401,7 +470,8 @@ for parent, function, summary in (
     (app, probe.train_probe, "Train the probe of a world model."),
     (app, probe.import_probe, "Make the published probe ready for use."),
 ):
-    parent.command(short_help=summary)(_reporting_errors()(function))
+    name = function.__name__.removeprefix("evaluate_").replace("_", "-")
+    parent.command(name, short_help=summary)(_reporting_errors()(function))
 app.add_typer(evaluation)
 app.add_typer(store.app)
 app.add_typer(models_command.app)

@@ -619,7 +619,7 @@ def _write_report(
 
 
 def _findings(graph: wire.SceneGraphMessage, finished: replaying.Finished) -> list[Finding]:
-    """What is off, from the diagnostics of the nodes and the graph."""
+    """Findings, from the diagnostics of the nodes and the graph."""
     seen = replace(
         observations_of(finished.diagnostics),
         images=finished.published,

@@ -57,9 +57,9 @@ def score_files(
     graphs: Path | None,
     out: Path | None,
     json_file: Path | None,
-    console: Console,
 ) -> None:
     """Score one of predictions and graphs; raises DeWorldSGError."""
+    console = Console(markup=False)
     annotations = open_annotations(data.dataset, data.layout)
     options = protocol_options(data, scoring)
     values = header(data, scoring)
@@ -125,7 +125,6 @@ def run_scans(
     scoring: ScoringOptions,
     out: Path,
     json_file: Path | None,
-    console: Console,
 ) -> None:
     """Run and score the scans; a scan that fails is reported and the others go on.
 
@@ -133,6 +132,7 @@ def run_scans(
         DeWorldSGError: the options or the data set cannot be used.
         typer.Exit: every scan failed.
     """
+    console = Console(markup=False)
     poses = pose_sources(running)
     if len(poses) > 1:
         raise EvaluationError(
@@ -265,7 +265,6 @@ def make_table(
     scoring: ScoringOptions,
     out: Path,
     json_file: Path | None,
-    console: Console,
 ) -> None:
     """Run the rows of a table over the scans, print and write it.
 
@@ -273,6 +272,7 @@ def make_table(
         DeWorldSGError: the options or the data set cannot be used; a scan that fails is reported.
         typer.Exit: every scan failed.
     """
+    console = Console(markup=False)
     files = _named_files(kind, comparing.predictions or [])
     annotations = open_annotations(data.dataset, data.layout)
     poses = pose_sources(running, KINDS if kind == "pose" else ())

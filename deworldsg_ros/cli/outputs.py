@@ -23,9 +23,8 @@ from deworldsg_ros.graph.provenance import path_beside, space_path
 from deworldsg_ros.recordings.recording import Recording
 from deworldsg_ros.ros.health import UNMATCHED_PREFIX
 from deworldsg_ros.scene.arrays import Float64
-from deworldsg_ros.scene.camera import RgbdFrame
+from deworldsg_ros.scene.camera import RgbdFrame, UpEstimator
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.wire import messages as wire
 
 if TYPE_CHECKING:
@@ -193,7 +192,7 @@ class RunObserver:
     def findings(
         self, recording: Recording, pipeline: Pipeline, drops: Mapping[str, Mapping[str, int]]
     ) -> list[Finding]:
-        """What is off with the run so far.
+        """Findings about the run so far.
 
         Args:
             recording: of the frames.

@@ -16,7 +16,7 @@ from deworldsg_ros.cli.terminal import frame_progress
 from deworldsg_ros.config import RelationsConfig, from_mapping
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.vocabulary import PREDICATE_SETS
-from deworldsg_ros.training.options import FitOptions, TrainingOptions
+from deworldsg_ros.training.options import ClipOrigin, FitOptions, TrainingOptions
 
 # Options of the command by the configuration fields that they set, for error messages.
 OPTION_OF = {
@@ -215,8 +215,9 @@ def run_training(options: ProbeTraining, console: Console) -> None:
             options.out,
             options.training,
             cache=options.cache,
-            source=options.source.name,
-            data_split=options.data_split if is_data_set(options.source) else "",
+            origin=ClipOrigin(
+                options.source.name, options.data_split if is_data_set(options.source) else ""
+            ),
             progress=Progress(lambda count: bar.update(encoding, advance=count), epoch),
         )
     held = metrics["held_out"]

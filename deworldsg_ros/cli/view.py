@@ -38,7 +38,7 @@ EMPTY_FILE = "the graph of this file is empty: no object was seen often enough"
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """What is viewed, and where the page is.
+    """The source of a page, and its address.
 
     Attributes:
         path: graph or recording; None = live.

@@ -1,4 +1,4 @@
-"""What differs between two graphs: of one session by id, of two sessions by place and class."""
+"""Differences of two graphs: of one session by id, of two sessions by place and class."""
 
 from __future__ import annotations
 

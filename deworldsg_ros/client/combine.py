@@ -302,7 +302,7 @@ class Combined:
 
 
 class Known:
-    """What was computed of the objects of one graph, for those that are the same the next time."""
+    """Results for the objects of one graph, for those that are the same the next time."""
 
     def __init__(self) -> None:
         self._where: tuple[object, ...] = ()

@@ -114,14 +114,105 @@ def _radius_m(node: wire.NodeState) -> float:
     return 0.5 * (a * a + b * b + c * c) ** 0.5 + 1e-6
 
 
-# --- The objects and relations of a graph at one moment.
+# --- The graph as a networkx graph.
+
+
+def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
+    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
+
+    Attributes are numbers and strings only, so that every writer of networkx takes them.
+
+    Raises:
+        ClientError: without the package networkx.
+    """
+    try:
+        import networkx
+    except ImportError as error:
+        raise ClientError("networkx is not installed: pip install networkx") from error
+    graph = networkx.MultiDiGraph()
+    for item in objects:
+        x, y, z = item.position_m
+        length, width, height = item.size_m
+        graph.add_node(
+            item.id,
+            label=item.label,
+            probability=round(item.probability, 4),
+            observations=item.observations,
+            x=x,
+            y=y,
+            z=z,
+            length=length,
+            width=width,
+            height=height,
+        )
+    for relation in relations:
+        graph.add_edge(
+            relation.subject.id,
+            relation.object.id,
+            key=relation.predicate,
+            predicate=relation.predicate,
+            probability=round(relation.probability, 4),
+            provenance=relation.provenance,
+            observations=relation.observations,
+        )
+    return graph
+
+
+# --- The most probable chain of relations between two objects.
+
+
+def cheapest_chain(
+    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
+) -> list[wire.EdgeState]:
+    """The edges of the chain with the largest product of probabilities; [] if there is none.
+
+    Edges are used in both directions.
+    """
+    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
+    for (a, b), edge in edges.items():
+        # Of two equal chains, the shorter one.
+        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
+        links.setdefault(a, []).append((cost, b, edge))
+        links.setdefault(b, []).append((cost, a, edge))
+    costs = {first: 0.0}
+    came: dict[int, tuple[int, wire.EdgeState]] = {}
+    waiting = [(0.0, first)]
+    while waiting:
+        cost, node = heapq.heappop(waiting)
+        for step, other, edge in links.get(node, ()):
+            if cost + step < costs.get(other, math.inf):
+                costs[other], came[other] = cost + step, (node, edge)
+                heapq.heappush(waiting, (cost + step, other))
+    chain: list[wire.EdgeState] = []
+    while last != first and last in came:
+        last, edge = came[last]
+        chain.insert(0, edge)
+    return chain
+
+
+# --- A scene graph to ask: from a file, or as a client copied it from the topics.
 
 # What an argument of a question may be: an object, its id, or the name of a class.
 Which = SceneObject | int | str
 
 
-class GraphContent:
-    """Finds objects and relations; see `SceneGraph`."""
+class SceneGraph:
+    """A graph at one moment, for questions. It never changes.
+
+    All positions are in the world frame `frame_id`, in metres.
+
+    Args:
+        message: of `/scene_graph`, or of a file.
+        seen: from which frames its objects and relations come, for `explain`.
+
+    Attributes:
+        message: the message.
+        frame_id: the world frame.
+        stamp_ns: time of the newest frame.
+        sequence: number of the update.
+        up: unit vector against gravity; +z if the message does not tell it.
+        space: the space that the camera has seen as free, for `goal_near`; None = not known.
+    """
 
     def __init__(self, message: wire.SceneGraphMessage, seen: Iterable[SeenFrames] = ()) -> None:
         self.message = message
@@ -135,6 +226,20 @@ class GraphContent:
         self._nodes = {node.id: node for node in message.nodes}
         self._edges = {(edge.subject, edge.object): edge for edge in message.edges}
         self._made: dict[int, SceneObject] = {}
+
+    @classmethod
+    def load(cls, path: str | Path) -> SceneGraph:
+        """The graph of a file, or of the folder of a run, with its frames and its seen space if
+        they are beside it.
+
+        Raises:
+            RefusedInput: if the file is missing or contains no scene graph.
+        """
+        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
+        message = read_graph(file)
+        graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
+        graph.space = read_space(file)
+        return graph
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -275,6 +380,81 @@ class GraphContent:
         """The message of a directed edge; None = there is none."""
         return self._edges.get((subject_id, object_id))
 
+    def on(self, support: Which, label: str | None = None) -> list[SceneObject]:
+        """Objects that are on another one with a probability of at least one half."""
+        found = self.relations(label, "on", support, min_probability=0.5)
+        return list(dict.fromkeys(item.subject for item in found))
+
+    def neighbours(self, of: Which, within: float = 1.0) -> list[tuple[SceneObject, float]]:
+        """The other objects in reach of one, with the gap of the boxes in metres, nearest first."""
+        center = self.one(of)
+        found = self.objects(near=center, within=within)
+        return [(item, gap_m(center.footprint, item.footprint)) for item in found]
+
+    def path(self, start: Which, end: Which) -> list[Relation]:
+        """The most probable chain of relations from one object to another; empty if there is none.
+
+        Directions do not count: each relation is given as the graph has it.
+        """
+        chain = cheapest_chain(self._edges, self.one(start).id, self.one(end).id)
+        return [relation_of(edge, self[edge.subject], self[edge.object], None) for edge in chain]
+
+    def free_direction(self, of: Which, towards: Point | None = None, room: float = 1.0) -> Point:
+        """A horizontal direction in which an object has room; see `goals.free_direction`."""
+        return free_direction(self.one(of), self, towards, room)
+
+    def goal_near(
+        self,
+        of: Which,
+        distance: float = 1.0,
+        *,
+        radius: float = ROBOT_RADIUS_M,
+        towards: Point | None = None,
+        space: SeenSpace | None = None,
+    ) -> Goal:
+        """A pose from which an object is in view; see `goals.goal_near`."""
+        target, seen = self.one(of), space or self.space
+        return goal_near(
+            target, self, distance, self.stamp_ns, radius=radius, towards=towards, space=seen
+        )
+
+    def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
+        """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""
+        if isinstance(what, tuple):
+            a, b = self.one(what[0]), self.one(what[1])
+            found = self.relations(a, None, b) or self.relations(b, None, a)
+            if not found:
+                return explain_no_relation(a, b)
+            what = found[0]
+        if isinstance(what, Relation):
+            return explain_relation(what, self.frames(what.subject.id, what.object.id))
+        if isinstance(what, str) and not self.objects(what):
+            return explain_absence(what, self.hidden, list(self))
+        item = self.one(what)
+        return explain_object(item, self.relations_of(item), self.frames(item.id))
+
+    def changes_since(self, before: SceneGraph) -> Changes:
+        """Differences from an earlier graph, in the same world frame.
+
+        Ids are compared if the earlier graph is of the same session. Otherwise objects are
+        recognised by place and class.
+        """
+        if self.is_later_than(before):
+            mine, theirs = ({i.id: i for i in graph} for graph in (self, before))
+            return changes_by_id(theirs, mine)
+        return changes_by_place(before, self)
+
+    def to_networkx(self) -> Any:
+        """The graph as a networkx.MultiDiGraph; needs the package networkx."""
+        return to_networkx(self, self.relations())
+
+    def is_later_than(self, other: SceneGraph) -> bool:
+        """Whether both graphs are of one session, and this one is not the earlier one."""
+        mine, theirs = (getattr(graph.message, "session", None) for graph in (self, other))
+        if isinstance(mine, str) and isinstance(theirs, str):
+            return mine == theirs and self.sequence >= other.sequence
+        return False
+
     def _candidates(
         self,
         label: str | None,
@@ -334,190 +514,3 @@ def distance_m(item: SceneObject, near: Point | SceneObject) -> float:
         return gap_m(item.footprint, near.footprint)
     point = footprint(near, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), item.up)
     return gap_m(item.footprint, point)
-
-
-# --- The graph as a networkx graph.
-
-
-def to_networkx(objects: Iterable[SceneObject], relations: Iterable[Relation]) -> Any:
-    """A networkx.MultiDiGraph: a node for each object id, an edge with the predicate as its key.
-
-    Attributes are numbers and strings only, so that every writer of networkx takes them.
-
-    Raises:
-        ClientError: without the package networkx.
-    """
-    try:
-        import networkx
-    except ImportError as error:
-        raise ClientError("networkx is not installed: pip install networkx") from error
-    graph = networkx.MultiDiGraph()
-    for item in objects:
-        x, y, z = item.position_m
-        length, width, height = item.size_m
-        graph.add_node(
-            item.id,
-            label=item.label,
-            probability=round(item.probability, 4),
-            observations=item.observations,
-            x=x,
-            y=y,
-            z=z,
-            length=length,
-            width=width,
-            height=height,
-        )
-    for relation in relations:
-        graph.add_edge(
-            relation.subject.id,
-            relation.object.id,
-            key=relation.predicate,
-            predicate=relation.predicate,
-            probability=round(relation.probability, 4),
-            provenance=relation.provenance,
-            observations=relation.observations,
-        )
-    return graph
-
-
-# --- The most probable chain of relations between two objects.
-
-
-def cheapest_chain(
-    edges: Mapping[tuple[int, int], wire.EdgeState], first: int, last: int
-) -> list[wire.EdgeState]:
-    """The edges of the chain with the largest product of probabilities; [] if there is none.
-
-    Edges are used in both directions.
-    """
-    links: dict[int, list[tuple[float, int, wire.EdgeState]]] = {}
-    for (a, b), edge in edges.items():
-        # Of two equal chains, the shorter one.
-        cost = 1e-6 - math.log(min(max(edge.probability, 1e-9), 1.0))
-        links.setdefault(a, []).append((cost, b, edge))
-        links.setdefault(b, []).append((cost, a, edge))
-    costs = {first: 0.0}
-    came: dict[int, tuple[int, wire.EdgeState]] = {}
-    waiting = [(0.0, first)]
-    while waiting:
-        cost, node = heapq.heappop(waiting)
-        for step, other, edge in links.get(node, ()):
-            if cost + step < costs.get(other, math.inf):
-                costs[other], came[other] = cost + step, (node, edge)
-                heapq.heappush(waiting, (cost + step, other))
-    chain: list[wire.EdgeState] = []
-    while last != first and last in came:
-        last, edge = came[last]
-        chain.insert(0, edge)
-    return chain
-
-
-# --- A scene graph to ask: from a file, or as a client copied it from the topics.
-
-
-class SceneGraph(GraphContent):
-    """A graph at one moment, for questions. It never changes.
-
-    All positions are in the world frame `frame_id`, in metres.
-
-    Args:
-        message: of `/scene_graph`, or of a file.
-        seen: from which frames its objects and relations come, for `explain`.
-
-    Attributes:
-        message: the message.
-        frame_id: the world frame.
-        stamp_ns: time of the newest frame.
-        sequence: number of the update.
-        up: unit vector against gravity; +z if the message does not tell it.
-        space: the space that the camera has seen as free, for `goal_near`; None = not known.
-    """
-
-    @classmethod
-    def load(cls, path: str | Path) -> SceneGraph:
-        """The graph of a file, or of the folder of a run, with its frames and its seen space if
-        they are beside it.
-
-        Raises:
-            RefusedInput: if the file is missing or contains no scene graph.
-        """
-        file = Path(path) / GRAPH_FILE if Path(path).is_dir() else Path(path)
-        message = read_graph(file)
-        graph = cls(message, read_seen(file, wire.ns_from_stamp(message.stamp)))
-        graph.space = read_space(file)
-        return graph
-
-    def on(self, support: Which, label: str | None = None) -> list[SceneObject]:
-        """Objects that are on another one with a probability of at least one half."""
-        found = self.relations(label, "on", support, min_probability=0.5)
-        return list(dict.fromkeys(item.subject for item in found))
-
-    def neighbours(self, of: Which, within: float = 1.0) -> list[tuple[SceneObject, float]]:
-        """The other objects in reach of one, with the gap of the boxes in metres, nearest first."""
-        center = self.one(of)
-        found = self.objects(near=center, within=within)
-        return [(item, gap_m(center.footprint, item.footprint)) for item in found]
-
-    def path(self, start: Which, end: Which) -> list[Relation]:
-        """The most probable chain of relations from one object to another; empty if there is none.
-
-        Directions do not count: each relation is given as the graph has it.
-        """
-        chain = cheapest_chain(self._edges, self.one(start).id, self.one(end).id)
-        return [relation_of(edge, self[edge.subject], self[edge.object], None) for edge in chain]
-
-    def free_direction(self, of: Which, towards: Point | None = None, room: float = 1.0) -> Point:
-        """A horizontal direction in which an object has room; see `goals.free_direction`."""
-        return free_direction(self.one(of), self, towards, room)
-
-    def goal_near(
-        self,
-        of: Which,
-        distance: float = 1.0,
-        *,
-        radius: float = ROBOT_RADIUS_M,
-        towards: Point | None = None,
-        space: SeenSpace | None = None,
-    ) -> Goal:
-        """A pose from which an object is in view; see `goals.goal_near`."""
-        target, seen = self.one(of), space or self.space
-        return goal_near(
-            target, self, distance, self.stamp_ns, radius=radius, towards=towards, space=seen
-        )
-
-    def explain(self, what: Which | Relation | tuple[Which, Which]) -> Explanation:
-        """Why something is in the graph, or is not: an object, a relation, a pair, or a class."""
-        if isinstance(what, tuple):
-            a, b = self.one(what[0]), self.one(what[1])
-            found = self.relations(a, None, b) or self.relations(b, None, a)
-            if not found:
-                return explain_no_relation(a, b)
-            what = found[0]
-        if isinstance(what, Relation):
-            return explain_relation(what, self.frames(what.subject.id, what.object.id))
-        if isinstance(what, str) and not self.objects(what):
-            return explain_absence(what, self.hidden, list(self))
-        item = self.one(what)
-        return explain_object(item, self.relations_of(item), self.frames(item.id))
-
-    def changes_since(self, before: SceneGraph) -> Changes:
-        """What differs from an earlier graph, in the same world frame.
-
-        Ids are compared if the earlier graph is of the same session. Otherwise objects are
-        recognised by place and class.
-        """
-        if self.is_later_than(before):
-            mine, theirs = ({i.id: i for i in graph} for graph in (self, before))
-            return changes_by_id(theirs, mine)
-        return changes_by_place(before, self)
-
-    def to_networkx(self) -> Any:
-        """The graph as a networkx.MultiDiGraph; needs the package networkx."""
-        return to_networkx(self, self.relations())
-
-    def is_later_than(self, other: SceneGraph) -> bool:
-        """Whether both graphs are of one session, and this one is not the earlier one."""
-        mine, theirs = (getattr(graph.message, "session", None) for graph in (self, other))
-        if isinstance(mine, str) and isinstance(theirs, str):
-            return mine == theirs and self.sequence >= other.sequence
-        return False

@@ -49,7 +49,7 @@ _LENGTH = re.compile(rf"({_NUMBER})(cm|m)?")
 
 @dataclass(frozen=True)
 class Condition:
-    """What an object has to fulfil.
+    """Conditions on an object.
 
     Attributes:
         predicate: of a relation; None = a distance only.

@@ -1,4 +1,4 @@
-"""What is wrong with a run, in sentences: observations → findings, without files and without ROS.
+"""Faults of a run, in sentences: observations → findings, without files and without ROS.
 
 `observations` is what a source knows: a run, or the diagnostics of running nodes. `frame_checks`
 measures a few frames of a recording. `findings` turns all of it into causes and remedies.

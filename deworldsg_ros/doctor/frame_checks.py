@@ -41,7 +41,7 @@ class FrameChecks:
 
 @dataclass(frozen=True)
 class Observations:
-    """What is known about a run.
+    """Observations of a run.
 
     Attributes:
         images: RGB images that arrived; None = not known.

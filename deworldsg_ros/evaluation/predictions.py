@@ -6,7 +6,8 @@ import io
 import math
 import pickle
 import pickletools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,10 @@ from deworldsg_ros.scene.errors import EvaluationError
 
 # --- Official prediction pickles, read without executing their code.
 #
-# A pickle is a program that names the functions to call. Here each known numpy name resolves to a
-# placeholder that only stores its arguments, and every other name is refused. The arrays are built
-# afterwards, after a check of type, shape and length.
+# A pickle is a program that names functions to call. Each name of a short list resolves to a
+# placeholder that stores its arguments, and every other name is refused. The arrays are built
+# afterwards, after a check of type, shape and length: numpy's own constructors allocate any shape,
+# and its dtypes take any offsets.
 
 # An array takes about 20 operations, and an item of a list one.
 MAX_OPERATIONS = 10_000_000
@@ -32,56 +34,38 @@ _KINDS = frozenset("?biuf")
 
 
 class _Dtype:
-    """Placeholder of numpy.dtype."""
-
-    __slots__ = ("text",)
+    """Placeholder of numpy.dtype: its text, and the byte order of its state."""
 
     def __init__(self, text: Any = "", *_: Any) -> None:
-        if isinstance(text, _NumpyClass):
-            text = text.name
-        if isinstance(text, bytes):
-            text = text.decode("ascii", errors="replace")
-        if not isinstance(text, str):
-            raise EvaluationError(f"pickle has a dtype {text!r}: expected the dtype of a number")
-        self.text = text
+        self.text = text.decode("ascii", errors="replace") if isinstance(text, bytes) else text
 
     def __setstate__(self, state: Any) -> None:
         order = state[1] if isinstance(state, tuple) and len(state) > 1 else None
-        if isinstance(order, bytes):
-            order = order.decode("ascii", errors="replace")
-        if order in ("<", ">") and self.text[:1] not in "<>=|":
-            self.text = order + self.text
+        order = order.decode("ascii", errors="replace") if isinstance(order, bytes) else order
+        if order in ("<", ">") and str(self.text)[:1] not in "<>=|":
+            self.text = order + str(self.text)
 
     def dtype(self) -> np.dtype[Any]:
-        try:
-            made = np.dtype(self.text)
-        except TypeError as error:
-            raise EvaluationError(f"pickle has a dtype '{self.text}': unknown") from error
-        if made.kind not in _KINDS and made.kind != "b":
-            raise EvaluationError(f"pickle has a dtype '{self.text}': expected numbers")
-        return made
+        if isinstance(self.text, str):
+            with suppress(TypeError):
+                made = np.dtype(self.text)
+                if made.kind in _KINDS:
+                    return made
+        raise EvaluationError(f"pickle has a dtype {self.text!r}: refused, expected numbers")
 
 
 class _Array:
     """Placeholder of an ndarray, filled by the constructor or by __setstate__."""
 
-    __slots__ = ("buffer", "dtype", "fortran", "shape", "strided")
-
     def __init__(self, shape: Any = (0,), dtype: Any = "f8", buffer: Any = None, *rest: Any):
-        self.shape = shape
-        self.dtype = dtype
-        self.buffer = buffer
-        self.fortran = False
         # Prediction files have no offsets or strides into a shared buffer.
-        self.strided = any(item is not None and item != 0 and item != "C" for item in rest)
-        if rest[-1:] == ("F",):
-            self.fortran, self.strided = True, False
+        self.strided = any(item not in (None, 0, "C", "F") for item in rest)
+        self.shape, self.dtype, self.buffer, self.fortran = shape, dtype, buffer, "F" in rest
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) not in (4, 5):
             raise EvaluationError("pickle has an array with an unknown state")
-        self.shape, self.dtype, fortran, self.buffer = state[-4:]
-        self.fortran = bool(fortran)
+        self.shape, self.dtype, self.fortran, self.buffer = state[-4:]
 
     def array(self) -> np.ndarray[Any, Any]:
         dtype = (self.dtype if isinstance(self.dtype, _Dtype) else _Dtype(self.dtype)).dtype()
@@ -91,10 +75,8 @@ class _Array:
         data = self.buffer
         if isinstance(data, str):
             data = data.encode("latin1")
-        if data is None and math.prod(shape) == 0:
-            data = b""
-        if isinstance(data, pickle.PickleBuffer):
-            data = bytes(data)
+        if isinstance(data, pickle.PickleBuffer) or (data is None and math.prod(shape) == 0):
+            data = bytes(data or b"")
         if not isinstance(data, bytes | bytearray):
             raise EvaluationError(f"pickle has an array of {type(data).__name__}: expected bytes")
         if len(data) != math.prod(shape) * dtype.itemsize:
@@ -106,124 +88,40 @@ class _Array:
         return made.astype(dtype.newbyteorder("="), copy=True)
 
 
-class _Callable:
-    """A function that a pickle may call. It has no state that a pickle could change."""
-
-    __slots__ = ()
-
-    def __setstate__(self, state: Any) -> None:
-        raise EvaluationError("pickle sets the state of a function: refused")
+def _encode(text: Any, encoding: Any = "latin1") -> bytes:
+    """Bytes in old pickle protocols."""
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise EvaluationError(f"pickle encodes with {encoding!r}: refused")
+    return text.encode("latin1")
 
 
-class _NumpyClass(_Callable):
-    """An array or number class of numpy; only ndarray and dtype may be called freely."""
-
-    __slots__ = ("name",)
-
-    name: str
-
-    def __init__(self, name: str) -> None:
-        object.__setattr__(self, "name", name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise EvaluationError("pickle sets the state of a class: refused")
-
-    def __call__(self, *arguments: Any) -> Any:
-        if self.name == "ndarray":
-            return _Array(*arguments)
-        if self.name == "dtype":
-            return _Dtype(*arguments)
-        if len(arguments) == 1 and isinstance(arguments[0], int | float):
-            return arguments[0]
-        raise EvaluationError(f"pickle calls numpy.{self.name}: refused")
-
-
-class _Reconstruct(_Callable):
-    """numpy's _reconstruct(class, shape, type code): an array that __setstate__ fills."""
-
-    __slots__ = ()
-
-    def __call__(self, *_: Any) -> _Array:
-        return _Array()
-
-
-class _FromBuffer(_Callable):
-    """numpy's _frombuffer(buffer, dtype, shape, order)."""
-
-    __slots__ = ()
-
-    def __call__(self, buffer: Any, dtype: Any, shape: Any, order: Any = "C", *_: Any) -> _Array:
-        made = _Array(shape, dtype, buffer)
-        made.fortran = order == "F"
-        return made
-
-
-class _Scalar(_Callable):
-    """numpy's scalar(dtype, bytes)."""
-
-    __slots__ = ()
-
-    def __call__(self, dtype: Any, data: Any = None) -> _Array:
-        return _Array((), dtype, data)
-
-
-class _Encode(_Callable):
-    """_codecs.encode: bytes in old pickle protocols."""
-
-    __slots__ = ()
-
-    def __call__(self, text: Any, encoding: Any = "latin1") -> bytes:
-        if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-            raise EvaluationError(f"pickle encodes with {encoding!r}: refused")
-        return text.encode("latin1")
-
-
-class _EmptyBytes(_Callable):
-    """bytes(): empty bytes in old pickle protocols."""
-
-    __slots__ = ()
-
-    def __call__(self) -> bytes:
-        return b""
-
-
-class _EmptyDict(_Callable):
-    """collections.OrderedDict as a plain dictionary."""
-
-    __slots__ = ()
-
-    def __call__(self, *arguments: Any) -> dict[Any, Any]:
-        return dict(*arguments)
-
-
-_CORE = ("numpy.core", "numpy._core")
-_NAMES: dict[tuple[str, str], _Callable] = {
-    ("_codecs", "encode"): _Encode(),
-    ("__builtin__", "bytes"): _EmptyBytes(),
-    ("builtins", "bytes"): _EmptyBytes(),
-    ("collections", "OrderedDict"): _EmptyDict(),
-    **{(f"{core}.multiarray", "_reconstruct"): _Reconstruct() for core in _CORE},
-    **{(f"{core}.multiarray", "scalar"): _Scalar() for core in _CORE},
-    **{(f"{core}.numeric", "_frombuffer"): _FromBuffer() for core in _CORE},
-    **{
-        ("numpy", name): _NumpyClass(name)
-        for name in (
-            "ndarray", "dtype", "bool", "bool_", "int8", "int16", "int32", "int64", "uint8",
-            "uint16", "uint32", "uint64", "float16", "float32", "float64",
-        )
-    },
-}  # fmt: skip
+_NAMES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("_codecs", "encode"): _encode,
+    ("__builtin__", "bytes"): lambda: b"",
+    ("builtins", "bytes"): lambda: b"",
+    ("collections", "OrderedDict"): lambda *items: dict(*items),
+    ("numpy", "ndarray"): _Array,
+    ("numpy", "dtype"): _Dtype,
+}
+for _core in ("numpy.core", "numpy._core"):
+    # _reconstruct(class, shape, type code): an array that __setstate__ fills.
+    _NAMES[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
+    _NAMES[f"{_core}.multiarray", "scalar"] = lambda dtype, data=None: _Array((), dtype, data)
+    _NAMES[f"{_core}.numeric", "_frombuffer"] = lambda buffer, dtype, shape, order="C": _Array(
+        shape, dtype, buffer, order
+    )
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        try:
-            return _NAMES[module, name]
-        except KeyError:
+        if (module, name) not in _NAMES:
             raise EvaluationError(
                 f"pickle names {module}.{name}: refused; expected only dictionaries, lists, "
                 "numbers, text and numpy arrays"
-            ) from None
+            )
+        function = _NAMES[module, name]
+        # A new one each time: a pickle may set attributes of what it names.
+        return lambda *arguments: function(*arguments)
 
     def persistent_load(self, pid: Any) -> Any:
         raise EvaluationError("pickle refers to an object outside the file: refused")

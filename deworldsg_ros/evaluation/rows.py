@@ -50,7 +50,7 @@ DETECTION = ("detector", "relation_head", "score_threshold", "max_relations", "r
 
 
 def networks(method: str, config: Config, front_end: FrontEndChoice) -> str:
-    """What a row runs on, e.g. ``RT-DETR, SAM 2, EGTR, V-JEPA 2``."""
+    """Models of a row, e.g. ``RT-DETR, SAM 2, EGTR, V-JEPA 2``."""
     perception = config.perception
     used = {
         "backend": [perception.detector, perception.segmenter, perception.relation_head],

@@ -110,7 +110,7 @@ class Fleet:
         return message
 
     def part_for(self, name: str) -> wire.SceneGraphMessage | None:
-        """What concerns a robot: objects near its own that only others have, in its world frame.
+        """The part for a robot: objects near its own that only others have, in its world frame.
 
         Returns:
             A graph with the ids of the fleet; None while the robot is not located.

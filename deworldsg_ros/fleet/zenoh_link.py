@@ -235,7 +235,7 @@ class Robots:
         return answers
 
     def take_errors(self) -> list[Exception]:
-        """What was refused or went wrong since the last call."""
+        """Refusals and errors since the last call."""
         errors, self._errors = self._errors, []
         return errors
 

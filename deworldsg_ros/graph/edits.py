@@ -1,4 +1,4 @@
-"""What an operator has said about nodes: labels, merges, splits and deletions.
+"""Edits of an operator: labels, merges, splits and deletions.
 
 The edits are a log. Everything that holds now is read from it, so that an edit holds for later
 frames, is saved with the graph, and can be undone. Nodes that a merge or a split replaced stay in

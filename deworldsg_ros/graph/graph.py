@@ -23,7 +23,8 @@ from deworldsg_ros.graph.pairs import (
     VotesByPair,
 )
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
-from deworldsg_ros.scene.frame_graph import Vocabulary
+from deworldsg_ros.scene.errors import RefusedInput
+from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.surface import NO_POINTS
 
 # --- The global 3D scene graph: Gaussian nodes, sparse directed edges, stable ids.
@@ -344,6 +345,45 @@ class SceneGraph:
     def votes(self) -> Mapping[Pair, PairVotes]:
         """Votes on each unordered pair (smaller id, larger id) seen together; read only."""
         return VotesByPair(self.nodes, self.pairs)
+
+    def check_fits(self, local: LocalGraph) -> None:
+        """Raise RefusedInput unless a frame's local graph can be merged.
+
+        The reasons are ``vocabulary_mismatch`` and ``wrong_frame``.
+        """
+        seen, known = local.vocabulary, self.vocabulary
+        # Identity first: to compare all names takes long.
+        if seen is not known and seen != known:
+            raise RefusedInput(
+                "vocabulary_mismatch",
+                f"local graph has {len(seen.classes)} classes and {len(seen.predicates)} "
+                f"predicates that are not the scene graph's {len(known.classes)} and "
+                f"{len(known.predicates)}",
+            )
+        if local.frame_id != self.frame_id:
+            raise RefusedInput(
+                "wrong_frame",
+                f"local graph is in frame {local.frame_id!r}: expected {self.frame_id!r}",
+            )
+
+    def add_relations(self, local: LocalGraph, node_ids: Sequence[int]) -> None:
+        """Add the visual relation logits of a frame to the edges of its nodes (Eq. 9).
+
+        Args:
+            local: the frame.
+            node_ids: the live node of each row of the frame; 0 = none.
+        """
+        # Summed by pair first: a frame counts once even if two of its rows are one node.
+        sums: dict[Pair, Float64] = {}
+        relations = local.relations
+        for (subject, object_), logits in zip(relations.pairs.tolist(), relations.logits):
+            pair = (node_ids[subject], node_ids[object_])
+            sums[pair] = sums[pair] + logits if pair in sums else logits
+        live = [pair for pair in sums if 0 not in pair and pair[0] != pair[1]]
+        if live:
+            slots = [[self.nodes.slot_of[node_id] for node_id in pair] for pair in live]
+            logits = np.array([sums[pair] for pair in live])
+            self.pairs.add_visual(np.array(slots, np.int64), logits, local.stamp_ns)
 
     def add_votes(self, a_id: int, b_id: int, counts: Float64 | None) -> None:
         """Count a frame that showed two live nodes; votes (2, R) or None, first row: a to b."""

@@ -185,7 +185,7 @@ class Observations:
 
 
 class _Gaussians(NamedTuple):
-    """What Eq. 7 fuses: means, covariances, classes, weights, and numbers of observations."""
+    """Arrays that Eq. 7 fuses."""
 
     means: Float64
     covariances: Float64

@@ -109,7 +109,7 @@ class PairArrays:
 
 @dataclass
 class PairChanges:
-    """What changed since the reader emptied it.
+    """Changes since the reader emptied it.
 
     Attributes:
         votes: rows of the pairs that more frames have shown.
@@ -181,7 +181,7 @@ class PairStore:
         self._watchers: list[PairChanges] = []
 
     def watch(self) -> PairChanges:
-        """What changes from now on. It starts with all pairs."""
+        """All changes from now on. It starts with all pairs."""
         changes = PairChanges(set(np.flatnonzero(self.rows["shown"]).tolist()))
         changes.edges.update(np.flatnonzero(self._is_edge().any(axis=1)).tolist())
         self._watchers.append(changes)
@@ -235,7 +235,7 @@ class PairStore:
             votes: (k, R).
         """
         rows = self.ensure(shown)
-        _show(self.rows, rows)
+        np.add.at(self.rows["shown"], rows, 1)
         counted = votes.any(axis=1)
         if counted.any():
             self._sum(self._votes, "votes", voted[counted], votes[counted])
@@ -369,7 +369,10 @@ class PairStore:
     def _see(
         self, rows: Int64, ends: Int64, stamp_ns: int, frames: int, neighbour_frames: int
     ) -> None:
-        _see(self.rows, rows, ends, stamp_ns, frames, neighbour_frames)
+        at = rows, ends
+        np.add.at(self.rows["frames"], at, frames)
+        np.add.at(self.rows["neighbour_frames"], at, neighbour_frames)
+        np.maximum.at(self.rows["last_seen_ns"], at, stamp_ns)
         for changes in self._watchers:
             changes.edges.update(rows.tolist())
 
@@ -445,30 +448,6 @@ def _has_evidence(known: NDArray[np.void]) -> Bool:
     is_edge = (known["frames"] > 0) | (known["neighbour_frames"] > 0)
     found: Bool = (known["shown"] > 0) | is_edge.any(axis=-1)
     return found
-
-
-@kernel
-def _show(pairs: NDArray[Any], rows: Int64) -> None:
-    """Count a frame that showed pairs."""
-    for row in rows:
-        pairs[row].shown += 1
-
-
-@kernel
-def _see(
-    pairs: NDArray[Any],
-    rows: Int64,
-    ends: Int64,
-    stamp_ns: int,
-    frames: int,
-    neighbour_frames: int,
-) -> None:
-    """Add frames to directions (m,) of pairs (m,)."""
-    for index in range(len(rows)):
-        pair, end = pairs[rows[index]], ends[index]
-        pair.frames[end] += frames
-        pair.neighbour_frames[end] += neighbour_frames
-        pair.last_seen_ns[end] = max(pair.last_seen_ns[end], stamp_ns)
 
 
 @kernel

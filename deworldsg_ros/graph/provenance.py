@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.array_file import read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, read_regular, write_atomically
-from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import invert_pose
@@ -105,10 +104,6 @@ class SeenSpace:
         since = self.stamps_ns >= since_ns
         self.poses[since] = T_correction @ self.poses[since]
 
-    def warm_up(self) -> None:
-        """Compile the kernel before the first frame."""
-        self._has(np.eye(4))
-
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Copies by name, for `restore`; empty without views."""
         values = (self.depths_mm, self.poses, self.cameras, self.stamps_ns)
@@ -130,22 +125,11 @@ class SeenSpace:
         self.stamps_ns = stamps_ns
 
     def _has(self, pose: Float64) -> bool:
-        return _has_like(self.poses, np.ascontiguousarray(pose))
-
-
-@kernel
-def _has_like(poses: Float64, pose: Float64) -> bool:
-    """Whether a pose (4, 4) differs little from one of some others."""
-    for known in poses[::-1]:  # the newest is most like it
-        squared_m2 = trace = 0.0
-        for i in range(3):
-            squared_m2 += (known[i, 3] - pose[i, 3]) ** 2
-            for j in range(3):
-                trace += known[i, j] * pose[i, j]
+        """Whether a pose (4, 4) differs little from that of a view."""
         # The trace of the rotation between both is 1 + 2 cos(angle).
-        if math.sqrt(squared_m2) < MOVED_M and trace >= LEAST_TRACE:
-            return True
-    return False
+        traces = self.poses[:, :3, :3].reshape(-1, 9) @ pose[:3, :3].ravel()
+        steps_m = self.poses[traces >= LEAST_TRACE, :3, 3] - pose[:3, 3]
+        return bool(((steps_m**2).sum(axis=1) < MOVED_M**2).any())
 
 
 def space_path(graph_path: Path) -> Path:
@@ -188,7 +172,7 @@ Key = tuple[int, int]
 
 
 class SeenFrame(msgspec.Struct, frozen=True, array_like=True, order=True):
-    """What one frame said: how clearly (0 to 1), when, and which class or predicate."""
+    """Evidence of one frame: how clear (0 to 1), when, and which class or predicate."""
 
     strength: Annotated[float, msgspec.Meta(ge=0.0, le=1.0 + 1e-9)]
     stamp_ns: Stamp

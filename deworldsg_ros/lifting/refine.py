@@ -38,29 +38,11 @@ def valid_depth(depth_m: Float32) -> Float32:
     The result is read-only and contiguous. An image without such values is not copied.
     """
     image_m = read_only(depth_m, np.float32)
-    return image_m if _is_valid(image_m) else read_only(_valid_depth(image_m))
-
-
-@kernel
-def _is_valid(depth_m: Float32) -> bool:
-    """Whether all depths are finite and not negative: their bits are below those of infinity."""
-    greatest = np.uint32(0)
-    for row in range(depth_m.shape[0]):
-        for column in range(depth_m.shape[1]):
-            greatest = max(greatest, np.float32(depth_m[row, column]).view(np.uint32))
-    return bool(greatest < 0x7F800000)
-
-
-@kernel
-def _valid_depth(depth_m: Float32) -> Float32:
-    height, width = depth_m.shape
-    valid = np.empty((height, width), np.float32)
-    zero, infinity = np.float32(0), np.float32(np.inf)
-    for row in range(height):
-        for column in range(width):
-            depth = depth_m[row, column]
-            valid[row, column] = depth if (depth > zero) & (depth < infinity) else zero
-    return valid
+    # The bits of finite depths that are not negative are below those of infinity.
+    bits, infinity = image_m.view(np.uint32), np.uint32(0x7F800000)
+    if bits.max(initial=0) < infinity:
+        return image_m
+    return read_only((bits * (bits < infinity)).view(np.float32))
 
 
 # --- Depth refinement in the spatial domain (Eq. 1).
@@ -92,11 +74,6 @@ def masks_of(instances: UInt16, count: int) -> Masks:
     # Whether a run begins at a pixel of a row, as bytes and as eight of them.
     begins = np.zeros((instances.shape[1] + 7) // 8 * 8, np.uint8)
     return Masks(*_masks_of(read_only(instances, np.uint16), count, begins, begins.view(np.uint64)))
-
-
-def valid_pixel_count(depth_m: Float32, runs: Int32) -> int:
-    """Number of valid pixels in runs (m, 4) of a depth image (H, W), from `valid_depth`."""
-    return int(_valid_pixel_count(depth_m, runs))
 
 
 def spatial_inliers(depth_m: Float32, runs: Int32, tau: float, epsilon_m: float) -> Pixels:
@@ -166,106 +143,56 @@ def _masks_of(
 
 
 @kernel
-def _valid_pixel_count(depth_m: Float32, runs: Int32) -> int:
-    count, zero = 0, np.float32(0)
-    for index in range(len(runs)):
-        row, start, stop, _ = runs[index]
-        run_m, valid = depth_m[row, start:stop], np.int32(0)
-        for step in range(run_m.size):
-            valid += np.int32(run_m[step] > zero)
-        count += int(valid)
-    return count
-
-
-@kernel
-def _ordered(a: np.int32, b: np.int32, c: np.int32) -> tuple[np.int32, np.int32, np.int32]:
-    """Three numbers in ascending order."""
-    low, high = min(a, b), max(a, b)
-    return min(low, c), max(low, min(high, c)), max(high, c)
-
-
-@kernel
-def _sort_columns(depth_m: Float32, row: int, start: int, stop: int, columns: Int32) -> None:
-    """Sort the depths of rows row - 1 to row + 1 in each column from start - 1 to stop.
-
-    Args:
-        depth_m: (H, W); positive floats have the order of their bits.
-        row: of a run of pixels.
-        start: its first column.
-        stop: the column after its last one.
-        columns: (3, W + 2), filled from 0 on with the lowest, middle and highest of each column.
-    """
-    height, width = depth_m.shape
-    first, last = max(start - 1, 0), min(stop + 1, width)
-    above = depth_m[max(row - 1, 0), first:last]
-    here = depth_m[row, first:last]
-    below = depth_m[min(row + 1, height - 1), first:last]
-    shift = first - (start - 1)
-    count = last - first
-    lows, middles, highs = columns[0, shift:], columns[1, shift:], columns[2, shift:]
-    for index in range(count):
-        lows[index], middles[index], highs[index] = _ordered(
-            np.float32(above[index]).view(np.int32),
-            np.float32(here[index]).view(np.int32),
-            np.float32(below[index]).view(np.int32),
-        )
-    end = shift + count
-    for rank in range(3):
-        if shift:
-            columns[rank, 0] = columns[rank, 1]
-        if last < stop + 1:
-            columns[rank, end] = columns[rank, end - 1]
-
-
-@kernel
-def _find_inliers(
-    depths_m: Float32, columns: Int32, medians: Int32, tau: float, epsilon_m: float, found: UInt8
-) -> None:
-    """Mark the inliers of a run of pixels (Eq. 1).
-
-    Of nine sorted in columns, the median is that of the highest low, the middle middle and the
-    lowest high.
-
-    Args:
-        depths_m: (n,) depths of the run.
-        columns: see `_sort_columns`.
-        medians: (W,) space for the bits of the medians.
-        tau: relative tolerance.
-        epsilon_m: absolute tolerance, metres.
-        found: (W,) filled with 1 for inliers and 0 for other pixels.
-    """
-    lows, middles, highs = columns[0], columns[1], columns[2]
-    for index in range(depths_m.size):
-        low = max(lows[index], max(lows[index + 1], lows[index + 2]))
-        _, middle, _ = _ordered(middles[index], middles[index + 1], middles[index + 2])
-        high = min(highs[index], min(highs[index + 1], highs[index + 2]))
-        medians[index] = _ordered(low, middle, high)[1]
-    for index in range(depths_m.size):
-        depth, median = (
-            np.float64(depths_m[index]),
-            np.float64(np.int32(medians[index]).view(np.float32)),
-        )
-        is_near = abs(depth - median) < tau * median + epsilon_m
-        found[index] = np.uint8((depth > 0.0) & is_near)
-
-
-@kernel
 def _spatial_inliers(
     depth_m: Float32, runs: Int32, tau: float, epsilon_m: float
 ) -> tuple[Int32, Int32, Float32]:
+    height, width = depth_m.shape
     # One slot more than pixels: rejected pixels are written, too.
-    slots, width = 1, depth_m.shape[1]
+    slots = 1
     for index in range(len(runs)):
         slots += int(runs[index, 2] - runs[index, 1])
     columns, rows = np.empty(slots, np.int32), np.empty(slots, np.int32)
     depths_m = np.empty(slots, np.float32)
+    # The lowest, middle and highest of three rows, from the column before a run to the one after
+    # it. Positive floats have the order of their bits.
     sorted_columns = np.empty((3, width + 2), np.int32)
+    lows, middles, highs = sorted_columns[0], sorted_columns[1], sorted_columns[2]
     medians, found, end = np.empty(width, np.int32), np.empty(width, np.uint8), np.uint64(0)
     for index in range(len(runs)):
         row, start, stop, _ = runs[index]
+        first, last = max(start - 1, 0), min(stop + 1, width)
+        above = depth_m[max(row - 1, 0), first:last]
+        here = depth_m[row, first:last]
+        below = depth_m[min(row + 1, height - 1), first:last]
+        shift = first - (start - 1)
+        low_here, middle_here, high_here = lows[shift:], middles[shift:], highs[shift:]
+        for step in range(here.size):
+            a = np.float32(above[step]).view(np.int32)
+            b = np.float32(here[step]).view(np.int32)
+            c = np.float32(below[step]).view(np.int32)
+            low, high = min(a, b), max(a, b)
+            low_here[step], high_here[step] = min(low, c), max(high, c)
+            middle_here[step] = max(low, min(high, c))
+        end_here = shift + here.size
+        for rank in range(3):
+            if shift:
+                sorted_columns[rank, 0] = sorted_columns[rank, 1]
+            if last < stop + 1:
+                sorted_columns[rank, end_here] = sorted_columns[rank, end_here - 1]
+        # Of nine sorted in columns, the median is that of the highest low, the middle middle and
+        # the lowest high.
         run_m = depth_m[row, start:stop]
-        _sort_columns(depth_m, row, start, stop, sorted_columns)
-        _find_inliers(run_m, sorted_columns, medians, tau, epsilon_m, found)
+        for step in range(run_m.size):
+            low = max(lows[step], max(lows[step + 1], lows[step + 2]))
+            high = min(highs[step], min(highs[step + 1], highs[step + 2]))
+            a, b, c = middles[step], middles[step + 1], middles[step + 2]
+            middle = max(min(a, b), min(max(a, b), c))
+            medians[step] = max(min(low, middle), min(max(low, middle), high))
+        for step in range(run_m.size):
+            depth = np.float64(run_m[step])
+            median = np.float64(np.int32(medians[step]).view(np.float32))
+            is_near = abs(depth - median) < tau * median + epsilon_m
+            found[step] = np.uint8((depth > 0.0) & is_near)
         for step in range(run_m.size):
             columns[end] = start + step
             rows[end] = row
@@ -298,6 +225,9 @@ MAX_GAPS = 32
 # Neighbouring pixels often fall into one bucket. So that their counts do not wait for one another,
 # they are counted in turn in this number of tables.
 COUNT_TABLES = 4
+# The depths in the bucket of the median are counted in finer ones, until so few are left that they
+# are sorted. (Numba would compile a kernel once more for a literal number.)
+MEDIAN_BUCKETS, FEW_DEPTHS = np.int64(256), 64
 # More than the rounding of a mean, relative to the highest depth.
 MEAN_ROUNDING = 1e-9
 # Above the bits of all depths.
@@ -356,8 +286,10 @@ def _extremes(depths: Float32) -> tuple[float, float]:
 
 
 @kernel
-def _buckets(depths: Float32, lowest: float, scale: float, count: int) -> UInt16:
-    """Bucket of each depth.
+def _counted(
+    depths: Float32, lowest: float, scale: float, count: int | np.int64
+) -> tuple[UInt16, Int64]:
+    """Bucket of each depth, and number of depths in each bucket.
 
     int((depth - lowest) * scale) is monotone in the depth, even with rounding. So buckets are
     ordered and never overlap.
@@ -365,14 +297,8 @@ def _buckets(depths: Float32, lowest: float, scale: float, count: int) -> UInt16
     buckets = np.empty(depths.size, np.uint16)
     last = np.int32(count - 1)
     for index in range(depths.size):
-        bucket = np.int32((np.float64(depths[index]) - lowest) * scale)
-        buckets[index] = min(bucket, last)
-    return buckets
-
-
-@kernel
-def _bucket_counts(buckets: UInt16, count: int) -> Int64:
-    """Number of depths in each bucket."""
+        place = np.int32((np.float64(depths[index]) - lowest) * scale)
+        buckets[index] = min(place, last)
     tables = np.zeros((COUNT_TABLES, count), np.int64)
     whole = buckets.size // COUNT_TABLES * COUNT_TABLES
     for index in range(0, whole, COUNT_TABLES):
@@ -383,40 +309,7 @@ def _bucket_counts(buckets: UInt16, count: int) -> Int64:
     for table in range(1, COUNT_TABLES):
         for bucket in range(count):
             tables[0, bucket] += tables[table, bucket]
-    counts: Int64 = tables[0]
-    return counts
-
-
-@kernel
-def _members(depths: Float32, buckets: UInt16, bucket: int, count: int) -> Float32:
-    """The depths in a bucket, by their number."""
-    members = np.empty(count + 1, np.float32)
-    member, wanted = np.uint64(0), np.uint16(bucket)
-    for index in range(depths.size):
-        members[member] = depths[index]
-        member += np.uint64(buckets[index] == wanted)
-    return members[:-1]
-
-
-@kernel
-def _least_above(depths: Float32, buckets: UInt16, bucket: int) -> float:
-    """The lowest depth in a later bucket."""
-    least = MOST_BITS
-    for index in range(depths.size):
-        bits = np.float32(depths[index]).view(np.int32)
-        least = min(least, bits if buckets[index] > bucket else MOST_BITS)
-    return np.float64(np.int32(least).view(np.float32))
-
-
-@kernel
-def _sort(depths: Float32) -> None:
-    """Sort a few depths in place."""
-    for index in range(1, depths.size):
-        depth, at = depths[index], index
-        while at > 0 and depths[at - 1] > depth:
-            depths[at] = depths[at - 1]
-            at -= 1
-        depths[at] = depth
+    return buckets, tables[0]
 
 
 @kernel
@@ -429,40 +322,51 @@ def _median(depths: Float32, buckets: UInt16, counts: Int64) -> float:
             rank -= counts[bucket]
             next_rank -= counts[bucket]
             bucket += 1
-        members = _members(depths, buckets, bucket, counts[bucket])
+        # The depths in this bucket; others are written, too.
+        members, member = np.empty(counts[bucket] + 1, np.float32), np.uint64(0)
+        wanted = np.uint16(bucket)
+        for index in range(depths.size):
+            members[member] = depths[index]
+            member += np.uint64(buckets[index] == wanted)
+        members = members[:-1]
         lowest, highest = _extremes(members)
-        if next_rank == members.size:  # the upper middle is the first of a later bucket
-            return (highest + _least_above(depths, buckets, bucket)) / 2.0
+        if next_rank == members.size:  # the upper middle is the lowest of the later buckets
+            least = MOST_BITS
+            for index in range(depths.size):
+                bits = np.float32(depths[index]).view(np.int32)
+                least = min(least, bits if buckets[index] > bucket else MOST_BITS)
+            return (highest + np.float64(np.int32(least).view(np.float32))) / 2.0
         if lowest == highest:
             return lowest
         depths = members
-        if depths.size <= 64:
-            _sort(depths)
+        if depths.size <= FEW_DEPTHS:
+            for index in range(1, depths.size):
+                depth, at = depths[index], index
+                while at > 0 and depths[at - 1] > depth:
+                    depths[at] = depths[at - 1]
+                    at -= 1
+                depths[at] = depth
             return (np.float64(depths[rank]) + np.float64(depths[next_rank])) / 2.0
-        count = int(np.int64(256))  # the kernels would be compiled once more for a literal
-        buckets = _buckets(depths, lowest, count / (highest - lowest), count)
-        counts = _bucket_counts(buckets, count)
-
-
-@kernel
-def _gaps(counts: Int64) -> Int64:
-    """Buckets that follow each run of empty buckets: each begins a block."""
-    starts = np.empty(counts.size, np.int64)
-    gaps = 0
-    for bucket in range(1, counts.size):
-        starts[gaps] = bucket
-        gaps += int(counts[bucket] > 0 and counts[bucket - 1] == 0)
-    return starts[:gaps]
+        scale = MEDIAN_BUCKETS / (highest - lowest)
+        buckets, counts = _counted(depths, lowest, scale, MEDIAN_BUCKETS)
 
 
 @kernel
 def _blocks(
-    depths: Float32, buckets: UInt16, starts: Int64, lowest: float, highest: float
+    depths: Float32, buckets: UInt16, counts: Int64, lowest: float, highest: float
 ) -> tuple[Float64, Float64]:
-    """Lowest and highest depth of each block; the blocks but the first begin at `starts`."""
-    lows, highs = np.empty(starts.size + 1, np.float64), np.empty(starts.size + 1, np.float64)
-    lows[0], highs[starts.size] = lowest, highest
-    for gap in range(starts.size):
+    """Lowest and highest depth of each block; none if there are more than MAX_GAPS gaps."""
+    # A bucket after an empty one begins a block.
+    starts, gaps = np.empty(MAX_GAPS, np.int64), 0
+    for bucket in range(1, counts.size):
+        if counts[bucket] > 0 and counts[bucket - 1] == 0:
+            if gaps == MAX_GAPS:
+                return np.empty(0, np.float64), np.empty(0, np.float64)
+            starts[gaps] = bucket
+            gaps += 1
+    lows, highs = np.empty(gaps + 1, np.float64), np.empty(gaps + 1, np.float64)
+    lows[0], highs[gaps] = lowest, highest
+    for gap in range(gaps):
         start = np.uint16(starts[gap])
         below, above = np.int32(0), MOST_BITS
         for index in range(depths.size):
@@ -472,32 +376,6 @@ def _blocks(
         lows[gap + 1] = np.float64(np.int32(above).view(np.float32))
         highs[gap] = np.float64(np.int32(below).view(np.float32))
     return lows, highs
-
-
-@kernel
-def _mean_between(depths: Float32, low: float, high: float, unit: float) -> float:
-    """Mean of the depths in [low, high], summed as multiples of a unit of length.
-
-    Depths that are multiples of the unit have an exact sum.
-    """
-    total, count, per_unit = np.int64(0), np.int64(0), 1.0 / unit
-    for index in range(depths.size):
-        depth = np.float64(depths[index])
-        inside = (depth >= low) & (depth <= high)
-        total += np.int64(depth * per_unit) if inside else np.int64(0)
-        count += np.int64(inside)
-    return np.float64(total) * unit / count
-
-
-@kernel
-def _unit(count: int, lowest: float, highest: float) -> float:
-    """The last binary place of the lowest depth, a unit of all depths.
-
-    The sum of `count` depths must fit into 62 bits, so a very large range of depths takes a coarser
-    unit. With 640 x 480 depths, this begins where the highest is 2^20 times the lowest.
-    """
-    finest = math.floor(math.log2(lowest)) - 23
-    return float(2.0 ** max(finest, math.ceil(math.log2(highest * count)) - 62))
 
 
 @kernel
@@ -524,11 +402,22 @@ def _nearest_cluster(
         last -= 1
     if last - first == 1:
         return lows[first], highs[first]
-    unit = _unit(depths.size, lows[0], highs[-1])
+    # Depths are summed as multiples of a unit, exactly: of the last binary place of the lowest. The
+    # sum must fit into 62 bits, so a very large range of depths takes a coarser unit. With 640 x
+    # 480 depths, this begins where the highest is 2^20 times the lowest.
+    finest = math.floor(math.log2(lows[0])) - 23
+    unit = float(2.0 ** max(finest, math.ceil(math.log2(highs[-1] * depths.size)) - 62))
+    per_unit = 1.0 / unit
     best, best_distance = -1, np.inf
     for cluster in range(first, last):
-        mean = _mean_between(depths, lows[cluster], highs[cluster], unit)
-        distance = abs(mean - reference)
+        total, count = np.int64(0), np.int64(0)
+        low, high = lows[cluster], highs[cluster]
+        for index in range(depths.size):
+            depth = np.float64(depths[index])
+            inside = (depth >= low) & (depth <= high)
+            total += np.int64(depth * per_unit) if inside else np.int64(0)
+            count += np.int64(inside)
+        distance = abs(np.float64(total) * unit / count - reference)
         if distance < best_distance:
             best, best_distance = cluster, distance
     return lows[best], highs[best]
@@ -546,13 +435,11 @@ def _dominant_layer(
     if 2.0 * spread / gamma_base >= MAX_BUCKETS:
         return np.inf, -np.inf
     count = max(int(2.0 * spread / gamma_base) + 2, MIN_BUCKETS)
-    buckets = _buckets(depths, lowest, count / spread, count)
-    counts = _bucket_counts(buckets, count)
-    starts = _gaps(counts)
-    if starts.size > MAX_GAPS:
+    buckets, counts = _counted(depths, lowest, count / spread, count)
+    lows, highs = _blocks(depths, buckets, counts, lowest, highest)
+    if lows.size == 0:
         return np.inf, -np.inf
     reference = _median(depths, buckets, counts)
-    lows, highs = _blocks(depths, buckets, starts, lowest, highest)
 
     threshold = max(gamma_base, beta * reference)
     # The bound on median(Δz), and the same bound without the steps between blocks: two distant
@@ -561,7 +448,7 @@ def _dominant_layer(
     for block in range(lows.size):
         within += highs[block] - lows[block]
     step_bound = 2.0 * spread / steps
-    inside = 0.5 * steps - starts.size
+    inside = 0.5 * steps - (lows.size - 1)
     if inside > 0:
         step_bound = min(step_bound, within / inside)
     if alpha * step_bound * (1.0 + 1e-9) > threshold:

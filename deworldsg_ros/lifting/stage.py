@@ -18,7 +18,6 @@ from deworldsg_ros.lifting.refine import (
     masks_of,
     spatial_inliers,
     valid_depth,
-    valid_pixel_count,
 )
 from deworldsg_ros.scene.arrays import Float32, Float64, Int32, UInt16
 from deworldsg_ros.scene.camera import Intrinsics, check_pose
@@ -104,6 +103,9 @@ def box_pixels(depth_m: Float32, box_xyxy: Float64) -> Pixels:
 # Points that are computed at once; they fit into the first-level cache.
 CHUNK = 256
 
+# fx, fy, cx, cy in pixels.
+_Camera = tuple[float, float, float, float]
+
 
 class Estimate(NamedTuple):
     """An object in the camera frame.
@@ -143,31 +145,19 @@ def estimate_gaussian(
     """
     camera = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     arrays = pixels.columns, pixels.rows, pixels.depths_m
-    return Estimate(*_estimate(*arrays, *layer_m, *camera, min_pixels, surface_points))
-
-
-@kernel
-def back_project(
-    column: int, row: int, depth_m: float, fx: float, fy: float, cx: float, cy: float
-) -> tuple[float, float, float]:
-    """`Intrinsics.back_project` of one pixel, with the same operations (Eq. 3)."""
-    return (column - cx) / fx * depth_m, (row - cy) / fy * depth_m, depth_m
+    return Estimate(*_estimate(arrays, layer_m, camera, min_pixels, surface_points))
 
 
 @kernel
 def _estimate(
-    all_columns: Int32,
-    all_rows: Int32,
-    all_depths_m: Float32,
-    lowest_m: float,
-    highest_m: float,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    pixels: tuple[Int32, Int32, Float32],
+    layer_m: tuple[float, float],
+    camera: _Camera,
     min_pixels: int,
     surface_points: int,
 ) -> tuple[int, Float64, Float64, Float64]:
+    all_columns, all_rows, all_depths_m = pixels
+    lowest_m, highest_m = layer_m
     columns = np.empty(all_columns.size, np.int32)
     rows, depths_m = np.empty(columns.size, np.int32), np.empty(columns.size, np.float32)
     count = 0
@@ -178,24 +168,27 @@ def _estimate(
     if count < min_pixels:
         nothing = np.empty((0, 0), np.float64)
         return count, np.empty(0, np.float64), nothing, nothing
-    mean, covariance = _moments(columns[:count], rows[:count], depths_m[:count], fx, fy, cx, cy)
+    mean, covariance = _moments(columns[:count], rows[:count], depths_m[:count], camera)
+    fx, fy, cx, cy = camera
     area_m2 = count * mean[2] ** 2 / (fx * fy)
     by_area = min(int(area_m2 / POINT_AREA_M2), LARGE_SURFACE_FACTOR * surface_points)
     points = np.empty((min(max(by_area, surface_points), count), 3), np.float64)
     for index in range(len(points)):
         place = index * count // len(points)
-        x, y, z = back_project(
-            columns[place], rows[place], np.float64(depths_m[place]), fx, fy, cx, cy
-        )
-        points[index, 0], points[index, 1], points[index, 2] = x, y, z
+        # As `Intrinsics.back_project` (Eq. 3), with the same operations.
+        depth_m = np.float64(depths_m[place])
+        points[index, 0] = (columns[place] - cx) / fx * depth_m
+        points[index, 1] = (rows[place] - cy) / fy * depth_m
+        points[index, 2] = depth_m
     return count, mean, covariance, points
 
 
 @kernel
 def _moments(
-    columns: Int32, rows: Int32, depths_m: Float32, fx: float, fy: float, cx: float, cy: float
+    columns: Int32, rows: Int32, depths_m: Float32, camera: _Camera
 ) -> tuple[Float64, Float64]:
     """Sample mean and covariance of the points of pixels."""
+    fx, fy, cx, cy = camera
     count = depths_m.size
     # The sums are taken about a point of the object, not about the origin. A covariance of square
     # centimetres at a distance of metres would lose its digits otherwise.
@@ -408,7 +401,7 @@ class Lifting:
             pixels = spatial_inliers(depth_m, runs, config.tau, constants.epsilon_m)
         least = constants.min_pixels
         if len(pixels) < least:
-            had_few = config.pixels != "refined" or valid_pixel_count(depth_m, runs) < least
+            had_few = config.pixels != "refined" or len(mask_pixels(depth_m, runs)) < least
             return "few_mask_pixels" if had_few else "few_spatial_inliers"
         layer_m = 0.0, np.inf
         if config.pixels == "refined":

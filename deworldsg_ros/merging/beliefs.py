@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.merging.views import VISIBILITIES
-from deworldsg_ros.scene.arrays import Bool, Float64, Int64
+from deworldsg_ros.scene.arrays import Float64, Int64
 
 # --- The class of a node: a hidden Markov model, because wrong names come in spells.
 #
@@ -201,18 +201,15 @@ def prior(fates: Int64) -> float:
     return OFFSET + FATES * math.log(fates[1] / fates[0])
 
 
-@kernel
 def settle(records: NDArray[Any], fates: Int64, slots: Int64, known: Float64) -> None:
     """Count the nodes that have turned out to be objects, or errors, by probabilities (n,).
 
     A node is an error only after a clear miss. A new node is improbable, too, if frames come fast.
     """
-    for index in range(len(slots)):
-        record, probability = records[slots[index]], known[index]
-        is_error = probability < 1.0 - SETTLED and record.missed_since > CLEAR_MISS
-        if not record.is_settled and (probability > SETTLED or is_error):
-            record.is_settled = True
-            fates[0 if is_error else 1] += 1
+    is_error = (known < 1.0 - SETTLED) & (records["missed_since"][slots] > CLEAR_MISS)
+    is_new = ~records["is_settled"][slots] & ((known > SETTLED) | is_error)
+    records["is_settled"][slots[is_new]] = True
+    fates += np.bincount(~is_error[is_new], minlength=2)
 
 
 def frame_weight(step_ns: int | None) -> float:
@@ -280,7 +277,21 @@ def observe_existence(
             continue
         has_moved = step_m > max(STILL_M, LOOK_RAD * distance_m)
         if has_moved or stamp_ns - record.look_ns > LOOK_NS:
-            _end_look(record, counts, step_m > STILL_M)
+            # Add the present look to those that have ended, and begin a new one.
+            found, missed = _look(record, counts)
+            record.looks += found
+            record.missed += missed
+            record.missed_since += missed
+            look = record.look_weight * min(MAX_WEIGHT, record.shown)
+            record.pending[record.visibility] += look
+            if record.detected > 0:
+                # Misses count for the rates if a detection follows: before, it may be no object.
+                counts[record.visibility, 1] += look
+                for visibility in range(len(counts)):
+                    counts[visibility, 0] += record.pending[visibility]
+                    record.pending[visibility] = 0.0
+            record.detected = record.shown = record.visibility = 0
+            record.look_weight = 1.0 if step_m > STILL_M else STILL_WEIGHT
             record.look_ns = stamp_ns
             for axis in range(3):
                 record.camera_world[axis] = camera_world[axis]
@@ -298,27 +309,8 @@ def observe_existence(
 
 
 @kernel
-def _end_look(record: Any, counts: Float64, camera_moves: bool) -> None:
-    """Add the present look to those that have ended, and begin a new one."""
-    found, missed = _look(record, counts)
-    record.looks += found
-    record.missed += missed
-    record.missed_since += missed
-    weight = record.look_weight * min(MAX_WEIGHT, record.shown)
-    record.pending[record.visibility] += weight
-    if record.detected > 0:
-        # Misses count for the rates if a detection follows: before that, it may be no object.
-        counts[record.visibility, 1] += weight
-        for visibility in range(len(counts)):
-            counts[visibility, 0] += record.pending[visibility]
-            record.pending[visibility] = 0.0
-    record.detected = record.shown = record.visibility = 0
-    record.look_weight = 1.0 if camera_moves else STILL_WEIGHT
-
-
-@kernel
 def _look(record: Any, counts: Float64) -> tuple[float, float]:
-    """What the present look adds to D and to M."""
+    """The summands of the present look for D and M."""
     if record.shown == 0:
         return 0.0, 0.0
     fraction = record.detected / record.shown
@@ -331,37 +323,27 @@ def _look(record: Any, counts: Float64) -> tuple[float, float]:
 
 
 @kernel
-def probabilities(records: NDArray[Any], counts: Float64, slots: Int64, prior: float) -> Float64:
-    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`."""
+def probabilities(
+    records: NDArray[Any], counts: Float64, slots: Int64, prior: float, with_misses: bool
+) -> Float64:
+    """Probability (n,) that each of n nodes is an object; the prior is that of `prior`.
+
+    Without misses, it is that of a detector that always finds what it sees.
+    """
     result = np.empty(len(slots))
     for index in range(len(slots)):
-        result[index] = _probability(records[slots[index]], counts, prior, True)
+        record = records[slots[index]]
+        found, missed = _look(record, counts)
+        score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
+        log_odds = prior + SCORE * math.log(score / (1.0 - score))
+        log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
+        if with_misses:
+            log_odds -= MISSES * math.log1p(record.missed + missed)
+            if record.last_ns - record.first_ns < MOMENT_NS:
+                since = record.missed_since + (missed if record.detected == 0 else 0.0)
+                log_odds -= MOMENT * math.log1p(since)
+        result[index] = 1.0 / (1.0 + math.exp(-log_odds))
     return result
-
-
-@kernel
-def are_missed(
-    records: NDArray[Any], counts: Float64, slots: Int64, prior: float, minimum: float
-) -> Bool:
-    """Whether (n,) only the misses make the probability of each of n nodes less than a minimum."""
-    result = np.empty(len(slots), np.bool_)
-    for index in range(len(slots)):
-        result[index] = _probability(records[slots[index]], counts, prior, False) >= minimum
-    return result
-
-
-@kernel
-def _probability(record: Any, counts: Float64, prior: float, with_misses: bool) -> float:
-    found, missed = _look(record, counts)
-    score = min(max(record.best_score, MIN_SCORE), MAX_SCORE)
-    log_odds = prior + SCORE * math.log(score / (1.0 - score))
-    log_odds += LOOKS * math.log(max(record.looks + found, 1e-3))
-    if with_misses:
-        log_odds -= MISSES * math.log1p(record.missed + missed)
-        if record.last_ns - record.first_ns < MOMENT_NS:
-            since = record.missed_since + (missed if record.detected == 0 else 0.0)
-            log_odds -= MOMENT * math.log1p(since)
-    return float(1.0 / (1.0 + math.exp(-log_odds)))
 
 
 def merge(record: Any, other: Any) -> None:

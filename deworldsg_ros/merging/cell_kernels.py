@@ -1,4 +1,4 @@
-"""Compiled kernels of the surface map (`voxel_map`), and the arrays they work on.
+"""Compiled kernels of the surface map (`surface_map`), and the arrays they work on.
 
 Space is divided into cells, and 4 x 4 x 4 cells are a block. The 64 cells of a block are the bits
 of a uint64 mask: bit 16 x + 4 y + z. Adjacent cells are then found by shifts.
@@ -35,6 +35,8 @@ _FACES = np.array(
 )
 _ROTATIONS = np.array([3, 61, 12, 52, 48, 16], np.uint64)
 _STEPS = np.array([1, -1, 1 << 21, -(1 << 21), 1 << 42, -(1 << 42)], np.int64)
+# Fibonacci hashing: the upper bits of the product depend on all bits of a block.
+_GOLDEN_RATIO = np.uint64(0x9E3779B97F4A7C15)
 
 
 class CellSets(NamedTuple):
@@ -66,7 +68,7 @@ class CellTable(NamedTuple):
         owners: (n,) int32; -1 = removed.
         marks: (n,) uint64, cells that a query has met; zero between queries.
         rejected: (n,) uint64, cells with a negative score.
-        scores: (n, 64) int8, evidence that each cell is the owner's surface (`cell_beliefs`). It
+        scores: (n, 64) int8, evidence that each cell is the owner's surface (`surface_map`). It
             stays when the owner loses the cell.
         nexts: (n,) int32, next row of the same owner; -1 = none.
     """
@@ -107,31 +109,18 @@ def new_table(capacity: int) -> CellTable:
 @kernel
 def _home_slot(slots: Int32, block: np.int64) -> int:
     """First slot in which a block may lie."""
-    mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
+    mixed = np.uint64(block) * _GOLDEN_RATIO
     return int(np.int64(mixed >> np.uint64(32)) & (len(slots) - 1))
 
 
 @kernel
-def _hash_bit(block: np.int64) -> np.uint64:
-    """One of 64 bits."""
-    mixed = np.uint64(block) * np.uint64(0x9E3779B97F4A7C15)
-    return np.uint64(1) << (mixed >> np.uint64(58))
-
-
-@kernel
-def _bit_count(mask: np.uint64) -> int:
+def bit_count(mask: np.uint64) -> int:
     """Number of set bits."""
     mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
     pairs = np.uint64(0x3333333333333333)
     mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
     mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
     return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
-
-
-@kernel
-def _rotated(mask: np.uint64, by: np.uint64) -> np.uint64:
-    """A mask, rotated to the right."""
-    return (mask >> by) | (mask << (np.uint64(64) - by))
 
 
 @kernel
@@ -190,31 +179,6 @@ def cells_of(points: Float32, starts: Int64, cell_m: float) -> tuple[Int64, UInt
 
 
 @kernel
-def _find_slots(table: TableArrays, block: np.int64, owner: int) -> tuple[int, int, int, np.uint64]:
-    """The owner's row of a block, a removed row (-1 = none), the next empty slot, and the cells of
-    the block that have four owners.
-    """
-    slots, blocks, masks, owners, _, _, _, _ = table
-    own = removed = -1
-    # The three bits of the number of owners of each cell.
-    ones = twos = fours = np.uint64(0)
-    slot = _home_slot(slots, block)
-    while slots[slot] != -1:
-        row = slots[slot]
-        if owners[row] < 0:
-            removed = row
-        elif blocks[row] == block:
-            if owners[row] == owner:
-                own = row
-            carried = ones & masks[row]
-            ones ^= masks[row]
-            fours |= twos & carried
-            twos ^= carried
-        slot = (slot + 1) & (len(slots) - 1)
-    return own, removed, slot, fours
-
-
-@kernel
 def add(
     table: TableArrays,
     counts: Int64,
@@ -243,72 +207,62 @@ def add(
     for index in range(len(owners)):
         owner = owners[index]
         for at in range(starts[index], starts[index + 1]):
-            row, removed, empty, full = _find_slots(table, set_blocks[at], owner)
+            # The owner's row of the block, and a removed row; -1 = none.
+            row = removed = -1
+            # The three bits of the number of owners of each cell.
+            ones = twos = fours = np.uint64(0)
+            slot = _home_slot(slots, set_blocks[at])
+            while slots[slot] != -1:
+                other = slots[slot]
+                if row_owners[other] < 0:
+                    removed = other
+                elif blocks[other] == set_blocks[at]:
+                    if row_owners[other] == owner:
+                        row = other
+                    carried = ones & masks[other]
+                    ones ^= masks[other]
+                    fours |= twos & carried
+                    twos ^= carried
+                slot = (slot + 1) & (len(slots) - 1)
             # A cell keeps four owners; a fifth is not recorded.
-            cells = set_masks[at] & ~full
+            cells = set_masks[at] & ~fours
             if row >= 0:
                 cells &= ~masks[row]
-            while _bit_count(cells) > max_cells - counts[owner]:
+            while bit_count(cells) > max_cells - counts[owner]:
                 cells &= cells - np.uint64(1)
             if cells == 0:
                 continue
             if row < 0:
                 row = removed
                 if removed < 0:
-                    row = slots[empty] = used
+                    row = slots[slot] = used
                     used += 1
                 blocks[row] = set_blocks[at]
                 row_owners[row] = owner
                 nexts[row] = firsts[owner]
                 firsts[owner] = row
             masks[row] |= cells
-            counts[owner] += _bit_count(cells)
+            counts[owner] += bit_count(cells)
     return used
 
 
 @kernel
-def _row_of(table: TableArrays, block: np.int64, owner: int) -> int:
-    """The row of an owner's cells in a block; -1 = none."""
-    slots, blocks, _, owners, _, _, _, _ = table
-    slot = _home_slot(slots, block)
-    while slots[slot] != -1:
-        row = slots[slot]
-        if blocks[row] == block and owners[row] == owner:
-            return int(row)
-        slot = (slot + 1) & (len(slots) - 1)
-    return -1
-
-
-@kernel
-def mark(table: TableArrays, owners: Int64, sets: SetArrays) -> None:
-    """Mark the cells of each set in the rows of its owner."""
-    marks = table[4]
-    blocks, set_masks, starts = sets
-    for index in range(len(owners)):
-        for at in range(starts[index], starts[index + 1]):
-            row = _row_of(table, blocks[at], owners[index])
-            if row >= 0:
-                marks[row] = set_masks[at]
-
-
-@kernel
-def add_scores(
-    table: TableArrays, owners: Int64, sets: SetArrays, scores: Int8, limit: int
-) -> None:
-    """Add to the scores of owners' cells, up to ± `limit`; see `VoxelMap.add_scores`."""
+def rows_at(table: TableArrays, owners: Int64, sets: SetArrays) -> Int64:
+    """The owner's row of each block of its set; -1 = none."""
+    slots, row_blocks, _, row_owners, _, _, _, _ = table
     blocks, _, starts = sets
-    rejected, known = table[5], table[6]
+    rows = np.empty(len(blocks), np.int64)
     for index in range(len(owners)):
         for at in range(starts[index], starts[index + 1]):
-            row = _row_of(table, blocks[at], owners[index])
-            if row < 0:
-                continue
-            negative = np.uint64(0)
-            for cell in range(64):
-                score = int(known[row, cell]) + int(scores[at, cell])
-                known[row, cell] = min(max(score, -limit), limit)
-                negative |= np.uint64(score < 0) << np.uint64(cell)
-            rejected[row] = negative
+            rows[at] = -1
+            slot = _home_slot(slots, blocks[at])
+            while slots[slot] != -1:
+                row = slots[slot]
+                if row_blocks[row] == blocks[at] and row_owners[row] == owners[index]:
+                    rows[at] = row
+                    break
+                slot = (slot + 1) & (len(slots) - 1)
+    return rows
 
 
 @kernel
@@ -332,25 +286,16 @@ def points_in(points: Float32, counts: Int64, rows: Int64, sets: SetArrays, cell
         # Most points are in no block of the set, and most of them need no comparison.
         hashes = np.uint64(0)
         for at in range(starts[index], starts[index + 1]):
-            hashes |= _hash_bit(blocks[at])
+            hashes |= np.uint64(1) << (np.uint64(blocks[at]) * _GOLDEN_RATIO >> np.uint64(58))
         row = rows[index]
         for place in range(counts[row] if hashes != 0 else 0):
             block, bit = _cell_of(points[row, place], cells_per_m)
-            if hashes & _hash_bit(block) == 0:
+            hashed = np.uint64(1) << (np.uint64(block) * _GOLDEN_RATIO >> np.uint64(58))
+            if hashes & hashed == 0:
                 continue
             for at in range(starts[index], starts[index + 1]):
                 inside[index, place] |= blocks[at] == block and set_masks[at] & bit != 0
     return inside
-
-
-@kernel
-def _mark(row: int, cells: np.uint64, marks: UInt64, marked: Int64, marked_count: int) -> int:
-    """Mark cells of a row; lists the row if it is new, and returns the number of rows listed."""
-    if cells != 0 and marks[row] == 0:
-        marked[marked_count] = row
-        marked_count += 1
-    marks[row] |= cells
-    return marked_count
 
 
 @kernel
@@ -362,8 +307,9 @@ def overlaps(
     blocks, set_masks, starts = sets
     on_block, on_owner, of_owner = sums
     set_count = len(starts) - 1
-    # For each set and owner that meet: both, and the two numbers of cells.
-    found, total = np.empty((64, 4), np.int64), 0
+    # For each set and owner that meet: both, and the two numbers of cells. Most rows are not used,
+    # and take no memory.
+    found, total = np.empty((set_count * len(counts), 4), np.int64), 0
     block_owners = np.empty(MAX_BLOCK_OWNERS, np.int64)
     most = 0
     for index in range(set_count):
@@ -376,75 +322,48 @@ def overlaps(
             owner_count, marked_count = _meet(
                 table, blocks[at], set_masks[at], on_block, block_owners, marked, marked_count
             )
-            while total + owner_count > len(found):
-                found = _doubled(found)
             for position in range(owner_count):
                 owner = block_owners[position]
                 if on_block[owner] != 0 and on_owner[owner] == 0:
                     found[total, 0], found[total, 1] = index, owner
                     total += 1
-                on_owner[owner] += _bit_count(on_block[owner])
+                on_owner[owner] += bit_count(on_block[owner])
                 on_block[owner] = 0
         for position in range(marked_count):
             row = marked[position]
-            of_owner[owners[row]] += _bit_count(marks[row])
+            of_owner[owners[row]] += bit_count(marks[row])
             marks[row] = 0
         for row in range(first, total):
             owner = found[row, 1]
             found[row, 2], found[row, 3] = on_owner[owner], of_owner[owner]
             on_owner[owner] = of_owner[owner] = 0
-    columns = _ascending(found[:total])
-    on_fractions = np.zeros((set_count, len(columns)), np.float64)
-    of_fractions = np.zeros((set_count, len(columns)), np.float64)
+    # The owners that any set meets, ascending, and the column of each.
+    columns, count, column_of = np.empty(total, np.int64), 0, on_owner
+    for row in range(total):
+        owner, column = found[row, 1], count
+        if column_of[owner] == 0:
+            while column > 0 and columns[column - 1] > owner:
+                columns[column] = columns[column - 1]
+                column -= 1
+            columns[column], column_of[owner] = owner, 1
+            count += 1
+    for column in range(count):
+        column_of[columns[column]] = column
+    on_fractions = np.zeros((set_count, count), np.float64)
+    of_fractions = np.zeros((set_count, count), np.float64)
     cell_counts = np.zeros(set_count, np.float64)
     for index in range(set_count):
         for at in range(starts[index], starts[index + 1]):
-            cell_counts[index] += _bit_count(set_masks[at])
+            cell_counts[index] += bit_count(set_masks[at])
     for row in range(total):
         index, owner = found[row, 0], found[row, 1]
-        column = _place(columns, owner)
+        column = column_of[owner]
         on_fractions[index, column] = found[row, 2] / cell_counts[index]
         if counts[owner] >= MIN_OWNER_CELLS:
             of_fractions[index, column] = found[row, 3] / counts[owner]
-    return columns, on_fractions, of_fractions
-
-
-@kernel
-def _doubled(rows: Int64) -> Int64:
-    """Rows (n, 4), and space for as many more."""
-    more = np.empty((2 * len(rows), 4), np.int64)
-    for row in range(len(rows)):
-        for item in range(4):
-            more[row, item] = rows[row, item]
-    return more
-
-
-@kernel
-def _ascending(found: Int64) -> Int64:
-    """The owners in column 1, each once."""
-    owners, count = np.empty(len(found), np.int64), 0
-    for row in range(len(found)):
-        owner = found[row, 1]
-        place = _place(owners[:count], owner)
-        if place == count or owners[place] != owner:
-            for later in range(count, place, -1):
-                owners[later] = owners[later - 1]
-            owners[place] = owner
-            count += 1
-    return owners[:count]
-
-
-@kernel
-def _place(numbers: Int64, number: int) -> int:
-    """Index of the first of ascending numbers that is not below a number."""
-    low, high = 0, len(numbers)
-    while low < high:
-        middle = (low + high) // 2
-        if numbers[middle] < number:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+    for column in range(count):
+        column_of[columns[column]] = 0
+    return columns[:count], on_fractions, of_fractions
 
 
 @kernel
@@ -470,7 +389,9 @@ def _meet(
         touching = _dilated(set_mask)
         if face >= 0:
             block += _STEPS[face]
-            touching = _rotated(set_mask & _FACES[face], _ROTATIONS[face])
+            right, left = _ROTATIONS[face], np.uint64(64) - _ROTATIONS[face]
+            touching = set_mask & _FACES[face]
+            touching = (touching >> right) | (touching << left)
             if touching == 0:
                 continue
         slot = _home_slot(slots, block)
@@ -479,32 +400,19 @@ def _meet(
             cells = touching & masks[row]
             if blocks[row] == block and cells != 0:
                 owner = owners[row]
-                marked_count = _mark(row, cells, marks, marked, marked_count)
+                if marks[row] == 0:
+                    marked[marked_count] = row
+                    marked_count += 1
+                marks[row] |= cells
                 if on_block[owner] == 0:
                     block_owners[owner_count] = owner
                     owner_count += 1
                 if face >= 0:
-                    on_block[owner] |= _rotated(cells, np.uint64(64) - _ROTATIONS[face])
+                    on_block[owner] |= (cells << right) | (cells >> left)
                 else:
                     on_block[owner] |= _dilated(masks[row]) & set_mask
             slot = (slot + 1) & (len(slots) - 1)
     return owner_count, marked_count
-
-
-@kernel
-def rows_of(table: TableArrays, first: int) -> Int64:
-    """Rows of an owner from its first one on."""
-    nexts = table[7]
-    rows = np.empty(16, np.int64)
-    count = 0
-    row = first
-    while row >= 0:
-        if count == len(rows):
-            rows = np.concatenate((rows, rows))
-        rows[count] = row
-        count += 1
-        row = nexts[row]
-    return rows[:count].copy()
 
 
 @kernel

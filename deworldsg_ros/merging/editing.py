@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.graph.edits import (
     MAX_EDITS,
     DeleteNode,
@@ -20,7 +21,6 @@ from deworldsg_ros.graph.edits import (
     Undo,
 )
 from deworldsg_ros.graph.graph import SceneGraph, copy_node
-from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import CLASS_AGREEMENT
 from deworldsg_ros.merging.records import NodeRecords
@@ -266,7 +266,7 @@ Belongs = Callable[[Float32], Bool]
 
 
 class EditReply(msgspec.Struct, frozen=True):
-    """What an edit did.
+    """The result of an edit.
 
     Attributes:
         kind: as the request: set_label, merge, split, delete or undo.
@@ -437,12 +437,12 @@ class SurfaceEditor(Editor):
     def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
         self._life_cycle.publish_again(graph, node_ids)
 
-    def memory(self) -> Memory:
+    def memory(self) -> Arrays:
         """The records of replaced nodes, for `restore`; empty without any."""
         memory = self.aside.memory() if len(self.aside.slots) else {}
         return {_ASIDE + name: values for name, values in memory.items()}
 
-    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
         """Continue with a graph of an earlier run."""
         own = {
             name.removeprefix(_ASIDE): values

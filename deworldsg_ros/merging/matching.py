@@ -20,39 +20,27 @@ from deworldsg_ros.scene.frame_graph import LocalGraph
 # graph_node to import.
 
 
-@kernel
 def assign(scores: Float64) -> Int64:
     """Column of each row, one to one, with the greatest total score; -1 = none.
-
-    Shortest augmenting paths in the order of scipy: D. F. Crouse, "On implementing 2D rectangular
-    assignment algorithms", IEEE Transactions on Aerospace and Electronic Systems 52(4), 2016.
 
     Args:
         scores: (n, k) float64, finite. All rows have a column if n <= k, else all columns have one.
     """
     count, width = scores.shape
-    turned = count > width
-    costs = np.empty((min(count, width), max(count, width)), np.float64)
-    for row in range(count):
-        for column in range(width):
-            if turned:
-                costs[column, row] = -scores[row, column]
-            else:
-                costs[row, column] = -scores[row, column]
-    columns = _columns_of_rows(costs)
-    if not turned:
-        return columns
-    rows, columns = columns, np.empty(count, np.int64)
-    for row in range(count):
-        columns[row] = -1
-    for column in range(width):
-        columns[rows[column]] = column
+    if count <= width:
+        return _columns_of_rows(np.ascontiguousarray(-scores))
+    columns = np.full(count, -1)
+    columns[_columns_of_rows(np.ascontiguousarray(-scores.T))] = np.arange(width)
     return columns
 
 
 @kernel
 def _columns_of_rows(costs: Float64) -> Int64:
-    """The assignment of n <= k rows with the least total cost."""
+    """The assignment of n <= k rows with the least total cost.
+
+    Shortest augmenting paths in the order of scipy: D. F. Crouse, "On implementing 2D rectangular
+    assignment algorithms", IEEE Transactions on Aerospace and Electronic Systems 52(4), 2016.
+    """
     count, width = costs.shape
     row_prices, column_prices = np.zeros(count, np.float64), np.zeros(width, np.float64)
     column_of, row_of = np.empty(count, np.int64), np.empty(width, np.int64)

@@ -7,16 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
 from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
-from deworldsg_ros.merging.common import Memory, add_relations, check_fits, warm_up_graph
 from deworldsg_ros.merging.editing import Editor, EditReply, may_merge
 from deworldsg_ros.merging.life_cycle import DELETED
 from deworldsg_ros.scene.arrays import Float64, Int64
-from deworldsg_ros.scene.frame_graph import LocalGraph
+from deworldsg_ros.scene.frame_graph import LocalGraph, Vocabulary
 from deworldsg_ros.scene.gaussian import eigenvalue_bound, log_determinant
 
 # --- Search for the nearest node that passes Eq. 5 and 6, compiled: one pass over all nodes.
@@ -186,7 +187,10 @@ class PaperMerging:
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
         warm_up()
-        warm_up_graph()
+        graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
+        observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
+        graph.observe(graph.add_node(*observation), *observation)
+        NodeStates(graph, 1, graph.even_gaussians).refresh()
 
     def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
@@ -194,11 +198,11 @@ class PaperMerging:
         Objects are processed in row order. An object may match a node that an earlier row of the
         same frame created. Relations are added when all objects have a node.
         """
-        check_fits(graph, local)
+        graph.check_fits(local)
         assigned = [self._assign(graph, local, row) for row in range(len(local))]
         node_ids = [graph.resolve(node_id) for node_id in assigned]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids)
+        graph.add_relations(local, node_ids)
         return node_ids
 
     def hidden(self, graph: SceneGraph) -> dict[int, str]:
@@ -209,11 +213,11 @@ class PaperMerging:
         """See `Merging.edit`."""
         return Editor().apply(graph, request, stamp_ns)
 
-    def memory(self) -> Memory:
+    def memory(self) -> Arrays:
         """Empty: the rule has no state besides the graph."""
         return {}
 
-    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
         """Does nothing: the rule has no state besides the graph."""
 
     def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.merging import beliefs, surface_map
 from deworldsg_ros.merging.beliefs import LABELS
 from deworldsg_ros.merging.cell_kernels import CellSets
-from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.matching import JointEvidence
 from deworldsg_ros.merging.surface_map import CELLS_PER_OWNER, VoxelMap
 from deworldsg_ros.merging.views import VISIBILITIES, NodeGrid
@@ -41,7 +41,7 @@ _BIT_COUNTS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum
 )
 
 
-def check_memory(memory: Memory, record: np.dtype[np.void], class_count: int) -> None:
+def check_memory(memory: Arrays, record: np.dtype[np.void], class_count: int) -> None:
     """Raise ValueError unless the arrays are those of `NodeRecords.memory`.
 
     Args:
@@ -65,7 +65,7 @@ def check_memory(memory: Memory, record: np.dtype[np.void], class_count: int) ->
     within("joint", joint[:, 2], -(2**52), 2**52)
 
 
-def _records(memory: Memory, record: np.dtype[np.void]) -> NDArray[np.void]:
+def _records(memory: Arrays, record: np.dtype[np.void]) -> NDArray[np.void]:
     records: NDArray[np.void] = memory["records"]
     names = record.names or ()
     if records.ndim != 1 or records.dtype.names != names:
@@ -109,7 +109,7 @@ def _check_names(records: NDArray[np.void], class_count: int) -> None:
     within("records (sum of joint)", sums, 1e-12, 1.0 + MAX_SUM_ERROR)
 
 
-def _check_cells(memory: Memory, count: int) -> None:
+def _check_cells(memory: Arrays, count: int) -> None:
     blocks = checked(memory, "blocks", np.int64, None)
     masks = checked(memory, "masks", np.uint64, len(blocks))
     scores = checked(memory, "scores", np.int8, len(blocks), 64)
@@ -235,12 +235,13 @@ class NodeRecords:
 
     def existence(self, slots: Int64) -> Float64:
         """Probability (n,) that each of n nodes is an object."""
-        return beliefs.probabilities(self.rows, self.looks, slots, beliefs.prior(self.fates))
+        return beliefs.probabilities(self.rows, self.looks, slots, beliefs.prior(self.fates), True)
 
     def are_missed(self, slots: Int64, minimum: float) -> Bool:
         """Whether (n,) only misses make the existence of each of n nodes less than a minimum."""
-        prior = beliefs.prior(self.fates)
-        return beliefs.are_missed(self.rows, self.looks, slots, prior, minimum)
+        known = self.rows, self.looks, slots, beliefs.prior(self.fates)
+        missed: Bool = beliefs.probabilities(*known, False) >= minimum
+        return missed
 
     def remove(self, slot: int) -> CellSets:
         """Drop everything of a node; returns its cells, as one set."""
@@ -273,7 +274,7 @@ class NodeRecords:
         self._add_cells(kept, cells, scores)
         self.place(graph, [kept])
 
-    def memory(self) -> Memory:
+    def memory(self) -> Arrays:
         """The records as arrays by name, for `restore`; equal records give equal arrays."""
         from numpy.lib.recfunctions import repack_fields  # slow to import, and only for maps
 
@@ -290,7 +291,7 @@ class NodeRecords:
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
-    def restore(self, graph: SceneGraph, memory: Memory, node_ids: Sequence[int]) -> None:
+    def restore(self, graph: SceneGraph, memory: Arrays, node_ids: Sequence[int]) -> None:
         """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
         slots = graph.nodes.slots_of(node_ids)
         self._make_room(int(slots.max(initial=-1)) + 1)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
 from deworldsg_ros.graph.graph import SceneGraph
-from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
@@ -42,11 +42,11 @@ class Merging(Protocol):
         """The nodes that are not published, each with its reason, in words."""
         ...
 
-    def memory(self) -> Memory:
+    def memory(self) -> Arrays:
         """The state besides the graph, as arrays by name, for `restore`."""
         ...
 
-    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
         """Continue with a graph of an earlier run; call it before the first frame.
 
         Args:

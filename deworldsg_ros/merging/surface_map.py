@@ -7,6 +7,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging import cell_kernels
@@ -16,8 +17,8 @@ from deworldsg_ros.merging.cell_kernels import (
     CellSets,
     SumArrays,
     TableArrays,
+    bit_count,
 )
-from deworldsg_ros.merging.common import Memory
 from deworldsg_ros.merging.views import NEAR_M, FrameArrays
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int8, Int64, UInt64
 
@@ -65,8 +66,19 @@ def judge(
         rejected cells that were marked.
     """
     _, row_blocks, masks, _, marks, rejected, scores, nexts = table
-    offsets = _offsets(frame[0], cell_m)
-    blocks, cells = np.empty(64, np.int64), np.empty(64, np.uint64)
+    # Position of each cell of a block from its first one, in camera axes, metres.
+    T, offsets = frame[0], np.empty((64, 3), np.float64)
+    for cell in range(64):
+        for axis in range(3):
+            steps = T[axis, 0] * (cell >> 4) + T[axis, 1] * ((cell >> 2) & 3)
+            offsets[cell, axis] = cell_m * (steps + T[axis, 2] * (cell & 3))
+    most = 0
+    for index in range(len(owners)):
+        row = firsts[owners[index]]
+        while row >= 0:
+            row = nexts[row]
+            most += 1
+    blocks, cells = np.empty(most, np.int64), np.empty(most, np.uint64)
     starts = np.zeros(len(owners) + 1, np.int64)
     count = 0
     for index in range(len(owners)):
@@ -87,40 +99,11 @@ def judge(
             dropped = (lost & ~rejected[row]) | (lost & marked)
             rejected[row] = (rejected[row] & ~changed) | lost
             if dropped != 0:
-                if count == len(blocks):
-                    blocks = np.concatenate((blocks, blocks))
-                    cells = np.concatenate((cells, cells))
                 blocks[count], cells[count] = row_blocks[row], dropped
                 count += 1
             row = nexts[row]
         starts[index + 1] = count
     return blocks[:count].copy(), cells[:count].copy(), starts
-
-
-@kernel
-def _offsets(T_camera_world: Float64, cell_m: float) -> Float64:
-    """Position of each cell of a block from its first one, in camera axes (64, 3), metres."""
-    offsets = np.empty((64, 3))
-    for cell in range(64):
-        for axis in range(3):
-            row = T_camera_world[axis]
-            steps = row[0] * (cell >> 4) + row[1] * ((cell >> 2) & 3) + row[2] * (cell & 3)
-            offsets[cell, axis] = cell_m * steps
-    return offsets
-
-
-@kernel
-def _index(bit: np.uint64) -> int:
-    """Index of a single bit: the number of bits below it.
-
-    As `_bit_count` of `cell_kernels`: a kernel calls kernels of its own module only.
-    """
-    mask = bit - np.uint64(1)
-    mask -= (mask >> np.uint64(1)) & np.uint64(0x5555555555555555)
-    pairs = np.uint64(0x3333333333333333)
-    mask = (mask & pairs) + ((mask >> np.uint64(2)) & pairs)
-    mask = (mask + (mask >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return int(np.int64((mask * np.uint64(0x0101010101010101)) >> np.uint64(56)))
 
 
 @kernel
@@ -154,7 +137,7 @@ def _judge_block(
     while cells != 0:
         bit = cells & (~cells + np.uint64(1))
         cells ^= bit
-        cell = _index(bit)
+        cell = bit_count(bit - np.uint64(1))
         step = HIT
         if marked & bit == 0:
             depth_m = ahead + offsets[cell, 2]
@@ -183,7 +166,7 @@ def _judge_block(
 #
 # The map is a sparse hash of small cubes. A cell keeps up to four nodes ("owners"). The cost of
 # each operation is linear in the number of its points, and independent of the size of the map. Each
-# cell of an owner has a score, the evidence that it is the owner's surface (`cell_beliefs`).
+# cell of an owner has a score, the evidence that it is the owner's surface (above).
 
 # Edge of a cell. In the rendered rooms, cells of 2 cm lose objects and cells of 5 cm lose relations
 # (docs/dev/notebook.md).
@@ -232,7 +215,7 @@ class VoxelMap:
         """Score of each cell in each block of `cells` (m, 64)."""
         return self._table.scores[self._rows_of(owner)]
 
-    def memory(self, owners: Int64) -> Memory:
+    def memory(self, owners: Int64) -> Arrays:
         """The cells and scores of all owners as arrays by name; the blocks of each ascend.
 
         Args:
@@ -282,8 +265,11 @@ class VoxelMap:
 
         Blocks without a cell of the owner are left out.
         """
-        owner_array, limit = np.array(owners, np.int64), MAX_SCORE
-        cell_kernels.add_scores(self._table[:], owner_array, sets[:], scores, limit)
+        rows, known = self._rows_at(np.array(owners, np.int64), sets)
+        sums = np.clip(self._table.scores[rows] + scores[known].astype(int), -MAX_SCORE, MAX_SCORE)
+        self._table.scores[rows] = sums
+        negative = np.packbits(sums < 0, axis=1, bitorder="little")
+        self._table.rejected[rows] = negative.view("<u8")[:, 0]
 
     def judge(
         self,
@@ -303,7 +289,8 @@ class VoxelMap:
         Returns:
             For each owner, the cells that became rejected, and the rejected ones of its set.
         """
-        cell_kernels.mark(self._table[:], owners, sets[:])
+        rows, known = self._rows_at(owners, sets)
+        self._table.marks[rows] = sets.masks[known]
         changed = judge(self._table[:], self._firsts, owners, values, frame, self.cell_m)
         return CellSets(*changed)
 
@@ -347,8 +334,17 @@ class VoxelMap:
 
     def _rows_of(self, owner: int) -> Int64:
         """Rows of an owner."""
-        first = int(self._firsts[owner]) if owner < len(self._firsts) else -1
-        return cell_kernels.rows_of(self._table[:], first)
+        rows, row = [], int(self._firsts[owner]) if owner < len(self._firsts) else -1
+        while row >= 0:
+            rows.append(row)
+            row = int(self._table.nexts[row])
+        return np.array(rows, np.int64)
+
+    def _rows_at(self, owners: Int64, sets: CellSets) -> tuple[Int64, Bool]:
+        """Rows of the blocks of sets where the owner of the set has cells, and which blocks do."""
+        rows = cell_kernels.rows_at(self._table[:], owners, sets[:])
+        known = rows >= 0
+        return rows[known], known
 
     def _make_room(self, owner_count: int) -> None:
         if owner_count > len(self._counts):

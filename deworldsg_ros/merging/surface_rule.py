@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
 from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.merging.cell_kernels import CellSets
-from deworldsg_ros.merging.common import Memory, add_relations, check_fits
 from deworldsg_ros.merging.editing import (
     EditReply,
     SurfaceEditor,
@@ -74,7 +74,7 @@ class SurfaceMerging:
 
         Two objects of one frame never become one node, even if both overlap the same node.
         """
-        check_fits(graph, local)
+        graph.check_fits(local)
         frame, rows = local, list(range(len(local)))
         if graph.edits.merged or graph.edits.separate:
             frame, rows = as_edited(graph, local, self._records)
@@ -85,7 +85,7 @@ class SurfaceMerging:
         ]
         node_ids = [merged[row] for row in rows]
         graph.remember_frame(local.stamp_ns, node_ids)
-        add_relations(graph, local, node_ids)
+        graph.add_relations(local, node_ids)
         return node_ids
 
     def _merge_frame(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
@@ -105,11 +105,11 @@ class SurfaceMerging:
         """See `Merging.hidden`."""
         return self._life_cycle.hidden(graph)
 
-    def memory(self) -> Memory:
+    def memory(self) -> Arrays:
         """See `Merging.memory`."""
         return {**self._records.memory(), **self._editor.memory()}
 
-    def restore(self, graph: SceneGraph, memory: Memory) -> None:
+    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
         """See `Merging.restore`."""
         replaced = graph.edits.replaced
         node_ids = [node_id for node_id in graph.nodes.slot_of if node_id not in replaced]
@@ -127,7 +127,7 @@ class SurfaceMerging:
             apply_correction(records, graph, node_ids, T_correction)
 
     def _see(self, graph: SceneGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
-        """What the frame shows of the nodes that may be in view."""
+        """Compare the frame with the nodes that may be in view."""
         if frame is None:
             return see_nothing(local)
         slots = self._records.grid.in_view(frame)
@@ -141,7 +141,7 @@ class SurfaceMerging:
         records = self._records
         slots, on_nodes, covered = records.map.overlaps(cells)
         # If the frame shows enough of a node, its visible part counts, and not the whole node.
-        covered = with_seen(covered, slots, view.covered, view.slots)
+        covered = with_seen(covered, slots, view)
         if graph.edits.deleted:
             reject_deleted(graph, local, graph.nodes.ids[slots].tolist(), on_nodes)
         return match(

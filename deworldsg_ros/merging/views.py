@@ -66,7 +66,7 @@ class View:
 
 
 def see(nodes: NodeTable, slots: Int64, local: LocalGraph, frame: FrameArrays) -> View:
-    """What a frame shows of some nodes.
+    """Compare a frame with some nodes.
 
     Args:
         nodes: of the graph.
@@ -98,27 +98,13 @@ def frame_arrays(T_camera_world: Float64, grid: DepthGrid) -> FrameArrays:
     return T_camera_world, depth_mm, instances, intrinsics
 
 
-@kernel
-def with_seen(covered: Float64, slots: Int64, seen: Float64, seen_slots: Int64) -> Float64:
-    """Fractions (n, k) of some nodes, from those (n, m) of a view where the view has the node."""
-    result = covered.copy()
-    for column in range(len(slots)):
-        place = 0
-        while place < len(seen_slots) and seen_slots[place] != slots[column]:
-            place += 1
-        for index in range(len(seen) if place < len(seen_slots) else 0):
-            if not np.isnan(seen[index, place]):
-                result[index, column] = seen[index, place]
-    return result
-
-
-@kernel
-def _in_camera(T: Float64, x: float, y: float, z: float) -> tuple[float, float, float]:
-    return (
-        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
-        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
-    )
+def with_seen(covered: Float64, slots: Int64, view: View) -> Float64:
+    """Fractions (n, k) of some nodes, from the view where it knows the node."""
+    if not len(view.slots):
+        return covered
+    places = view.slots.searchsorted(slots).clip(max=len(view.slots) - 1)
+    seen = view.covered[:, places]
+    return np.where((view.slots[places] == slots) & ~np.isnan(seen), seen, covered)
 
 
 @kernel
@@ -167,8 +153,11 @@ def _compare(
     height, width = depth_mm.shape
     behind = present = inside = 0
     for index in range(count):
-        x, y, z = points[index, 0], points[index, 1], points[index, 2]
-        right, down, ahead = _in_camera(T, np.float64(x), np.float64(y), np.float64(z))
+        x, y = np.float64(points[index, 0]), np.float64(points[index, 1])
+        z = np.float64(points[index, 2])
+        right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+        down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+        ahead = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
         if ahead < NEAR_M:
             continue
         u, v = fx * right / ahead + cx, fy * down / ahead + cy

@@ -20,11 +20,10 @@ from deworldsg_ros.perception.protocols import (
     Segmenter,
 )
 from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64, UInt16, areas, shared_areas
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, UpEstimator, quarter_turns
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.frame_graph import FrameGraph, Relations, Vocabulary
 from deworldsg_ros.scene.limits import check_names
-from deworldsg_ros.scene.up import UpEstimator, quarter_turns
 
 # --- Frames of a camera that is mounted on its side, turned upright for the detector.
 #

@@ -57,12 +57,9 @@ class SurfelMap:
         Gauss-Newton on the distances of the frame's depth from the planes of the surfels in view,
         projected into the frame. Directions that these planes leave open are not corrected.
         """
-        self._view = view = _view(grid)
-        rows = self._rows[: self._count]
-        self._seen = _in_view(rows, invert_pose(T_world_camera), view)
-        # Contiguous: a kernel is compiled for one layout.
-        sample = np.ascontiguousarray(self._seen[:: max(1, len(self._seen) // SAMPLES)])
-        is_found, T_fitted = _fit(rows, sample, T_world_camera, view)
+        self._view = _view(grid)
+        rows, poses = self._rows[: self._count], (T_world_camera, invert_pose(T_world_camera))
+        self._seen, is_found, T_fitted = _register(rows, *poses, self._view)
         return T_fitted if is_found else None
 
     def add(self, T_world_camera: Float64) -> None:
@@ -80,16 +77,13 @@ class SurfelMap:
         self._count = _fuse(self._rows, self._count, self._seen, *arguments)
 
 
-@kernel
 def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
     """A rotation vector about the camera and a translation (6,), world axes, as (4, 4)."""
-    T, turn = np.zeros((4, 4), np.float64), _turn(step)
-    T[3, 3] = 1.0
-    for i in range(3):
-        T[i, 3] = step[3 + i] + T_world_camera[i, 3]
-        for j in range(3):
-            T[i, j] = turn[i, j]
-            T[i, 3] -= turn[i, j] * T_world_camera[j, 3]
+    T, camera_world, turn = np.eye(4), T_world_camera[:3, 3], _turn(step)
+    T[:3, :3], T[:3, 3] = turn, step[3:] + camera_world
+    # One after the other: a matrix product rounds in another order.
+    for axis in range(3):
+        T[:3, 3] -= turn[:, axis] * camera_world[axis]
     return T
 
 
@@ -168,18 +162,6 @@ def _pixel(T: Float64, surfel: Float64, view: _View) -> tuple[int, int, float, f
 
 
 @kernel
-def _in_view(rows: Float64, T_camera_world: Float64, view: _View) -> Int64:
-    """Indices of the surfels in view that the depth image does not hide."""
-    indices, count = np.empty(len(rows), np.int64), 0
-    for index in range(len(rows)):
-        row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
-        if row >= 0 and depth < measured + REACHES_M[0]:
-            indices[count] = index
-            count += 1
-    return indices[:count]
-
-
-@kernel
 def _ray(row: int, column: int, view: _View) -> tuple[float, float, float]:
     fx, fy, cx, cy, depth_mm = view
     z = 0.001 * depth_mm[row, column]
@@ -197,7 +179,7 @@ def _turned(T: Float64, x: float, y: float, z: float) -> tuple[float, float, flo
 
 @kernel
 def _system(
-    rows: Float64, sample: Int64, T: Float64, view: _View, reach_m: float
+    rows: Float64, seen: Int64, T: Float64, view: _View, reach_m: float
 ) -> tuple[Float64, Float64, int]:
     """Damped normal equations (6, 6) and (6,) of a point-to-plane step; the number of matches."""
     hessian, gradient = np.zeros((6, 6), np.float64), np.zeros(6, np.float64)
@@ -207,8 +189,8 @@ def _system(
         for j in range(3):
             inverse[i, j] = T[j, i]
             inverse[i, 3] -= T[j, i] * T[j, 3]
-    for index in sample:
-        surfel = rows[index]
+    for index in range(0, len(seen), max(1, len(seen) // SAMPLES)):
+        surfel = rows[seen[index]]
         row, column, _, measured = _pixel(inverse, surfel, view)
         if row < 0 or measured > FAR_M:
             continue
@@ -241,33 +223,36 @@ def _system(
 
 
 @kernel
-def _solve(matrix: Float64, vector: Float64) -> bool:
-    """Solve positive definite equations in place (Gauss); false if they are singular."""
-    size = len(vector)
-    for k in range(size):
-        if not matrix[k, k] > 0.0:
-            return False
-        for i in range(k + 1, size):
-            factor = matrix[i, k] / matrix[k, k]
-            vector[i] -= factor * vector[k]
-            for j in range(k, size):
-                matrix[i, j] -= factor * matrix[k, j]
-    for i in range(size - 1, -1, -1):
-        for j in range(i + 1, size):
-            vector[i] -= matrix[i, j] * vector[j]
-        vector[i] /= matrix[i, i]
-    return True
-
-
-@kernel
-def _fit(rows: Float64, sample: Int64, T: Float64, view: _View) -> tuple[bool, Float64]:
-    """Whether enough surfels fit, and the pose at which they do."""
+def _register(
+    rows: Float64, T: Float64, T_camera_world: Float64, view: _View
+) -> tuple[Int64, bool, Float64]:
+    """The surfels in view that the depth image does not hide; whether enough fit, at which pose."""
+    seen, count = np.empty(len(rows), np.int64), 0
+    for index in range(len(rows)):
+        row, _, depth, measured = _pixel(T_camera_world, rows[index], view)
+        if row >= 0 and depth < measured + REACHES_M[0]:
+            seen[count] = index
+            count += 1
+    seen = seen[:count]
     for reach_m in REACHES_M:
-        hessian, gradient, matches = _system(rows, sample, T, view, reach_m)
-        if matches < MIN_MATCHES or not _solve(hessian, gradient):
-            return False, T
-        T = stepped(gradient, T)
-    return True, T
+        hessian, step, matches = _system(rows, seen, T, view, reach_m)
+        if matches < MIN_MATCHES:
+            return seen, False, T
+        # Gauss: the equations are positive definite, or singular.
+        for k in range(6):
+            if not hessian[k, k] > 0.0:
+                return seen, False, T
+            for i in range(k + 1, 6):
+                factor = hessian[i, k] / hessian[k, k]
+                step[i] -= factor * step[k]
+                for j in range(k, 6):
+                    hessian[i, j] -= factor * hessian[k, j]
+        for i in range(5, -1, -1):
+            for j in range(i + 1, 6):
+                step[i] -= hessian[i, j] * step[j]
+            step[i] /= hessian[i, i]
+        T = stepped(step, T)
+    return seen, True, T
 
 
 @kernel

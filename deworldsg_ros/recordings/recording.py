@@ -14,8 +14,12 @@ from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings.bags.bag import BagSource
 from deworldsg_ros.recordings.bags.storage import SALVAGERS, storage_files
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.folders import detect_dataset, open_dataset
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions, expectations
+from deworldsg_ros.recordings.folders.dataset import (
+    DatasetOptions,
+    detect_dataset,
+    expectations,
+    open_dataset,
+)
 from deworldsg_ros.recordings.source import Role, Source
 from deworldsg_ros.scene.camera import RgbdFrame
 from deworldsg_ros.scene.errors import RecordingError

@@ -23,7 +23,7 @@ from deworldsg_ros.graph.graph import SceneGraph
 from deworldsg_ros.graph.messages import DECIMALS, listed, some_of
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph.publication import MEASURED_A_CALL, NEW_A_CALL
-from deworldsg_ros.relations.pairs import PairTable, joined
+from deworldsg_ros.relations.pairs import AT_ONCE, PairTable, joined
 from deworldsg_ros.relations.paper import (
     OUTLIER_RATE,
     PROVENANCES,
@@ -56,9 +56,9 @@ from deworldsg_ros.relations.states import (
     uncertain,
 )
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, SoftmaxWeights
+from deworldsg_ros.scene.camera import UpEstimator
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import LocalGraph, RelationEvidence, Vocabulary, derived
-from deworldsg_ros.scene.up import UpEstimator
 from deworldsg_ros.scene.vocabulary import SYMMETRIC, plain
 from deworldsg_ros.wire import messages as wire
 
@@ -247,8 +247,9 @@ class RobustBeliefs:
         slots = slots[shapes["node_id"][slots] > 0]
         if not len(slots):
             return slots
-        if len(rows):
-            self._take_in(rows)
+        # In parts, so that a whole map needs no large arrays.
+        for start in range(0, len(rows), AT_ONCE):
+            self._take_in(rows[start : start + AT_ONCE])
         slots = self._reopen_circles(slots)
         if self._geometry:
             floor_odds(shapes, slots, table.floor_m, self._model.floor)
@@ -258,7 +259,7 @@ class RobustBeliefs:
         return changed
 
     def _take_in(self, rows: Int64) -> None:
-        """What the evidence on each of some pairs alone says."""
+        """Take in the evidence on each of some pairs alone."""
         table, model, pairs = self._table, self._model, self._graph.pairs
         beliefs = table.beliefs
         counts, others = relation_counts(pairs.counts(rows), self._names.relation_of)
@@ -345,14 +346,18 @@ class RobustBeliefs:
     def _index(self, rows: Int64, open_: Bool, classes: Int64) -> None:
         """Note the class pairs whose prior may enter pairs."""
         beliefs = self._table.beliefs
-        if not open_.any() and not beliefs["open"][rows].any():
+        before = beliefs["open"][rows] > 0
+        may_enter = open_ | before
+        if not may_enter.any():
             return
-        same = (beliefs["open"][rows] == open_) & (beliefs["classes"][rows] == classes)
+        differ = (before != open_) | (beliefs["classes"][rows] != classes)
+        places = (differ.any(axis=1) & may_enter.any(axis=1)).nonzero()[0]
         beliefs["open"][rows], beliefs["classes"][rows] = open_, classes
-        for index, end in np.argwhere(open_ & ~same.all(axis=1, keepdims=True)).tolist():
+        for index in places.tolist():
             both = classes[index].tolist()
-            pair = both[end], both[1 - end]
-            self._by_classes.setdefault(pair, set()).add(int(rows[index]))
+            for end in open_[index].nonzero()[0].tolist():
+                pair = both[end], both[1 - end]
+                self._by_classes.setdefault(pair, set()).add(int(rows[index]))
 
     def _open_rows(self, classes: ClassPair) -> set[int]:
         """Rows of the pairs into which the prior of a class pair may enter."""
@@ -584,7 +589,7 @@ class EdgeBeliefs:
         return changed
 
     def _evidence(self, rows: Int64, ends: Int64) -> list[dict[str, Any]]:
-        """What the messages of directed pairs say of their evidence."""
+        """The evidence of directed pairs as their messages have it."""
         pairs = self._graph.pairs
         if not len(rows):
             return []

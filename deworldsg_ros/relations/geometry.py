@@ -1,4 +1,4 @@
-"""The fused geometry of two nodes: shapes of nodes, and features of ordered pairs.
+"""The fused geometry of two nodes: their shapes, whether they are in reach, and features of both.
 
 All lengths are metres in an upright frame: axes 0 and 1 are horizontal, axis 2 is up.
 """
@@ -6,14 +6,13 @@ All lengths are metres in an upright frame: axes 0 and 1 are horizontal, axis 2 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
-from deworldsg_ros.relations.reach import REACH_M
-from deworldsg_ros.scene.arrays import Float32, Float64, Int64
+from deworldsg_ros.scene.arrays import Bool, Float32, Float64, Int64
 
 # Points of a node that its shape uses, which is all that a node keeps. With half of them, tables
 # have no point near the small objects on them.
@@ -26,6 +25,8 @@ MARGIN_M = 0.06
 LAYER_M = 0.035
 # Points of a surface count for its height beside an object by exp(-(distance / this)²).
 SOFT_RADIUS_M = 0.15
+# Points of an object so near the bounds of the other one are compared, this many of them.
+NEAR_BOUNDS_M, NEAR_POINTS = 0.15, 48
 # Nodes in arrays of turned points at once, so that a whole map needs no large ones.
 TURNED_AT_ONCE = 256
 _NO_TURN = np.eye(3)
@@ -153,6 +154,226 @@ def rotation_to_upright(up_world: Float64) -> Float64:
     )
 
 
+# --- A grid over the ground that finds the objects in reach of an object.
+#
+# Objects are places in an array of `SHAPE`. The cells that the bounds of an object touch are lists
+# of entries, linked through arrays. Cells share a list if their hashes are equal.
+
+# About the size of furniture: most objects touch one cell or two.
+CELL_M = 2.0
+# An object over more cells lies in all of them by another way: in a list that is always searched.
+MAX_CELLS = 1024
+# Lists of cells. The last one is of the objects over more cells than `MAX_CELLS`.
+LISTS = 1 << 15
+# Pairs of objects that are farther apart are not related: horizontally, vertically, and
+# vertically for objects that are not over one another.
+REACH_M = 0.6
+OVER_REACH_M = 1.3
+BESIDE_REACH_M = 0.15
+# A node with fewer points has no reliable bounds; its relations are not judged.
+MIN_SHAPE_POINTS = 8
+
+# A span that no object has.
+_NOWHERE = np.iinfo(np.int64).max
+
+
+class _Lists(NamedTuple):
+    """The arrays of a grid.
+
+    Attributes:
+        heads: (LISTS + 1,) first entry of each list; 0 = none.
+        items: by entry, the object.
+        next_: by entry, the next one of its list. Free entries are linked from entry 0.
+        spans: by object, its cells, from left back to right front.
+        seen: by object, the number of the last search that met it.
+    """
+
+    heads: Int64
+    items: Int64
+    next_: Int64
+    spans: Int64
+    seen: Int64
+
+
+class ReachGrid:
+    """The objects by the cells that they touch."""
+
+    def __init__(self) -> None:
+        self._lists = _Lists(
+            np.zeros(LISTS + 1, np.int64),
+            np.zeros(64, np.int64),
+            np.append(np.arange(1, 64), 0),
+            np.full((64, 4), _NOWHERE),
+            np.zeros(64, np.int64),
+        )
+        self._searches = 0
+
+    def put(self, item: int, low: Float64, high: Float64) -> None:
+        """Set the bounds of an object; (3,) metres, axes 0 and 1 are horizontal."""
+        while item >= len(self._lists.spans):
+            spans, seen = self._lists.spans, self._lists.seen
+            self._lists = self._lists._replace(
+                spans=np.concatenate([spans, np.full_like(spans, _NOWHERE)]),
+                seen=np.concatenate([seen, np.zeros_like(seen)]),
+            )
+        while not _put(self._lists, item, low, high):
+            items, next_ = self._lists.items, self._lists.next_
+            # The new entries are free; the old ones that are free come last.
+            more = np.append(np.arange(len(items) + 1, 2 * len(items)), next_[0])
+            self._lists = self._lists._replace(
+                items=np.concatenate([items, np.zeros_like(items)]),
+                next_=np.concatenate([next_, more]),
+            )
+            self._lists.next_[0] = len(items)
+
+    def remove(self, item: int) -> None:
+        """Forget an object, if it is known."""
+        if item < len(self._lists.spans):
+            _remove(self._lists, item)
+
+    def pairs(self, changed: Int64, shapes: NDArray[np.void]) -> Int64:
+        """Pairs (m, 2) of objects in reach, the first one of the changed ones; some twice.
+
+        Args:
+            changed: (k,) different places in
+            shapes: (n,) of `SHAPE`, of all objects.
+        """
+        self._searches += len(changed)
+        return _pairs(self._lists, self._searches - len(changed), changed, shapes)
+
+
+def pairs_in_reach(shapes: NDArray[np.void]) -> Int64:
+    """All pairs (m, 2) of places in reach, the smaller first; see `ReachGrid.pairs`."""
+    grid = ReachGrid()
+    solid = np.flatnonzero(shapes["count"] >= MIN_SHAPE_POINTS)
+    for place in solid.tolist():
+        grid.put(place, shapes["low"][place], shapes["high"][place])
+    return np.unique(np.sort(grid.pairs(solid, shapes), axis=1), axis=0)
+
+
+@kernel
+def _span(low: Float64, high: Float64, more_m: float) -> tuple[int, int, int, int]:
+    return (
+        int(np.floor((low[0] - more_m) / CELL_M)),
+        int(np.floor((low[1] - more_m) / CELL_M)),
+        int(np.floor((high[0] + more_m) / CELL_M)),
+        int(np.floor((high[1] + more_m) / CELL_M)),
+    )
+
+
+@kernel
+def _cells(left: int, back: int, right: int, front: int) -> Int64:
+    """The lists of the cells of a span."""
+    if float(right - left + 1) * float(front - back + 1) > MAX_CELLS:
+        return np.full(1, LISTS)
+    lists = np.empty((right - left + 1) * (front - back + 1), np.int64)
+    count = 0
+    for x in range(left, right + 1):
+        for y in range(back, front + 1):
+            lists[count] = (x * 73856093 ^ y * 19349663) & (LISTS - 1)
+            count += 1
+    return lists
+
+
+@kernel
+def _put(lists: _Lists, item: int, low: Float64, high: Float64) -> bool:
+    """False, and nothing is done, if there are too few free entries."""
+    heads, items, next_, spans, _ = lists
+    left, back, right, front = _span(low, high, 0.0)
+    known = spans[item]
+    if known[0] == left and known[1] == back and known[2] == right and known[3] == front:
+        return True
+    cells = _cells(left, back, right, front)
+    free = 0
+    entry = next_[0]
+    while entry and free < len(cells):
+        free += 1
+        entry = next_[entry]
+    if free < len(cells):
+        return False
+    _remove(lists, item)
+    for cell in cells:
+        entry = next_[0]
+        next_[0] = next_[entry]
+        items[entry] = item
+        next_[entry] = heads[cell]
+        heads[cell] = entry
+    spans[item, 0], spans[item, 1], spans[item, 2], spans[item, 3] = left, back, right, front
+    return True
+
+
+@kernel
+def _remove(lists: _Lists, item: int) -> None:
+    heads, items, next_, spans, _ = lists
+    if spans[item, 0] == _NOWHERE:
+        return
+    for cell in _cells(spans[item, 0], spans[item, 1], spans[item, 2], spans[item, 3]):
+        before, entry = 0, heads[cell]
+        while items[entry] != item:
+            before, entry = entry, next_[entry]
+        if before:
+            next_[before] = next_[entry]
+        else:
+            heads[cell] = next_[entry]
+        next_[entry] = next_[0]
+        next_[0] = entry
+    spans[item] = _NOWHERE
+
+
+@kernel
+def _pairs(lists: _Lists, searches: int, changed: Int64, shapes: NDArray[Any]) -> Int64:
+    heads, items, next_, spans, seen = lists
+    found = [(0, 0)][:0]
+    for a in changed:
+        searches += 1
+        if shapes[a].count < MIN_SHAPE_POINTS:
+            continue
+        seen[a] = searches
+        left, back, right, front = _span(shapes[a].low, shapes[a].high, REACH_M)
+        cells = _cells(left, back, right, front)
+        if len(cells) == 1 and cells[0] == LISTS:  # over as many cells: all objects
+            for b in range(len(spans)):
+                if spans[b, 0] != _NOWHERE and b != a and _in_reach(shapes[a], shapes[b]):
+                    found.append((int(a), int(b)))
+            continue
+        for index in range(len(cells) + 1):
+            entry = heads[cells[index] if index < len(cells) else LISTS]
+            while entry:
+                b = items[entry]
+                if seen[b] != searches and _in_reach(shapes[a], shapes[b]):
+                    found.append((int(a), int(b)))
+                seen[b] = searches
+                entry = next_[entry]
+    pairs = np.empty((len(found), 2), np.int64)
+    for index in range(len(found)):
+        pairs[index, 0], pairs[index, 1] = found[index]
+    return pairs
+
+
+@kernel
+def in_reach(pairs: Int64, shapes: NDArray[Any]) -> Bool:
+    """Whether pairs of places (m, 2) are in reach, (m,) bool."""
+    result = np.zeros(len(pairs), np.bool_)
+    for index in range(len(pairs)):
+        a, b = shapes[pairs[index, 0]], shapes[pairs[index, 1]]
+        solid = a.count >= MIN_SHAPE_POINTS and b.count >= MIN_SHAPE_POINTS
+        result[index] = solid and _in_reach(a, b)
+    return result
+
+
+@kernel
+def _in_reach(a: Any, b: Any) -> bool:
+    x = max(a.low[0], b.low[0]) - min(a.high[0], b.high[0])
+    y = max(a.low[1], b.low[1]) - min(a.high[1], b.high[1])
+    z = max(a.low[2], b.low[2]) - min(a.high[2], b.high[2])
+    if x > REACH_M or y > REACH_M or z > OVER_REACH_M:
+        return False
+    return not (z > BESIDE_REACH_M and (x > BESIDE_REACH_M or y > BESIDE_REACH_M))
+
+
+# --- Features of ordered pairs.
+
+
 @kernel
 def pair_features(
     first: Int64, second: Int64, shapes: NDArray[Any], points: Float32, floor_m: float
@@ -176,10 +397,12 @@ def pair_features(
         _contact(back, other, one, of_one)
         there[15] = _enclosure(one, of_other)
         there[16] = _enclosure(other, of_one)
-        there[17] = _inside(of_one, other)
-        there[18] = _inside(of_other, one)
+        # Fractions of the points inside the bounds of the other object.
+        inside_one = len(_near(of_one, other, 0.01, len(of_one)))
+        inside_other = len(_near(of_other, one, 0.01, len(of_other)))
+        there[17] = inside_one / max(1, len(of_one))
+        there[18] = inside_other / max(1, len(of_other))
         there[19] = _distance(one, other, of_one, of_other)
-        there[20] = _mahalanobis(one, other)
         # The opposite direction, without what `_contact` writes.
         for place in (0, 1, 2, 3, 19, 20):
             back[place] = there[place]
@@ -195,7 +418,7 @@ def pair_features(
 
 @kernel
 def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
-    """Features 0 to 5 and 21 to 35: sizes, gaps and heights of the bounds."""
+    """Features 0 to 5 and 20 to 35: sizes, gaps and heights of the bounds, and their distance."""
     overlap_x = min(one.high[0], other.high[0]) - max(one.low[0], other.low[0])
     overlap_y = min(one.high[1], other.high[1]) - max(one.low[1], other.low[1])
     gap_x, gap_y = max(0.0, -overlap_x), max(0.0, -overlap_y)
@@ -219,11 +442,7 @@ def _bounds(out: Float64, one: Any, other: Any, floor_m: float) -> None:
     out[33] = out[27] - out[30]
     out[34] = math.log(float(one.count))
     out[35] = math.log(float(other.count))
-
-
-@kernel
-def _mahalanobis(one: Any, other: Any) -> float:
-    """Distance of the means in standard deviations of both objects."""
+    # The distance of the means in standard deviations of both objects.
     offset = one.mean - other.mean
     s = one.covariance + other.covariance
     for axis in range(3):
@@ -237,7 +456,7 @@ def _mahalanobis(one: Any, other: Any) -> float:
     x = offset[0] / l00
     y = (offset[1] - l10 * x) / l11
     z = (offset[2] - l20 * x - l21 * y) / l22
-    return math.sqrt(x * x + y * y + z * z)
+    out[20] = math.sqrt(x * x + y * y + z * z)
 
 
 @kernel
@@ -324,32 +543,14 @@ def _enclosure(one: Any, points: Float32) -> float:
 
 
 @kernel
-def _within(point: Float32, shape: Any, margin_m: float) -> bool:
-    """Whether a point is inside the bounds of a shape, or at most a margin outside."""
-    within = True
-    for axis in range(3):
-        within &= shape.low[axis] - margin_m < point[axis] < shape.high[axis] + margin_m
-    return within
-
-
-@kernel
-def _inside(points: Float32, shape: Any) -> float:
-    """Fraction of points inside the bounds of a shape."""
-    inside = 0
-    for k in range(len(points)):
-        inside += int(_within(points[k], shape, 0.01))
-    fraction: float = inside / max(1, len(points))
-    return fraction
-
-
-@kernel
 def _distance(one: Any, other: Any, of_one: Float32, of_other: Float32) -> float:
     """Smallest distance of two points that are near the other's bounds; at most 1 m.
 
-    Only the first points near the other object are compared.
+    Only the first NEAR_POINTS points near the other object are compared.
     """
     best = 1.0
-    near_one, near_other = _near(of_one, other), _near(of_other, one)
+    near_one = _near(of_one, other, NEAR_BOUNDS_M, NEAR_POINTS)
+    near_other = _near(of_other, one, NEAR_BOUNDS_M, NEAR_POINTS)
     for i in near_one:
         for j in near_other:
             squared = 0.0
@@ -361,16 +562,18 @@ def _distance(one: Any, other: Any, of_one: Float32, of_other: Float32) -> float
 
 
 @kernel
-def _near(points: Float32, shape: Any) -> Int64:
-    """Indices of the first 48 points that are within 0.15 m of the bounds of a shape."""
-    found = np.empty(48, np.int64)
+def _near(points: Float32, shape: Any, margin_m: float, most: int) -> Int64:
+    """Indices of the first points that are in the bounds of a shape, or a margin outside."""
+    found = np.empty(most, np.int64)
     count = 0
     for k in range(len(points)):
-        if _within(points[k], shape, 0.15):
+        within = True
+        for axis in range(3):
+            value = points[k, axis]
+            within &= shape.low[axis] - margin_m < value < shape.high[axis] + margin_m
+        if within and count < most:
             found[count] = k
             count += 1
-            if count == len(found):
-                break
     return found[:count]
 
 

@@ -15,15 +15,17 @@ from deworldsg_ros.graph.pairs import Pair, PairChanges
 from deworldsg_ros.graph.publication import NEW_A_CALL
 from deworldsg_ros.relations.geometry import (
     FEATURES,
+    MIN_SHAPE_POINTS,
     SHAPE_POINTS,
+    ReachGrid,
     centre_steps,
+    in_reach,
     measure,
     pair_features,
     rotation_to_upright,
     upright,
 )
 from deworldsg_ros.relations.physics import PairInputs, PhysicsModel
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, ReachGrid, in_reach
 from deworldsg_ros.relations.rules import Scene
 from deworldsg_ros.relations.states import BELIEF, SHAPE
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64
@@ -283,15 +285,14 @@ class PairTable:
         if not self._geometry or not len(slots):
             return
         pairs, shapes = self._graph.pairs, self.shapes
-        rows = pairs.ensure(self._grid.pairs(slots, shapes))
-        if len(rows):
-            pairs.hold(rows)
-            self._make_room()
-            self._wait(rows, moved=True)
+        near = pairs.ensure(self._grid.pairs(slots, shapes))
+        pairs.hold(near)
+        self._make_room()
         # Those that were in reach, and may be no more; and those with too few points until now.
         rows = self.known_rows(slots)
         differ = self.beliefs["judged"][rows] != self._are_solid(rows)
-        self._wait(rows[differ | np.isfinite(self.beliefs["gap_m"][rows])], moved=True)
+        others = rows[differ | np.isfinite(self.beliefs["gap_m"][rows])]
+        self._wait(np.concatenate([near, others]), moved=True)
 
     def _are_solid(self, rows: Int64) -> Bool:
         """Whether (k,) both nodes of pairs have enough points."""
@@ -315,8 +316,6 @@ class PairTable:
         if moved:
             beliefs["moved"][rows] = True
         known = beliefs["known"]
-        if not waiting:
-            return
         for row in dict.fromkeys(waiting):
             (self._again if known[row] else self._new).append(row)
 

@@ -61,7 +61,7 @@ class VoteScales(NamedTuple):
 
 @kernel
 def relation_counts(votes: Float32, relation_of: Int64) -> tuple[Float64, Float64]:
-    """What votes are on.
+    """Votes by relation.
 
     Args:
         votes: (m, ends, R) sums of the votes, in some directions.
@@ -103,26 +103,22 @@ def _vote_logits(
     logits = np.zeros((len(counts), STATE_COUNT), np.float64)
     near = np.empty(len(counts), np.float64)
     for row in range(len(counts)):
-        for state in range(1, STATE_COUNT):
-            votes = 0.0
-            for end in range(2):
-                relation = _STATES[state, end]
-                if relation != NONE:
-                    votes += counts[row, end, relation] / _NAMED[state]
-            logits[row, state] = evidence(votes, frames[row], slope, n_half, floor, even)
-        votes = (counts[row, 0, NEAR] + counts[row, 1, NEAR]) / 2.0
-        near[row] = evidence(votes, frames[row], slope, n_half, floor, even)
+        worth = frames[row] / (frames[row] + n_half) * slope
+        for state in range(1, STATE_COUNT + 1):
+            votes = (counts[row, 0, NEAR] + counts[row, 1, NEAR]) / 2.0
+            if state < STATE_COUNT:
+                votes = 0.0
+                for end in range(2):
+                    relation = _STATES[state, end]
+                    if relation != NONE:
+                        votes += counts[row, end, relation] / _NAMED[state]
+            fraction = votes / max(frames[row], 1e-9)
+            evidence = worth * math.log((fraction + floor) / (even + floor))
+            if state < STATE_COUNT:
+                logits[row, state] = evidence
+            else:
+                near[row] = evidence
     return logits, near
-
-
-@kernel
-def evidence(
-    votes: float, frames: int, slope: float, n_half: float, floor: float, even: float
-) -> float:
-    """Evidence in nats of votes among frames, 0 without frames: the formula above."""
-    fraction = votes / max(frames, 1e-9)
-    ratio = math.log((fraction + floor) / (even + floor))
-    return float(frames / (frames + n_half) * slope * ratio)
 
 
 assert len(RELATIONS) == NONE + 1
@@ -177,7 +173,7 @@ class PhysicsModel:
 
     @cached_property
     def votes(self) -> VoteScales:
-        """What votes are worth."""
+        """The weights of votes."""
         return VoteScales(*self.vote_scales.tolist())
 
     @cached_property

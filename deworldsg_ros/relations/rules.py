@@ -180,7 +180,10 @@ def share_supports(scene: Scene, slots: Int64) -> Int64:
     for slot in slots:
         node, weakest, least = slot, 0, 2.0
         for _ in range(MAX_CIRCLE):
-            place = _likely(scene, node)
+            # The pair in which the object probably rests on the other one.
+            place = firsts[node]
+            while place and beliefs[(place - 1) >> 1].kept[(place - 1) & 1] <= 0.5:
+                place = pairs[(place - 1) >> 1].links[(place - 1) & 1]
             if not place:
                 break
             row, end = (place - 1) >> 1, (place - 1) & 1
@@ -193,18 +196,6 @@ def share_supports(scene: Scene, slots: Int64) -> Int64:
                 count += 1
                 break
     return cut[:count].copy()
-
-
-@kernel
-def _likely(scene: Scene, slot: int) -> int:
-    """The place of the pair in which an object probably rests on the other one; 0 = none."""
-    place = scene.firsts[slot]
-    while place:
-        row, end = (place - 1) >> 1, (place - 1) & 1
-        if scene.beliefs[row].kept[end] > 0.5:
-            return int(place)
-        place = scene.pairs[row].links[end]
-    return 0
 
 
 @kernel
@@ -236,8 +227,15 @@ def find_neighbours(scene: Scene, slots: Int64) -> Int64:
             now = False
             belief.near = 0.0
             if not np.isinf(belief.gap_m):
+                # Probability that the other one rests on the same support.
+                together, at = 0.0, firsts[other]
+                while at:
+                    ends = pairs[(at - 1) >> 1].slots
+                    share = shapes[ends[1 - ((at - 1) & 1)]].share
+                    together += beliefs[(at - 1) >> 1].kept[(at - 1) & 1] * share
+                    at = pairs[(at - 1) >> 1].links[(at - 1) & 1]
                 floor = shapes[slot].on_floor * shapes[other].on_floor
-                belief.near = _beside(belief, floor, _together(scene, other))
+                belief.near = _beside(belief, floor, together)
                 _share(belief, states)
                 now = belief.near * states[0] > MIN_NEIGHBOUR
             if now != belief.eligible and not shapes[other].mark:
@@ -262,31 +260,14 @@ def _spread(scene: Scene, slot: int, factor: float) -> None:
 
 
 @kernel
-def _together(scene: Scene, slot: int) -> float:
-    """Probability that an object rests on the support of another one, whose shares are given."""
-    total = 0.0
-    place = scene.firsts[slot]
-    while place:
-        row, end = (place - 1) >> 1, (place - 1) & 1
-        other = scene.pairs[row].slots[1 - end]
-        total += scene.beliefs[row].kept[end] * scene.shapes[other].share
-        place = scene.pairs[row].links[end]
-    return total
-
-
-@kernel
 def _beside(belief: Any, floor: float, together: float) -> float:
     """Probability that two objects stand side by side, on the floor or together on a support."""
     reach = SEAT_GAP_M if belief.with_[0] + belief.with_[1] > 0 else NEAR_FLOOR_M
-    floor *= _expit((reach - belief.gap_m) / NEAR_FLOOR_SPREAD_M)
-    together *= _expit((NEAR_SUPPORT_M - belief.gap_m) / NEAR_SUPPORT_SPREAD_M)
-    together *= _expit((NEAR_LEVEL_M - abs(belief.bottom_step_m)) / NEAR_LEVEL_SPREAD_M)
+    floor *= 1.0 / (1.0 + math.exp(-(reach - belief.gap_m) / NEAR_FLOOR_SPREAD_M))
+    step_m = abs(belief.bottom_step_m)
+    together *= 1.0 / (1.0 + math.exp(-(NEAR_SUPPORT_M - belief.gap_m) / NEAR_SUPPORT_SPREAD_M))
+    together *= 1.0 / (1.0 + math.exp(-(NEAR_LEVEL_M - step_m) / NEAR_LEVEL_SPREAD_M))
     return float(min(floor + together, 1.0))
-
-
-@kernel
-def _expit(value: float) -> float:
-    return 1.0 / (1.0 + math.exp(-value)) if value > -700.0 else 0.0
 
 
 @kernel
@@ -407,7 +388,8 @@ def relate(scene: Scene, slots: Int64, more: Int64) -> Int64:
         if belief.with_[0] + belief.with_[1] == 0 and belief.close[0] * belief.close[1] == 0:
             beside = 0.0
         beside = min(max(beside, 1.0 - NEAR_CERTAINTY), NEAR_CERTAINTY)
-        beside = _expit(math.log(beside / (1.0 - beside)) + belief.near_votes)
+        logit = math.log(beside / (1.0 - beside)) + belief.near_votes
+        beside = 1.0 / (1.0 + math.exp(-logit))
         is_new = False
         for end in range(2):
             now[end, NEAR] = states[0] * beside

@@ -172,7 +172,7 @@ _PRIME = np.int64(0x100000001B3)
 
 
 class PredicateNames(NamedTuple):
-    """What the predicates of a vocabulary name.
+    """The relations that the predicates of a vocabulary name.
 
     Attributes:
         relation_of: (R,) relation of each predicate; -1 = it names none.
@@ -191,15 +191,11 @@ class PredicateNames(NamedTuple):
         return cls(relation_of_predicates(predicates), canonical_predicates(predicates), with_index)
 
 
-@kernel
 def related_pairs(beliefs: NDArray[Any], rows: Int64) -> Bool:
     """Whether pairs (k,) may be related, or have votes beyond the physical relations; (k,) bool."""
-    related = np.empty(len(rows), np.bool_)
-    for index in range(len(rows)):
-        belief = beliefs[rows[index]]
-        free = min(belief.relations[0, NONE], belief.relations[1, NONE])
-        related[index] = free < 1.0 - MIN_RELATED or belief.other_votes >= MIN_OTHER_VOTES
-    return related
+    there, back = beliefs["relations"][:, :, NONE][rows].T
+    related: Bool = np.minimum(there, back) < 1.0 - MIN_RELATED
+    return related | (beliefs["other_votes"][rows] >= MIN_OTHER_VOTES)
 
 
 @kernel
@@ -225,6 +221,7 @@ def predicate_probabilities(
         scales: (4,) of `VoteScales`.
     """
     relation_of, canonical, with_index = names
+    slope, n_half, low, even = scales
     count, _, width = votes.shape
     result, voted = np.zeros((count, 2, width)), np.zeros((count, 2), np.bool_)
     sums = np.empty(NONE)
@@ -249,33 +246,19 @@ def predicate_probabilities(
                 if canonical[relation] >= 0:
                     out[name] += relations[relation] * NAMING_VOTES / sums[relation]
             if others >= MIN_OTHER_VOTES:
-                worth = scales[0] * beliefs[index].votes_worth
-                _add_others(out, relations[NONE], told, frames[index], worth, relation_of, scales)
+                # Probabilities of the predicates that name no physical relation.
+                shown, total = frames[index], 1.0
+                worth = shown / (shown + n_half) * slope * beliefs[index].votes_worth
+                for name in range(width):
+                    if relation_of[name] < 0:
+                        share = (told[name] / max(shown, 1e-9) + low) / (even + low)
+                        evidence = min(max(worth * math.log(share), -MAX_EVIDENCE), MAX_EVIDENCE)
+                        out[name] = OTHER_ODDS * math.exp(evidence)
+                        total += out[name]
+                for name in range(width):
+                    if relation_of[name] < 0:
+                        out[name] *= relations[NONE] / total
     return result, voted
-
-
-@kernel
-def _add_others(
-    out: Float64,
-    free: float,
-    votes: Float32,
-    frames: int,
-    slope: float,
-    relation_of: Int64,
-    scales: Float64,
-) -> None:
-    """Probabilities of the predicates that name no physical relation, of a pair that is `free`."""
-    _, n_half, low, even = scales
-    worth, total = frames / (frames + n_half) * slope, 1.0
-    for name in range(len(out)):
-        if relation_of[name] < 0:
-            share = (votes[name] / max(frames, 1e-9) + low) / (even + low)
-            evidence = min(max(worth * math.log(share), -MAX_EVIDENCE), MAX_EVIDENCE)
-            out[name] = OTHER_ODDS * math.exp(evidence)
-            total += out[name]
-    for name in range(len(out)):
-        if relation_of[name] < 0:
-            out[name] *= free / total
 
 
 @kernel

@@ -155,10 +155,6 @@ class JoiningNode(StageNode, Generic[Out]):
         """Number of frames in the queue."""
         return {} if self._worker is None else {"queue": str(self._worker.waiting)}
 
-    def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until all frames are processed; False on timeout."""
-        return self._worker is None or self._worker.wait_idle(timeout_s)
-
     def close(self) -> None:
         """End the thread."""
         if self._worker is not None:

@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, TimeoutError
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -33,7 +33,6 @@ from deworldsg_ros.ros.inputs import (
 from deworldsg_ros.ros.joining import MAX_BUSY_S, JoiningNode
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import RelationEvidence
 from deworldsg_ros.streams.frames import FrameAssembler, PairingFrame
 from deworldsg_ros.wire import messages as wire
@@ -65,58 +64,6 @@ class ModelError(Exception):
     """A model hangs or is missing."""
 
 
-@dataclass
-class Faults:
-    """Faults of one model, to come.
-
-    Attributes:
-        raises: number of calls that raise.
-        hang_s: how long the next call takes.
-        missing: None, or the number of failing attempts to load the model, which is lost at once.
-    """
-
-    raises: int = 0
-    hang_s: float = 0.0
-    missing: int | None = None
-
-    def before_call(self) -> None:
-        """Raise or hang."""
-        if self.raises:
-            self.raises -= 1
-            raise RuntimeError("injected fault (debug.faults)")
-        pause_s, self.hang_s = self.hang_s, 0.0
-        time.sleep(pause_s)
-
-    def before_load(self) -> None:
-        """Raise while the model is missing."""
-        if self.missing:
-            self.missing -= 1
-            raise ModelError("injected fault (debug.faults): it is not there")
-
-
-def parse_faults(text: str) -> dict[str, Faults]:
-    """Faults by part; raises ConfigurationError. The parameter `debug.faults` has the format."""
-    faults = {part: Faults() for part in PARTS}
-    for item in filter(None, text.replace(" ", "").split(",")):
-        part, _, rest = item.partition(":")
-        kind, _, amount = rest.partition(":")
-        try:
-            if kind == "raise":
-                faults[part].raises = int(amount)
-            elif kind == "hang":
-                faults[part].hang_s = min(float(amount), threading.TIMEOUT_MAX)
-            elif kind == "missing":
-                faults[part].missing = int(amount)
-            else:
-                raise KeyError(kind)
-        except (KeyError, ValueError) as error:
-            raise ConfigurationError(
-                f"parameter debug.faults has '{item}', expected PART:KIND:AMOUNT with a part of "
-                f"{', '.join(PARTS)}; raise:CALLS, hang:SECONDS or missing:LOADS"
-            ) from error
-    return faults
-
-
 class Supervised:
     """A model whose calls raise an exception rather than hang.
 
@@ -128,23 +75,13 @@ class Supervised:
         model: detector, segmenter, relation head or world model.
         limit_s: maximum time of a call.
         reload: loads the model again and calls `replace`; it may raise.
-        faults: injected ones.
     """
 
-    def __init__(
-        self,
-        name: str,
-        model: Any,
-        limit_s: float,
-        reload: Callable[[], None],
-        faults: Faults,
-    ) -> None:
+    def __init__(self, name: str, model: Any, limit_s: float, reload: Callable[[], None]) -> None:
         self._name = name
         self._model = model
         self._limit_s = limit_s
         self._reload = reload
-        self._faults = faults
-        self._lost = faults.missing is not None
         self._failures = 0
         self._tried_s = -RELOAD_PERIOD_S
         self._error = ""
@@ -161,11 +98,10 @@ class Supervised:
 
     def replace(self, model: Any) -> None:
         """Use another model from now on."""
-        self._faults.before_load()
-        self._model, self._lost, self._failures = model, False, 0
+        self._model, self._failures = model, 0
 
     def hung(self) -> str:
-        """What is wrong with a model that never returns, in words; "" = it may return."""
+        """The fault of a model that never returns, in words; "" = it may return."""
         call, busy_s = self._call, time.monotonic() - self._since_s
         if call is None or call.done() or busy_s < HUNG_LIMITS * self._limit_s:
             return ""
@@ -175,7 +111,7 @@ class Supervised:
         )
 
     def problem(self) -> str:
-        """What is wrong, in words; "" = nothing."""
+        """The fault, in words; "" = none."""
         if hung := self.hung():
             return hung
         call, busy_s = self._call, time.monotonic() - self._since_s
@@ -191,7 +127,7 @@ class Supervised:
             self._call = None
         try:
             self._load_again()
-            result = self._run(lambda: self._called(name, arguments))
+            result = self._run(lambda: getattr(self._model, name)(*arguments))
         except Exception as error:
             self._failures += 1
             self._error = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -199,19 +135,12 @@ class Supervised:
         self._failures, self._error = 0, ""
         return result
 
-    def _called(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        self._faults.before_call()
-        return getattr(self._model, name)(*arguments)
-
     def _load_again(self) -> None:
-        """Load a model that is lost or fails; at most every RELOAD_PERIOD_S."""
+        """Load a model that keeps failing; at most every RELOAD_PERIOD_S."""
         now_s = time.monotonic()
-        if self._lost or self._failures >= RELOAD_AFTER_FAILURES:
-            if now_s - self._tried_s >= RELOAD_PERIOD_S:
-                self._tried_s = now_s
-                self._reload()
-            elif self._lost:
-                raise ModelError(f"the {self._name} is not there")
+        if self._failures >= RELOAD_AFTER_FAILURES and now_s - self._tried_s >= RELOAD_PERIOD_S:
+            self._tried_s = now_s
+            self._reload()
 
     def _run(self, function: Callable[[], Any]) -> Any:
         call: Future[Any] = Future()
@@ -258,13 +187,11 @@ class PerceivingNode(JoiningNode[RgbdFrame]):
         inputs = self.parameters.inputs
         require_checkpoints(self.parameters.perception)
         self._perception = build_perception(self.parameters.perception, world_up=inputs.world_up)
-        faults = parse_faults(self.parameters.debug.faults)
         self._models: dict[str, Supervised] = {}
 
         def supervise(part: str, backend: Any) -> Supervised:
-            self._models[part] = Supervised(
-                part.replace("_", " "), backend, PERCEPTION_LIMIT_S, self._reload, faults[part]
-            )
+            name = part.replace("_", " ")
+            self._models[part] = Supervised(name, backend, PERCEPTION_LIMIT_S, self._reload)
             return self._models[part]
 
         self._perception.watch(supervise)
@@ -338,10 +265,7 @@ class Relating:
         require_checkpoints(relations=config)
         world_model: Any = build_world_model(config, node.parameters.perception.device)
         if world_model is not None:
-            faults = parse_faults(node.parameters.debug.faults)["world_model"]
-            world_model = Supervised(
-                "world model", world_model, WORLD_MODEL_LIMIT_S, self._reload, faults
-            )
+            world_model = Supervised("world model", world_model, WORLD_MODEL_LIMIT_S, self._reload)
         self._config, self._model = config, world_model
         predicates = graph_predicates(node.parameters.perception)
         if predicates is not None:  # else the first local graph contains them
@@ -362,7 +286,7 @@ class Relating:
         self._reasoner.configure(config)
 
     def problems(self) -> list[str]:
-        """What is wrong with the world model, in words."""
+        """The fault of the world model, in words."""
         return [] if self._model is None else list(filter(None, [self._model.problem()]))
 
     def hung(self) -> str:

@@ -19,9 +19,12 @@ import msgspec
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation as rcl
 from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
@@ -38,7 +41,7 @@ from deworldsg_ros.ros.health import (
     Report,
 )
 from deworldsg_ros.ros.options import Parameters
-from deworldsg_ros.ros.parameters import LiveParameters, OverridableNode, declare
+from deworldsg_ros.ros.parameters import LiveParameters, declare
 from deworldsg_ros.ros.qos import AutoSubscription, LossCounter, Source, reliable
 from deworldsg_ros.scene.errors import ConfigurationError, DeWorldSGError, RefusedInput
 from deworldsg_ros.wire import messages as wire
@@ -229,13 +232,19 @@ STUCK_S = 60.0
 # A thread of Python code lets the others run after this time (Python's default is 5 ms), so that a
 # message does not wait for the stage's thread.
 SWITCH_S = 0.001
+# Begins the names of parameters that override the QoS of a topic.
+OVERRIDES = "qos_overrides."
 
 
-class StageNode(OverridableNode):
+class StageNode(Node):
     """A node around one stage.
 
     Callbacks made by `guarded` never raise. Refused input is counted under its reason; an
     unexpected exception is counted as ``internal_error`` and logged with its traceback.
+
+    ``qos_overrides./TOPIC.publisher.POLICY`` and ``….subscription.POLICY`` apply as in other ROS 2
+    nodes. Only overrides that are given become parameters: the QoS of the camera's topics follows
+    their publishers without one.
 
     Args:
         name: node name.
@@ -256,7 +265,7 @@ class StageNode(OverridableNode):
 
     def __init__(self, name: str, product: str, **options: Any) -> None:
         super().__init__(name, **options)
-        self.parameters: Any = declare(self, self.PARAMETERS, self.LIVE)
+        self.parameters: Any = declare(self, self.PARAMETERS, self.LIVE, (OVERRIDES,))
         self.get_logger().info("loading")
         on_compilation(lambda: self.get_logger().info(COMPILING))
         LiveParameters(self)
@@ -280,7 +289,7 @@ class StageNode(OverridableNode):
         return []
 
     def hung(self) -> str:
-        """What never returns, in words; "" = nothing; for subclasses."""
+        """The call that never returns, in words; "" = none; for subclasses."""
         return ""
 
     def more_values(self) -> dict[str, str]:
@@ -296,6 +305,22 @@ class StageNode(OverridableNode):
     def longest_wait_s(self) -> float:
         """How long to wait for messages at most; for subclasses."""
         return SPIN_PERIOD_S
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Any:
+        """As rclpy's; raises ConfigurationError for an override that rclpy does not take."""
+        arguments = (msg_type, topic, qos_profile)
+        return self._create(super().create_publisher, "publisher", arguments, options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
+    ) -> Any:
+        """As rclpy's; raises ConfigurationError for an override that rclpy does not take."""
+        arguments = (msg_type, topic, callback, qos_profile)
+        return self._create(super().create_subscription, "subscription", arguments, options)
+
+    def unused_overrides(self) -> list[str]:
+        """The overrides of topics that the node does not have so far."""
+        return [name for name in self._qos_overrides() if not self.has_parameter(name)]
 
     def wake(self) -> None:
         """Let the executor's thread look again which messages are wanted; from any thread."""
@@ -407,6 +432,31 @@ class StageNode(OverridableNode):
         """A function that publishes texts on a topic."""
         publisher = self.create_publisher(String, topic, reliable(depth, latched=latched))
         return lambda text: publisher.publish(String(data=text))
+
+    def _qos_overrides(self) -> list[str]:
+        # rclpy's own publishers are made before it has read the overrides.
+        given = getattr(self, "_parameter_overrides", {})
+        return [name for name in given if name.startswith(OVERRIDES)]
+
+    def _create(
+        self, create: Any, kind: str, arguments: tuple[Any, ...], options: dict[str, Any]
+    ) -> Any:
+        prefix = f"{OVERRIDES}{self.resolve_topic_name(arguments[1])}.{kind}."
+        names = [name for name in self._qos_overrides() if name.startswith(prefix)]
+        if not names:
+            return create(*arguments, **options)
+        try:
+            policies = [QoSPolicyKind[name[len(prefix) :].upper()] for name in names]
+            options["qos_overriding_options"] = QoSOverridingOptions(policies)
+            return create(*arguments, **options)
+        except (KeyError, RuntimeError, InvalidParameterTypeException, ParameterException) as error:
+            given = ", ".join(
+                f"{name} = {self._parameter_overrides[name].value!r}" for name in names
+            )
+            raise ConfigurationError(
+                f"{self.get_name()}: {given}: {error}; expected policies of "
+                "rclpy.qos.QoSPolicyKind with their values, e.g. reliability: best_effort"
+            ) from error
 
     def _lost(self, name: str) -> Callable[[int], None]:
         """A function that counts lost messages of a stream."""

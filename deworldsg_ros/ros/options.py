@@ -41,24 +41,10 @@ class NodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 10.0
 
 
-class DebugOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Faults that a node makes on purpose."""
-
-    faults: Annotated[
-        str,
-        option(
-            "faults of the models, to try a robot: PART:raise:CALLS, PART:hang:SECONDS or "
-            "PART:missing:LOADS, separated by commas; parts are detector, segmenter, relation_head "
-            "and world_model; empty = none"
-        ),
-    ] = ""
-
-
 class Parameters(Config, frozen=True, forbid_unknown_fields=True):
     """Parameters of the pipeline's nodes: the configuration, and `node` without a prefix."""
 
     node: NodeOptions = NodeOptions()
-    debug: DebugOptions = DebugOptions()
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -74,26 +74,11 @@ def _hash(bits: UInt32) -> np.uint64:
 
 
 @kernel
-def _sort(hashes: UInt64, points: Int64, count: int) -> None:
-    """Sort the first hashes, and their points with them (Shell sort)."""
-    gap = count // 2
-    while gap > 0:
-        for index in range(gap, count):
-            one, point, place = hashes[index], points[index], index
-            while place >= gap and hashes[place - gap] > one:
-                hashes[place], points[place] = hashes[place - gap], points[place - gap]
-                place -= gap
-            hashes[place], points[place] = one, point
-        gap //= 2
-
-
-@kernel
 def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int64) -> Bool:
     capacity = bits.shape[1]
     changed = np.zeros(len(rows), np.bool_)
-    # The points that enter a sample, their hashes, and the known points that they come before.
-    entering, places = np.empty(len(new_bits), np.int64), np.empty(len(new_bits), np.int64)
-    hashes = np.empty(len(new_bits), np.uint64)
+    # The points that may enter a sample, and their hashes.
+    entering, hashes = np.empty(len(new_bits), np.int64), np.empty(len(new_bits), np.uint64)
     for index in range(len(rows)):
         row = rows[index]
         known = counts[row]
@@ -105,53 +90,58 @@ def _add(bits: UInt32, counts: Int64, rows: Int64, new_bits: UInt32, starts: Int
         # Most frames add nothing to a full sample.
         if count == 0:
             continue
-        _sort(hashes, entering, count)
-        place = fresh = 0
-        for new in range(count):
-            place = _place(bits[row], place, known, hashes[new])
-            # Equal hashes mean equal points: with 64 bits, collisions within a node are negligible.
-            if place < known and _hash(bits[row, place]) == hashes[new]:
-                continue
-            if new and hashes[new - 1] == hashes[new]:
-                continue
-            entering[fresh], places[fresh] = entering[new], place
-            fresh += 1
+        # In the order of their hashes (Shell sort).
+        gap = count // 2
+        while gap > 0:
+            for later in range(gap, count):
+                one, point, place = hashes[later], entering[later], later
+                while place >= gap and hashes[place - gap] > one:
+                    hashes[place], entering[place] = hashes[place - gap], entering[place - gap]
+                    place -= gap
+                hashes[place], entering[place] = one, point
+            gap //= 2
+        fresh = _enter(bits[row], known, new_bits, entering[:count], hashes)
         changed[index] = fresh > 0
-        _insert(bits[row], known, new_bits, entering[:fresh], places)
         counts[row] = min(capacity, known + fresh)
     return changed
 
 
 @kernel
-def _place(bits: UInt32, first: int, known: int, wanted: np.uint64) -> int:
-    """First of the known points, from a place on, whose hash is not less; few are hashed."""
-    low, high, step = first, first, 1
-    while high < known and _hash(bits[high]) < wanted:
-        low, high, step = high + 1, high + step, 2 * step
-    high = min(high, known)
-    while low < high:
-        middle = (low + high) // 2
-        if _hash(bits[middle]) < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    return low
-
-
-@kernel
-def _insert(bits: UInt32, known: int, new_bits: UInt32, points: Int64, places: Int64) -> None:
-    """Insert points before those at some places, ascending; the last ones fall out."""
-    old, write = known - 1, known + len(points) - 1
-    for index in range(len(points) - 1, -1, -1):
-        while old >= places[index]:
+def _enter(bits: UInt32, known: int, new_bits: UInt32, points: Int64, hashes: UInt64) -> int:
+    """Insert points in the order of their hashes; the last ones fall out. Returns their number."""
+    places = np.empty(len(points), np.int64)  # of the known points that they come before
+    place = fresh = 0
+    for new in range(len(points)):
+        # First known point, from the last place on, whose hash is not less. Few are hashed.
+        high, step = place, 1
+        while high < known and _hash(bits[high]) < hashes[new]:
+            place, high, step = high + 1, high + step, 2 * step
+        high = min(high, known)
+        while place < high:
+            middle = (place + high) // 2
+            if _hash(bits[middle]) < hashes[new]:
+                place = middle + 1
+            else:
+                high = middle
+        # Equal hashes mean equal points: with 64 bits, collisions within a node are negligible.
+        if place < known and _hash(bits[place]) == hashes[new]:
+            continue
+        if new and hashes[new - 1] == hashes[new]:
+            continue
+        points[fresh], places[fresh] = points[new], place
+        fresh += 1
+    old, write = known - 1, known + fresh - 1
+    for new in range(fresh - 1, -1, -1):
+        while old >= places[new]:
             if write < len(bits):
                 for axis in range(3):
                     bits[write, axis] = bits[old, axis]
             old, write = old - 1, write - 1
         if write < len(bits):
             for axis in range(3):
-                bits[write, axis] = new_bits[points[index], axis]
+                bits[write, axis] = new_bits[points[new], axis]
         write -= 1
+    return fresh
 
 
 @kernel
@@ -161,8 +151,10 @@ def drop_points(points_world: Float32, counts: Int64, rows: Int64, dropped: Bool
     The other arguments are those of `add_points`.
     """
     for index in range(len(rows)):
-        row = rows[index]
-        if dropped[index, : counts[row]].all():
+        row, kept = rows[index], 0
+        for place in range(counts[row]):
+            kept += int(not dropped[index, place])
+        if kept == 0:
             continue
         kept = 0
         for place in range(counts[row]):

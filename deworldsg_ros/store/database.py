@@ -215,7 +215,7 @@ _Item = TypeVar("_Item", wire.NodeState, wire.EdgeState, Stay)
 
 @dataclass
 class Head:
-    """What the database contains.
+    """Content of the database.
 
     Attributes:
         position: in the file of messages; all before it is in the database.
@@ -273,7 +273,7 @@ class Database:
         self.write_head(Head())
 
     def head(self) -> Head | None:
-        """What is in the database; None = nothing, or it is of another version."""
+        """Content of the database; None = nothing, or it is of another version."""
         names = [name for name in _HEAD if name != "key"]
         try:
             found = self.run("MATCH (h:Head) RETURN " + ", ".join(f"h.{name}" for name in names))

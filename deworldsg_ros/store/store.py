@@ -372,7 +372,7 @@ class Store:
 
     @property
     def head(self) -> Head:
-        """What the database contains."""
+        """Content of the database."""
         with self.opened() as database:
             return database.head() or Head()
 

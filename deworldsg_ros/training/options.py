@@ -46,3 +46,16 @@ class TrainingOptions:
     held_out_groups: tuple[str, ...] = ()
     batch_size: int = 1
     fit: FitOptions = field(default_factory=FitOptions)
+
+
+@dataclass(frozen=True)
+class ClipOrigin:
+    """Where clips come from, for the record.
+
+    Attributes:
+        source: its name.
+        data_split: of a data set; empty = a folder of clips.
+    """
+
+    source: str = ""
+    data_split: str = ""

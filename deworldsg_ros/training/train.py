@@ -31,7 +31,7 @@ from deworldsg_ros.relations.clip_models import FrozenBackbone
 from deworldsg_ros.scene.arrays import Float32, Float64, Int64
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.training.clips import LabelledClip, of_length
-from deworldsg_ros.training.options import FitOptions, TrainingOptions
+from deworldsg_ros.training.options import ClipOrigin, FitOptions, TrainingOptions
 
 # --- Fit of a probe on features: weighted cross-entropy, early stopping, one random seed.
 
@@ -463,8 +463,7 @@ def train_probe(
     options: TrainingOptions,
     *,
     cache: Path | None = None,
-    source: str = "",
-    data_split: str = "",
+    origin: ClipOrigin | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Train a probe and save it.
@@ -476,9 +475,7 @@ def train_probe(
         out: folder of the probe.
         options: of the training.
         cache: folder of the features; default: a folder in `out`.
-        source: origin of the clips, for the record.
-        data_split: split of the data set that they come from, for the record; empty = a folder of
-            clips.
+        origin: of the clips, for the record.
         progress: callbacks for progress.
 
     Returns:
@@ -507,8 +504,8 @@ def train_probe(
         name: score(fit.probe.distributions(inputs[rows]), labels[rows], labels[split.train])
         for name, rows in split.parts().items()
     }
-    origin = {"source": source, "data_split": data_split}
-    return _save(out, fit, scores, {**origin, **_record(clips, split, backbone, options)})
+    record = asdict(origin or ClipOrigin()) | _record(clips, split, backbone, options)
+    return _save(out, fit, scores, record)
 
 
 def _card(

@@ -210,7 +210,7 @@ class ChangeLog:
             self._edges.replace(edges, graph.sequence)
 
     def since(self, session: str | None, sequence: int) -> wire.SceneGraphUpdateMessage | None:
-        """What a reader lacks; None = nothing, or there is no graph yet.
+        """The updates that a reader lacks; None = none, or there is no graph yet.
 
         Args:
             session: of the graph that the reader has; None = none.

@@ -517,7 +517,7 @@ def decode(text: Union[str, bytes], kind: type[M], most_bytes: Optional[int] = N
 
 
 def _check_graph(message: Union[SceneGraphMessage, SceneGraphUpdateMessage]) -> None:
-    """What the schema cannot say of a graph: text, unit lengths, ids. Raises ValueError."""
+    """Check text, unit lengths and ids of a graph, which no schema can. Raises ValueError."""
     nodes, edges = message.nodes, message.edges
     labels = {node.label for node in nodes} | {edge.predicate for edge in edges}
     labels.update(belief.label for node in nodes for belief in node.classes)

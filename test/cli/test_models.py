@@ -1,21 +1,18 @@
 """`deworldsg models get`, `list` and `inspect`, against a hub on this machine."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.cli import invoke, printed, refusal
 from support.fake_hub import FakeHub
-from typer.testing import CliRunner, Result
 
 pytest.importorskip("huggingface_hub")
 safetensors = pytest.importorskip("safetensors.numpy")
 
 from deworldsg_ros.checkpoints.catalogue import CATALOGUE, GROUPS  # noqa: E402  after the guards
 from deworldsg_ros.checkpoints.hub import read_headers  # noqa: E402
-from deworldsg_ros.cli.app import app  # noqa: E402
 from deworldsg_ros.cli.demo import configuration_of  # noqa: E402
 from deworldsg_ros.config import load_config  # noqa: E402
 from deworldsg_ros.scene.errors import ConfigurationError  # noqa: E402
@@ -33,152 +30,122 @@ FILES = {
 
 
 @pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch):
+def hub(monkeypatch):
     with FakeHub("facebook/dinov2-small", dict(FILES)).serving() as hub:
         monkeypatch.setenv("HF_ENDPOINT", hub.url)
         monkeypatch.setenv("HF_HUB_DISABLE_XET", "1")
         yield hub
 
 
-def models(*words: object) -> Result:
-    return CliRunner().invoke(app, ["models", *(str(word) for word in words)])
+def get(into: Path, name: str = "dinov2-small") -> str:
+    return printed("models", "get", name, "--into", into)
 
 
-def test_a_model_is_fetched_verified_and_kept(hub: FakeHub, tmp_path: Path) -> None:
-    result = models("get", "dinov2-small", "--into", tmp_path)
-    assert result.exit_code == 0, result.output
-    assert "licence mit" in result.output and "commit 0123456789ab" in result.output
+def test_a_model_is_fetched_verified_listed_and_kept(hub, tmp_path):
+    shown = get(tmp_path)
+    assert "licence mit" in shown and "commit 0123456789ab" in shown
     folder = tmp_path / "dinov2-small"
     for name, content in FILES.items():
         if name == "pytorch_model.bin":
             assert not (folder / name).exists()
         else:
             assert (folder / name).read_bytes() == content
-    checked = subprocess.run(
-        ["sha256sum", "-c", "SHA256SUMS"], cwd=folder, capture_output=True, text=True, check=True
-    )
-    assert checked.stdout.count(": OK") == 4
+    subprocess.run(["sha256sum", "-c", "SHA256SUMS"], cwd=folder, check=True)
+    assert len((folder / "SHA256SUMS").read_text().splitlines()) == 4
+    listed = printed("models", "list", "--into", tmp_path)
+    assert "there      dinov2-small" in listed and "missing    sam2.1-hiera-tiny" in listed
+    for words in ("sha256sum -c", "import-fross", "import-probe", "licence mit"):
+        assert words in listed
     hub.requested.clear()
-    result = models("get", "facebook/dinov2-small", "--into", tmp_path)
-    assert result.exit_code == 0 and "was there" in result.output
+    assert "was there" in get(tmp_path, "facebook/dinov2-small")
     assert hub.requested == []
 
 
-def test_a_download_that_was_cut_continues_where_it_stopped(hub: FakeHub, tmp_path: Path) -> None:
+def test_a_download_that_was_cut_continues_where_it_stopped(hub, tmp_path):
     # The client writes pieces of 10 MB.
     weights = safetensors.save({"layer.weight": np.ones((6000, 1000), np.float32)})
     hub.files["model.safetensors"] = weights
     hub.cut.add("model.safetensors")
     for _ in range(2):  # the client may continue by itself, or end with an error
-        result = models("get", "dinov2-small", "--into", tmp_path)
+        result = invoke("models", "get", "dinov2-small", "--into", tmp_path)
     assert result.exit_code == 0, result.stderr
     ranges = [asked for kind, name, asked in hub.requested if kind == "GET" and "model" in name]
     assert "bytes=10485760-" in ranges, ranges
     assert (tmp_path / "dinov2-small" / "model.safetensors").read_bytes() == weights
 
 
-def test_only_missing_files_are_fetched(hub: FakeHub, tmp_path: Path) -> None:
-    models("get", "dinov2-small", "--into", tmp_path)
+def test_a_damaged_file_is_removed_and_only_what_is_missing_is_fetched(hub, tmp_path):
+    hub.damaged.add("model.safetensors")
+    assert "checksum" in refusal("models", "get", "dinov2-small", "--into", tmp_path)
+    assert not (tmp_path / "dinov2-small" / "model.safetensors").exists()
+    hub.damaged.clear()
+    get(tmp_path)
     (tmp_path / "dinov2-small" / "model.safetensors").unlink()
     hub.requested.clear()
-    assert "incomplete dinov2-small" in models("list", "--into", tmp_path).output
-    assert models("get", "dinov2-small", "--into", tmp_path).exit_code == 0
+    assert "incomplete dinov2-small" in printed("models", "list", "--into", tmp_path)
+    get(tmp_path)
     assert {name for _, name, _ in hub.requested} == {"model.safetensors"}
 
 
-def test_a_damaged_file_is_removed_and_reported(hub: FakeHub, tmp_path: Path) -> None:
-    hub.damaged.add("model.safetensors")
-    result = models("get", "dinov2-small", "--into", tmp_path)
-    assert result.exit_code == 2
-    assert "has another checksum" in result.stderr and "run the command again" in result.stderr
-    assert not (tmp_path / "dinov2-small" / "model.safetensors").exists()
-    hub.damaged.clear()
-    assert models("get", "dinov2-small", "--into", tmp_path).exit_code == 0
-
-
-def test_errors_name_the_remedy(hub: FakeHub, tmp_path: Path) -> None:
-    unknown = models("get", "dino", "--into", tmp_path)
-    assert unknown.exit_code == 2 and "expected paper, embedded, rtdetr_r18vd" in unknown.stderr
-    absent = models("get", "nobody/nothing", "--into", tmp_path)
-    assert absent.exit_code == 2 and "check the network and the id" in absent.stderr
+def test_errors_name_the_remedy(hub, tmp_path):
     hub.files.pop("model.safetensors")
-    pickles = models("get", "dinov2-small", "--into", tmp_path)
-    assert "has no model.safetensors" in pickles.stderr
+    for name, words in (
+        ("dino", "expected paper, embedded, rtdetr_r18vd"),
+        ("nobody/nothing", "check the network and the id"),
+        ("dinov2-small", "model.safetensors"),
+    ):
+        assert words in refusal("models", "get", name, "--into", tmp_path)
 
 
-def test_the_embedded_models_need_no_network(tmp_path: Path, monkeypatch) -> None:
+def test_the_groups_are_the_models_of_their_configurations(root_dir, tmp_path, monkeypatch):
     monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:9")
-    result = models("get", "embedded", "--into", tmp_path)
-    assert result.exit_code == 0 and "nothing to download" in result.output
+    assert "nothing to download" in get(tmp_path, "embedded")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_list_says_what_is_there_and_how_to_get_the_rest(hub: FakeHub, tmp_path: Path) -> None:
-    models("get", "dinov2-small", "--into", tmp_path)
-    lines = models("list", "--into", tmp_path).output.splitlines()
-    assert any(line.startswith("there      dinov2-small") for line in lines)
-    assert any(line.startswith("missing    sam2.1-hiera-tiny") for line in lines)
-    text = " ".join(lines)
-    for words in ("without network", "sha256sum -c", "import-fross", "import-probe", "licence mit"):
-        assert words in text
-
-
-def test_the_paper_is_the_hub_models_and_the_files_of_paper_yaml(root_dir: Path) -> None:
-    config = load_config(root_dir / "config" / "paper.yaml")
+    paper = root_dir / "config" / "paper.yaml"
+    config = load_config(paper)
     paths = {config.perception.segmenter_path, config.relations.world_model_path}
     assert paths == {f"./models/{name}" for name in GROUPS["paper"]}
     assert set(GROUPS["paper"]) <= CATALOGUE.keys()
-
-
-def test_the_demo_takes_the_configuration_of_the_models(root_dir: Path, tmp_path: Path) -> None:
     assert configuration_of("embedded", None) is None
-    assert configuration_of("paper", None) == root_dir / "config" / "paper.yaml"
+    assert configuration_of("paper", None) == paper
     assert configuration_of("paper", tmp_path) == tmp_path
-    with pytest.raises(ConfigurationError, match="expected embedded or paper"):
+    with pytest.raises(ConfigurationError, match="embedded or paper"):
         configuration_of("large", None)
-    result = CliRunner().invoke(app, ["demo", "--models", "paper", "--out", str(tmp_path / "out")])
-    assert result.exit_code == 2 and "deworldsg models get sam2.1-hiera-tiny" in result.stderr
+    refused = refusal("demo", "--models", "paper", "--out", tmp_path / "out")
+    assert "deworldsg models get sam2.1-hiera-tiny" in refused
 
 
-def test_inspect_prints_names_and_shapes(tmp_path: Path) -> None:
+def test_inspect_prints_names_and_shapes(tmp_path):
     torch = pytest.importorskip("torch")
     (tmp_path / "model.safetensors").write_bytes(WEIGHTS)
     torch.save({"state_dict": {"a": torch.zeros(2, 3)}, "epoch": 3}, tmp_path / "model.ckpt")
     for path in (tmp_path, tmp_path / "model.safetensors"):
-        result = models("inspect", path)
-        assert result.exit_code == 0
-        assert "1 parameters, 0.12 million values" in result.output
-        assert "layer.weight  float32  300 x 400" in result.output
-    assert "state_dict.a  float32  2 x 3" in models("inspect", tmp_path / "model.ckpt").output
+        shown = printed("models", "inspect", path)
+        assert "1 parameters, 0.12 million values" in shown
+        assert "layer.weight  float32  300 x 400" in shown
+    assert "state_dict.a  float32  2 x 3" in printed("models", "inspect", tmp_path / "model.ckpt")
 
 
-def test_inspect_ends_on_dictionaries_without_end(tmp_path: Path) -> None:
+def test_inspect_refuses_other_files_and_dictionaries_without_end(tmp_path):
     torch = pytest.importorskip("torch")
-    path = tmp_path / "model.pt"
-    itself: dict[str, object] = {"weight": torch.zeros(1)}
+    once = {"weight": torch.zeros(1)}
+    itself: dict[str, object] = {**once}
     itself["a"] = itself
-    torch.save(itself, path)
-    with pytest.raises(ConfigurationError, match="nested more than 32 deep"):
-        read_headers(path)
-    often: dict[str, object] = {"weight": torch.zeros(1)}
+    often: dict[str, object] = {**once}
     for _ in range(30):
         often = {"a": often, "b": often}
-    torch.save(often, path)
-    with pytest.raises(ConfigurationError, match="more than 1000000 entries"):
-        read_headers(path)
-    once = {"weight": torch.zeros(1)}
+    path = tmp_path / "model.pt"
+    for content, words in ((itself, "32 deep"), (often, "1000000 entries")):
+        torch.save(content, path)
+        with pytest.raises(ConfigurationError, match=words):
+            read_headers(path)
     torch.save({"a": once, "b": once}, path)
     assert [header.name for header in read_headers(path)] == ["a.weight", "b.weight"]
-
-
-def test_inspect_refuses_other_files(tmp_path: Path) -> None:
-    cut = tmp_path / "cut.safetensors"
-    cut.write_bytes(WEIGHTS[:50])
-    with pytest.raises(ConfigurationError, match="no complete safetensors file"):
-        read_headers(cut)
-    pickled = tmp_path / "evil.pt"
-    pickled.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
-    with pytest.raises(ConfigurationError, match="without executing code"):
-        read_headers(pickled)
-    result = models("inspect", tmp_path / "none.pt")
-    assert result.exit_code == 2 and "no such file" in result.stderr
+    for name, data, words in (
+        ("cut.safetensors", WEIGHTS[:50], "no complete safetensors file"),
+        ("evil.pt", b"cos\nsystem\n(S'true'\ntR.", "without executing code"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(ConfigurationError, match=words):
+            read_headers(tmp_path / name)
+    assert "none.pt" in refusal("models", "inspect", tmp_path / "none.pt")

@@ -1,7 +1,5 @@
 """The recipes of docs/dev/models.md with small networks of random weights from a local hub."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -9,20 +7,16 @@ from pathlib import Path
 
 import pytest
 from support.checkpoints import config_of, save_vjepa2
+from support.cli import DEMO_ROOM, invoke, printed
 from support.fake_hub import FakeHub
 from support.torch_models import PREDICATES, save_paper_checkpoint, save_sam2, torch
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from deworldsg_ros.checkpoints.cards import ProbeCard
 from deworldsg_ros.checkpoints.probe_network import Probe, build_network, save_probe
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.relations import clip_models
 
 pytestmark = pytest.mark.models
-
-
-def deworldsg(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words])
 
 
 def get(repository: str, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -30,13 +24,12 @@ def get(repository: str, source: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = {path.name: path.read_bytes() for path in source.iterdir() if path.is_file()}
     with FakeHub(repository, files).serving() as hub:
         monkeypatch.setenv("HF_ENDPOINT", hub.url)
-        result = deworldsg("models", "get", repository.partition("/")[2])
-        assert result.exit_code == 0, result.stderr
+        printed("models", "get", repository.partition("/")[2])
 
 
 def run_paper(root_dir: Path, out: str) -> Result:
-    return deworldsg(
-        *("run", root_dir / "bags" / "demo_room", "--out", out, "--max-frames", 3),
+    return invoke(
+        *("run", DEMO_ROOM, "--out", out, "--max-frames", 3),
         *("--config", root_dir / "config" / "paper.yaml"),
         # Scores of random weights are low.
         *("--set", "perception.score_threshold=0.3"),
@@ -45,8 +38,8 @@ def run_paper(root_dir: Path, out: str) -> Result:
 
 @pytest.mark.timeout(600)
 def test_the_paper_runs_with_models_of_a_hub_and_on_a_machine_without_network(
-    root_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    root_dir, tmp_path, monkeypatch
+):
     here, robot = tmp_path / "here", tmp_path / "robot"
     here.mkdir()
     monkeypatch.chdir(here)
@@ -62,7 +55,7 @@ def test_the_paper_runs_with_models_of_a_hub_and_on_a_machine_without_network(
     torch.manual_seed(0)
     card = ProbeCard(identity, PREDICATES)
     save_probe(here / "models" / "probe_3dssg", Probe(card, build_network(card).eval()))
-    listed = deworldsg("models", "list").output
+    listed = printed("models", "list")
     for name in ("sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384", "fross_3dssg", "probe_3dssg"):
         assert f"there      {name}" in listed
     done = run_paper(root_dir, "out")

@@ -1,25 +1,23 @@
-"""`deworldsg run` on the recording that ships."""
-
-from __future__ import annotations
+"""`deworldsg run` and scripts/tour on the recording that ships."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
-from support.cli import DEMO_ROOM, deworldsg
+from support.cli import COMMAND, DEMO_ROOM, ROOT, deworldsg, environment, printed
 from support.recordings import camera_items, write_bag
-from typer.testing import CliRunner
 
 from deworldsg_ros import pipeline
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.config import load_config
 from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.relations.world_model import FakeWorldModel
 from deworldsg_ros.wire import messages as wire
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 
-@pytest.mark.timeout(400)
 def test_a_run_writes_every_file_that_it_names(tmp_path):
     result = deworldsg(
         tmp_path,
@@ -34,10 +32,10 @@ def test_a_run_writes_every_file_that_it_names(tmp_path):
     assert all(len(surface_points(node)) for node in graph.nodes)
     assert all(len(node.classes) <= 3 for node in graph.nodes)
     assert (out / "scene_graph.png").read_bytes().startswith(b"\x89PNG")
-    page = (out / "scene_graph.html").read_text(encoding="utf-8")
+    page = (out / "scene_graph.html").read_text()
     assert graph.nodes[0].label in page
     assert load_config(out / "config.yaml").output.top_k == 3
-    report = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    report = json.loads((out / "run.json").read_text())
     assert report["frames"] == {"images": 171, "processed": 12}
     assert report["nodes"] == len(graph.nodes)
     assert set(report["times_ms"]) >= {"perception", "masks", "lifting", "merging", "relations"}
@@ -48,7 +46,6 @@ def test_a_run_writes_every_file_that_it_names(tmp_path):
         assert name in result.stdout
 
 
-@pytest.mark.timeout(400)
 def test_a_recording_without_a_usable_frame_is_an_error_with_reasons(tmp_path):
     items = [item for item in camera_items(3) if "depth" not in item[0]]
     items += [item for item in camera_items(9)[-4:] if "depth" in item[0]]
@@ -66,13 +63,56 @@ class Broken(FakeWorldModel):
         raise RuntimeError("no memory left")
 
 
-@pytest.mark.timeout(400)
 def test_a_failing_world_model_is_in_the_report_and_the_run_continues(tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "build_world_model", lambda config, device: Broken(16))
     options = ["--max-frames", "6", "--set", "relations.max_clips_per_s=0"]
-    result = CliRunner().invoke(app, ["run", str(DEMO_ROOM), "--out", str(tmp_path), *options])
-    assert result.exit_code == 0, result.output
-    clips = json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["clips"]
+    shown = printed("run", DEMO_ROOM, "--out", tmp_path, *options)
+    clips = json.loads((tmp_path / "run.json").read_text())["clips"]
     failed = clips["dropped"]["world_model_error"]
     assert failed > 0 and clips["encoded"] == 0
-    assert f"left out by world model: {failed} world_model_error" in result.output
+    assert f"left out by world model: {failed} world_model_error" in shown
+
+
+FILES = ("out/scene_graph.json", "out/scene_graph.html", "out/scene_graph.png", "room.map")
+MACHINES = (
+    {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+    {"PYTHONHASHSEED": "4711", "OMP_NUM_THREADS": "3"},
+)
+
+
+@pytest.mark.timeout(600)
+def test_files_are_equal_to_the_byte_whatever_the_threads_and_the_seed_of_hashes(tmp_path):
+    found = []
+    for number, machine in enumerate(MACHINES):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        command = ["run", DEMO_ROOM, "--out", "out", "--map", "room.map", "--max-frames", 15]
+        subprocess.run(
+            [*COMMAND, *map(str, command)],
+            cwd=folder,
+            env={**environment(folder), **machine},
+            check=True,
+            capture_output=True,
+            timeout=280,
+        )
+        found.append({name: (folder / name).read_bytes() for name in FILES})
+    assert [name for name in FILES if found[0][name] != found[1][name]] == []
+
+
+@pytest.mark.timeout(900)
+def test_the_tour_is_all_that_a_user_does_with_a_graph(tmp_path):
+    path = os.pathsep.join([str(ROOT), *sys.path[1:]])
+    done = subprocess.run(
+        [sys.executable, ROOT / "scripts" / "tour.py", DEMO_ROOM, tmp_path / "out"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for words in (
+        ">>> which cup is on the table, where\ncup #", "not sure", "stand at", "transform found",
+        "is a 'my mug'", "undone: delete", "labelled by hand: True", "undone: split", "relabelled",
+    ):  # fmt: skip
+        assert words in done.stdout
+    assert "MCP find" in done.stdout or "mcp is not installed" in done.stdout

@@ -1,25 +1,21 @@
 """The graph of the shipped recording, as an earlier release saved it."""
 
-from __future__ import annotations
-
 import shutil
-from pathlib import Path
 
 import pytest
+from support.view import SAVED
 
 from deworldsg_ros.client import SceneGraph
 
-SAVED = Path(__file__).parent / "saved" / "scene_graph_v1.json"
-
 
 @pytest.fixture(scope="session")
-def room() -> SceneGraph:
+def room():
     """34 objects of the shipped recording; a file of version 1, with 60 surface points each."""
     return SceneGraph.load(SAVED)
 
 
 @pytest.fixture
-def demo_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def demo_out(tmp_path, monkeypatch):
     """The folder of a run in the present folder."""
     folder = tmp_path / "demo_out"
     folder.mkdir()

@@ -1,16 +1,12 @@
 """The live client over DDS: the first graph, updates, a gap, changes, the end."""
 
-from __future__ import annotations
-
 import threading
-import time
 from collections.abc import Callable
 
 import pytest
 
 pytest.importorskip("rclpy")
 
-import msgspec
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.nodes import Peer, peer, wait_until
@@ -26,9 +22,14 @@ LIMIT_S = 20.0
 
 def graph(sequence: int, *labels: str) -> wire.SceneGraphMessage:
     """A snapshot: objects 1, 2, … in a row, the second one on the first."""
-    nodes = [make_node(i + 1, label, (float(i), 0.0, 0.0)) for i, label in enumerate(labels)]
+    nodes = [make_node(i + 1, label, (i, 0, 0)) for i, label in enumerate(labels)]
     edges = [make_edge(2, 1, "on")] if len(nodes) > 1 else []
-    return msgspec.structs.replace(make_graph(nodes, edges), sequence=sequence)
+    return make_graph(nodes, edges, sequence=sequence)
+
+
+def growing(count: int) -> list[wire.SceneGraphMessage]:
+    """The first graphs of a session: one object more in each."""
+    return [graph(i, *["table", "cup", "book", "vase", "bowl"][:i]) for i in range(count)]
 
 
 class Robot:
@@ -55,10 +56,11 @@ class Robot:
         self._updates.publish(String(data=text))
 
 
-def test_a_client_follows_the_graph_and_closes_a_gap_by_itself() -> None:
-    steps = [graph(i, *["table", "cup", "book", "vase", "bowl"][:i]) for i in range(6)]
-    with peer("robot") as me, SceneGraphClient() as client:
-        robot = Robot(me)
+def test_a_client_follows_the_graph_and_closes_a_gap_by_itself():
+    steps = growing(6)
+    with peer("robot") as me, SceneGraphClient("/robot_1/") as client:
+        Robot(me).latch(graph(7, "a", "graph", "of", "another", "robot"))
+        robot = Robot(me, "/robot_1")
         seen: list[list[str]] = []
         threads = set()
         client.on_change(lambda now, changes: threads.add(threading.get_ident()))
@@ -88,39 +90,18 @@ def test_a_client_follows_the_graph_and_closes_a_gap_by_itself() -> None:
         assert threads.isdisjoint({threading.get_ident()})
 
 
-def test_two_robots_in_two_namespaces() -> None:
-    with (
-        peer("robots") as me,
-        SceneGraphClient("/robot_1") as one,
-        SceneGraphClient("/robot_2/") as two,
-    ):
-        Robot(me, "/robot_1").latch(graph(1, "cup"))
-        Robot(me, "/robot_2").latch(graph(7, "table", "cup"))
-        assert (len(one.wait(1, LIMIT_S)), len(two.wait(7, LIMIT_S))) == (1, 2)
-
-
-def test_without_a_graph_the_reason_is_told() -> None:
+def test_without_a_graph_the_reason_is_told():
     with (
         SceneGraphClient("/nobody") as client,
-        pytest.raises(ClientError, match="no graph on /nobody/scene_graph within 0.1 s"),
+        pytest.raises(ClientError, match="/nobody/scene_graph within 0.1 s"),
     ):
         client.wait(timeout_s=0.1)
 
 
-def test_a_client_ends_at_once_and_twice() -> None:
-    client = SceneGraphClient().__enter__()
-    started_s = time.monotonic()
-    client.close()
-    client.close()
-    assert time.monotonic() - started_s < 5.0
+def test_functions_of_the_user_that_raise_do_not_end_the_client(capfd, monkeypatch):
+    steps = growing(5)
 
-
-def test_functions_of_the_user_that_raise_do_not_end_the_client(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    steps = [graph(i, *["table", "cup", "book", "vase"][:i]) for i in range(5)]
-
-    def fail(*arguments: object) -> None:
+    def fail(*arguments):
         raise KeyError("a mistake of the user")
 
     with peer("robot") as me, SceneGraphClient() as client:
@@ -145,25 +126,26 @@ def test_functions_of_the_user_that_raise_do_not_end_the_client(
         wait_until(lambda: len(seen) == 7, LIMIT_S, "the last change")
     assert (client.gaps, client.refused) == (0, 0)
     log = capfd.readouterr().err
-    assert "the client goes on after KeyError('a mistake of the user')" in log
-    assert "Traceback" in log
+    assert "KeyError('a mistake of the user')" in log and "Traceback" in log
 
 
-def test_a_function_of_the_client_cannot_wait_for_it() -> None:
+def outcome(call: Callable[[], object], outcomes: list[str]) -> None:
+    """Append the reason why a call is refused."""
+    try:
+        call()
+    except ClientError as error:
+        outcomes.append(str(error))
+
+
+def test_a_function_of_the_client_cannot_wait_for_it():
     refusals: list[str] = []
-
-    def note(call: Callable[[], object]) -> None:
-        try:
-            call()
-        except ClientError as error:
-            refusals.append(str(error))
 
     with peer("graph_node") as me, SceneGraphClient() as client:
         called = threading.Event()
         me.node.create_service(Trigger, "~/save", lambda request, response: response)
-        client.on_message(lambda message: note(lambda: client.wait(2)))
-        client.on_change(lambda now, changes: note(client.save))
-        client.on_change(lambda now, changes: note(lambda: client.goal_near("cup")))
+        client.on_message(lambda message: outcome(lambda: client.wait(2), refusals))
+        client.on_change(lambda now, changes: outcome(client.save, refusals))
+        client.on_change(lambda now, changes: outcome(lambda: client.goal_near("cup"), refusals))
         client.on_change(lambda now, changes: refusals.append(f"{len(client.graph)} object"))
         client.on_change(lambda now, changes: called.set())
         Robot(me).latch(graph(1, "cup"))
@@ -173,17 +155,11 @@ def test_a_function_of_the_client_cannot_wait_for_it() -> None:
     assert all("call this from another thread" in refusal for refusal in refusals)
 
 
-def test_closing_a_client_ends_those_who_wait_for_it() -> None:
-    errors: list[BaseException] = []
+def test_closing_a_client_ends_those_who_wait_for_it():
+    errors: list[str] = []
     closed = threading.Event()
 
-    def wait(call: Callable[[], object]) -> None:
-        try:
-            call()
-        except BaseException as error:
-            errors.append(error)
-
-    def answer(request: object, response: Trigger.Response) -> Trigger.Response:
+    def answer(request, response):
         client.close()
         closed.set()
         return response
@@ -191,13 +167,14 @@ def test_closing_a_client_ends_those_who_wait_for_it() -> None:
     with peer("graph_node") as me, SceneGraphClient() as client:
         me.node.create_service(Trigger, "~/save", answer)
         # Waiting for an answer, for a service, and for a graph.
-        calls: list[Callable[[], object]] = [client.save, client.clear, client.wait]
-        threads = [threading.Thread(target=wait, args=(call,), daemon=True) for call in calls]
+        threads = [
+            threading.Thread(target=outcome, args=(call, errors), daemon=True)
+            for call in (client.save, client.clear, client.wait)
+        ]
         for thread in threads:
             thread.start()
         me.spin_until(closed.is_set, LIMIT_S, "the request")
         for thread in threads:
             thread.join(LIMIT_S)
-        wait(client.save)
-    assert [str(error) for error in errors] == ["the client is closed"] * 4
-    assert {type(error) for error in errors} == {ClientError}
+        outcome(client.save, errors)
+    assert errors == ["the client is closed"] * 4

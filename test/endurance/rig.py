@@ -9,13 +9,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from diagnostic_msgs.msg import DiagnosticArray
 from support.nodes import ROOT, Camera, NodeProcess, Peer
 
 from deworldsg_ros.cli.terminal import dds_environment
 from deworldsg_ros.recordings.recording import open_source
 from deworldsg_ros.recordings.source import RawRoleMessage, Role
-from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.wire import messages as wire
 
 NODES = ("segmentation_node", "lifting_node", "relation_node", "graph_node")
@@ -25,19 +23,14 @@ MAP_PERIOD_S = 1.0
 WINDOW_FRAMES = 3
 SILENCE_S = 1.0
 # In the CDR encoding, the stamp of the header is the first field after the four bytes of its kind.
-STAMP = struct.Struct("<iI")
-STAMP_AT = 4
+STAMP, STAMP_AT = struct.Struct("<iI"), 4
 
 
 class Rig:
-    """The nodes and their camera.
-
-    Args:
-        folder: for logs, the map and everything the nodes write.
+    """The nodes and their camera; `folder` is for everything that the nodes write.
 
     Attributes:
         processes: by name.
-        map_path: of graph_node.
         graph: the newest whole graph; None before the first.
         updates: number of updates so far.
         values: newest diagnostics of each node, by its name.
@@ -46,37 +39,31 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         # A domain of its own, and shared memory for images, also outside of pytest.
         os.environ.update(dds_environment())
-        self._folder = folder
-        self.map_path = folder / "room.map"
+        self._folder, self.map_path = folder, folder / "room.map"
+        self.processes: dict[str, NodeProcess] = {}
         self.peer = Peer("endurance")
         self.graph: wire.SceneGraphMessage | None = None
         self.updates = 0
         self.values: dict[str, dict[str, str]] = {}
-        self._texts = self.peer.collect("/scene_graph", 1, latched=True)
+        self._graph_texts = self.peer.collect("/scene_graph", 1, latched=True)
         self._update_texts = self.peer.collect("/scene_graph/updates")
-        self.peer.node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_diagnostics, reliable(50)
-        )
+        self._results = self.peer.collect("deworldsg/local_graph")
+        self._statuses = self.peer.statuses()
         source = open_source(RECORDING)
         self._messages = list(source.raw_messages())
         source.close()
         self._camera = Camera(self.peer, self._messages)
         self._first_ns = self._messages[0].stamp_ns
         self._length_ns = self._messages[-1].stamp_ns - self._first_ns + 10**8
-        self._next = 0
-        self._started_s = self._last_s = 0.0
-        self._results = self.peer.collect("deworldsg/local_graph")
-        self._in_flight = 0
-        self._result_s = 0.0
-        self.processes: dict[str, NodeProcess] = {}
+        self._next = self._in_flight = 0
+        self._started_s = self._last_s = self._result_s = 0.0
 
     def start(self, name: str) -> None:
         """Start a node; does not wait for it."""
-        values = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
-        arguments = [word for key, value in values.items() for word in ("-p", f"{key}:={value}")]
         folder = self._folder / str(time.monotonic_ns())
         folder.mkdir(parents=True)
-        self.processes[name] = NodeProcess(name, folder, "--ros-args", *arguments)
+        parameters = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
+        self.processes[name] = NodeProcess(name, folder, parameters=parameters)
 
     def start_all(self) -> None:
         """Start all nodes and wait until they are ready."""
@@ -93,7 +80,7 @@ class Rig:
         os.kill(process.pid, signal.SIGKILL)
         process.wait(10)
 
-    def run(self, until: Callable[[], bool], limit_s: float) -> bool:
+    def run(self, limit_s: float, until: Callable[[], bool] = lambda: False) -> bool:
         """Publish frames at their pace until a condition is true; False at the limit."""
         end_s = time.monotonic() + limit_s
         while not until():
@@ -127,25 +114,21 @@ class Rig:
             self._next += 1
 
     def _read(self) -> None:
+        """Take what has arrived."""
         self.updates += len(self._update_texts)
-        self._update_texts.clear()
-        if self._results:
-            self._results.clear()
-            # A result also ends the frames before it.
+        if self._results:  # a result also ends the frames before it
             self._in_flight, self._result_s = 0, time.monotonic()
-        if self._texts:
-            self.graph = wire.decode(self._texts[-1], wire.SceneGraphMessage)
-            self._texts.clear()
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            name = status.name.split(":")[0]
-            self.values[name] = {item.key: item.value for item in status.values}
+        if self._graph_texts:
+            self.graph = wire.decode(self._graph_texts[-1], wire.SceneGraphMessage)
+        for status in self._statuses:
+            values = {item.key: item.value for item in status.values}
+            self.values[status.name.split(":")[0]] = values
+        for arrived in (self._update_texts, self._results, self._graph_texts, self._statuses):
+            arrived.clear()
 
 
 def shifted(message: RawRoleMessage, by_ns: int) -> bytes:
     """The serialized message with a later stamp."""
     data = bytearray(message.data)
-    sec, nanosec = divmod(message.stamp_ns + by_ns, 10**9)
-    STAMP.pack_into(data, STAMP_AT, sec, nanosec)
+    STAMP.pack_into(data, STAMP_AT, *divmod(message.stamp_ns + by_ns, 10**9))
     return bytes(data)

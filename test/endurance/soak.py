@@ -12,8 +12,8 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,39 +43,36 @@ FRAMES_PER_UPDATE = 10
 ROOM_DISTANCE_M = 20.0
 
 
-@dataclass
 class Series:
     """A value over time, such as the memory of a process."""
 
-    times_s: list[float] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-
-    def add(self, time_s: float, value: float) -> None:
-        """Add a sample."""
-        self.times_s.append(time_s)
-        self.values.append(value)
+    def __init__(self, samples: Iterable[tuple[float, float]] = ()) -> None:
+        self.samples = list(samples)  # of the time in seconds, and the value
 
     def settled(self, settle_s: float) -> Series:
         """The samples after a time."""
-        first = int(np.searchsorted(self.times_s, settle_s))
-        return Series(self.times_s[first:], self.values[first:])
+        return Series(sample for sample in self.samples if sample[0] >= settle_s)
 
     def slope_per_h(self) -> float:
         """Median slope between samples that are half of the time apart (as Theil and Sen)."""
-        half = len(self.times_s) // 2
-        times_s, values = np.array(self.times_s), np.array(self.values)
+        half = len(self.samples) // 2
         if half < 1:
             return 0.0
-        later, earlier = slice(half, 2 * half), slice(0, half)
-        slopes = (values[later] - values[earlier]) / (times_s[later] - times_s[earlier])
-        return float(3600 * np.median(slopes))
+        samples = np.array(self.samples)
+        times_s, values = (samples[half : 2 * half] - samples[:half]).T
+        return float(3600 * np.median(values / times_s))
+
+    def ends(self) -> tuple[float, float]:
+        """Medians of the first and the last third."""
+        values = [value for _, value in self.samples]
+        third = max(1, len(values) // 3)
+        return float(np.median(values[:third])), float(np.median(values[-third:]))
 
 
 @dataclass(frozen=True)
-class Times:
+class Costs:
     """Cost per frame of the first and the last tenth, by a clock, and the growth of the memory."""
 
-    name: str
     frames: int
     first: float
     last: float
@@ -83,7 +80,6 @@ class Times:
 
     @property
     def slower(self) -> float:
-        """How much slower the last frames are."""
         return self.last / self.first
 
 
@@ -102,72 +98,52 @@ def allocated_mb(pid: int | str = "self") -> float:
 def replay(minutes: float, folder: Path) -> tuple[dict[str, Series], Series]:
     """Memory of each node during an endless replay, and latency of graph_node as a series."""
     rig = Rig(folder)
-    memory = {name: Series() for name in NODES}
-    latencies = Series()
+    memory, latencies = {name: Series() for name in NODES}, Series()
     try:
         rig.start_all()
         started_s = time.monotonic()
-        rig.run(lambda: False, FIRST_PAUSE_S)
+        rig.run(FIRST_PAUSE_S)
         for process in rig.processes.values():
             os.kill(process.pid, signal.SIGSTOP)
             try:
-                rig.run(lambda: False, PAUSE_S)
+                rig.run(PAUSE_S)
             finally:
                 os.kill(process.pid, signal.SIGCONT)
         while (now_s := time.monotonic() - started_s) < 60 * minutes:
             for name, process in rig.processes.items():
                 assert process.alive, process.log[-500:]
-                memory[name].add(now_s, allocated_mb(process.pid))
+                memory[name].samples.append((now_s, allocated_mb(process.pid)))
             latency_ms = rig.values.get("graph_node", {}).get("latency mean ms")
             if latency_ms is not None:
-                latencies.add(now_s, float(latency_ms))
-            next_s = time.monotonic() + SAMPLE_PERIOD_S
-            rig.run(lambda next_s=next_s: time.monotonic() > next_s, 10)  # type: ignore[misc]
+                latencies.samples.append((now_s, float(latency_ms)))
+            rig.run(SAMPLE_PERIOD_S)
     finally:
         rig.close()
     return memory, latencies
 
 
-def room(offset_m: float) -> list[tuple[np.ndarray, int]]:
-    """Objects of a room: a table, a mug on it and a chair."""
+def rooms(count: int, frames: int = ROOM_FRAMES) -> Iterator[LocalGraph]:
+    """Frames of a camera that goes from room to room: a table, a mug on it and a chair in each."""
     shapes = [
-        ((0.0, 0.0, 1.0), (1.2, 0.8, 0.04), TABLE),
-        ((0.2, 0.1, 0.95), (0.08, 0.08, 0.08), CUP),
-        ((1.2, 0.0, 1.0), (0.4, 0.5, 0.4), CHAIR),
+        (slab((0.0, 0.0, 1.0), (1.2, 0.8, 0.04)), TABLE),
+        (slab((0.2, 0.1, 0.95), (0.08, 0.08, 0.08)), CUP),
+        (slab((1.2, 0.0, 1.0), (0.4, 0.5, 0.4)), CHAIR),
     ]
-    shift = np.array([offset_m, 0.0, 0.0], np.float32)
-    return [(slab(centre, size) + shift, kind) for centre, size, kind in shapes]
-
-
-def still(count: int) -> Iterator[LocalGraph]:
-    """Frames of a camera that stands still."""
-    objects = room(0.0)
-    for stamp in range(1, count + 1):
-        yield frame(stamp, *objects)
-
-
-def rooms(count: int) -> Iterator[LocalGraph]:
-    """Frames of a camera that goes from room to room."""
-    stamp = 0
     for number in range(count):
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = ROOM_DISTANCE_M * number
-        objects = room(ROOM_DISTANCE_M * number)
-        for _ in range(ROOM_FRAMES):
-            stamp += 1
-            yield frame(stamp, *objects, T_world_camera=T_world_camera)
+        shift = T_world_camera[:3, 3].astype(np.float32)
+        objects = [(points + shift, kind) for points, kind in shapes]
+        for stamp in range(number * frames, (number + 1) * frames):
+            yield frame(stamp + 1, *objects, T_world_camera=T_world_camera)
 
 
 def merge(
-    name: str,
-    frames: Iterator[LocalGraph],
-    settle: int,
-    clock: Callable[[], float] = time.thread_time,
-) -> Times:
+    frames: Iterator[LocalGraph], settle: int, clock: Callable[[], float] = time.thread_time
+) -> Costs:
     """Merge frames and make updates of the graph; `settle` frames are not measured."""
     builder = GraphBuilder(Config(), VOCABULARY, "world")
-    costs = []
-    before_mb = 0.0
+    costs, before_mb = [], 0.0
     for index, local in enumerate(frames):
         if index == settle:
             before_mb = allocated_mb()
@@ -178,13 +154,36 @@ def merge(
         costs.append(clock() - started)
     measured = np.array(costs[settle:])
     tenth = max(1, len(measured) // 10)
-    return Times(
-        name,
-        len(measured),
-        float(np.median(measured[:tenth])),
-        float(np.median(measured[-tenth:])),
-        allocated_mb() - before_mb,
+    first, last = np.median(measured[:tenth]), np.median(measured[-tenth:])
+    return Costs(len(measured), float(first), float(last), allocated_mb() - before_mb)
+
+
+def problems_of_merging(name: str, costs: Costs) -> Iterator[str]:
+    """What grows; prints the figures."""
+    print(
+        f"{name}: {costs.frames} frames, {1e3 * costs.first:.2f} ms a frame at first, "
+        f"{1e3 * costs.last:.2f} ms at the end; memory grew by {costs.grown_mb:.1f} MB",
+        flush=True,
     )
+    if costs.slower > MAX_SLOWER:
+        yield f"{name}: {costs.slower:.1f} times slower"
+
+
+def problems_of_replay(minutes: float) -> Iterator[str]:
+    """What grows; prints the figures."""
+    with tempfile.TemporaryDirectory() as folder:
+        memory, latencies = replay(minutes, Path(folder))
+    settle_s = min(SETTLE_S, 12 * minutes)
+    for name, series in memory.items():
+        settled = series.settled(settle_s)
+        slope = settled.slope_per_h()
+        print(f"{name}: {settled.samples[-1][1]:.0f} MB, {slope:+.2f} MB an hour")
+        if 60 * minutes >= LEAST_SLOPE_S and slope > MAX_SLOPE_MB_PER_H:
+            yield f"{name} grows by {slope:.2f} MB an hour"
+    first_ms, last_ms = latencies.settled(settle_s).ends()
+    print(f"graph_node: latency {first_ms:.1f} ms at first, {last_ms:.1f} ms at the end")
+    if last_ms > MAX_SLOWER * first_ms + 1.0:
+        yield "the latency of graph_node grows"
 
 
 def main() -> int:
@@ -194,38 +193,12 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=100_000, help="of the still camera")
     parser.add_argument("--rooms", type=int, default=300)
     options = parser.parse_args()
-    problems = []
-    parts: list[Callable[[], Times]] = [
-        lambda: merge("still camera", still(options.frames), settle=1000),
-        lambda: merge("rooms", rooms(options.rooms), settle=10 * ROOM_FRAMES),
+    still, many = rooms(1, options.frames), rooms(options.rooms)
+    problems = [
+        *problems_of_merging("still camera", merge(still, settle=1000)),
+        *problems_of_merging("rooms", merge(many, settle=10 * ROOM_FRAMES)),
+        *(problems_of_replay(options.minutes) if options.minutes else ()),
     ]
-    for part in parts:
-        times = part()
-        print(
-            f"{times.name}: {times.frames} frames, {1e3 * times.first:.2f} ms a frame at first, "
-            f"{1e3 * times.last:.2f} ms at the end; memory grew by {times.grown_mb:.1f} MB",
-            flush=True,
-        )
-        if times.slower > MAX_SLOWER:
-            problems.append(f"{times.name}: {times.slower:.1f} times slower")
-    if options.minutes:
-        with tempfile.TemporaryDirectory() as folder:
-            memory, latencies = replay(options.minutes, Path(folder))
-        settle_s = min(SETTLE_S, 12 * options.minutes)
-        for name, series in memory.items():
-            settled = series.settled(settle_s)
-            slope = settled.slope_per_h()
-            print(f"{name}: {settled.values[-1]:.0f} MB, {slope:+.2f} MB an hour")
-            if 60 * options.minutes >= LEAST_SLOPE_S and slope > MAX_SLOPE_MB_PER_H:
-                problems.append(f"{name} grows by {slope:.2f} MB an hour")
-        settled = latencies.settled(settle_s)
-        third = max(1, len(settled.values) // 3)
-        first_ms, last_ms = (
-            np.median(settled.values[part]) for part in (slice(third), slice(-third, None))
-        )
-        print(f"graph_node: latency {first_ms:.1f} ms at first, {last_ms:.1f} ms at the end")
-        if last_ms > MAX_SLOWER * first_ms + 1.0:
-            problems.append("the latency of graph_node grows")
     for problem in problems:
         print("problem:", problem)
     return 1 if problems else 0

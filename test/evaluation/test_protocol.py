@@ -1,16 +1,13 @@
 """The protocol: the official program's numbers, and its rules one by one on data made here."""
 
-from __future__ import annotations
-
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.evaluation import one_hot, segment, surface, write_dataset, write_json, write_ply
+from support.evaluation import one_hot, segment, write_dataset, write_json
 
 from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
 from deworldsg_ros.evaluation.scoring import (
@@ -28,7 +25,7 @@ LAYOUT_NAMES = {"replica": "replica", "scannet": "3rscan"}
 CASES = ("case_00", "case_01", "case_03", "case_05")
 
 
-def options_of(arguments: list[str]) -> ProtocolOptions:
+def options_of(arguments):
     values = dict(zip(arguments, [*arguments[1:], ""]))
     return ProtocolOptions(
         split=values.get("--split", "test"),
@@ -39,7 +36,7 @@ def options_of(arguments: list[str]) -> ProtocolOptions:
 
 @pytest.mark.parametrize("file_name", ["predictions.json", "predictions.pkl"])
 @pytest.mark.parametrize("case", CASES)
-def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
+def test_official_numbers(shared_dir, case, file_name):
     folder = shared_dir / "data" / "eval_cases" / case
     expected = json.loads((folder / "expected.json").read_text())
     annotations = Annotations(folder, LAYOUT_NAMES[expected["label_categories"]])
@@ -51,22 +48,18 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
         for name in ("object", "predicate", "relationship"):
             assert numbers[f"{name}_recall"] == run[f"{name}_recall@1"]
         for name in ("object", "predicate"):
-            assert numbers[f"{name}_mean_recall"] == pytest.approx(
-                run[f"{name}_mrecall@1"], abs=1e-12
-            )
+            mean = pytest.approx(run[f"{name}_mrecall@1"], abs=1e-12)
+            assert numbers[f"{name}_mean_recall"] == mean
         for counts, key in (
             (result.object_classes, "object_per_class"),
             (result.predicate_classes, "predicate_per_class"),
         ):
-            expected = {name: (item["hits"], item["gt"]) for name, item in run[key].items()}
-            assert {name: tuple(count) for name, count in counts.items()} == expected
+            assert counts == {name: (item["hits"], item["gt"]) for name, item in run[key].items()}
         assert len(result.scans) == len(run["scans"])
         for scan, official in zip(result.scans, run["scans"]):
-            assert scan.scan == official["scan"]
             assert scan.object_ids == official["gt_object_ids"]
-            assert scan.object_ranks == official["object_ranks"]
-            assert scan.predicate_ranks == official["predicate_ranks"]
-            assert scan.relationship_ranks == official["relationship_ranks"]
+            for name in ("scan", "object_ranks", "predicate_ranks", "relationship_ranks"):
+                assert getattr(scan, name) == official[name], name
             matched = [scan.matching.prediction_of.get(number, -1) for number in scan.object_ids]
             assert matched == official["matched_prediction"]
             supports = [
@@ -76,51 +69,24 @@ def test_official_numbers(shared_dir: Path, case: str, file_name: str) -> None:
             assert supports == official["prediction_supports"]
 
 
-# Scores, index, rank: of equals the last comes first, NaN before every number.
-@pytest.mark.parametrize(
-    ("scores", "index", "expected"),
-    [
-        ([], 0, NO_RANK),
-        ([1.0], 0, 0),
-        ([1.0], 5, NO_RANK),
-        ([0.5, 0.5], 0, 1),
-        ([0.5, 0.5], 1, 0),
-        ([0.0, 0.0, 0.0], 2, 0),
-        ([0.0, -0.0], 0, 1),
-        ([math.nan, 9.0], 1, 1),
-        ([math.nan, 9.0], 0, 0),
-        ([math.nan, 9.0, math.nan], 0, 1),
-        ([math.inf, math.nan], 0, 1),
-    ],
-)
-def test_rank(scores: list[float], index: int, expected: int) -> None:
-    assert rank(np.array(scores), index) == expected
-
-
-def test_rank_is_that_of_a_flipped_stable_sort() -> None:
+def test_rank_is_that_of_a_flipped_stable_sort():
+    """Of equals the last comes first, NaN before every number."""
     generator = np.random.default_rng(3)
     for _ in range(50):
-        scores = generator.choice([0.0, 0.25, 1.0, np.nan, np.inf], 12)
+        scores = generator.choice([0.0, -0.0, 0.25, 1.0, np.nan, np.inf], 12)
         order = np.argsort(scores, kind="stable")[::-1]
         assert [rank(scores, index) for index in order] == list(range(12))
+    assert rank(np.array([]), 0) == rank(np.array([1.0]), 5) == NO_RANK
 
 
-def test_triple_rank_takes_every_cell_of_the_table() -> None:
+def test_triple_rank_takes_every_cell_of_the_table():
     generator = np.random.default_rng(4)
     subject, object_, predicate = (generator.choice([0.0, 0.1, 0.3, 0.7], n) for n in (4, 4, 3))
-    table = [
-        (subject[a] * object_[b]) * predicate[k]
-        for a in range(4)
-        for b in range(4)
-        for k in range(3)
-    ]
-    order = list(np.argsort(table, kind="stable")[::-1])
-    for index in range(48):
-        triple = (index // 12, index // 3 % 4, index % 3)
-        assert triple_rank(subject, object_, predicate, triple) == order.index(index)
-
-
-def test_zero_vectors_make_the_last_triple_the_top() -> None:
+    triples = list(np.ndindex(4, 4, 3))
+    table = [(subject[a] * object_[b]) * predicate[k] for a, b, k in triples]
+    for position, index in enumerate(np.argsort(table, kind="stable")[::-1]):
+        assert triple_rank(subject, object_, predicate, triples[index]) == position
+    # Zero vectors make the last triple the top.
     zeros = np.zeros(3)
     assert triple_rank(zeros, zeros, zeros, (2, 2, 2)) == 0
     assert triple_rank(np.ones(3), np.ones(3), zeros, (0, 0, 0)) == 26
@@ -128,63 +94,19 @@ def test_zero_vectors_make_the_last_triple_the_top() -> None:
 
 @pytest.mark.parametrize(
     ("offset", "inside"),
-    [
-        ((0.0, 0.0, 0.1), False),
-        ((0.0, 0.08, 0.06), True),
-        ((0.0, 0.0, 0.1 - 1e-9), True),
-        ((0.0, 0.0, 0.1 + 1e-9), False),
-    ],
+    [((0.0, 0.0, 0.1), False), ((0.0, 0.08, 0.06), True), ((0.0, 0.0, 0.1 - 1e-9), True)],
 )
-def test_a_point_votes_when_strictly_nearer_than_the_threshold(
-    offset: tuple[float, float, float], inside: bool
-) -> None:
+def test_a_point_votes_when_strictly_nearer_than_the_threshold(offset, inside):
     matching = match([7], np.zeros((1, 3)), np.array([7]), [np.array([offset])])
     assert (matching.supports[0] is not None) is inside
-
-
-# Votes for two objects and points that vote for nothing.
-@pytest.mark.parametrize(
-    ("best", "second", "nothing", "kept"),
-    [
-        (0, 0, 0, False),
-        (0, 0, 5, False),
-        (5, 0, 0, True),
-        (5, 0, 5, True),
-        (20, 0, 21, False),
-        (4, 3, 0, True),
-        (12, 9, 1, False),
-        (28, 21, 1, True),
-        (5, 5, 0, False),
-        (5, 4, 0, False),
-    ],
-)
-def test_void_predictions(best: int, second: int, nothing: int, kept: bool) -> None:
-    surface_points = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    points = np.zeros((best + second + nothing, 3))
-    points[best : best + second, 0] = 1.0
-    points[best + second :, 2] = 9.0
-    matching = match([1, 2], surface_points, np.array([1, 2]), [points])
-    assert (matching.supports[0] is not None) is kept
-    assert matching.prediction_of == ({1: 0} if kept else {})
-
-
-def test_points_of_other_ids_are_removed_before_the_search() -> None:
-    surface_points = np.array([[0.0, 0, 0], [0.0, 0, 0.08]])
-    prediction = [np.zeros((3, 3))]
-    ids = np.array([50, 1])
-    assert match([1], surface_points, ids, prediction).prediction_of == {1: 0}
-    matching = match([1, 50], surface_points, ids, prediction)
-    assert matching.prediction_of == {50: 0}
-
-
-def test_most_points_win_and_the_first_of_equals() -> None:
-    segments = [segment(1, 6), segment(1, 8), segment(1, 8)]
-    ids = np.repeat(1, 20)
-    assert match([1], surface(ids), ids, segments).prediction_of == {1: 1}
+    # Points that are not finite do not vote, but count.
+    points = np.array([offset, [np.nan] * 3, [np.nan] * 3])
+    matching = match([7], np.zeros((1, 3)), np.array([7]), [points])
+    assert (matching.supports, matching.skipped_points) == ((None,), 2)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-def test_matching_equals_a_search_over_all_pairs(seed: int) -> None:
+def test_matching_equals_a_search_over_all_pairs(seed):
     generator = np.random.default_rng(seed)
     surface_points = generator.uniform(0, 0.5, (40, 3))
     ids = generator.integers(0, 5, 40)
@@ -193,227 +115,144 @@ def test_matching_equals_a_search_over_all_pairs(seed: int) -> None:
     supports = []
     for points in segments:
         votes = dict.fromkeys(wanted_ids, 0)
-        for x, y, z in points.tolist():
-            listed = [
-                ((x - a) * (x - a) + (y - b) * (y - b) + (z - c) * (z - c), number)
-                for (a, b, c), number in zip(surface_points.tolist(), ids.tolist())
-                if number in wanted_ids
-            ]
-            squared, number = min(listed, default=(1.0, 0))
-            if squared < 0.1 * 0.1:
-                votes[number] += 1
+        for point in points:
+            # Points of other ids are removed before the search.
+            squared = ((surface_points - point) ** 2).sum(axis=1)
+            squared[~np.isin(ids, wanted_ids)] = np.inf
+            if squared.min() < 0.1 * 0.1:
+                votes[ids[squared.argmin()]] += 1
         first, second = sorted(votes.values())[:-3:-1]
         void = not first or first / len(points) < 0.5
         if void or (second / len(points)) / (first / len(points)) > 0.75:
             supports.append(None)
         else:
-            supports.append((max(votes, key=lambda number: votes[number]), first))
+            supports.append((max(votes, key=votes.get), first))
     matching = match(wanted_ids, surface_points, ids, segments)
     assert [s and (s.object_id, s.points) for s in matching.supports] == supports
+    # Most points win, and the first of equals.
     for number in wanted_ids:
         rows = [row for row, support in enumerate(supports) if support and support[0] == number]
         best = max(rows, key=lambda row: supports[row][1], default=None)
         assert matching.prediction_of.get(number) == best
 
 
-def test_points_that_are_not_finite_do_not_vote_but_count() -> None:
-    ids = np.repeat(1, 20)
-    bad = np.full((11, 3), np.nan)
-    matching = match([1], surface(ids), ids, [np.vstack([segment(1), bad])])
-    assert matching.supports == (None,)
-    assert matching.skipped_points == 11
-
-
-def graph(
-    objects: list[tuple[int, int]], edges: list[tuple[int, int, int]], **extra: np.ndarray
-) -> ScanPrediction:
+def graph(objects, edges, predicates=None):
     """Nodes (object id, class) and edges (subject, object, predicate) between indices."""
-    return ScanPrediction(
-        tuple(segment(number) for number, _ in objects),
-        extra.get("classes", np.array([one_hot(c) for _, c in objects]).reshape(-1, 3)),
-        np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2),
-        extra.get("predicates", np.array([one_hot(e[2]) for e in edges]).reshape(-1, 3)),
-    )
+    if predicates is None:
+        predicates = np.array([one_hot(edge[2]) for edge in edges]).reshape(-1, 3)
+    points = tuple(segment(number) for number, _ in objects)
+    classes = np.array([one_hot(index) for _, index in objects]).reshape(-1, 3)
+    pairs = np.array([edge[:2] for edge in edges], np.int64).reshape(-1, 2)
+    return ScanPrediction(points, classes, pairs, predicates)
+
+
+def data_set(root, layout="replica", split_scans=None, **scans):
+    """Annotations of scans, each a list of objects and a list of relations."""
+    return Annotations(write_dataset(root, scans, layout=layout, split_scans=split_scans), layout)
 
 
 # An annotated chair 1 and table 2, and two relations between them.
-ROOM = ([("chair", 1), ("table", 2)], [(1, 2, "near"), (2, 1, "near")])
+OBJECTS = [("chair", 1), ("table", 2)]
+ROOM = (OBJECTS, [(1, 2, "near"), (2, 1, "near")])
+NODES = [(1, 1), (2, 2)]
 
 
 @pytest.mark.parametrize(
-    ("prediction", "object_hits", "predicate_hits", "relationship_hits"),
+    ("nodes", "edges", "hits"),
     [
-        (graph([], []), 0, 0, 0),
-        (graph([(1, 1), (2, 2)], [(0, 1, 0), (1, 0, 0)]), 2, 2, 2),
+        ([], [], (0, 0, 0)),
+        (NODES, [(0, 1, 0), (1, 0, 0)], (2, 2, 2)),
         # Only one direction is predicted.
-        (graph([(1, 1), (2, 2)], [(0, 1, 0)]), 2, 1, 1),
+        (NODES, [(0, 1, 0)], (2, 1, 1)),
         # Wrong classes do not matter to predicates.
-        (graph([(1, 0), (2, 2)], [(0, 1, 0)]), 1, 1, 0),
+        ([(1, 0), (2, 2)], [(0, 1, 0)], (1, 1, 0)),
         # Of a pair predicted twice the first entry counts.
-        (graph([(1, 1), (2, 2)], [(0, 1, 1), (0, 1, 0)]), 2, 0, 0),
+        (NODES, [(0, 1, 1), (0, 1, 0)], (2, 0, 0)),
         # The edge is at a duplicate that was not taken.
-        (graph([(1, 1), (2, 2), (1, 1)], [(2, 1, 0)]), 2, 0, 0),
+        ([*NODES, (1, 1)], [(2, 1, 0)], (2, 0, 0)),
         # An edge to a node that does not exist.
-        (graph([(1, 1), (2, 2)], [(0, 7, 0)]), 2, 0, 0),
+        (NODES, [(0, 7, 0)], (2, 0, 0)),
     ],
 )
-def test_items(
-    tmp_path: Path,
-    prediction: ScanPrediction,
-    object_hits: int,
-    predicate_hits: int,
-    relationship_hits: int,
-) -> None:
-    annotations = Annotations(write_dataset(tmp_path, {"a": ROOM}), "replica")
+@pytest.mark.parametrize("layout", ["replica", "3rscan"])
+def test_items(tmp_path, layout, nodes, edges, hits):
+    prediction = graph(nodes, edges)
+    annotations = data_set(tmp_path, layout, a=ROOM)
     result = evaluate_predictions(annotations, {"a": prediction, "other": prediction})
-    assert result.objects == (object_hits, 2)
-    assert result.predicates == (predicate_hits, 2)
-    assert result.relationships == (relationship_hits, 2)
+    assert (result.objects, result.predicates, result.relationships) == tuple(
+        (hit, 2) for hit in hits
+    )
 
 
-def test_zero_predicate_vector_is_right_for_the_last_predicate_and_no_relationship(
-    tmp_path: Path,
-) -> None:
-    content = ([("chair", 1), ("table", 2)], [(1, 2, "under")])
-    annotations = Annotations(write_dataset(tmp_path, {"a": content}), "replica")
-    prediction = graph([(1, 1), (2, 2)], [(0, 1, 0)], predicates=np.zeros((1, 3)))
+def test_a_zero_predicate_vector_is_right_for_the_last_predicate_and_no_relationship(tmp_path):
+    annotations = data_set(tmp_path, a=(OBJECTS, [(1, 2, "under")]))
+    prediction = graph(NODES, [(0, 1, 0)], np.zeros((1, 3)))
     result = evaluate_predictions(annotations, {"a": prediction})
     assert (result.predicates, result.relationships) == ((1, 1), (0, 1))
 
 
-def test_every_relation_line_is_an_item_and_a_self_relation_needs_a_loop(tmp_path: Path) -> None:
+def test_every_relation_line_is_an_item_and_a_self_relation_needs_a_loop(tmp_path):
     lines = [(1, 2, "near"), (1, 2, "near"), (1, 2, "on"), (1, 1, "on")]
-    annotations = Annotations(
-        write_dataset(tmp_path, {"a": ([("chair", 1), ("table", 2)], lines)}), "replica"
-    )
-    prediction = graph([(1, 1), (2, 2)], [(0, 1, 0), (0, 0, 1)])
-    result = evaluate_predictions(annotations, {"a": prediction})
+    annotations = data_set(tmp_path, a=(OBJECTS, lines))
+    result = evaluate_predictions(annotations, {"a": graph(NODES, [(0, 1, 0), (0, 0, 1)])})
     assert result.predicates == (3, 4)
     assert result.predicate_classes == {"near": (2, 2), "on": (1, 2)}
 
 
-def test_items_are_pooled_and_absent_predictions_count(tmp_path: Path) -> None:
-    scans = {"a": ROOM, "b": ([("chair", 1)] * 1 + [("book", 4), ("book", 5)], [])}
-    annotations = Annotations(write_dataset(tmp_path, scans), "replica")
-    result = evaluate_predictions(annotations, {"a": graph([(1, 1), (2, 2)], [])})
+def test_items_are_pooled_and_absent_predictions_count(tmp_path):
+    annotations = data_set(tmp_path, a=ROOM, b=([("chair", 1), ("book", 4), ("book", 5)], []))
+    result = evaluate_predictions(annotations, {"a": graph(NODES, [])})
     assert result.objects == (2, 5)
     assert result.object_mean_recall == pytest.approx((0 + 0.5 + 1) / 3)
     assert any("b has no prediction" in note for note in result.notes)
+    # A scan that is listed twice is evaluated twice.
+    twice = data_set(tmp_path / "twice", split_scans=["a", " a ", ""], a=ROOM)
+    assert evaluate_predictions(twice, {}).objects == (0, 4)
 
 
-def test_a_scan_written_twice_is_evaluated_twice(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM}, split_scans=["a", " a ", ""])
-    result = evaluate_predictions(Annotations(root, "replica"), {})
-    assert result.objects == (0, 4)
-
-
-def test_skipped_objects_follow_the_last_relation_entry(
-    tmp_path: Path,
-) -> None:
-    objects = [("chair", 1), ("table", 2), ("book", 3)]
-    root = write_dataset(tmp_path, {"a": (objects, [])})
+def test_skipped_objects_follow_the_last_relation_entry(tmp_path):
+    annotations = data_set(tmp_path, a=([*OBJECTS, ("book", 3)], []))
     entries = [[[1, 2, 0, "near"], [3, 2, 0, "on"]], [[1, 2, 0, "on"]]]
-    write_json(
-        root / "ReplicaSSG/relationships.json",
-        {"scans": [{"scan": "a", "relationships": entry} for entry in entries]},
-    )
-    annotations = Annotations(root, "replica")
+    listed = [{"scan": "a", "relationships": entry} for entry in entries]
+    write_json(tmp_path / "ReplicaSSG/relationships.json", {"scans": listed})
+    annotations = Annotations(tmp_path, "replica")
     assert evaluate_predictions(annotations, {}).objects == (0, 3)
     skipping = evaluate_predictions(annotations, {}, ProtocolOptions(skip_no_rel_objects=True))
     assert skipping.objects == (0, 2)
     # The relations of all entries count in both, also one whose end was skipped.
     assert skipping.predicates == (0, 3)
-    scan = annotations.scan("a")
-    assert scan.related_ids == {1, 2}
+    assert annotations.scan("a").related_ids == {1, 2}
 
 
-def test_labels_ids_and_entries(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM})
+def test_labels_ids_and_entries(tmp_path):
+    data_set(tmp_path, a=ROOM)
+    last = {"wall": "8", "never heard": "7", "table": "2", "chair": "30"}
     listed = [
-        {"scan": "a", "objects": [{"label": "book", "id": "9"}]},
-        {
-            "scan": "a",
-            "objects": [
-                {"label": "wall", "id": "8"},
-                {"label": "never heard", "id": "7"},
-                {"label": "table", "id": "2"},
-                {"label": "chair", "id": "30"},
-            ],
-        },
+        {"scan": "a", "objects": [{"label": label, "id": id_} for label, id_ in entry.items()]}
+        for entry in ({"book": "9"}, last)
     ]
-    write_json(root / "ReplicaSSG/objects.json", {"scans": listed})
-    annotations = Annotations(root, "replica")
+    write_json(tmp_path / "ReplicaSSG/objects.json", {"scans": listed})
+    annotations = Annotations(tmp_path, "replica")
     # The last entry stands; an object without a point in the PLY stays in the denominator.
     assert annotations.scan("a").objects == {2: 2, 30: 1}
     assert evaluate_predictions(annotations, {}).objects == (0, 2)
 
 
-@pytest.mark.parametrize("layout", ["replica", "3rscan"])
-def test_both_layouts(tmp_path: Path, layout: str) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM}, layout=layout)
-    prediction = graph([(1, 1), (2, 2)], [(0, 1, 0)])
-    result = evaluate_predictions(Annotations(root, layout), {"a": prediction})
-    assert (result.objects, result.relationships) == ((2, 2), (1, 2))
-
-
-def test_input_on_which_the_official_program_stops(tmp_path: Path) -> None:
-    scans = {
-        "none": ([("wall", 1)], []),
-        "one": ([("chair", 1)], [(1, 6, "near"), (1, 1, "never heard")]),
-    }
-    annotations = Annotations(write_dataset(tmp_path, scans), "replica")
+def test_input_on_which_the_official_program_stops(tmp_path):
+    one = ([("chair", 1)], [(1, 6, "near"), (1, 1, "never heard")])
+    annotations = data_set(tmp_path, none=([("wall", 1)], []), one=one)
     prediction = graph([(1, 1)], [(0, 0, 0)])
     result = evaluate_predictions(annotations, {"none": prediction, "one": prediction})
     assert (result.objects, result.predicates) == ((1, 1), (0, 2))
     assert sum("never" in note for note in result.notes) == 2
-    empty = Annotations(write_dataset(tmp_path / "e", {"a": ([("chair", 1)], [])}), "replica")
+    empty = data_set(tmp_path / "e", a=([("chair", 1)], []))
     assert math.isnan(evaluate_predictions(empty, {}).predicates.recall)
 
 
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("dtype", ["float", "double"])
-def test_ply_flavours(tmp_path: Path, form: str, dtype: str) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM})
-    points = np.random.default_rng(0).normal(size=(5, 3))
-    ids = np.array([1, 1, 2, 65535, 0])
-    write_ply(root / "data/a/labels.instances.annotated.v2.ply", points, ids, form, dtype)
-    read = Annotations(root, "replica").points("a")
-    expected = points.astype(np.float32).astype(np.float64) if dtype == "float" else points
-    assert (read.points_world == expected).all()
-    assert (read.object_ids == ids).all()
-
-
-@pytest.mark.parametrize(
-    ("content", "expected"),
-    [
-        (b"", "no PLY file"),
-        (b"ply\nformat ascii 1.0\nend_header\n", "element vertex"),
-        (b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "y, z"),
-        (b"ply\nformat strange 1.0\nend_header\n", "not understood"),
-    ],
-)
-def test_a_bad_ply_is_named(tmp_path: Path, content: bytes, expected: str) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM})
-    path = root / "data/a/labels.instances.annotated.v2.ply"
-    path.write_bytes(content)
-    with pytest.raises(RecordingError, match=expected):
-        Annotations(root, "replica").points("a")
-
-
-def test_a_cut_ply_is_named(tmp_path: Path) -> None:
-    root = write_dataset(tmp_path, {"a": ROOM})
-    path = root / "data/a/labels.instances.annotated.v2.ply"
-    for form in ("ascii", "binary_big_endian"):
-        write_ply(path, np.zeros((9, 3)), np.ones(9, int), form)
-        path.write_bytes(path.read_bytes()[:-40])
-        with pytest.raises(RecordingError, match="of 9 rows of the element vertex"):
-            Annotations(root, "replica").points("a")
-
-
-def test_a_missing_file_is_reported_with_its_source(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_with_its_source(tmp_path):
     with pytest.raises(RecordingError, match=r"replica_to_visual_genome\.json is missing.*Replica"):
         Annotations(tmp_path, "replica")
-    root = write_dataset(tmp_path, {"a": ROOM})
-    (root / "data/a/labels.instances.annotated.v2.ply").unlink()
+    annotations = data_set(tmp_path, a=ROOM)
+    (tmp_path / "data/a/labels.instances.annotated.v2.ply").unlink()
     with pytest.raises(RecordingError, match=r"annotated\.v2\.ply is missing"):
-        evaluate_predictions(Annotations(root, "replica"), {})
+        evaluate_predictions(annotations, {})

@@ -1,7 +1,5 @@
 """Switches and flips, counted on made-up streams of updates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,137 +9,113 @@ from deworldsg_ros.wire import messages as wire
 ZERO = wire.stamp_from_ns(0)
 
 
-def node(node_id: int, label: str = "cup") -> wire.NodeState:
+def node(node_id, label="cup"):
     belief = [wire.Belief(label, 1.0)]
     return wire.NodeState(node_id, label, belief, [0.0] * 3, [0.0] * 9, 1, ZERO, ZERO)
 
 
-def edge(subject: int, object_: int, predicate: str = "on") -> wire.EdgeState:
+def edge(subject, object_, predicate="on"):
     belief = [wire.Belief(predicate, 1.0)]
     return wire.EdgeState(subject, object_, predicate, 1.0, belief, "visual", 0.0, 1)
 
 
-def stream(*parts: dict) -> list[wire.SceneGraphUpdateMessage]:  # type: ignore[type-arg]
-    """One update a second; `at` gives the associations of its frame."""
-    updates = []
-    for number, part in enumerate(parts, start=1):
-        stamp = wire.stamp_from_ns(number * 10**9)
-        nodes = part.pop("at", None)
-        updates.append(
-            wire.SceneGraphUpdateMessage(
-                schema=wire.schema_of(wire.SceneGraphUpdateMessage),
-                stamp=stamp,
-                frame_id="map",
-                sequence=number,
-                associations=[] if nodes is None else [wire.Association(stamp, nodes)],
-                **{"removed_nodes": [], "removed_edges": [], "nodes": [], "edges": [], **part},
-            )
-        )
-    return updates
+def update(number, at=None, removed_nodes=(), removed_edges=(), nodes=(), edges=()):
+    """The update of a second; `at` gives the associations of its frame."""
+    stamp = wire.stamp_from_ns(number * 10**9)
+    return wire.SceneGraphUpdateMessage(
+        schema=wire.schema_of(wire.SceneGraphUpdateMessage),
+        stamp=stamp,
+        frame_id="map",
+        sequence=number,
+        associations=[] if at is None else [wire.Association(stamp, at)],
+        removed_nodes=[wire.RemovedNode(*item) for item in removed_nodes],
+        removed_edges=[wire.RemovedEdge(*item) for item in removed_edges],
+        nodes=list(nodes),
+        edges=list(edges),
+    )
 
 
-def truth(*frames: list[int]) -> dict[int, list[int]]:
-    return {number * 10**9: frame for number, frame in enumerate(frames, start=1)}
+def measure(*parts, truth=None):
+    """The quality of one update a second; `truth` lists the true objects of each."""
+    updates = [update(number, **part) for number, part in enumerate(parts, start=1)]
+    if truth is not None:
+        truth = {number * 10**9: objects for number, objects in enumerate(truth, start=1)}
+    return measure_stream(updates, truth)
 
 
-def test_an_empty_stream_has_nothing_and_no_rates() -> None:
-    quality = measure_stream([])
-    assert (quality.duration_s, quality.updates, quality.label_flips) == (0.0, 0, 0)
-    assert quality.per_minute(3) is None
-    assert quality.numbers()["id_switches_per_minute"] is None
-
-
-def test_a_stable_graph_has_no_switches_and_no_flips() -> None:
-    steady = {"nodes": [node(1), node(2, "table")], "edges": [edge(1, 2)]}
-    updates = stream(*({**steady, "at": [1, 2]} for _ in range(4)))
-    quality = measure_stream(updates, truth(*[[10, 20]] * 4))
+def test_a_stable_graph_has_no_switches_and_no_flips():
+    steady = {"nodes": [node(1), node(2, "table")], "edges": [edge(1, 2)], "at": [1, 2]}
+    quality = measure(*[steady] * 4, truth=[[10, 20]] * 4)
     assert quality.duration_s == 3.0
     assert (quality.associations, quality.id_switches) == (8, 0)
     assert (quality.label_flips, quality.edge_flips, quality.merges, quality.removals) == (0,) * 4
+    # An empty stream has no rates.
+    assert measure().numbers()["id_switches_per_minute"] is None
 
 
-def test_without_ground_truth_switches_are_unknown() -> None:
-    updates = stream({"at": [1]}, {"at": [2]})
-    assert measure_stream(updates).id_switches is None
-    assert measure_stream(updates, {}).id_switches == 0
-
-
-def test_another_node_is_a_switch_each_time() -> None:
-    updates = stream(*({"at": [node_id]} for node_id in (1, 2, 2, 1)))
-    quality = measure_stream(updates, truth([7], [7], [7], [7]))
-    assert quality.id_switches == 2
-    assert quality.per_minute(quality.id_switches) == pytest.approx(40.0)
-
-
-def test_a_merge_is_not_a_switch() -> None:
-    merged = [wire.RemovedNode(2, 1)]
-    updates = stream({"nodes": [node(1), node(2)], "at": [2]}, {"removed_nodes": merged, "at": [1]})
-    quality = measure_stream(updates, truth([7], [7]))
-    assert (quality.id_switches, quality.merges, quality.removals) == (0, 1, 0)
-
-
-def test_a_node_that_is_removed_and_created_again_is_a_switch() -> None:
-    updates = stream(
-        {"nodes": [node(1)], "at": [1]},
-        {"removed_nodes": [wire.RemovedNode(1)]},
-        {"nodes": [node(2)], "at": [2]},
-    )
-    quality = measure_stream(updates, truth([7], [], [7]))
-    assert (quality.id_switches, quality.removals) == (1, 1)
-
-
-def test_detections_without_a_true_object_or_node_are_left_out() -> None:
-    updates = stream({"at": [1, 5]}, {"at": [0, 6]}, {"at": [1, 7]})
-    quality = measure_stream(updates, truth([7, 0], [7, 0], [7, 0]))
-    assert (quality.associations, quality.id_switches) == (2, 0)
-
-
-def test_unpublished_nodes_do_not_count_as_removed() -> None:
-    quality = measure_stream(stream({"removed_nodes": [wire.RemovedNode(9)]}))
-    assert quality.removals == 0
-
-
-def test_labels_that_change_are_flips() -> None:
-    labels = ("cup", "cup", "bowl", "cup")
-    quality = measure_stream(stream(*({"nodes": [node(1, label)]} for label in labels)))
-    assert quality.label_flips == 2
-
-
-def test_a_node_that_is_published_again_has_no_label_flip() -> None:
-    gone = {"removed_nodes": [wire.RemovedNode(1)]}
-    quality = measure_stream(stream({"nodes": [node(1)]}, gone, {"nodes": [node(1, "bowl")]}))
-    assert (quality.label_flips, quality.removals) == (0, 1)
-
-
-REMOVED = {"removed_edges": [wire.RemovedEdge(1, 2)]}
+BOTH = {"nodes": [node(1), node(2)], "at": [2]}
+MERGED, GONE = {"removed_nodes": [(2, 1)], "at": [1]}, {"removed_nodes": [(1,)]}
 
 
 @pytest.mark.parametrize(
-    ("parts", "flips"),
+    ("parts", "truth", "associations", "switches"),
     [
-        ([{"edges": [edge(1, 2)]}, {"edges": [edge(1, 2)]}], 0),
-        ([{"edges": [edge(1, 2)]}, {"edges": [edge(1, 2, "near")]}], 1),
-        ([{"edges": [edge(1, 2)]}, {**REMOVED, "edges": [edge(2, 1)]}], 1),
-        ([{"edges": [edge(1, 2)]}, REMOVED, {"edges": [edge(1, 2)]}], 0),
-        ([{"edges": [edge(1, 2)]}, REMOVED, {"edges": [edge(1, 2, "near")]}], 1),
-        ([{"edges": [edge(1, 2)]}, {"edges": [edge(1, 3, "near")]}], 0),
-        ([REMOVED], 0),
+        # Without ground truth switches are unknown.
+        ([{"at": [1]}, {"at": [2]}], None, 0, None),
+        ([{"at": [1]}, {"at": [2]}], [], 0, 0),
+        # Another node is a switch each time.
+        ([{"at": [1]}, {"at": [2]}, {"at": [2]}, {"at": [1]}], [[7]] * 4, 4, 2),
+        # A merge is not a switch, but a node that is removed and created again is one.
+        ([BOTH, MERGED], [[7]] * 2, 2, 0),
+        ([{"at": [1], "nodes": [node(1)]}, GONE, {"at": [2]}], [[7], [], [7]], 2, 1),
+        # Detections without a true object or node are left out.
+        ([{"at": [1, 5]}, {"at": [0, 6]}, {"at": [1, 7]}], [[7, 0]] * 3, 2, 0),
     ],
 )
-def test_edges_that_change_are_flips(parts: list[dict], flips: int) -> None:  # type: ignore[type-arg]
-    quality = measure_stream(stream(*(dict(part) for part in parts)))
-    assert quality.edge_flips == flips
+def test_switches(parts, truth, associations, switches):
+    quality = measure(*parts, truth=truth)
+    assert quality.id_switches == switches
+    if truth:
+        assert quality.associations == associations
+    if len(parts) == 4:
+        assert quality.per_minute(quality.id_switches) == pytest.approx(40.0)
 
 
-def test_different_numbers_of_rows_and_associations_are_an_error() -> None:
-    with pytest.raises(ValueError, match="2 true objects and 1 associations"):
-        measure_stream(stream({"at": [1]}), truth([7, 8]))
+STATED, REMOVED = {"edges": [edge(1, 2)]}, {"removed_edges": [(1, 2)]}
+LABELS = [{"nodes": [node(1, label)]} for label in ("cup", "cup", "bowl", "cup")]
 
 
-def test_the_true_object_covers_most_pixels_of_the_detection() -> None:
+@pytest.mark.parametrize(
+    ("parts", "counts"),
+    [
+        # Merges and removals. Unpublished nodes do not count as removed.
+        ([BOTH, MERGED], (1, 0, 0, 0)),
+        ([GONE], (0, 0, 0, 0)),
+        # Labels that change are flips, unless the node was published again.
+        (LABELS, (0, 0, 2, 0)),
+        ([LABELS[0], GONE, LABELS[2]], (0, 1, 0, 0)),
+        # Edges that change are flips, too.
+        ([STATED, STATED], (0, 0, 0, 0)),
+        ([STATED, {"edges": [edge(1, 2, "near")]}], (0, 0, 0, 1)),
+        ([STATED, {**REMOVED, "edges": [edge(2, 1)]}], (0, 0, 0, 1)),
+        ([STATED, REMOVED, STATED], (0, 0, 0, 0)),
+        ([STATED, REMOVED, {"edges": [edge(1, 2, "near")]}], (0, 0, 0, 1)),
+        ([STATED, {"edges": [edge(1, 3, "near")]}], (0, 0, 0, 0)),
+        ([REMOVED], (0, 0, 0, 0)),
+    ],
+)
+def test_changes(parts, counts):
+    quality = measure(*parts)
+    flips = quality.label_flips, quality.edge_flips
+    assert (quality.merges, quality.removals, *flips) == counts
+
+
+def test_the_true_object_covers_most_pixels_of_the_detection():
     instances = np.array([[1, 1, 1, 2], [3, 3, 0, 2]], np.uint16)
     shown = np.array([[7, 7, 8, 0], [5, 6, 9, 0]], np.uint16)
     assert true_objects([1, 2, 3, 4], instances, shown) == [7, 0, 5, 0]
     scattered = np.array([[7, 8, 9, 0], [0, 0, 0, 0]], np.uint16)
     assert true_objects([1], instances, scattered) == [0]
     assert true_objects([], instances, shown) == []
+    with pytest.raises(ValueError, match="2 true objects and 1 associations"):
+        measure({"at": [1]}, truth=[[7, 8]])

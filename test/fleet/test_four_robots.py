@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import signal
-import socket
 import subprocess
 import sys
 import time
 from collections import Counter
 from itertools import islice
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -44,7 +41,7 @@ ROUTER = (
 
 
 @pytest.fixture(scope="module")
-def local_graphs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def local_graphs(tmp_path_factory):
     """Local graphs of the shipped recording, a line each: true masks, a tenth of wrong labels."""
     source = open_source(RECORDING)
     annotations = open_annotations(RECORDING, "recording")
@@ -58,45 +55,34 @@ def local_graphs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-class Processes:
-    """Python processes, ended by their own ids."""
+@pytest.fixture
+def start(tmp_path):
+    """Starts Python processes; `start.said` waits for a line."""
+    running = []
+    path = os.pathsep.join([str(ROOT), str(ROOT / "test"), os.environ.get("PYTHONPATH", "")])
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._running: list[subprocess.Popen[str]] = []
-
-    def start(self, name: str, *words: str) -> subprocess.Popen[str]:
-        """Start one, and wait until its first line."""
-        python_path = os.pathsep.join(
-            [str(ROOT), str(ROOT / "test"), os.environ.get("PYTHONPATH", "")]
-        )
-        log = (self._folder / f"{name}.log").open("w")
-        process = subprocess.Popen(
-            [sys.executable, *words],
-            env={**os.environ, "PYTHONPATH": python_path},
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-        )
-        self._running.append(process)
+    def start(*words, said=None):
+        with (tmp_path / f"{len(running)}.log").open("w") as log:
+            process = subprocess.Popen(
+                [sys.executable, *words],
+                env={**os.environ, "PYTHONPATH": path},
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        running.append(process)
+        if said is not None:
+            assert process.stdout.readline() == said
         return process
 
-    def end(self) -> None:
-        """End all of them."""
-        for process in self._running:
-            if process.poll() is None:
-                process.terminate()
-                try:
-                    process.wait(15)
-                except subprocess.TimeoutExpired:
-                    process.kill()
-                    process.wait(5)
+    yield start
+    for process in running:
+        process.kill()
+        process.wait(15)
 
 
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
+def moved(T, places):
+    return places @ T[:3, :3].T + T[:3, 3]
 
 
 def nodes_of_objects(graph: SceneGraph, T_room_graph: np.ndarray) -> Counter[int]:
@@ -109,8 +95,7 @@ def nodes_of_objects(graph: SceneGraph, T_room_graph: np.ndarray) -> Counter[int
     objects = truth["objects"]
     low, high = np.array([one["aabb"] for one in objects]).transpose(1, 0, 2)
     labels = [SPELLINGS.get(one["class"], one["class"]) for one in objects]
-    places = np.array([item.position_m for item in graph]) @ T_room_graph[:3, :3].T
-    places = (places + T_room_graph[:3, 3])[:, None]
+    places = moved(T_room_graph, np.array([item.position_m for item in graph]))[:, None]
     outside_m = np.linalg.norm(np.maximum(0, np.maximum(low - places, places - high)), axis=-1)
     same = np.array([[label == item.label for label in labels] for item in graph])
     costs = np.linalg.norm(places - (low + high) / 2, axis=-1)
@@ -127,124 +112,96 @@ def nodes_of_objects(graph: SceneGraph, T_room_graph: np.ndarray) -> Counter[int
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_four_robots_become_one_graph(local_graphs: Path, tmp_path: Path) -> None:
+def test_four_robots_become_one_graph(local_graphs, tmp_path, endpoint, start):
     pytest.importorskip("zenoh", reason="needs the extra fleet: eclipse-zenoh")
     count = len(local_graphs.read_bytes().splitlines())
     length = 2 * count // 5
     rng = np.random.default_rng(0)
-    port = free_port()
-    endpoint = f"tcp/127.0.0.1:{port}"
-    link = CutLink(port)
-    plans = [
-        Plan(
+    link = CutLink(int(endpoint.rpartition(":")[2]))
+    plans, worlds = {}, {}
+    for index, name in enumerate(("ada", "bert", "carl", "dora")):
+        worlds[name] = rigid_motion(
+            rng.uniform(-30, 30, 3), rng.uniform(-3, 3) * np.array([0, 0, 1.0])
+        )
+        plans[name] = Plan(
             name,
             f"tcp/127.0.0.1:{link.port}" if name == "carl" else endpoint,
             str(local_graphs),
             (index * count // 5, index * count // 5 + length),
             PERIOD_S,
-            rigid_motion(
-                rng.uniform(-30, 30, 3), rng.uniform(-3, 3) * np.array([0, 0, 1.0])
-            ).tolist(),
+            worlds[name].tolist(),
             str(tmp_path / f"{name}.result.json"),
         )
-        for index, name in enumerate(("ada", "bert", "carl", "dora"))
-    ]
-    processes = Processes(tmp_path)
-    started: dict[str, subprocess.Popen[str]] = {}
+    started = []
 
-    def start_robot(plan: Plan) -> None:
-        path = tmp_path / f"{plan.name}.json"
-        path.write_bytes(msgspec.json.encode(plan))
-        started[plan.name] = processes.start(plan.name, "-m", "support.fleet_robot", str(path))
+    def start_robot(name: str) -> None:
+        path = tmp_path / f"{name}.json"
+        path.write_bytes(msgspec.json.encode(plans[name]))
+        started.append(start("-m", "support.fleet_robot", str(path)))
 
-    def start_router() -> subprocess.Popen[str]:
-        router = processes.start("router", "-c", ROUTER, endpoint)
-        assert router.stdout is not None and router.stdout.readline() == "ready\n"
-        return router
-
-    fleet = NodeProcess("fleet_node", tmp_path, "--ros-args", "-p", f"connect:={endpoint}")
-    try:
-        router = start_router()
+    with NodeProcess("fleet_node", tmp_path, parameters={"connect": endpoint}) as fleet:
+        router = start("-c", ROUTER, endpoint, said="ready\n")
         fleet.wait_ready()
-        start_robot(plans[0])
+        start_robot("ada")
         time.sleep(3.0)
-        start_robot(plans[1])
-        start_robot(plans[2])
+        start_robot("bert")
+        start_robot("carl")
         time.sleep(8.0)
         link.is_cut.set()  # carl is cut off
         cut_s = time.monotonic()
         time.sleep(3.0)
-        router.send_signal(signal.SIGKILL)
+        router.kill()
         router.wait(5)
         time.sleep(3.0)
-        start_router()
-        start_robot(plans[3])  # joins late
+        start("-c", ROUTER, endpoint, said="ready\n")
+        start_robot("dora")  # joins late
         time.sleep(max(0.0, CUT_S - (time.monotonic() - cut_s)))
         link.is_cut.clear()
-        for process in started.values():
-            assert process.stdout is not None
+        for process in started:
             assert process.stdout.readline() == "replayed\n"
         with SceneGraphClient("/fleet") as client, peer() as listener:
             robots = listener.collect("/fleet/robots", latched=True)
-            expected = len(started)
 
             def is_settled() -> bool:
-                listener.spin_for(0.2)
                 known = json.loads(robots[-1]) if robots else []
-                return sum(item["located"] for item in known) == expected
+                return sum(item["located"] for item in known) == len(plans)
 
-            end_s = time.monotonic() + 60
-            while not is_settled():
-                assert time.monotonic() < end_s, robots[-1:]
+            listener.spin_until(is_settled, 60.0, "the robots to be located")
             time.sleep(5.0)  # questions and answers in both directions
             whole = client.graph
             status = {item["name"]: item for item in json.loads(robots[-1])}
-        for process in started.values():
+        for process in started:
             process.terminate()
             process.wait(15)
-    finally:
-        fleet.end()
-        processes.end()
-        link.close()
+    link.close()
     results = {
-        plan.name: msgspec.json.decode(Path(plan.result_path).read_bytes(), type=Result)
-        for plan in plans
+        name: msgspec.json.decode((tmp_path / f"{name}.result.json").read_bytes(), type=Result)
+        for name in plans
     }
     # Nothing is lost: the fleet has each robot's last graph.
     assert {name: item["objects"] for name, item in status.items()} == {
         name: len(result.graph.nodes) for name, result in results.items()
     }
-    first = next(plan for plan in plans if status[plan.name]["confidence"] == 1.0)
-    T_room_fleet = invert_pose(np.array(first.T_world_room)) @ invert_pose(
-        np.reshape(status[first.name]["T_fleet_world"], (4, 4))
-    )
-    objects = nodes_of_objects(whole, T_room_fleet)
-    seen = set()
-    for plan in plans:
-        own = SceneGraph(results[plan.name].graph)
-        seen |= nodes_of_objects(own, invert_pose(np.array(plan.T_world_room))).keys()
-        mine = {node.label for node in results[plan.name].part.nodes}
-        assert mine, f"{plan.name} was told nothing"
-        error = (
-            T_room_fleet
-            @ np.reshape(status[plan.name]["T_fleet_world"], (4, 4))
-            @ plan.T_world_room
-        )
-        places = np.array([item.position_m for item in whole]) @ T_room_fleet[:3, :3].T
-        places += T_room_fleet[:3, 3]
-        moved = places @ error[:3, :3].T + error[:3, 3]
-        assert np.abs(moved - places).max() < 0.2, plan.name
-    images = (RECORDING / "demo_room.mcap").stat().st_size / 171 * 4 * length
-    figures = {
-        "nodes": len(whole),
-        "true objects": len(objects),
-        "nodes an object": round(objects.total() / len(objects), 3),
-        "bytes sent": sum(result.sent_bytes for result in results.values()),
-        "bytes of whole graphs": sum(result.whole_bytes for result in results.values()),
-        "bytes of images": int(images),
+    T_fleet_worlds = {
+        name: np.reshape(item["T_fleet_world"], (4, 4)) for name, item in status.items()
     }
-    print(figures)
+    first = next(name for name in plans if status[name]["confidence"] == 1.0)
+    T_room_fleet = invert_pose(worlds[first]) @ invert_pose(T_fleet_worlds[first])
+    places = moved(T_room_fleet, np.array([item.position_m for item in whole]))
+    objects, seen = nodes_of_objects(whole, T_room_fleet), set()
+    for name, result in results.items():
+        seen |= nodes_of_objects(SceneGraph(result.graph), invert_pose(worlds[name])).keys()
+        assert result.part.nodes, f"{name} was told nothing"
+        error = T_room_fleet @ T_fleet_worlds[name] @ worlds[name]
+        assert np.abs(moved(error, places) - places).max() < 0.2, name
+    sent = sum(result.sent_bytes for result in results.values())
+    of_whole_graphs = sum(result.whole_bytes for result in results.values())
+    of_images = (RECORDING / "demo_room.mcap").stat().st_size / 171 * len(plans) * length
+    print(
+        f"{len(whole)} nodes of {len(objects)} objects; {sent} bytes were sent, of whole graphs it "
+        f"were {of_whole_graphs}, of images {of_images:.0f}"
+    )
     assert len(objects) >= 0.95 * len(seen)
     assert objects.total() <= MOST_NODES_PER_OBJECT * len(objects)
-    assert figures["bytes sent"] < 0.5 * figures["bytes of whole graphs"]
-    assert figures["bytes sent"] < 0.1 * figures["bytes of images"]
+    assert sent < 0.5 * of_whole_graphs
+    assert sent < 0.1 * of_images

@@ -1,92 +1,76 @@
-"""Feeds and followers over a real Zenoh router, which is ended and started again."""
+"""Feeds and followers over a real Zenoh router; which robots are asked, over an imitated one."""
 
 from __future__ import annotations
 
-import socket
 import time
 import zlib
+from types import SimpleNamespace as Value
 
 import msgspec
 import pytest
 from support.view import make_graph, make_node
 
-from deworldsg_ros.fleet.zenoh_link import Feed, Follower, Robots, open_session, robot_key
+from deworldsg_ros.fleet import zenoh_link
+from deworldsg_ros.fleet.zenoh_link import GONE_S, Feed, Follower, Robots, open_session, robot_key
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import ChangeLog
 
-pytest.importorskip("zenoh", reason="needs the extra fleet: eclipse-zenoh")
 LIMIT_S = 20.0
 
 
-def graph(sequence: int, *labels: str):
+def graph(sequence, *labels):
     nodes = [make_node(i, label) for i, label in enumerate(labels, 1)]
     return msgspec.structs.replace(make_graph(nodes), session="s", sequence=sequence)
 
 
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+def log_of(sequence, *labels):
+    log = ChangeLog()
+    log.set(graph(sequence, *labels))
+    return log
 
 
 @pytest.fixture
-def opened():
+def opened(endpoint):
+    """Opens sessions of a router, which is there at first; `opened.router` ends it."""
+    pytest.importorskip("zenoh", reason="needs the extra fleet: eclipse-zenoh")
     sessions = []
-    yield lambda *args: sessions.append(open_session(*args)) or sessions[-1]
+
+    def opened(connect=endpoint, listen=""):
+        sessions.append(open_session(connect, listen))
+        return sessions[-1]
+
+    opened.router = opened("", endpoint)
+    yield opened
     for session in sessions:
         session.close()
 
 
-def ask_until(follower: Follower, wanted: bool) -> None:
-    """Ask until the graph changed, or until there is an answer."""
+def until(condition):
     end_s = time.monotonic() + LIMIT_S
-    while time.monotonic() < end_s:
-        answer = follower.ask(1.0)
-        if answer or (answer is not None and not wanted):
-            return
+    while not condition():
+        assert time.monotonic() < end_s
         time.sleep(0.1)
-    raise AssertionError("no answer")
 
 
-def test_a_follower_has_the_graph_also_after_the_router_was_away(endpoint: str, opened) -> None:
-    router = opened("", endpoint)
+def test_a_follower_has_the_graph_also_after_the_router_was_away(endpoint, opened):
     log = ChangeLog()
-    feed = Feed(opened(endpoint), robot_key("ada"), log)
-    follower = Follower(opened(endpoint), robot_key("ada"))
-    ask_until(follower, False)  # there is no graph yet
+    feed = Feed(opened(), robot_key("ada"), log)
+    follower = Follower(opened(), robot_key("ada"))
+    until(lambda: follower.ask(1.0) is False)  # there is no graph yet
     log.set(graph(1, "cup", "bowl"))
-    ask_until(follower, True)
+    until(lambda: follower.ask(1.0))
     assert follower.replica.message() == graph(1, "cup", "bowl")
     assert follower.ask(1.0) is False
     assert follower.received_bytes == feed.sent_bytes > 0
 
-    router.close()
+    opened.router.close()
     log.set(graph(2, "cup"))
     log.set(graph(3, "cup", "bowl", "chair"))
     assert follower.ask(0.5) is None
     opened("", endpoint)
-    ask_until(follower, True)
+    until(lambda: follower.ask(1.0))
     assert follower.replica.message() == graph(3, "cup", "bowl", "chair")
-
-
-def test_robots_are_found_and_asked_at_the_same_time(endpoint: str, opened) -> None:
-    opened("", endpoint)
-    robots = Robots(opened(endpoint))
-    assert robots.ask(1.0) == {}
-    feeds = []
-    for name in ("ada", "bob"):
-        log, session = ChangeLog(), opened(endpoint)
-        log.set(graph(1, name))
-        feeds.append(Feed(session, robot_key(name), log))
-        feeds.append(session.liveliness().declare_token(robot_key(name)))
-    end_s = time.monotonic() + LIMIT_S
-    while set(robots.followers) != {"ada", "bob"} and time.monotonic() < end_s:
-        robots.ask(1.0)
-    robots.ask(1.0)
-    labels = {name: item.replica.nodes[1].label for name, item in robots.followers.items()}
-    assert labels == {"ada": "ada", "bob": "bob"}
 
 
 @pytest.mark.parametrize(
@@ -98,26 +82,19 @@ def test_robots_are_found_and_asked_at_the_same_time(endpoint: str, opened) -> N
         (zlib.compress(b"x" * 100)[:-5], "message_too_large"),
     ],
 )
-def test_hostile_answers_are_refused_and_change_nothing(
-    endpoint: str, opened, answer: bytes, reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hostile_answers_are_refused_and_change_nothing(opened, answer, reason, monkeypatch):
     monkeypatch.setattr(wire, "MAX_GRAPH_BYTES", 1_000_000)
-    opened("", endpoint)
-    session = opened(endpoint)
-    session.declare_queryable("k", lambda query: query.reply(query.key_expr, answer))
-    follower = Follower(opened(endpoint), "k")
+    opened().declare_queryable("k", lambda query: query.reply(query.key_expr, answer))
+    follower = Follower(opened(), "k")
     with pytest.raises(RefusedInput) as refused:
-        ask_until(follower, False)
+        until(lambda: follower.ask(1.0) is not None)
     assert refused.value.reason == reason
     assert follower.replica.sequence == 0
 
 
-def test_questions_that_nobody_would_ask_get_the_whole_graph(endpoint: str, opened) -> None:
-    opened("", endpoint)
-    log = ChangeLog()
-    log.set(graph(1, "cup"))
-    feed = Feed(opened(endpoint), "k", log)
-    asker = opened(endpoint)
+def test_questions_that_nobody_would_ask_get_the_whole_graph(opened):
+    feed = Feed(opened(), "k", log_of(1, "cup"))
+    asker = opened()
     time.sleep(0.5)
     for parameters in ("", "since=", "since=-1", "since=1e9;session=s", "since=" + "9" * 400):
         (reply,) = asker.get(f"k?{parameters}", timeout=2.0)
@@ -125,8 +102,109 @@ def test_questions_that_nobody_would_ask_get_the_whole_graph(endpoint: str, open
     assert feed.sent_bytes
 
 
-def test_endpoints_that_cannot_be_used_are_refused_in_one_line(endpoint: str, opened) -> None:
-    opened("", endpoint)
+def test_endpoints_that_cannot_be_used_are_refused_in_one_line(endpoint, opened):
     for connect, listen in (("no endpoint", ""), ("", endpoint)):
         with pytest.raises(ConfigurationError, match="no Zenoh session with connect"):
             opened(connect, listen)
+
+
+class Network:
+    """A Zenoh session: the names of robots that are there, and the logs of those that answer.
+
+    A log may be an exception, which is raised. `asked` has the names of the robots that were asked.
+    """
+
+    def __init__(self):
+        self.tokens, self.logs, self.asked = [], {}, []
+
+    def liveliness(self):
+        replies = [Value(ok=Value(key_expr=robot_key(name))) for name in self.tokens]
+        return Value(get=lambda key, timeout: replies)
+
+    def get(self, selector, timeout):
+        name = selector.partition("?")[0][len(robot_key("")) :]
+        self.asked.append(name)
+        log = self.logs.get(name)
+        if log is None:
+            return []
+        if isinstance(log, Exception):
+            raise log
+        packed = zlib.compress(wire.encode(log.since(None, 0)).encode())
+        return [Value(ok=Value(payload=Value(to_bytes=lambda: packed)))]
+
+
+class Clock:
+    """The clock of the module."""
+
+    now_s = 100.0
+
+    def monotonic(self):
+        return self.now_s
+
+
+@pytest.fixture
+def network():
+    return Network()
+
+
+@pytest.fixture
+def robots(network):
+    return Robots(network)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(zenoh_link, "time", clock)
+    return clock
+
+
+def errors(robots):
+    return [getattr(error, "reason", repr(error)) for error in robots.take_errors()]
+
+
+@pytest.mark.parametrize("name", ["a/b", "", "a?since=0", "**", "ä", "x" * 65, "a\nb"])
+def test_a_name_that_is_none_is_refused_and_not_asked(network, robots, name):
+    network.tokens = [name, "ada"]
+    assert robots.ask(1.0) == {"ada": None}
+    assert network.asked == ["ada"]
+    assert errors(robots) == ["invalid_robot"] and errors(robots) == []
+
+
+def test_robots_that_are_gone_are_forgotten(network, robots, clock):
+    network.tokens = ["ada", "bob", "cat"]
+    network.logs = {"ada": log_of(1, "cup"), "bob": log_of(1, "pot")}
+    assert robots.ask(1.0) == {"ada": True, "bob": True, "cat": None}
+    received = robots.received_bytes
+    assert received > 0
+    network.tokens = ["ada"]
+    del network.logs["ada"]  # it is there, and does not answer
+    clock.now_s += GONE_S  # bob answers, without a token
+    assert set(robots.ask(1.0)) == {"ada", "bob", "cat"}
+    del network.logs["bob"]
+    clock.now_s += GONE_S + 1.0
+    assert set(robots.ask(1.0)) == set(robots.followers) == {"ada"}
+    assert robots.received_bytes > received
+    network.tokens = ["ada", "bob"]
+    network.logs["bob"] = log_of(1, "pot")
+    assert robots.ask(1.0) == {"ada": None, "bob": True}  # its whole graph again
+
+
+def test_the_number_of_robots_is_bounded(network, robots, clock, monkeypatch):
+    monkeypatch.setattr(zenoh_link, "MAX_ROBOTS", 3)
+    network.tokens = ["silent"]
+    robots.ask(1.0)
+    for number in range(5):  # ever new names, one at a time
+        clock.now_s += GONE_S + 1.0
+        network.tokens, network.logs = [f"robot{number}"], {f"robot{number}": log_of(1, "cup")}
+        robots.ask(1.0)
+    assert errors(robots) == ["too_many_robots"] * 2
+    network.tokens, network.logs = ["robot0"], {"robot0": log_of(1, "cup")}
+    assert robots.ask(1.0) == {"robot0": True}  # one that is known may come back
+
+
+def test_a_robot_that_fails_does_not_stop_the_others(network, robots):
+    network.tokens = ["ada", "bob"]
+    network.logs = {"ada": ZeroDivisionError("odd"), "bob": log_of(1, "pot")}
+    assert robots.ask(1.0) == {"ada": None, "bob": True}
+    assert errors(robots) == ["ZeroDivisionError('odd')"]

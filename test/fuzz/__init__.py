@@ -1,5 +1,5 @@
 """One fuzz harness for all that reads data from outside; docs/dev/reliability.md has its figures.
 
-`targets` says what is read, `mutations` damages good files, `worker` runs one case in limits of
-memory and time, `harness` makes cases and keeps those that failed, `corpus/` has all of them.
+`targets` says what is read, `mutations` damages good files, `worker` runs cases in limits of memory
+and time, `harness` keeps those that failed, `corpus/` has all of them.
 """

@@ -8,9 +8,8 @@ import resource
 import sys
 import time
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, RUSAGE_SELF
 
-from fuzz.harness import CORPUS, keep, replay, run_parallel
+from fuzz.harness import CORPUS, keep, run_cases
 from fuzz.targets import TARGETS
 
 
@@ -22,21 +21,16 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=time.time_ns() // 10**9, help="of the cases")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--corpus", type=Path, default=CORPUS, help="folder of failed cases")
-    parser.add_argument("--replay", action="store_true", help="run the cases of the corpus only")
     options = parser.parse_args()
-    if options.replay:
-        report = replay(options.targets, options.corpus)
-        print(report)
-        return 1 if report.failures else 0
     print(f"seed {options.seed}, {len(options.targets)} targets, {options.jobs} processes")
-    report = run_parallel(
+    report = run_cases(
         options.targets, seed=options.seed, jobs=options.jobs, seconds=60 * options.minutes
     )
     for name, count in sorted(report.cases.items()):
         print(f"  {name:24} {count:7}  {1000 * report.seconds[name] / count:7.1f} ms each")
     print(report)
-    peaks = [resource.getrusage(who).ru_maxrss >> 10 for who in (RUSAGE_SELF, RUSAGE_CHILDREN)]
-    print(f"most memory: {peaks[0]} MB here, {peaks[1]} MB in a process of cases")
+    peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss >> 10
+    print(f"most memory: {peak} MB in a process of cases")
     for path in keep(report, options.corpus):
         print(f"kept {path}")
     return 1 if report.failures else 0

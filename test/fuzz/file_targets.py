@@ -5,35 +5,16 @@ from __future__ import annotations
 import dataclasses
 import json
 import pickle
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from support.evaluation import (
-    CLASSES,
-    PREDICATES,
-    segment,
-    write_dataset,
-    write_ply,
-    write_predictions,
-)
+from support import evaluation, sequences
+from support import recordings as camera
 from support.merging import VOCABULARY, random_local_graphs
-from support.recordings import (
-    CAMERA,
-    WORLD,
-    camera_items,
-    depth_mm,
-    encoded,
-    pose,
-    rgb_pixels,
-    stamp_ns,
-    transform,
-    write_bag,
-    write_seven_scenes,
-)
-from support.sequences import write_ground_truth, write_room, write_sequence
+from support.recordings import pose, stamp_ns
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 from support.view import make_edge, make_graph, make_node
 
@@ -50,7 +31,7 @@ from deworldsg_ros.recordings.folders.sequence import read_ground_truth, read_in
 from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.recordings.source import TF_MESSAGE
 from deworldsg_ros.wire import messages as wire
-from fuzz.target import Target
+from fuzz.target import Target, one_file
 
 # --- hypothesis: whole documents -------------------------------------------------------------
 
@@ -61,41 +42,35 @@ _JSON: st.SearchStrategy[Any] = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(_TEXT, inner, max_size=5),
     max_leaves=20,
 )
-
-
-def _encoded(value: Any) -> bytes:
-    return json.dumps(value).encode()
-
-
-JSON_DOCUMENTS = _JSON.map(_encoded)
+JSON_DOCUMENTS = _JSON.map(lambda value: json.dumps(value).encode())
+OPTIONS = {section: sorted(values) for section, values in to_mapping(Config()).items()}
 
 
 @st.composite
 def _configurations(draw: st.DrawFn) -> bytes:
     """Sections and options that exist, with any values."""
-    mapping = to_mapping(Config())
     chosen: dict[str, Any] = {}
     for _ in range(draw(st.integers(1, 4))):
-        section = draw(st.sampled_from(sorted(mapping)))
-        field = draw(st.sampled_from(sorted(mapping[section])) | _TEXT)
+        section = draw(st.sampled_from(sorted(OPTIONS)))
+        field = draw(st.sampled_from(OPTIONS[section]) | _TEXT)
         chosen.setdefault(section, {})[field] = draw(_JSON)
-    return _encoded(draw(st.sampled_from([chosen, {"/**": {"ros__parameters": chosen}}])))
+    as_parameters = {"/**": {"ros__parameters": chosen}}
+    return json.dumps(draw(st.sampled_from([chosen, as_parameters]))).encode()
 
 
 @st.composite
 def _settings(draw: st.DrawFn) -> bytes:
-    mapping = to_mapping(Config())
-    section = draw(st.sampled_from(sorted(mapping)))
-    field = draw(st.sampled_from(sorted(mapping[section])))
-    value = draw(_TEXT | _JSON.map(lambda value: json.dumps(value)))
+    section = draw(st.sampled_from(sorted(OPTIONS)))
+    field = draw(st.sampled_from(OPTIONS[section]))
+    value = draw(_TEXT | _JSON.map(json.dumps))
     return f"{section}.{field}={value}".encode(errors="replace")
 
 
 # --- maps ------------------------------------------------------------------------------------
 
 
-def _map_config(association: str) -> Config:
-    merging = MergingConfig(association=association)  # type: ignore[arg-type]
+def _map_config(association: Any) -> Config:
+    merging = MergingConfig(association=association)
     return Config(merging=merging, output=OutputConfig(min_existence=0.0))
 
 
@@ -106,36 +81,34 @@ def _frames() -> list[Any]:
     return [frame(stamp, *few) for stamp in range(1, 7)]
 
 
-def _write_map(association: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        builder = GraphBuilder(_map_config(association), VOCABULARY, "world")
-        frames = _frames()
-        if association == "paper":
-            frames = random_local_graphs(np.random.default_rng(3), 20)
-        for local in frames:
-            builder.integrate(local)
-        write_map(builder, folder / "room.map")
-
-    return write
+def _write_map(association: str, path: Path) -> None:
+    builder = GraphBuilder(_map_config(association), VOCABULARY, "world")
+    paper = association == "paper"
+    for local in random_local_graphs(np.random.default_rng(3), 20) if paper else _frames():
+        builder.integrate(local)
+    write_map(builder, path)
 
 
-def _read_map(association: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        """Continue as graph_node does: publish, merge frames, publish, save."""
-        builder = read_map(_map_config(association), folder / "room.map")
+def _read_map(association: str, path: Path) -> None:
+    """Continue as graph_node does: publish, merge frames, publish, save."""
+    builder = read_map(_map_config(association), path)
+    builder.update()
+    _check_graph(builder.full())
+    if builder.graph.vocabulary == VOCABULARY and builder.graph.frame_id == "world":
+        newest = int(builder.graph.nodes.last_seen_ns.max(initial=0))
+        for local in _frames()[:3]:
+            stamp = max(newest, 0) + local.stamp_ns
+            builder.integrate(dataclasses.replace(local, stamp_ns=stamp))
         builder.update()
         _check_graph(builder.full())
-        if builder.graph.vocabulary == VOCABULARY and builder.graph.frame_id == "world":
-            newest = int(builder.graph.nodes.last_seen_ns.max(initial=0))
-            for local in _frames()[:3]:
-                stamp = max(newest, 0) + local.stamp_ns
-                builder.integrate(dataclasses.replace(local, stamp_ns=stamp))
-            builder.update()
-            _check_graph(builder.full())
-        write_map(builder, folder.parent / f"{folder.name}.again")
-        read_map(_map_config(association), folder.parent / f"{folder.name}.again")
+    again = path.parents[1] / f"{association}.again"
+    write_map(builder, again)
+    read_map(_map_config(association), again)
 
-    return read
+
+def _map(association: str, weight: int) -> Target:
+    write, read = partial(_write_map, association), partial(_read_map, association)
+    return one_file(f"map_{association}", "room.map", write, read, weight=weight)
 
 
 def _check_graph(message: wire.SceneGraphMessage) -> None:
@@ -165,84 +138,73 @@ def _read_recording(folder: Path) -> None:
     read_ground_truth(source)
 
 
-def _bag(storage: str, with_tf: bool = False) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        items = camera_items(3, compressed=not with_tf, with_pose=not with_tf)
-        if with_tf:
-            items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
-            moving = [
-                ("/tf", TF_MESSAGE, stamp_ns(i), transform(stamp_ns(i), WORLD, CAMERA, pose(i)))
-                for i in range(3)
-            ]
-            items = sorted([*items, *moving], key=lambda item: item[2])
-        write_bag(folder / "bag", items, storage)
+def _write_bag(storage: str, folder: Path) -> None:
+    camera.write_bag(folder / "bag", camera.camera_items(3), storage)
 
-    return write
+
+def _write_bag_with_tf(folder: Path) -> None:
+    items = camera.camera_items(3, compressed=False, with_pose=False)
+    items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
+    for i in range(3):
+        moving = camera.transform(stamp_ns(i), camera.WORLD, camera.CAMERA, pose(i))
+        items.append(("/tf", TF_MESSAGE, stamp_ns(i), moving))
+    camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
 
 
 def _write_tum(folder: Path) -> None:
     sequence = folder / "rgbd_dataset_freiburg1_xyz"
-    sequence.mkdir()
     rows: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for index in range(2):
         stamp = f"{1 + index * 0.1:.4f}"
-        for name, pixels in (("rgb", rgb_pixels(index)), ("depth", depth_mm(index))):
-            (sequence / name).mkdir(exist_ok=True)
-            (sequence / name / f"{stamp}.png").write_bytes(encoded(pixels))
+        for name, pixels in (("rgb", camera.rgb_pixels(index)), ("depth", camera.depth_mm(index))):
+            (sequence / name).mkdir(parents=True, exist_ok=True)
+            (sequence / name / f"{stamp}.png").write_bytes(camera.encoded(pixels))
             rows[name].append(f"{stamp} {name}/{stamp}.png")
         rows["groundtruth"].append(f"{stamp} 0.{index} 0 1 0 0 0 1")
     for name, lines in rows.items():
         (sequence / f"{name}.txt").write_text("# made by a test\n" + "\n".join(lines) + "\n")
 
 
-def _write_rio(folder: Path) -> None:
-    write_sequence(folder / "scan", 2)
-
-
 def _write_rooms(folder: Path) -> None:
-    write_room(folder, 2)
-    write_ground_truth(folder / "data" / "room_0")
+    sequences.write_room(folder, 2)
+    sequences.write_ground_truth(folder / "data" / "room_0")
 
 
 def _write_replica(folder: Path) -> None:
-    write_dataset(folder, {"room_0": ([("chair", 1)], [])})
-    write_sequence(folder / "data" / "room_0", 2)
+    evaluation.write_dataset(folder, {"room_0": ([("chair", 1)], [])})
+    sequences.write_sequence(folder / "data" / "room_0", 2)
 
 
-def _write_annotations(layout: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
-        write_dataset(folder, scans, layout=layout)
-
-    return write
+def _write_annotations(layout: str, folder: Path) -> None:
+    scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
+    evaluation.write_dataset(folder, scans, layout=layout)
 
 
-def _read_annotations(layout: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        annotations = Annotations(folder, layout)
-        annotations.scans("test")
-        for scan in ("a", "b"):
-            annotations.scan(scan)
-            annotations.points(scan)
+def _read_annotations(layout: str, folder: Path) -> None:
+    annotations = Annotations(folder, layout)
+    annotations.scans("test")
+    for scan in ("a", "b"):
+        annotations.scan(scan)
+        annotations.points(scan)
 
-    return read
 
+_ANNOTATIONS = (_write_annotations, _read_annotations)
 
 # --- other files -----------------------------------------------------------------------------
 
 
-def _write_trajectory(folder: Path) -> None:
-    write_tum(folder / "poses.txt", [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)])
+def _write_trajectory(path: Path) -> None:
+    write_tum(path, [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)])
 
 
-def _read_trajectory(folder: Path) -> None:
-    found = read_trajectory(folder / "poses.txt")
+def _write_kitti(path: Path) -> None:
+    np.savetxt(path, [pose(i)[:3].ravel() for i in range(4)], "%.9g")
+
+
+def _read_trajectory(path: Path) -> None:
+    found = read_trajectory(path)
     assert len(found) and np.isfinite(found.T_world_cameras).all()
     found.at(stamp_ns(1) + 5, 1, 1, 10**8)
-
-
-def _write_kitti(folder: Path) -> None:
-    np.savetxt(folder / "poses.txt", [pose(i)[:3].ravel() for i in range(4)], "%.9g")
 
 
 def _write_pose_files(folder: Path) -> None:
@@ -250,57 +212,49 @@ def _write_pose_files(folder: Path) -> None:
         np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
 
 
-def _ply(form: str) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        points = np.random.default_rng(0).random((5, 3))
-        write_ply(folder / "points.ply", points, np.arange(5), form)
-
-    return write
+def _write_ply(form: str, path: Path) -> None:
+    points = np.random.default_rng(0).random((5, 3))
+    evaluation.write_ply(path, points, np.arange(5), form)
 
 
-def _read_ply(folder: Path) -> None:
-    columns = read_vertices(folder / "points.ply", ("x", "y", "z", "objectId"))
+def _read_ply(path: Path) -> None:
+    columns = read_vertices(path, ("x", "y", "z", "objectId"))
     assert len({len(column) for column in columns.values()}) == 1
 
 
-def _prediction() -> ScanPrediction:
-    return ScanPrediction(
-        (segment(1, 3), segment(2, 3)),
-        np.array([[0.1, 0.8, 0.1], [0.2, 0.2, 0.6]]),
-        np.array([[0, 1]]),
-        np.array([[0.7, 0.2, 0.1]]),
-    )
+PREDICTION = ScanPrediction(
+    (evaluation.segment(1, 3), evaluation.segment(2, 3)),
+    np.array([[0.1, 0.8, 0.1], [0.2, 0.2, 0.6]]),
+    np.array([[0, 1]]),
+    np.array([[0.7, 0.2, 0.1]]),
+)
 
 
-def _write_predictions(folder: Path) -> None:
-    predictions = {"a": _prediction(), "b": ScanPrediction.empty(3, 3)}
-    write_predictions(folder / "predictions.json", predictions, len(CLASSES), len(PREDICATES))
+def _write_predictions(path: Path) -> None:
+    predictions = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
+    sizes = len(evaluation.CLASSES), len(evaluation.PREDICATES)
+    evaluation.write_predictions(path, predictions, *sizes)
 
 
-def _write_pickle(protocol: int) -> Callable[[Path], None]:
-    def write(folder: Path) -> None:
-        item = _prediction()
-        graph = {
-            "pcd": [points.astype(np.float32) for points in item.points_world],
-            "cls": [scores.astype(np.float32) for scores in item.class_scores],
-            "edge_index": item.edges.T,
-            "edge_cls": item.edge_scores.astype(np.float32),
-        }
-        (folder / "predictions.pkl").write_bytes(pickle.dumps({"a": graph}, protocol))
-
-    return write
+def _write_pickle(protocol: int, path: Path) -> None:
+    graph = {
+        "pcd": [points.astype(np.float32) for points in PREDICTION.points_world],
+        "cls": [scores.astype(np.float32) for scores in PREDICTION.class_scores],
+        "edge_index": PREDICTION.edges.T,
+        "edge_cls": PREDICTION.edge_scores.astype(np.float32),
+    }
+    path.write_bytes(pickle.dumps({"a": graph}, protocol))
 
 
-def _read_predictions(folder: Path) -> None:
-    path = next(folder.iterdir())
+def _read_predictions(path: Path) -> None:
     for prediction in read_predictions(path).values():
         assert len(prediction.class_scores) == len(prediction)
         assert len(prediction.edges) == len(prediction.edge_scores)
 
 
-def _write_card(folder: Path) -> None:
+def _write_card(path: Path) -> None:
     made = cards.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
-    cards.write_detector_card(folder / cards.DETECTOR_CARD, made)
+    cards.write_detector_card(path, made)
 
 
 def _write_probe_card(folder: Path) -> None:
@@ -315,12 +269,10 @@ def _read_probe_card(folder: Path) -> None:
     str(found.backbone)
 
 
-def _write_headers(folder: Path) -> None:
-    entries = {
-        name: {"dtype": "F32", "shape": [2, 2], "data_offsets": [0, 16]} for name in ("a", "b")
-    }
-    text = json.dumps(entries).encode()
-    (folder / "model.safetensors").write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
+def _write_headers(path: Path) -> None:
+    entry = {"dtype": "F32", "shape": [2, 2], "data_offsets": [0, 16]}
+    text = json.dumps({"a": entry, "b": entry}).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
 
 
 def _write_graph(folder: Path) -> None:
@@ -328,55 +280,64 @@ def _write_graph(folder: Path) -> None:
     graph_files.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
 
 
+def _read_setting(path: Path) -> None:
+    effective_config(None, [path.read_bytes().decode(errors="surrogateescape")])
+
+
 TARGETS: list[Target] = [
-    Target("map_surface", _write_map("surface"), _read_map("surface"), weight=3),
-    Target("map_paper", _write_map("paper"), _read_map("paper"), weight=2),
-    Target(
+    _map("surface", weight=3),
+    _map("paper", weight=2),
+    one_file(
         "config_yaml",
-        lambda folder: (folder / "config.yaml").write_text(to_yaml(Config())),
-        lambda folder: effective_config(folder / "config.yaml"),
+        "config.yaml",
+        lambda path: path.write_text(to_yaml(Config())),
+        effective_config,
         documents=_configurations(),
         weight=2,
     ),
-    Target(
+    one_file(
         "set_option",
-        lambda folder: (folder / "set.txt").write_text("output.rate_hz=2.5"),
-        lambda folder: effective_config(
-            None, [(folder / "set.txt").read_bytes().decode(errors="surrogateescape")]
-        ),
+        "set.txt",
+        lambda path: path.write_text("output.rate_hz=2.5"),
+        _read_setting,
         documents=_settings(),
     ),
-    Target("bag_mcap", _bag("mcap"), _read_recording, weight=2),
-    Target("bag_sqlite", _bag("sqlite3"), _read_recording, weight=2),
-    Target("bag_tf", _bag("mcap", with_tf=True), _read_recording),
+    Target("bag_mcap", partial(_write_bag, "mcap"), _read_recording, weight=2),
+    Target("bag_sqlite", partial(_write_bag, "sqlite3"), _read_recording, weight=2),
+    Target("bag_tf", _write_bag_with_tf, _read_recording),
     Target("tum", _write_tum, _read_recording),
-    Target(
-        "seven_scenes", lambda folder: write_seven_scenes(folder / "seq-01", 2), _read_recording
-    ),
-    Target("scan_3rscan", _write_rio, _read_recording),
+    Target("seven_scenes", lambda at: camera.write_seven_scenes(at / "seq-01", 2), _read_recording),
+    Target("scan_3rscan", lambda at: sequences.write_sequence(at / "scan", 2), _read_recording),
     Target("scan_replica", _write_replica, _read_recording),
     Target("scan_rooms", _write_rooms, _read_recording),
-    Target("annotations_replica", _write_annotations("replica"), _read_annotations("replica")),
-    Target("annotations_3rscan", _write_annotations("3rscan"), _read_annotations("3rscan")),
-    Target("trajectory_tum", _write_trajectory, _read_trajectory),
-    Target("trajectory_kitti", _write_kitti, _read_trajectory),
-    Target("trajectory_folder", _write_pose_files, lambda folder: read_trajectory(folder)),
-    Target("ply_ascii", _ply("ascii"), _read_ply),
-    Target("ply_binary", _ply("binary_little_endian"), _read_ply),
-    Target("predictions_json", _write_predictions, _read_predictions, documents=JSON_DOCUMENTS),
-    Target("predictions_pickle_2", _write_pickle(2), _read_predictions),
-    Target("predictions_pickle_5", _write_pickle(5), _read_predictions),
-    Target(
+    *(
+        Target(f"annotations_{layout}", *(partial(do, layout) for do in _ANNOTATIONS))
+        for layout in ("replica", "3rscan")
+    ),
+    one_file("trajectory_tum", "poses.txt", _write_trajectory, _read_trajectory),
+    one_file("trajectory_kitti", "poses.txt", _write_kitti, _read_trajectory),
+    Target("trajectory_folder", _write_pose_files, read_trajectory),
+    one_file("ply_ascii", "points.ply", partial(_write_ply, "ascii"), _read_ply),
+    one_file("ply_binary", "points.ply", partial(_write_ply, "binary_little_endian"), _read_ply),
+    one_file(
+        "predictions_json",
+        "predictions.json",
+        _write_predictions,
+        _read_predictions,
+        documents=JSON_DOCUMENTS,
+    ),
+    *(
+        one_file(f"predictions_pickle_{number}", "predictions.pkl", write, _read_predictions)
+        for number, write in ((2, partial(_write_pickle, 2)), (5, partial(_write_pickle, 5)))
+    ),
+    one_file(
         "checkpoint_card",
+        cards.DETECTOR_CARD,
         _write_card,
-        lambda folder: cards.read_detector_card(folder / cards.DETECTOR_CARD),
+        cards.read_detector_card,
         documents=JSON_DOCUMENTS,
     ),
     Target("probe_card", _write_probe_card, _read_probe_card, documents=JSON_DOCUMENTS),
-    Target(
-        "safetensors",
-        _write_headers,
-        lambda folder: hub.read_headers(folder / "model.safetensors"),
-    ),
+    one_file("safetensors", "model.safetensors", _write_headers, hub.read_headers),
     Target("scene_graph", _write_graph, graph_files.read_graph, documents=JSON_DOCUMENTS),
 ]

@@ -1,22 +1,25 @@
-"""A reader under test, with good files to start from."""
+"""A reader under test: its good files, and cases made from them."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import hypothesis
 from hypothesis import strategies as st
 
-from deworldsg_ros.scene.errors import DeWorldSGError
+from fuzz.mutations import mutate
 
 
 @dataclass(frozen=True)
 class Target:
     """A reader of data from outside.
 
-    A case replaces the content of one file of the good ones. The reader may accept it or raise one
-    of the documented errors. Everything else is a failure: other exceptions (also AssertionError,
+    A case replaces the content of one file of the good ones. The reader may accept it or raise a
+    DeWorldSGError. Everything else is a failure: other exceptions (also AssertionError,
     for content that should not have been accepted), too much memory or time, a dead process.
 
     Attributes:
@@ -24,8 +27,6 @@ class Target:
         make: writes the good files into an empty folder.
         read: reads the folder, uses what it read as the program does, and asserts what the schema
             promises.
-        errors: documented errors of the reader.
-        files: names of the files that cases damage; empty = all that `make` wrote.
         documents: whole contents of the files as a hypothesis strategy; None = mutations only.
         weight: number of cases in proportion to other targets.
     """
@@ -33,14 +34,55 @@ class Target:
     name: str
     make: Callable[[Path], object]
     read: Callable[[Path], object]
-    errors: tuple[type[Exception], ...] = (DeWorldSGError,)
-    files: tuple[str, ...] = ()
     documents: st.SearchStrategy[bytes] | None = None
     weight: int = 1
 
-    def members(self, folder: Path) -> list[str]:
-        """Names of the files that cases may replace, relative to the folder that `make` filled."""
-        if self.files:
-            return list(self.files)
-        found = (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
-        return sorted(map(str, found))
+    def good_files(self, folder: Path) -> dict[str, bytes]:
+        """Contents of the files that cases may replace, by name; `make` has filled the folder."""
+        paths = sorted(path for path in folder.rglob("*") if path.is_file())
+        return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+
+    def make_cases(
+        self, good: dict[str, bytes], seed: str, count: int, use: Callable[[str, bytes], None]
+    ) -> None:
+        """Give the name and the new content of a file to `use`, `count` times.
+
+        The same seed makes the same cases. Hypothesis makes fewer if it knows no more.
+        """
+        rng = random.Random(f"{self.name} {seed}")
+        names = list(good)
+        # Every third turn.
+        if self.documents is None or rng.randrange(3):
+            for _ in range(count):
+                name = rng.choice(names)
+                use(name, mutate(name, good[name], rng))
+            return
+        name = rng.choice(names)
+
+        @hypothesis.seed(rng.randrange(2**32))
+        @hypothesis.settings(
+            max_examples=count,
+            database=None,
+            deadline=None,
+            derandomize=False,
+            phases=[hypothesis.Phase.generate],
+            suppress_health_check=list(hypothesis.HealthCheck),
+        )
+        @hypothesis.given(self.documents)
+        def each(content: bytes) -> None:
+            use(name, content)
+
+        each()
+
+
+def one_file(
+    name: str,
+    file: str,
+    write: Callable[[Path], object],
+    read: Callable[[Path], object],
+    **options: Any,
+) -> Target:
+    """A target with one file; `write` and `read` get its path."""
+    return Target(
+        name, lambda folder: write(folder / file), lambda folder: read(folder / file), **options
+    )

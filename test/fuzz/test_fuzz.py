@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
-from functools import partial
 
 import pytest
 
-from fuzz.cases import make_cases
-from fuzz.harness import CORPUS, corpus_cases, run_parallel
+from fuzz.harness import CORPUS, corpus_cases, run_cases
 from fuzz.mutations import MAX_CASE_BYTES
 from fuzz.targets import TARGETS
 from fuzz.worker import Worker
 
 
 @pytest.fixture(scope="module")
-def worker() -> Iterator[Worker]:
+def worker():
     one = Worker()
     yield one
     one.close()
@@ -26,9 +23,8 @@ def worker() -> Iterator[Worker]:
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", TARGETS)
 def test_good_files_are_read_and_cases_that_failed_once_no_longer_do(worker, name):
-    assert worker.members(name)
-    for member, content in corpus_cases(name):
-        assert worker.run(name, member, content) is None, member
+    cases = corpus_cases(name)
+    assert list(worker.run(name, cases)) == [None] * len(cases)
 
 
 def test_the_corpus_has_cases_of_known_targets_only():
@@ -36,32 +32,32 @@ def test_the_corpus_has_cases_of_known_targets_only():
 
 
 def test_a_process_that_dies_is_a_failure_and_is_replaced(worker):
-    assert worker.run("set_option", "set.txt", b"output.rate_hz=3") is None
-    os.kill(worker._process.pid, signal.SIGKILL)
-    failure = worker.run("set_option", "set.txt", b"output.rate_hz=3")
+    cases = [("set.txt", b"output.rate_hz=3")]
+    assert list(worker.run("set_option", cases)) == [None]
+    os.kill(worker.process.pid, signal.SIGKILL)
+    (failure,) = worker.run("set_option", cases)
     assert failure is not None and "crash" in failure.text
-    assert worker.run("set_option", "set.txt", b"output.rate_hz=3") is None
+    assert list(worker.run("set_option", cases)) == [None]
 
 
 def test_the_same_seed_makes_the_same_cases_and_none_is_huge():
     target, good = TARGETS["config_yaml"], {"config.yaml": b"a: [1, x]\nb: {c: 2.5}\n" * 50}
-    made: list[list[bytes]] = [[], []]
-    for cases in made:
-        keep = partial(_keep, cases)
+
+    def contents() -> list[bytes]:
+        made: list[bytes] = []
         for turn in range(20):
-            make_cases(target, good, str(turn), 10, keep)
-    assert made[0] == made[1] and len(set(made[0])) > 50
-    assert max(map(len, made[0])) <= MAX_CASE_BYTES
+            target.make_cases(good, str(turn), 10, lambda _, content: made.append(content))
+        return made
 
-
-def _keep(cases: list[bytes], name: str, content: bytes) -> None:
-    cases.append(content)
+    made = contents()
+    assert made == contents() and len(set(made)) > 50
+    assert max(map(len, made)) <= MAX_CASE_BYTES
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("count", [2000, pytest.param(40_000, marks=pytest.mark.nightly)])
 def test_no_case_fails(count):
-    report = run_parallel(TARGETS, seed=1, jobs=min(os.cpu_count() or 1, 4), cases=count)
+    report = run_cases(TARGETS, seed=1, jobs=min(os.cpu_count() or 1, 4), cases=count)
     assert sum(report.cases.values()) >= count
     assert not report.failures, str(report)

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from deworldsg_ros.view.page import content_of
 from deworldsg_ros.wire import codec
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
-from fuzz.target import Target
+from fuzz.target import Target, one_file
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = {
@@ -54,62 +54,49 @@ FRAMES = 6
 EXPORTS = ("graphml", "csv", "ply")
 
 
-@lru_cache
-def _validator(name: str) -> Any:
-    schema = json.loads((ROOT / "msg_schemas" / f"{name}.schema.json").read_text())
-    return jsonschema.Draft202012Validator(schema)
-
-
 def _example(name: str) -> bytes:
     return (ROOT / "msg_schemas" / f"{name}.example.json").read_bytes()
 
 
+SNAPSHOT = SceneGraph(wire.decode(_example("scene_graph"), wire.SceneGraphMessage))
+
+
 def _message(name: str, use: Callable[[Any], object]) -> Target:
     """A kind of message. What `wire.decode` accepts has to fit the committed schema."""
+    schema = json.loads((ROOT / "msg_schemas" / f"{name}.schema.json").read_text())
+    validator = jsonschema.Draft202012Validator(schema)
 
-    def read(folder: Path) -> None:
-        text = (folder / "message.json").read_bytes()
-        message = wire.decode(text, wire.MESSAGES[name])
-        _validator(name).validate(json.loads(wire.encode(message)))
+    def read(path: Path) -> None:
+        message = wire.decode(path.read_bytes(), wire.MESSAGES[name])
+        validator.validate(json.loads(wire.encode(message)))
         use(message)
 
-    def make(folder: Path) -> None:
-        (folder / "message.json").write_bytes(_example(name))
-
-    return Target(f"wire_{name}", make, read, weight=6)
+    write = partial(Path.write_bytes, data=_example(name))
+    return one_file(f"wire_{name}", "message.json", write, read, weight=6)
 
 
-def _rows_are_distributions(rows: np.ndarray) -> bool:
-    return bool((rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4))
-
-
-def _boxes_are_ordered(boxes: np.ndarray) -> bool:
-    return bool((boxes[:, :2] <= boxes[:, 2:]).all())
+def _check_objects(graph: FrameGraph | LocalGraph) -> None:
+    rows, boxes = graph.class_probabilities, graph.boxes_xyxy
+    assert (rows >= 0).all() and np.allclose(rows.sum(axis=1), 1.0, atol=1e-4)
+    assert (boxes[:, :2] <= boxes[:, 2:]).all()
 
 
 def _use_frame_graph(message: wire.FrameGraphMessage) -> None:
     graph: FrameGraph = codec.frame_graph_from_message(message)
-    assert _rows_are_distributions(graph.class_probabilities)
-    assert _boxes_are_ordered(graph.boxes_xyxy)
+    _check_objects(graph)
     assert codec.frame_graph_to_message(graph) is not None
 
 
-def _check_local_graph(local: LocalGraph) -> None:
-    assert _rows_are_distributions(local.class_probabilities)
-    assert _boxes_are_ordered(local.boxes_xyxy)
+def _use_local_graph(message: wire.LocalGraphMessage) -> None:
+    local: LocalGraph = codec.local_graph_from_message(message)
+    _check_objects(local)
     assert len(set(local.instance_ids.tolist())) == len(local)
     assert local.pixel_counts.min(initial=1) >= 1
     rotation = local.T_world_camera[:3, :3]
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-2)
     for covariance in local.covariances_world:
         np.linalg.cholesky(covariance)
-    for subject, object_ in local.relations.pairs.tolist():
-        assert subject != object_
-
-
-def _use_local_graph(message: wire.LocalGraphMessage) -> None:
-    local = codec.local_graph_from_message(message)
-    _check_local_graph(local)
+    assert (local.relations.pairs[:, 0] != local.relations.pairs[:, 1]).all()
     for config in CONFIGS.values():
         builder = GraphBuilder(config, local.vocabulary, local.frame_id)
         builder.integrate(local)
@@ -144,37 +131,25 @@ def _use_snapshot(message: wire.SceneGraphMessage) -> None:
 def _ask_as_a_client(graph: SceneGraph) -> None:
     """Questions are answered, or refused in words."""
     for item in list(graph)[:2]:
-        for question in (
-            lambda item=item: ask(graph, f"anything near {item.label}"),
-            lambda item=item: graph.goal_near(item),
-            lambda item=item: graph.explain(item),
-            lambda item=item: graph.neighbours(item),
-        ):
+        for method in (graph.goal_near, graph.explain, graph.neighbours):
             with suppress(ClientError):
-                question()
-    graph.changes_since(_snapshot())
+                method(item)
+        with suppress(ClientError):
+            ask(graph, f"anything near {item.label}")
+    graph.changes_since(SNAPSHOT)
 
 
 def _combine(message: wire.SceneGraphMessage) -> None:
     """A fleet goes on whatever one of its robots sends."""
     fleet = Fleet()
-    fleet.update("good", _snapshot().message)
+    fleet.update("good", SNAPSHOT.message)
     fleet.combine()
     fleet.update("other", message)
     whole = fleet.combine()
-    assert {node.label for node in _snapshot().message.nodes} <= {
-        item.label for item in whole.nodes
-    }
-    wire.decode(wire.encode(whole), wire.SceneGraphMessage)
-    for name in fleet.members:
-        part = fleet.part_for(name)
+    assert {node.label for node in SNAPSHOT} <= {node.label for node in whole.nodes}
+    for part in (whole, *map(fleet.part_for, fleet.members)):
         if part is not None:
             wire.decode(wire.encode(part), wire.SceneGraphMessage)
-
-
-@lru_cache
-def _snapshot() -> SceneGraph:
-    return SceneGraph(wire.decode(_example("scene_graph"), wire.SceneGraphMessage))
 
 
 def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
@@ -187,41 +162,39 @@ def _use_update(message: wire.SceneGraphUpdateMessage) -> None:
     wire.encode(replica.message())
 
 
-def _write_seed(folder: Path) -> None:
-    (folder / "seed").write_bytes(b"hostile")
+def _seeded(name: str, use: Callable[[np.random.Generator, Path], object]) -> Target:
+    """Something that gets random numbers; the content of the file is their seed."""
+
+    def read(path: Path) -> None:
+        digest = hashlib.sha256(path.read_bytes()).digest()
+        use(np.random.default_rng(int.from_bytes(digest[:8], "little")), path.parent)
+
+    return one_file(name, "seed", partial(Path.write_bytes, data=b"hostile"), read)
 
 
-def _rng_of(folder: Path) -> np.random.Generator:
-    digest = hashlib.sha256((folder / "seed").read_bytes()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+def _use_hostile_frames(config: Config, rng: np.random.Generator, _: Path) -> None:
+    """A graph that gets local graphs of the worst allowed values."""
+    builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
+    stamp_ns = 0
+    for _ in range(FRAMES):
+        stamp_ns = abs(stamp_ns + int(rng.choice([*STEPS_NS, -(10**9), -(10**12)])))
+        stamp_ns = min(stamp_ns, 2**31 * 10**9 - 1)
+        local = hostile_local_graph(rng, stamp_ns)
+        before = state_of(builder)
+        try:
+            builder.integrate(local)
+        except RefusedInput:
+            assert state_of(builder) == before, "a refused local graph changed the graph"
+            continue
+        evidence = hostile_evidence(rng, local)
+        while evidence.pairs.max(initial=0) >= max(len(local), 1):  # of pairs that it contains
+            evidence = hostile_evidence(rng, local)
+        builder.add_evidence(evidence)
+        check_published(builder, replica)
 
 
-def _graph(name: str) -> Target:
-    """A graph that gets local graphs of the worst allowed values; the content is their seed."""
-
-    def read(folder: Path) -> None:
-        rng = _rng_of(folder)
-        builder, replica = GraphBuilder(CONFIGS[name], VOCABULARY, "map"), GraphReplica()
-        stamp_ns = 0
-        for _ in range(FRAMES):
-            stamp_ns = abs(stamp_ns + int(rng.choice([*STEPS_NS, -(10**9), -(10**12)])))
-            stamp_ns = min(stamp_ns, 2**31 * 10**9 - 1)
-            local = hostile_local_graph(rng, stamp_ns)
-            before = state_of(builder)
-            try:
-                builder.integrate(local)
-            except RefusedInput:
-                assert state_of(builder) == before, "a refused local graph changed the graph"
-                continue
-            builder.add_evidence(hostile_evidence_in(rng, local))
-            check_published(builder, replica)
-
-    return Target(f"graph_{name}", _write_seed, read)
-
-
-def _use_hostile_graph(folder: Path) -> None:
+def _use_hostile_graph(rng: np.random.Generator, folder: Path) -> None:
     """A graph of the worst allowed values, in everything that shows or writes graphs."""
-    rng = _rng_of(folder)
     message = hostile_scene_graph(rng)
     _use_snapshot(message)
     _ask_as_a_client(SceneGraph(message))
@@ -238,20 +211,15 @@ def _use_hostile_graph(folder: Path) -> None:
         picture.draw(message, folder / "graph.png")
 
 
-def hostile_evidence_in(rng: np.random.Generator, local: LocalGraph) -> RelationEvidence:
-    """Evidence for pairs that the local graph contains."""
-    while True:
-        evidence = hostile_evidence(rng, local)
-        if not len(evidence.pairs) or evidence.pairs.max() < len(local):
-            return evidence
-
-
 TARGETS: list[Target] = [
     _message("frame_graph", _use_frame_graph),
     _message("local_graph", _use_local_graph),
     _message("relation_evidence", _use_evidence),
     _message("scene_graph", _use_snapshot),
     _message("scene_graph_updates", _use_update),
-    *map(_graph, CONFIGS),
-    Target("clients", _write_seed, _use_hostile_graph),
+    *(
+        _seeded(f"graph_{name}", partial(_use_hostile_frames, config))
+        for name, config in CONFIGS.items()
+    ),
+    _seeded("clients", _use_hostile_graph),
 ]

@@ -133,15 +133,14 @@ def test_the_node_applies_corrections_and_refuses_invalid_ones() -> None:
     from deworldsg_ros.nodes.graph_node import GraphNode
 
     topics = {"deworldsg/local_graph": String, "deworldsg/pose_correction": PoseStamped}
-    at = Bench(GraphNode, topics)
+    with Bench(GraphNode, topics) as at:
 
-    def correct(*args: object) -> None:
-        at.send(deworldsg__pose_correction=pose(at.stamp_ns, *args))
+        def correct(*args: object) -> None:
+            at.send(deworldsg__pose_correction=pose(at.stamp_ns, *args))
 
-    def see() -> None:
-        at.send(deworldsg__local_graph=message_of(at.next_stamp()))
+        def see() -> None:
+            at.send(deworldsg__local_graph=message_of(at.next_stamp()))
 
-    try:
         at.refuses("no_graph", lambda: correct(0.5))
         works(at, see)
         at.refuses("wrong_frame", lambda: correct(0.5, "odom"))
@@ -150,5 +149,3 @@ def test_the_node_applies_corrections_and_refuses_invalid_ones() -> None:
         at.expect(lambda: at.node.more_values().get("pose corrections") == "1", "the correction")
         assert at.node.more_values()["nodes moved by corrections"] == "1"
         works(at, see)
-    finally:
-        at.close()

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from support.gaussians import moments
-from support.merging import random_pose, seeds
+from support.merging import moments, random_pose, seeds
 from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
 
 from deworldsg_ros.graph.nodes import NodeTable

@@ -8,14 +8,13 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import CameraInfo, Image
+from support.nodes import peer
+from support.nodes_bench import stamped
 
 from deworldsg_ros.doctor import find
 from deworldsg_ros.ros.observing import observe_nodes
 from deworldsg_ros.ros.qos import best_effort, reliable
-from deworldsg_ros.streams.poses import set_stamp
 
 VALUES = {
     "received rgb": "9.8 per second, 100 in total",
@@ -32,58 +31,44 @@ VALUES = {
 
 
 @pytest.fixture
-def context():
-    context = Context()
-    rclpy.init(context=context)
-    yield context
-    rclpy.try_shutdown(context=context)
-
-
-def test_a_running_system_is_examined(context):
+def robot():
     """A camera under another name, best-effort depth, and poses of another clock."""
-    node = rclpy.create_node("a_robot", context=context)
-    diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-    node.create_publisher(Image, "/camera/color/image_raw", reliable(1))
-    node.create_publisher(Image, "/depth/image_raw", best_effort(1))
-    info = node.create_publisher(CameraInfo, "/rgb/camera_info", reliable(1))
-    poses = node.create_publisher(PoseStamped, "/camera/pose", reliable(1))
+    with peer("a_robot") as robot:
+        node = robot.node
+        diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        node.create_publisher(Image, "/camera/color/image_raw", reliable(1))
+        node.create_publisher(Image, "/depth/image_raw", best_effort(1))
+        info = node.create_publisher(CameraInfo, "/rgb/camera_info", reliable(1))
+        poses = node.create_publisher(PoseStamped, "/camera/pose", reliable(1))
 
-    def publish():
-        status = DiagnosticStatus(
-            name="segmentation_node: /segmentation_node",
-            hardware_id="deworldsg_ros",
-            values=[KeyValue(key=key, value=value) for key, value in VALUES.items()],
-        )
-        other = DiagnosticStatus(name="motor", hardware_id="motor")
-        diagnostics.publish(DiagnosticArray(status=[status, other]))
-        info.publish(CameraInfo(header=stamped(-(10**9))))  # no time: it is left out
-        info.publish(CameraInfo(header=stamped(node.get_clock().now().nanoseconds)))
-        poses.publish(PoseStamped(header=stamped(7 * 10**9)))
+        def publish():
+            status = DiagnosticStatus(
+                name="segmentation_node: /segmentation_node",
+                hardware_id="deworldsg_ros",
+                values=[KeyValue(key=key, value=value) for key, value in VALUES.items()],
+            )
+            other = DiagnosticStatus(name="motor", hardware_id="motor")
+            diagnostics.publish(DiagnosticArray(status=[status, other]))
+            info.publish(stamped(CameraInfo(), -(10**9)))  # no time: it is left out
+            info.publish(stamped(CameraInfo(), node.get_clock().now().nanoseconds))
+            poses.publish(stamped(PoseStamped(), 7 * 10**9))
 
-    def stamped(stamp_ns):
-        message = PoseStamped()
-        set_stamp(message, stamp_ns)
-        return message.header
+        node.create_timer(0.1, publish)
+        stop = threading.Event()
 
-    node.create_timer(0.1, publish)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    stop = threading.Event()
+        def spin():
+            while not stop.is_set():
+                robot.spin_for(0.1)
 
-    def spin():
-        while not stop.is_set():
-            executor.spin_once(timeout_sec=0.1)
-
-    thread = threading.Thread(target=spin)
-    thread.start()
-    try:
-        findings = find(observe_nodes(4.0))
-    finally:
+        thread = threading.Thread(target=spin)
+        thread.start()
+        yield
         stop.set()
         thread.join()
-        executor.shutdown()
-        node.destroy_node()
-    texts = {finding.code: str(finding) for finding in findings}
+
+
+def test_a_running_system_is_examined(robot):
+    texts = {finding.code: str(finding) for finding in find(observe_nodes(4.0))}
     assert set(texts) == {"no_publisher", "qos", "clock", "no_input", "late_poses", "turned"}
     assert "Nobody publishes /rgb/image_raw" in texts["no_publisher"]
     assert "/camera/color/image_raw" in texts["no_publisher"]
@@ -92,5 +77,10 @@ def test_a_running_system_is_examined(context):
     assert "60 images" in texts["late_poses"]
 
 
-def test_without_nodes_that_is_the_finding(context):
-    assert [finding.code for finding in find(observe_nodes(2.0, context))] == ["no_nodes"]
+def test_without_nodes_that_is_the_finding():
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        assert [finding.code for finding in find(observe_nodes(2.0, context))] == ["no_nodes"]
+    finally:
+        rclpy.try_shutdown(context=context)

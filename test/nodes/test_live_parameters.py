@@ -2,57 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
-import rclpy
 from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
-from support.failing_backend import Backend
-from support.nodes_bench import CAMERA, Bench, send_frame, works
+from support.nodes_bench import CAMERA, Bench, alone, fake_perception, send_frame, works
 
-from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
-from deworldsg_ros.perception import Perception
-from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.options import Parameters
 from deworldsg_ros.ros.parameters import fields
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.wire import messages as wire
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
 
-PAPER = [Parameter("merging.association", value="paper")]
-UPDATES, GRAPHS = "/scene_graph/updates.publisher", "/deworldsg/local_graph.subscription"
-
 
 @pytest.fixture(autouse=True)
-def perception(monkeypatch: pytest.MonkeyPatch) -> None:
-    def build(config: PerceptionConfig, *, world_up: str) -> Perception:
-        backend = Backend()
-        return Perception(backend, backend, backend, config, world_up=world_up)
-
-    monkeypatch.setattr(models, "build_perception", build)
+def perception(monkeypatch):
+    fake_perception(monkeypatch)
 
 
 @pytest.fixture
-def whole() -> Iterator[Bench]:
-    made = Bench(DeworldsgNode, CAMERA, parameter_overrides=PAPER)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def context() -> Iterator[rclpy.Context]:
-    made = rclpy.Context()
-    rclpy.init(context=made)
-    yield made
-    rclpy.try_shutdown(context=made)
+def whole():
+    with Bench(DeworldsgNode, CAMERA, parameters={"merging.association": "paper"}) as made:
+        yield made
 
 
 def change(node: StageNode, name: str, value: Any) -> tuple[bool, str]:
@@ -61,7 +38,7 @@ def change(node: StageNode, name: str, value: Any) -> tuple[bool, str]:
     return result.successful, result.reason
 
 
-def test_thresholds_and_rates_change_while_the_node_runs(whole: Bench) -> None:
+def test_thresholds_and_rates_change_while_the_node_runs(whole):
     node = whole.node
     for name in DeworldsgNode.LIVE:
         section, key = name.split(".")
@@ -83,69 +60,45 @@ def test_thresholds_and_rates_change_while_the_node_runs(whole: Bench) -> None:
     assert node.graph._builder.merging._bound > before  # the first one was made with 0.25
 
 
-def test_a_score_threshold_is_that_of_the_next_frame() -> None:
-    at = Bench(SegmentationNode, CAMERA)
-    texts = at.peer.collect("deworldsg/frame_graph")
-    try:
-        works(at, lambda: send_frame(at))
-        assert change(at.node, "perception.score_threshold", 0.85)[0]
-        works(at, lambda: send_frame(at))
-        at.expect(lambda: len(texts) == 2, "frame graphs")
-        scores = [
-            [item.score for item in wire.decode(text, wire.FrameGraphMessage).objects]
-            for text in texts
-        ]
-        assert min(scores[0]) < 0.85 < min(scores[1])
-    finally:
-        at.close()
-
-
-def test_other_parameters_and_values_out_of_range_are_refused(whole: Bench) -> None:
+def test_other_parameters_and_values_out_of_range_are_refused(whole):
     node = whole.node
     before = node.parameters
     for field in fields(Parameters):
         if field.name not in node.LIVE:
             expected = f"Trying to set a read-only parameter: {field.name}."
             assert change(node, field.name, field.default) == (False, expected)
-    for name, value in (("output.rate_hz", -1.0), ("merging.overlap_threshold", 0.0)):
+    for name, value, says in (
+        ("output.rate_hz", -1.0, "output.rate_hz"),
+        ("merging.overlap_threshold", 0.0, "merging.overlap_threshold"),
+        ("relations.max_clips_per_s", 0.0, "needs a restart"),
+    ):
         taken, reason = change(node, name, value)
         assert not taken
-        assert name in reason
-    taken, reason = change(node, "relations.max_clips_per_s", 0.0)
-    assert not taken
-    assert "needs a restart" in reason
+        assert says in reason
     assert node.parameters == before
 
 
-def graph_node(context: rclpy.Context, overrides: dict[str, Any]) -> GraphNode:
-    given = [Parameter(f"qos_overrides.{name}", value=value) for name, value in overrides.items()]
-    return GraphNode(context=context, parameter_overrides=given)
+UPDATES, GRAPHS = "/scene_graph/updates.publisher", "/deworldsg/local_graph.subscription"
 
 
-def test_qos_overrides_are_honoured(context: rclpy.Context) -> None:
+def test_qos_overrides_are_honoured():
+    unused = "qos_overrides./no/such/topic.subscription.depth"
     overrides = {
-        f"{UPDATES}.reliability": "best_effort",
-        f"{GRAPHS}.depth": 3,
-        "/no/such/topic.subscription.depth": 3,
+        f"qos_overrides.{UPDATES}.reliability": "best_effort",
+        f"qos_overrides.{GRAPHS}.depth": 3,
+        unused: 3,
     }
-    node = graph_node(context, overrides)
-    try:
-        (updates,) = (item for item in node.publishers if item.topic_name == "/scene_graph/updates")
-        (graphs,) = (
-            item for item in node.subscriptions if item.topic_name == "/deworldsg/local_graph"
-        )
-        assert updates.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-        assert graphs.qos_profile.depth == 3
-        assert node.unused_overrides() == ["qos_overrides./no/such/topic.subscription.depth"]
-    finally:
-        node.close()
-        node.destroy_node()
+    with alone(GraphNode, overrides) as node:
+        topics = (*node.publishers, *node.subscriptions)
+        profiles = {item.topic_name: item.qos_profile for item in topics}
+        assert profiles["/scene_graph/updates"].reliability == ReliabilityPolicy.BEST_EFFORT
+        assert profiles["/deworldsg/local_graph"].depth == 3
+        assert node.unused_overrides() == [unused]
 
 
-def test_a_camera_topic_follows_its_override() -> None:
-    name = "qos_overrides./rgb/image_raw.subscription.reliability"
-    at = Bench(SegmentationNode, CAMERA, parameter_overrides=[Parameter(name, value="best_effort")])
-    try:
+def test_a_camera_topic_follows_its_override():
+    overrides = {"qos_overrides./rgb/image_raw.subscription.reliability": "best_effort"}
+    with Bench(SegmentationNode, CAMERA, parameters=overrides) as at:
         listening = [item.describe() for item in at.node._subscriptions_to_check]
         assert "/rgb/image_raw [sensor_msgs/msg/Image] best effort" in listening
         assert "/depth/image_raw [sensor_msgs/msg/Image] reliable" in listening
@@ -156,15 +109,12 @@ def test_a_camera_topic_follows_its_override() -> None:
             if at.products():
                 break
         assert at.products()
-    finally:
-        at.close()
 
 
 @pytest.mark.parametrize(
     ("policy", "value"), [("colour", 1), ("reliability", "sometimes"), ("depth", "many")]
 )
-def test_an_override_that_rclpy_does_not_take_is_refused(
-    context: rclpy.Context, policy: str, value: Any
-) -> None:
-    with pytest.raises(ConfigurationError, match=f"{policy} = {value!r}: .*expected policies"):
-        graph_node(context, {f"{UPDATES}.{policy}": value})
+def test_an_override_that_rclpy_does_not_take_is_refused(policy, value):
+    refused = pytest.raises(ConfigurationError, match=f"{policy} = {value!r}: .*expected policies")
+    with refused, alone(GraphNode, {f"qos_overrides.{UPDATES}.{policy}": value}):
+        pass

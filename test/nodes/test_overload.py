@@ -2,80 +2,100 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.parameter import Parameter
 from std_msgs.msg import String
-from support.failing_backend import Backend
 from support.nodes_bench import (
     CAMERA,
     LIMIT_S,
     Bench,
     depth,
+    fake_perception,
     local_graph,
     pose,
-    rgb,
     send_frame,
     works,
 )
 
-from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.nodes.deworldsg_node import DeworldsgNode
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.nodes.lifting_node import LiftingNode
-from deworldsg_ros.nodes.relation_node import RelationNode
-from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.relations.world_model import FakeWorldModel
-from deworldsg_ros.ros import models
+from deworldsg_ros.nodes.segmentation_node import SegmentationNode
+from deworldsg_ros.ros import joining, models
 from deworldsg_ros.ros.graph_keeper import QUEUE_JOBS
 from deworldsg_ros.ros.health import received_in
 from deworldsg_ros.ros.joining import COLLECT_PERIOD_S, MAX_BUSY_S
 from deworldsg_ros.ros.node import Waiting, serve
 from deworldsg_ros.ros.qos import reliable
-from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.streams import frames
+from deworldsg_ros.streams.poses import stamp_ns_of
 
 # A first start compiles.
 pytestmark = pytest.mark.timeout(300)
 
-PAPER = [Parameter("merging.association", value="paper")]
+PAPER = {"merging.association": "paper"}
 
 
 @pytest.fixture
-def graph() -> Iterator[Bench]:
-    made = Bench(GraphNode, {"deworldsg/local_graph": String}, parameter_overrides=PAPER)
-    yield made
-    made.close()
+def graph():
+    with Bench(GraphNode, {"deworldsg/local_graph": String}, parameters=PAPER) as made:
+        yield made
 
 
-def test_diagnostics_continue_while_the_graph_hangs(
-    graph: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begin = threading.Event()
+@pytest.fixture
+def segmentation(monkeypatch):
+    monkeypatch.setattr(models, "MAX_BUSY_S", LIMIT_S)  # a busy machine delays the worker
+    with Bench(SegmentationNode, CAMERA) as made:
+        works(made, lambda: send_frame(made))
+        yield made
+
+
+@pytest.fixture
+def whole(monkeypatch):
+    fake_perception(monkeypatch)
+    with Bench(DeworldsgNode, CAMERA, parameters=PAPER) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def held(at: Bench):
+    """Perception waits until the event is set; gives it, and the stamps that were begun."""
+    begin, begun = threading.Event(), list[int]()
+    perceive = at.node._perception.perceive
+
+    def wait(frame):
+        begun.append(frame.stamp_ns)
+        assert begin.wait(4 * LIMIT_S)
+        return perceive(frame)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(at.node._perception, "perceive", wait)
+        yield begin, begun
+
+
+def flood(graph: Bench, count: int) -> None:
+    for _ in range(count):
+        graph.send_made(deworldsg__local_graph=local_graph)
+        graph.peer.spin_for(0.05)
+
+
+def test_diagnostics_continue_while_the_graph_hangs(graph, monkeypatch):
+    begin, merged = threading.Event(), []
     integrate = GraphBuilder.integrate
-    merged: list[int] = []
 
-    def hang(builder: GraphBuilder, local: Any) -> list[int]:
+    def hang(builder, local):
         assert begin.wait(4 * LIMIT_S)
         merged.append(local.stamp_ns)
         return integrate(builder, local)
 
-    statuses: list[DiagnosticArray] = []
-    graph.peer.node.create_subscription(DiagnosticArray, "/diagnostics", statuses.append, 10)
+    statuses = graph.peer.statuses()
     monkeypatch.setattr(GraphBuilder, "integrate", hang)
     sent = QUEUE_JOBS + 20
-
-    def flood() -> None:
-        for _ in range(sent):
-            graph.send(deworldsg__local_graph=local_graph(graph.next_stamp()))
-            graph.peer.spin_for(0.05)
-
-    graph.refuses("overrun", flood, 10)
+    graph.refuses("overrun", lambda: flood(graph, sent), 10)
     seen = len(statuses)
     graph.expect(lambda: len(statuses) > seen + 1, "diagnostics")
     assert graph.node.graph._worker.waiting <= QUEUE_JOBS
@@ -84,124 +104,80 @@ def test_diagnostics_continue_while_the_graph_hangs(
     assert len(merged) + graph.node.health.drops["overrun"] == sent
 
 
-def test_a_stalled_subscriber_does_not_delay_the_graph(graph: Bench) -> None:
+def test_a_stalled_subscriber_does_not_delay_the_graph(graph):
     """It is reliable, and never takes a message."""
     stalled = graph.peer.node.create_subscription(
         String, "/scene_graph/updates", print, reliable(1)
     )
     graph.peer._executor.remove_node(graph.peer.node)
-    for _ in range(60):
-        graph.send(deworldsg__local_graph=local_graph(graph.next_stamp()))
-        graph.peer.spin_for(0.05)
+    flood(graph, 60)
     graph.expect(lambda: graph.node.graph.newest_ns == graph.stamp_ns, "the newest frame")
     assert graph.node.health.products > 0
     assert graph.node.health.drops == {}
     graph.peer.node.destroy_subscription(stalled)
 
 
-class Hanging(FakeWorldModel):
-    """A world model that does not return before it is released."""
+def test_images_that_come_too_fast_are_left_to_dds(segmentation, monkeypatch):
+    """They are not received, and they are counted."""
+    at, before = segmentation, segmentation.products()
 
-    release = threading.Event()
+    def lost() -> int:
+        return at.node.health.drops.get("lost_rgb", 0)
 
-    def predict(self, request: Any) -> Any:
-        assert self.release.wait(4 * LIMIT_S)
-        return super().predict(request)
-
-
-def test_evidence_continues_while_the_world_model_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(models, "build_world_model", lambda config, device: Hanging(2))
-    options = {"relations.clip_length": 2, "relations.max_clips_per_s": 0.0}
-    at = Bench(
-        RelationNode,
-        {"rgb/image_raw": CAMERA["rgb/image_raw"], "deworldsg/local_graph": String},
-        parameter_overrides=[Parameter(name, value=value) for name, value in options.items()],
-    )
-
-    def send() -> None:
-        stamp_ns = at.next_stamp()
-        at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=local_graph(stamp_ns))
-
-    try:
-        for _ in range(10):
-            works(at, send)
-    finally:
-        Hanging.release.set()
-        at.close()
+    with held(at) as (begin, _), monkeypatch.context() as patch:
+        patch.setattr(joining, "TAKE_PERIOD_S", LIMIT_S)  # nothing while a frame waits
+        for _ in range(12):
+            send_frame(at)
+            at.peer.spin_for(0.1)  # serves one message at a time
+        begin.set()
+        at.expect(lambda: at.products() - before + lost() == 12, "each to be processed or lost")
+    assert lost() > 0
+    works(at, lambda: send_frame(at))
 
 
-@pytest.fixture
-def whole() -> Iterator[Bench]:
-    def build(config: PerceptionConfig, *, world_up: str) -> Perception:
-        backend = Backend()
-        return Perception(backend, backend, backend, config, world_up=world_up)
+def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(whole, monkeypatch):
+    """It takes all images that wait in DDS at once, and decodes only those that it processes."""
+    decode, decoded = frames.rgb_from_message, []
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(models, "build_perception", build)
-        made = Bench(DeworldsgNode, CAMERA, parameter_overrides=PAPER)
-        yield made
-        made.close()
+    def note(message):
+        decoded.append(stamp_ns_of(message))
+        return decode(message)
 
-
-def test_one_process_builds_and_publishes_the_graph(whole: Bench) -> None:
-    updates = whole.peer.collect("/scene_graph/updates")
-    for _ in range(3):
-        works(whole, lambda: send_frame(whole))
-    whole.expect(lambda: whole.node.graph.newest_ns == whole.stamp_ns, "the newest frame")
-    whole.expect(lambda: "edges" in whole.node.more_values(), "the whole graph")
-    for text in updates:
-        assert wire.decode(text, wire.SceneGraphUpdateMessage).associations
-    assert whole.node.health.drops == {}
-
-
-def test_a_node_that_does_not_keep_up_goes_on_with_the_newest_image(
-    whole: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It takes all images that wait in DDS at once: a frame is not old when its turn comes."""
-    begin, begun = threading.Event(), list[int]()
-    perceive = whole.node._perception.perceive
-
-    def wait(frame: Any) -> Any:
-        begun.append(frame.stamp_ns)
-        assert begin.wait(4 * LIMIT_S)
-        return perceive(frame)
-
-    monkeypatch.setattr(whole.node._perception, "perceive", wait)
+    monkeypatch.setattr(frames, "rgb_from_message", note)
     waiting = Waiting(whole.node, whole._executor)
     whole.peer.also_spin.clear()
+    worker = whole.node._worker
 
-    def serve_until(condition: Callable[[], bool]) -> None:
+    def serve_until(condition) -> None:
         end_s = time.monotonic() + LIMIT_S
         while not condition():
             assert time.monotonic() < end_s
             serve(whole.node, waiting)
 
-    send_frame(whole)
-    serve_until(lambda: len(begun) == 1)
-    worker = whole.node._worker
-    for _ in range(3):
+    with held(whole) as (begin, begun):
         send_frame(whole)
-    time.sleep(2 * MAX_BUSY_S)  # DDS has them all
-    serve_until(lambda: worker.waiting > 0)
-    assert worker.waiting == 3
-    begin.set()
-    serve_until(lambda: len(begun) == 2)
-    assert begun[1] == whole.stamp_ns
-    assert whole.node.health.drops == {"overrun": 2}
+        serve_until(lambda: len(begun) == 1)
+        for _ in range(3):
+            send_frame(whole)
+        time.sleep(2 * MAX_BUSY_S)  # DDS has them all
+        serve_until(lambda: worker.waiting > 0)
+        assert worker.waiting == 3
+        begin.set()
+        serve_until(lambda: len(begun) == 2)
+        assert begun[1] == whole.stamp_ns
+        assert begun == decoded
+        assert whole.node.health.drops == {"overrun": 2}
 
 
-def test_messages_that_no_frame_waits_for_are_taken_together() -> None:
-    topics = ("camera/pose", "depth/image_raw")
-    at = Bench(LiftingNode, {topic: CAMERA[topic] for topic in topics})
-    waiting = Waiting(at.node, at._executor)
-    at.peer.also_spin.clear()
-    turns = sent = 0
-    started_s = time.monotonic()
-    try:
-        while sent < 200:
-            sent += 1
-            stamp_ns = at.next_stamp()
-            at.send(camera__pose=pose(stamp_ns), depth__image_raw=depth(stamp_ns))
+def test_messages_that_no_frame_waits_for_are_taken_together():
+    topics = {topic: CAMERA[topic] for topic in ("camera/pose", "depth/image_raw")}
+    turns, sent = 0, 200
+    with Bench(LiftingNode, topics) as at:
+        waiting = Waiting(at.node, at._executor)
+        at.peer.also_spin.clear()
+        started_s = time.monotonic()
+        for _ in range(sent):
+            at.send_made(camera__pose=pose, depth__image_raw=depth)
             end_s = time.monotonic() + 0.005
             while time.monotonic() < end_s:
                 serve(at.node, waiting)
@@ -214,5 +190,3 @@ def test_messages_that_no_frame_waits_for_are_taken_together() -> None:
         assert received_in(report, "pose") > sent // 2
         # Timers and the wait for nothing are turns, too.
         assert turns < 2 * taken_s / COLLECT_PERIOD_S + 20
-    finally:
-        at.close()

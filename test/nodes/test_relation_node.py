@@ -1,17 +1,13 @@
-"""relation_node and the published graph: the pairs that the world model encodes."""
+"""relation_node: predictions of the world model, and the pairs that it encodes."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import msgspec
-import numpy as np
 import pytest
-import rclpy
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image
+from msgspec.structs import replace
 from std_msgs.msg import String
-from support.nodes_bench import Bench, changed, local_graph, rgb
+from support.nodes_bench import PAIRING, Bench, alone, send_pair
+from support.reference_updates import diff
+from support.view import make_graph, make_node
 
 from deworldsg_ros.checkpoints.cards import CheckpointCard, write_detector_card
 from deworldsg_ros.nodes.relation_node import RelationNode
@@ -21,138 +17,79 @@ from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire import messages as wire
 
-WORLD_MODEL = [
-    Parameter("relations.world_model", value="fake"),
-    Parameter("relations.clip_length", value=4),
-]
-TWO_CLASSES = {"classes": ["chair", "cup"], "predicates": ["on", "under", "near"]}
+WORLD_MODEL = {"relations.world_model": "fake", "relations.clip_length": 4}
 
 
-def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
-    """A chair and a cup beside it."""
-    message = changed(local_graph, **TWO_CLASSES)(stamp_ns)
-    chair = message.objects[0]
-    cup = msgspec.structs.replace(chair, instance=2, class_probabilities=[0.1, 0.9])
-    message.objects = [chair, cup]
-    return message
+def clips_are(at: Bench, **expected: int) -> None:
+    """Wait until the counts of clips are these."""
+
+    def reached() -> bool:
+        values = at.node.more_values()
+        return all(
+            values.get(f"clips {name.replace('__', ' ')}", "0") == str(count)
+            for name, count in expected.items()
+        )
+
+    at.expect(reached, f"clips {expected}, not {at.node.more_values()}")
 
 
-def send_two_objects(at: Bench) -> int:
-    stamp_ns = at.next_stamp()
-    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
-    return stamp_ns
+def test_predictions_follow_the_pairs_of_a_frame():
+    with Bench(RelationNode, PAIRING, parameters=WORLD_MODEL) as at:
+        texts = at.peer.collect("deworldsg/relation_evidence")
+        at.peer.spin_for(0.5)
+        for _ in range(3):
+            send_pair(at)
+        at.expect(lambda: len(texts) >= 6, "three times the pairs, three times a prediction")
+        messages = [wire.decode(text, wire.RelationEvidenceMessage) for text in texts]
+        assert {(message.source, message.frame_id) for message in messages} == {("fake", "map")}
+        predicted = [bool(pair.prediction) for message in messages for pair in message.pairs]
+        assert sorted(predicted) == [False] * 6 + [True] * 6
+        clips_are(at, encoded=3)
 
 
-def test_the_published_graph_selects_the_pairs_of_the_world_model() -> None:
+def test_the_published_graph_selects_the_pairs_of_the_world_model():
     """Lost updates and a restarted graph_node, too."""
-    topics = {
-        "rgb/image_raw": Image,
-        "deworldsg/local_graph": String,
-        "/scene_graph/updates": String,
-        "/scene_graph": String,
-    }
-    at = Bench(RelationNode, topics, reliable(50, latched=True), parameter_overrides=WORLD_MODEL)
-    graph = {"schema": None, "frame_id": "map", "edges": []}
+    topics = {**PAIRING, "/scene_graph/updates": String, "/scene_graph": String}
+    latched = reliable(50, latched=True)
+    with Bench(RelationNode, topics, latched, parameters=WORLD_MODEL) as at:
 
-    def nodes(observations: int) -> list[wire.NodeState]:
-        return [
-            wire.NodeState(
-                id=node_id,
-                label=label,
-                classes=[wire.Belief(label, 1.0)],
-                mean_m=[0.0, 0.0, 1.0],
-                covariance_m2=np.eye(3).ravel().tolist(),
-                observations=observations,
-                first_seen=wire.Stamp(0, 0),
-                last_seen=wire.Stamp(0, 0),
-            )
-            for node_id, label in ((1, "chair"), (2, "cup"))
-        ]
+        def publish(sequence: int, stamp_ns: int, observations: int) -> None:
+            stamp, labels = wire.stamp_from_ns(stamp_ns), ("chair", "cup")
+            nodes = [make_node(i, labels[i - 1], observations=observations) for i in (1, 2)]
+            graph = replace(make_graph(nodes), stamp=stamp, sequence=sequence)
+            before = replace(graph, sequence=sequence - 1, nodes=[])
+            update = diff(before, graph, associations=[wire.Association(stamp, [1, 2])])
+            at.send(**{"/scene_graph/updates": update, "/scene_graph": graph})
 
-    def publish(sequence: int, stamp_ns: int, observations: int) -> None:
-        stamp = wire.stamp_from_ns(stamp_ns)
-        common = {**graph, "stamp": stamp, "sequence": sequence, "nodes": nodes(observations)}
-        update = wire.SceneGraphUpdateMessage(
-            **{**common, "schema": wire.schema_of(wire.SceneGraphUpdateMessage)},
-            removed_nodes=[],
-            removed_edges=[],
-            associations=[wire.Association(stamp, [1, 2])],
-        )
-        snapshot = wire.SceneGraphMessage(
-            **{**common, "schema": wire.schema_of(wire.SceneGraphMessage)}
-        )
-        at.send(**{"/scene_graph/updates": update, "/scene_graph": snapshot})
-
-    def clips(**expected: int) -> None:
-        def reached() -> bool:
-            values = at.node.more_values()
-            return all(
-                values.get(f"clips {name.replace('__', ' ')}", "0") == str(count)
-                for name, count in expected.items()
-            )
-
-        at.expect(reached, f"clips {expected}, not {at.node.more_values()}")
-
-    try:
-        stamp_ns = send_two_objects(at)
-        clips(encoded=1)  # without a graph, every pair is encoded
+        stamp_ns = send_pair(at)
+        clips_are(at, encoded=1)  # without a graph, every pair is encoded
         publish(1, stamp_ns, 3)
         at.expect(lambda: at.node._graph.newest_ns == stamp_ns, "the update to come")
-        stamp_ns = send_two_objects(at)
-        clips(encoded=1, waiting=1)  # until the graph is updated
+        stamp_ns = send_pair(at)
+        clips_are(at, encoded=1, waiting=1)  # until the graph is updated
         publish(2, stamp_ns, 4)
-        clips(encoded=2, waiting=0)
-        publish(3, send_two_objects(at), 5)
-        clips(encoded=2, dropped__already_encoded=1)
-        publish(7, send_two_objects(at), 8)  # lost updates, and twice the observations
-        clips(encoded=3, waiting=0)
-        publish(1, send_two_objects(at), 3)  # another graph
-        clips(encoded=4, waiting=0)
-        assert "dropped internal_error" not in at.node.health.drops
-    finally:
-        at.close()
+        clips_are(at, encoded=2, waiting=0)
+        publish(3, send_pair(at), 5)
+        clips_are(at, encoded=2, dropped__already_encoded=1)
+        publish(7, send_pair(at), 8)  # lost updates, and twice the observations
+        clips_are(at, encoded=3, waiting=0)
+        publish(1, send_pair(at), 3)  # another graph
+        clips_are(at, encoded=4, waiting=0)
+        assert "internal_error" not in at.node.health.drops
 
 
-def test_a_restarted_recording_is_encoded_again() -> None:
-    at = Bench(
-        RelationNode,
-        {"rgb/image_raw": Image, "deworldsg/local_graph": String},
-        parameter_overrides=WORLD_MODEL,
-    )
-
-    def encoded() -> int:
-        return int(at.node.more_values()["clips encoded"])
-
-    try:
+def test_a_restarted_recording_is_encoded_again():
+    with Bench(RelationNode, PAIRING, parameters=WORLD_MODEL) as at:
         at.peer.spin_for(0.5)
         started_ns = at.stamp_ns
         for count in range(1, 13):  # more than the buffer of eight holds
-            send_two_objects(at)
-            at.expect(lambda expected=count: encoded() == expected, f"{count} clips")
+            send_pair(at)
+            clips_are(at, encoded=count)
         at.stamp_ns = started_ns - 5 * 10**9
         # A clock that jumps back is believed when the next message confirms it.
-        send_two_objects(at)
-        send_two_objects(at)
-        at.expect(lambda: encoded() == 14, "14 clips")
-        assert at.node.more_values().get("clips dropped no_frame") is None
-    finally:
-        at.close()
-
-
-def start(**overrides: str) -> RelationNode:
-    """The node as it starts with a world model and parameters, named with __ for a dot."""
-    parameters = [
-        Parameter(name.replace("__", "."), value=value) for name, value in overrides.items()
-    ]
-    context = rclpy.Context()
-    rclpy.init(context=context)
-    try:
-        node = RelationNode(context=context, parameter_overrides=[*WORLD_MODEL, *parameters])
-        node.close()
-        node.destroy_node()
-    finally:
-        rclpy.try_shutdown(context=context)
-    return node
+        send_pair(at)
+        send_pair(at)
+        clips_are(at, encoded=14, dropped__no_frame=0)
 
 
 class Bound(FakeWorldModel):
@@ -163,20 +100,30 @@ class Bound(FakeWorldModel):
             raise ConfigurationError(f"the probe was trained on others than {predicates}")
 
 
+@pytest.mark.parametrize(
+    ("predicates", "parameters", "refused"),
+    [
+        (("on", "under"), {}, None),
+        (("on", "near"), {}, "trained on others"),
+        ((), {}, "names no predicates"),
+        (("on", "near"), {"perception.detector_path": "somebody/elsewhere"}, None),
+        (("on", "under"), {"perception.predicate_set": "3dssg"}, "trained on others"),
+    ],
+)
 def test_predicates_of_an_imported_checkpoint_are_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch, predicates, parameters, refused
+):
     """The relation node runs no perception, and may run where its checkpoint is not."""
     monkeypatch.setattr(models, "build_world_model", lambda config, device: Bound(4))
-    chosen = {"perception__predicate_set": "checkpoint"}
-    for predicates in (("on", "under"), ("on", "near"), ()):
-        write_detector_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
-        if predicates == ("on", "under"):
-            start(**chosen, perception__detector_path=str(tmp_path))
-            continue
-        message = "trained on others" if predicates else "names no predicates"
-        with pytest.raises(ConfigurationError, match=message):
-            start(**chosen, perception__detector_path=str(tmp_path))
-    start(**chosen, perception__detector_path="somebody/elsewhere")
-    with pytest.raises(ConfigurationError, match="trained on others"):
-        start(perception__predicate_set="3dssg")
+    write_detector_card(tmp_path / "deworldsg.json", CheckpointCard(predicates=predicates))
+    chosen = {
+        "perception.predicate_set": "checkpoint",
+        "perception.detector_path": str(tmp_path),
+        **WORLD_MODEL,
+        **parameters,
+    }
+    if refused is None:
+        with alone(RelationNode, chosen):
+            return
+    with pytest.raises(ConfigurationError, match=refused), alone(RelationNode, chosen):
+        pass

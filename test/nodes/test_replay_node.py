@@ -9,11 +9,10 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from support.nodes import NodeProcess, peer, wait_until
+from support.nodes import NodeProcess, peer, run_to_end, wait_until
 from support.recordings import camera_items, pose, stamp_ns, transform, write_bag
 
 from deworldsg_ros.recordings import replaying, source
-from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.streams.poses import stamp_ns_of
 
 COUNT = 12
@@ -23,6 +22,8 @@ KINDS = {
     "rgb/image_raw": Image,
     "depth/image_raw": Image,
     "rgb/camera_info": CameraInfo,
+    "camera/pose": PoseStamped,
+    "/clock": Clock,
 }
 
 
@@ -31,15 +32,14 @@ def bag(tmp_path_factory):
     return write_bag(tmp_path_factory.mktemp("bags") / "bag", camera_items(COUNT))
 
 
-def replay(tmp_path, bag, **parameters):
-    values = {"recording": f"'{bag}'", "rate": 0.0, "wait_s": 0.0, "events": "true", **parameters}
-    arguments = [word for name, value in values.items() for word in ("-p", f"{name}:={value}")]
-    return NodeProcess("replay_node", tmp_path, "--ros-args", *arguments)
+def options(bag, **changes):
+    defaults = {"recording": f"'{bag}'", "rate": 0.0, "wait_s": 0.0, "events": "true"}
+    return {"parameters": {**defaults, **changes}}
 
 
-def events_of(process):
+def events_of(log):
     found = []
-    for line in process.log.splitlines():
+    for line in log.splitlines():
         try:
             found.append(replaying.decode(line))
         except msgspec.MsgspecError:
@@ -47,63 +47,47 @@ def events_of(process):
     return found
 
 
-def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
-    received = {topic: [] for topic in KINDS}
+def received(folder, bag, **changes):
+    """What a replay at the recorded rate publishes, by topic, and its events."""
     with peer() as camera:
-        for topic, kind in KINDS.items():
-            camera.node.create_subscription(
-                kind, topic, received[topic].append, reliable(100), raw=False
-            )
-        clocks = []
-        camera.node.create_subscription(Clock, "/clock", clocks.append, reliable(100))
-        process = replay(tmp_path, bag, rate=1.0, clock="true")
-        try:
+        messages = {topic: camera.listen(kind, topic) for topic, kind in KINDS.items()}
+        with NodeProcess("replay_node", folder, **options(bag, rate=1.0, **changes)) as process:
             camera.spin_until(lambda: not process.alive, 30, "the replay to end")
             camera.spin_for(0.3)
             assert process.wait(5) == 0, process.log
-        finally:
-            process.end()
+    return messages, events_of(process.log)
+
+
+def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
+    messages, events = received(tmp_path, bag, clock="true")
     recorded = {
-        (topic.split("/camera")[-1], stamp): message
+        stamp: message
         for topic, _, stamp, message in camera_items(COUNT)
+        if topic.endswith("/color/image_raw/compressed")
     }
-    rgb = received["rgb/image_raw/compressed"]
+    rgb = messages["rgb/image_raw/compressed"]
     assert len(rgb) == COUNT
     for message in rgb:
-        expected = recorded["/color/image_raw/compressed", stamp_ns_of(message)]
+        expected = recorded[stamp_ns_of(message)]
         assert bytes(message.data) == expected.data.tobytes()
         assert message.format == expected.format
-    assert len(received["depth/image_raw/compressedDepth"]) == COUNT
-    assert len(received["rgb/camera_info"]) == COUNT
-    assert not received["rgb/image_raw"]
-    assert clocks
-    assert clocks[-1].clock.sec * 10**9 + clocks[-1].clock.nanosec == stamp_ns(COUNT - 1)
-    finished = events_of(process)[-1]
-    assert isinstance(finished, replaying.Finished)
-    assert finished.published == COUNT
+    assert len(messages["depth/image_raw/compressedDepth"]) == COUNT
+    assert len(messages["rgb/camera_info"]) == COUNT
+    assert not messages["rgb/image_raw"]
+    clock = messages["/clock"][-1].clock
+    assert clock.sec * 10**9 + clock.nanosec == stamp_ns(COUNT - 1)
+    assert isinstance(events[-1], replaying.Finished)
+    assert events[-1].published == COUNT
 
 
 def test_poses_from_tf_are_published_as_poses(tmp_path):
     items = camera_items(COUNT, with_pose=False)
-    items += [
-        (
-            "/tf",
-            source.TF_MESSAGE,
-            stamp_ns(i),
-            transform(stamp_ns(i), "map", "camera_optical", pose(i)),
-        )
-        for i in range(COUNT)
-    ]
+    for i in range(COUNT):
+        moving = transform(stamp_ns(i), "map", "camera_optical", pose(i))
+        items.append(("/tf", source.TF_MESSAGE, stamp_ns(i), moving))
     bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
-    poses = []
-    with peer() as camera:
-        camera.node.create_subscription(PoseStamped, "camera/pose", poses.append, reliable(100))
-        process = replay(tmp_path, bag, rate=1.0)
-        try:
-            camera.spin_until(lambda: not process.alive, 30, "the replay to end")
-            camera.spin_for(0.3)
-        finally:
-            process.end()
+    messages, _ = received(tmp_path, bag)
+    poses = messages["camera/pose"]
     assert len(poses) == COUNT
     for message in poses:
         index = (stamp_ns_of(message) - stamp_ns(0)) / (stamp_ns(1) - stamp_ns(0))
@@ -111,76 +95,58 @@ def test_poses_from_tf_are_published_as_poses(tmp_path):
         assert message.header.frame_id == "map"
 
 
-def test_save_requires_the_four_nodes(tmp_path, bag):
-    process = replay(tmp_path, bag, wait_s=1.0, save="true")
-    try:
-        assert process.wait(30) == 3
-        assert "still waiting for" in process.log
-        assert "segmentation_node" in process.log
-    finally:
-        process.end()
-
-
 def test_without_the_nodes_it_replays_at_the_recorded_rate(tmp_path, bag):
-    process = replay(tmp_path, bag, wait_s=0.5)
-    try:
-        assert process.wait(30) == 0
-    finally:
-        process.end()
-    printed = events_of(process)
-    assert any(isinstance(event, replaying.Waiting) for event in printed)
-    assert printed[-1].published == COUNT
-    assert "replaying without waiting for results" in process.log
+    code, log = run_to_end("replay_node", tmp_path, **options(bag, wait_s=0.5))
+    assert code == 0
+    events = events_of(log)
+    assert any(isinstance(event, replaying.Waiting) for event in events)
+    assert events[-1].published == COUNT
+    assert "replaying without waiting for results" in log
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_0(tmp_path, bag, number):
-    process = replay(tmp_path, bag, rate=0.02)
-    try:
+    with NodeProcess("replay_node", tmp_path, **options(bag, rate=0.02)) as process:
         wait_until(lambda: '"Started"' in process.log, 30, "the replay to start")
         process._process.send_signal(number)
         assert process.wait(10) == 0, process.log
-    finally:
-        process.end()
-    assert "Traceback" not in process.log
+        assert "Traceback" not in process.log
 
 
 @pytest.mark.parametrize(
-    ("parameters", "words"),
+    ("parameters", "exit_code", "words"),
     [
-        ({"recording": "nowhere"}, "nowhere"),
-        ({"recording": "''"}, "recording:="),
-        ({"intrinsics": "'1,2'"}, "FX,FY,CX,CY"),
-        ({"topics": "pose=/nothing"}, "/nothing"),
-        ({"topics": "colour=/a"}, "rgb=/a,depth=/b,camera_info=/c,pose=/d"),
-        ({"rgb_topic": "/a"}, "did you mean topics?"),
-        ({"frame_rate": 30.0}, "there is no parameter frame_rate"),
-        ({"rates": 2.0}, "did you mean rate"),
-        ({"rate": -1}, "expected float >= 0"),
+        ({"save": "true", "wait_s": 1.0}, 3, "still waiting for"),  # the nodes
+        ({"recording": "nowhere"}, 2, "nowhere"),
+        ({"recording": "''"}, 2, "recording:="),
+        ({"intrinsics": "'1,2'"}, 2, "FX,FY,CX,CY"),
+        ({"topics": "pose=/nothing"}, 2, "/nothing"),
+        ({"topics": "colour=/a"}, 2, "rgb=/a,depth=/b,camera_info=/c,pose=/d"),
+        ({"rgb_topic": "/a"}, 2, "did you mean topics?"),
+        ({"frame_rate": 30.0}, 2, "there is no parameter frame_rate"),
+        ({"rates": 2.0}, 2, "did you mean rate"),
+        ({"rate": -1}, 2, "expected float >= 0"),
     ],
 )
-def test_unusable_parameters_end_it_with_2(tmp_path, bag, parameters, words):
-    process = replay(tmp_path, bag, **parameters)
-    try:
-        assert process.wait(30) == 2
-    finally:
-        process.end()
-    assert words in process.log
-    assert "Traceback" not in process.log
+def test_what_cannot_be_replayed_ends_it(tmp_path, bag, parameters, exit_code, words):
+    code, log = run_to_end("replay_node", tmp_path, **options(bag, **parameters))
+    assert code == exit_code
+    assert words in log
+    assert "Traceback" not in log
 
 
 def test_named_topics_and_a_parameter_file_are_used(tmp_path, bag):
     """The file of the pipeline serves the replay, too: here it asks for raw images only."""
-    topics = "rgb=/camera/color/image_raw/compressed"
-    parameters = tmp_path / "parameters.yaml"
-    parameters.write_text("/**: {ros__parameters: {inputs: {transport: raw}, output: {top_k: 3}}}")
-    arguments = ("--ros-args", "--params-file", str(parameters), "-p", f"recording:='{bag}'")
-    process = NodeProcess("replay_node", tmp_path, *arguments, "-p", f"topics:='{topics}'")
-    try:
-        assert process.wait(30) == 2
-    finally:
-        process.end()
-    assert "no depth topic" in process.log  # the named RGB topic is compressed all the same
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**: {ros__parameters: {inputs: {transport: raw}, output: {top_k: 3}}}")
+    parameters = {
+        "recording": f"'{bag}'",
+        "topics": "'rgb=/camera/color/image_raw/compressed'",
+    }
+    words = ("--params-file", str(file))
+    code, log = run_to_end("replay_node", tmp_path, *words, parameters=parameters)
+    assert code == 2
+    assert "no depth topic" in log  # the named RGB topic is compressed all the same
 
 
 def test_events_survive_their_line():

@@ -2,107 +2,89 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import String
 from support.nodes import peer
 from support.nodes_bench import (
     CAMERA,
     LIMIT_S,
     Bench,
+    alone,
     camera_info,
-    local_graph,
     pose,
-    rgb,
     send_frame,
     stamped,
     works,
 )
 
-from deworldsg_ros.nodes.relation_node import RelationNode
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.ros import inputs
 from deworldsg_ros.ros.inputs import TFMessage
-from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import AutoSubscription, best_effort, reliable, source
 from deworldsg_ros.scene.errors import ConfigurationError
-from deworldsg_ros.wire import messages as wire
 
 
-def published(topics: dict[str, type], **options: Any) -> Iterator[Bench]:
-    made = Bench(SegmentationNode, topics, **options)
-    yield made
-    made.close()
+def compressed_rgb(stamp_ns: int) -> CompressedImage:
+    message = CompressedImage(format="rgb8; jpeg compressed bgr8")
+    message.data = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
+    return stamped(message, stamp_ns)
+
+
+def compressed_depth(stamp_ns: int) -> CompressedImage:
+    message = CompressedImage(format="16UC1; compressedDepth png")
+    png = cv2.imencode(".png", np.full((48, 64), 1500, np.uint16))[1].tobytes()
+    message.data = bytes(12) + png
+    return stamped(message, stamp_ns)
+
+
+def odometry(stamp_ns: int, frame_id: str = "odom", child: str = "camera") -> Odometry:
+    message = Odometry(child_frame_id=child)
+    message.pose.pose = pose(stamp_ns).pose
+    return stamped(message, stamp_ns, frame_id)
 
 
 @pytest.fixture
-def best_effort_camera() -> Iterator[Bench]:
-    yield from published(CAMERA, qos=best_effort(10))
-
-
-@pytest.fixture
-def other_camera() -> Iterator[Bench]:
+def other_camera():
+    """A node with a camera that publishes other messages than raw images and PoseStamped."""
     topics = {
         "rgb/image_raw/compressed": CompressedImage,
         "depth/image_raw/compressedDepth": CompressedImage,
         "rgb/camera_info": CameraInfo,
         "camera/pose": Odometry,
     }
-    yield from published(topics)
-
-
-def test_best_effort_publishers_are_received(best_effort_camera: Bench) -> None:
-    works(best_effort_camera, lambda: [send_frame(best_effort_camera) for _ in range(5)])
-
-
-def compressed_rgb(stamp_ns: int) -> CompressedImage:
-    pixels = np.zeros((48, 64, 3), np.uint8)
-    message = CompressedImage(format="rgb8; jpeg compressed bgr8")
-    message.data = cv2.imencode(".jpg", pixels)[1].tobytes()
-    return stamped(message, stamp_ns)
-
-
-def compressed_depth(stamp_ns: int) -> CompressedImage:
-    pixels = np.full((48, 64), 1500, np.uint16)
-    message = CompressedImage(format="16UC1; compressedDepth png")
-    message.data = bytes(12) + cv2.imencode(".png", pixels)[1].tobytes()
-    return stamped(message, stamp_ns)
-
-
-def odometry(stamp_ns: int, frame_id: str = "odom") -> Odometry:
-    message = Odometry(child_frame_id="camera")
-    message.pose.pose = pose(stamp_ns).pose
-    return stamped(message, stamp_ns, frame_id)
+    with Bench(SegmentationNode, topics) as at:
+        yield at
 
 
 def send_other(at: Bench, **changes: Any) -> None:
-    """A frame in other messages than raw images and PoseStamped."""
-    others = {
-        "rgb__image_raw": None,
-        "depth__image_raw": None,
+    makers = {
+        "rgb__camera_info": camera_info,
         "rgb__image_raw__compressed": compressed_rgb,
         "depth__image_raw__compressedDepth": compressed_depth,
         "camera__pose": odometry,
     }
-    send_frame(at, **{**others, **changes})
+    at.send_made(**{**makers, **changes})
 
 
-def test_compressed_images_and_odometry_are_received(other_camera: Bench) -> None:
-    works(other_camera, lambda: send_other(other_camera))
+def test_compressed_images_and_odometry_are_received(other_camera):
+    works(other_camera, partial(send_other, other_camera))
     assert not other_camera.node.health.drops
 
 
-def test_a_subscription_follows_its_publishers() -> None:
+def test_best_effort_publishers_are_received():
+    with Bench(SegmentationNode, CAMERA, best_effort(10)) as at:
+        works(at, lambda: [send_frame(at) for _ in range(5)])
+
+
+def test_a_subscription_follows_its_publishers():
     with peer() as me:
         got: list[Any] = []
         sources = [source("image", Image), source("image/compressed", CompressedImage)]
@@ -125,120 +107,68 @@ def test_a_subscription_follows_its_publishers() -> None:
         assert not subscription.check()
 
 
-def test_a_topic_can_change_its_type() -> None:
-    with peer() as me:
+def test_a_topic_can_change_its_type():
+    with peer() as me, peer("odometry_publisher") as other:
         got: list[Any] = []
         sources = [source("pose", PoseStamped), source("pose", Odometry)]
         subscription = AutoSubscription(me.node, sources, got.append, reliability="auto")
-        with peer("odometry_publisher") as other:
-            publisher = other.node.create_publisher(Odometry, "pose", reliable(5))
-            me.spin_until(subscription.check, LIMIT_S, "the other type")
-            other.spin_until(lambda: publisher.get_subscription_count() == 1, LIMIT_S, "the match")
-            publisher.publish(Odometry())
-            me.spin_until(lambda: len(got) == 1, LIMIT_S, "odometry")
-            assert isinstance(got[0], Odometry)
+        publisher = other.node.create_publisher(Odometry, "pose", reliable(5))
+        me.spin_until(subscription.check, LIMIT_S, "the other type")
+        other.spin_until(lambda: publisher.get_subscription_count() == 1, LIMIT_S, "the match")
+        publisher.publish(Odometry())
+        me.spin_until(lambda: len(got) == 1, LIMIT_S, "odometry")
+        assert isinstance(got[0], Odometry)
 
 
-def test_tf_without_tf2_msgs_is_refused_at_the_start() -> None:
-    if TFMessage is not None:
-        pytest.skip("tf2_msgs is installed")
-    with peer() as me, pytest.raises(ConfigurationError, match="tf2_msgs is not installed"):
-        SegmentationNode(
-            context=me.context, parameter_overrides=[Parameter("inputs.pose_source", value="tf")]
-        )
+def test_diagnostics_name_missing_and_refused_input(other_camera):
+    at, statuses = other_camera, other_camera.peer.statuses()
 
+    def reported(text: str) -> bool:
+        send_other(at, rgb__camera_info=None)
+        at.peer.spin_for(0.1)
+        return any(text in status.message for status in statuses)
 
-def test_predictions_follow_the_pairs_of_a_frame() -> None:
-    overrides = [
-        Parameter("relations.world_model", value="fake"),
-        Parameter("relations.clip_length", value=4),
-    ]
-
-    def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
-        message = local_graph(stamp_ns)
-        message.objects = [
-            *message.objects,
-            msgspec.structs.replace(message.objects[0], instance=2),
-        ]
-        return message
-
-    topics = {"rgb/image_raw": Image, "deworldsg/local_graph": String}
-    at = Bench(RelationNode, topics, parameter_overrides=overrides)
-    try:
-        texts = at.peer.collect("deworldsg/relation_evidence")
-        at.peer.spin_for(0.5)
-        for _ in range(3):
-            stamp_ns = at.next_stamp()
-            at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
-        at.expect(lambda: len(texts) >= 6, "three times the pairs, three times a prediction")
-        messages = [wire.decode(text, wire.RelationEvidenceMessage) for text in texts]
-        assert {message.source for message in messages} == {"fake"}
-        assert {message.frame_id for message in messages} == {"map"}
-        predicted = [bool(pair.prediction) for message in messages for pair in message.pairs]
-        assert sorted(predicted) == [False] * 6 + [True] * 6
-        assert at.node.more_values()["clips encoded"] == "3"
-    finally:
-        at.close()
-
-
-def test_diagnostics_name_missing_and_refused_input(other_camera: Bench) -> None:
-    at = other_camera
-    statuses: list[DiagnosticStatus] = []
-    at.peer.node.create_subscription(
-        DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 10
-    )
-
-    def reported(text: str) -> Callable[[], bool]:
-        def sending() -> bool:
-            send_other(at, rgb__camera_info=None)
-            at.peer.spin_for(0.1)
-            return any(text in status.message for status in statuses)
-
-        return sending
-
-    at.expect(reported("no camera_info on /rgb/camera_info for 3 s"), "the missing input")
+    missing = "no camera_info on /rgb/camera_info for 3 s"
+    at.expect(lambda: reported(missing), "the missing input")
     assert statuses[-1].level == DiagnosticStatus.WARN
     at.send(camera__pose=odometry(at.next_stamp(), "elsewhere"))
-    at.expect(
-        reported("wrong_frame: pose is in frame 'elsewhere', expected 'odom'"), "the refused input"
-    )
+    refused = "wrong_frame: pose is in frame 'elsewhere', expected 'odom'"
+    at.expect(lambda: reported(refused), "the refused input")
 
 
-def topics_of(node: StageNode) -> set[str]:
-    return {subscription.topic_name for subscription in node.subscriptions}
+@pytest.mark.skipif(TFMessage is not None, reason="tf2_msgs is installed")
+def test_tf_without_tf2_msgs_is_refused_at_the_start():
+    refused = pytest.raises(ConfigurationError, match="tf2_msgs")
+    with refused, alone(SegmentationNode, {"inputs.pose_source": "tf"}):
+        pass
 
 
-@pytest.mark.parametrize("posed", [False, True])
-def test_tf_is_used_only_without_a_publisher_of_poses(
-    monkeypatch: pytest.MonkeyPatch, posed: bool
-) -> None:
+@pytest.fixture
+def any_tf(monkeypatch):
     # Only the topic matters here, and any message type will do.
     monkeypatch.setattr(inputs, "TFMessage", TransformStamped)
     monkeypatch.setattr(inputs, "TF_AFTER_S", 1.0)
+
+
+def listens_to_tf(at: Bench) -> bool:
+    return {"/tf", "/tf_static"} <= {item.topic_name for item in at.node.subscriptions}
+
+
+@pytest.mark.parametrize("posed", [False, True])
+def test_tf_is_used_only_without_a_publisher_of_poses(any_tf, posed):
     camera = {topic: kind for topic, kind in CAMERA.items() if posed or topic != "camera/pose"}
-    at = Bench(SegmentationNode, camera)
-    try:
-        assert "/tf" not in topics_of(at.node)
+    with Bench(SegmentationNode, camera) as at:
+        assert not listens_to_tf(at)
         at.peer.spin_for(2.0)
-        assert ({"/tf", "/tf_static"} <= topics_of(at.node)) == (not posed)
-    finally:
-        at.close()
+        assert listens_to_tf(at) is not posed
 
 
 @pytest.mark.parametrize("child", ["camera", "base_link"])
-def test_tf_is_used_for_odometry_of_another_frame(
-    monkeypatch: pytest.MonkeyPatch, child: str
-) -> None:
-    monkeypatch.setattr(inputs, "TFMessage", TransformStamped)
-    at = Bench(SegmentationNode, {**CAMERA, "camera/pose": Odometry})
-    try:
-        at.send(rgb__camera_info=camera_info(at.next_stamp()))
+def test_tf_is_used_for_odometry_of_another_frame(any_tf, child):
+    with Bench(SegmentationNode, {**CAMERA, "camera/pose": Odometry}) as at:
+        at.send_made(rgb__camera_info=camera_info)
         at.expect(lambda: at.node._frames.camera_frame == "camera", "the camera's frame")
-        message = odometry(at.next_stamp())
-        message.child_frame_id = child
-        at.send(camera__pose=message)
+        at.send_made(camera__pose=partial(odometry, child=child))
         at.expect(lambda: at.node._frames._had_poses, "the odometry")
         at.peer.spin_for(0.2)
-        assert ({"/tf", "/tf_static"} <= topics_of(at.node)) == (child == "base_link")
-    finally:
-        at.close()
+        assert listens_to_tf(at) is (child == "base_link")

@@ -1,20 +1,19 @@
-"""Documentation names only files, headings and functions that exist."""
-
-from __future__ import annotations
+"""Documentation names only what exists, and its site builds strictly and loads nothing."""
 
 import ast
+import os
 import re
 import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "deworldsg_ros"
-METHOD = ROOT / "docs" / "dev" / "method.md"
-# The fixtures below are checked as if they were the text of this page.
-PAGE = ROOT / "docs" / "dev" / "page.md"
+DEV = ROOT / "docs" / "dev"
 # A changelog names files of earlier versions.
 HISTORY = {"CHANGELOG.md"}
 # A program of another project, and files that the package writes.
@@ -26,6 +25,15 @@ FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
 SOURCE_PATH = re.compile(r"[\w./-]+\.(?:py|yaml|yml|sh|toml|md)")
 PAGE_IN_CODE = re.compile(r"\b(?:docs|bench|bags)/[\w/-]+\.md")
+STEP = re.compile(r"^\| [^|]+ \| `(\w+)` \| `([\w/]+\.py)` \|$", re.MULTILINE)
+
+
+# What a browser fetches by itself; links that a reader clicks are not in it.
+FETCHED = re.compile(
+    r"<(?:script|img|iframe)[^>]*\bsrc=[\"']?https?://|"
+    r"<link[^>]*rel=[\"']?(?:stylesheet|preconnect|preload|icon)[\"']?[^>]*https?://|"
+    r"@import url\(http"
+)
 
 
 @cache
@@ -37,12 +45,7 @@ def tracked() -> tuple[Path, ...]:
     return tuple(path for path in paths if (ROOT / path).is_file())
 
 
-def pages() -> list[Path]:
-    return [path for path in tracked() if path.suffix == ".md" and path.name not in HISTORY]
-
-
-def page_id(path: Path) -> str:
-    return path.as_posix()
+PAGES = [str(path) for path in tracked() if path.suffix == ".md" and path.name not in HISTORY]
 
 
 def anchors(text: str) -> set[str]:
@@ -86,17 +89,6 @@ def missing_files(text: str) -> list[str]:
     return [name for name in checked if name not in ends | ELSEWHERE]
 
 
-def method_rows(text: str) -> list[tuple[list[str], list[str], list[str]]]:
-    """Functions, source files and test files of each row of the table of equations."""
-    rows = []
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        if re.fullmatch(r"\d+", cells[0]):
-            _, _, functions, files, tests = cells
-            rows.append((CODE.findall(functions), CODE.findall(files), CODE.findall(tests)))
-    return rows
-
-
 def defined_in(path: Path) -> set[str]:
     """Names of all functions and classes of a module."""
     kinds = (ast.FunctionDef, ast.ClassDef)
@@ -104,18 +96,14 @@ def defined_in(path: Path) -> set[str]:
     return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}
 
 
-@pytest.mark.parametrize("page", pages(), ids=page_id)
-def test_links_lead_to_files_and_headings(page: Path) -> None:
-    path = ROOT / page
-    assert broken_links(path, path.read_text(encoding="utf-8")) == []
+@pytest.mark.parametrize("page", PAGES)
+def test_links_and_named_source_files_of_a_page_exist(page):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert broken_links(ROOT / page, text) == []
+    assert missing_files(text) == []
 
 
-@pytest.mark.parametrize("page", pages(), ids=page_id)
-def test_named_source_files_exist(page: Path) -> None:
-    assert missing_files((ROOT / page).read_text(encoding="utf-8")) == []
-
-
-def test_pages_named_in_code_exist() -> None:
+def test_pages_named_in_code_exist():
     missing = {
         f"{path}: {name}"
         for path in tracked()
@@ -126,45 +114,56 @@ def test_pages_named_in_code_exist() -> None:
     assert missing == set()
 
 
-def test_functions_of_the_equations_exist_where_the_table_says() -> None:
-    rows = method_rows(METHOD.read_text(encoding="utf-8"))
-    assert len(rows) == 10
-    for functions, files, tests in rows:
+def test_functions_of_the_equations_exist_where_the_table_says():
+    text = (DEV / "method.md").read_text(encoding="utf-8")
+    cells = [[CODE.findall(cell) for cell in line.strip("|").split("|")]
+             for line in text.splitlines() if re.match(r"\| *\d+ *\|", line)]  # fmt: skip
+    assert len(cells) == 10
+    for _, _, functions, files, tests in cells:
         assert functions and files and tests
-        defined = set().union(*(defined_in(PACKAGE / file) for file in files))
-        assert set(functions) <= defined
+        assert set(functions) <= set().union(*(defined_in(PACKAGE / file) for file in files))
         assert all((ROOT / test).is_file() for test in tests)
+
+
+def test_the_page_of_the_architecture_names_functions_and_every_folder():
+    page = (DEV / "architecture.md").read_text(encoding="utf-8")
+    steps = STEP.findall(page)
+    assert len(steps) >= 20
+    assert [step for step in steps if step[0] not in defined_in(ROOT / step[1])] == []
+    described = set(re.findall(r"^\| `([\w.]+)/?` \|", page, re.MULTILINE))
+    assert {path.parent.name for path in PACKAGE.glob("*/__init__.py")} <= described
+    assert {"pipeline.py", "graph_builder.py", "config.py", "map_file.py"} <= described
 
 
 @pytest.mark.parametrize(
     ("text", "broken"),
     [
-        ("", []),
-        ("[here](#a-heading)\n# A heading", []),
-        ("[here](#no-heading)\n# A heading", ["#no-heading"]),
-        ("[a page](method.md) [a site](https://example.org/x.md)", []),
-        ("[a page](no_such_page.md)", ["no_such_page.md"]),
-        (
-            "[a part](method.md#equations) [none](method.md#no-such-part)",
-            ["method.md#no-such-part"],
-        ),
+        ("[here](#a-heading) [there](#no-heading)\n# A heading", ["#no-heading"]),
+        ("[a page](no.md) [a site](https://example.org/x.md)", ["no.md"]),
+        ("[a part](method.md#equations) [none](method.md#none)", ["method.md#none"]),
+        ("`lifting/stage.py`, `stage.py`, `python bench/no.py`", ["bench/no.py"]),
+        ("`lifting/no_such.py` and `no_such.py`", ["lifting/no_such.py", "no_such.py"]),
     ],
 )
-def test_a_broken_link_is_found(text: str, broken: list[str]) -> None:
-    assert broken_links(PAGE, text) == broken
+def test_what_is_broken_or_missing_is_found(text, broken):
+    assert broken_links(DEV / "page.md", text) + missing_files(text) == broken
 
 
-@pytest.mark.parametrize(
-    ("text", "missing"),
-    [
-        ("", []),
-        ("`lifting/stage.py`, `config/default.yaml`, `stage.py`, `bench/NAME.py`", []),
-        ("`python bench/no_such_bench.py`", ["bench/no_such_bench.py"]),
-        (
-            "`lifting/no_such_file.py` and `no_such_file.py`",
-            ["lifting/no_such_file.py", "no_such_file.py"],
-        ),
-    ],
-)
-def test_a_missing_file_is_found(text: str, missing: list[str]) -> None:
-    assert missing_files(text) == missing
+@pytest.mark.slow
+@pytest.mark.timeout(180)
+def test_the_site_has_all_pages_builds_strictly_and_fetches_nothing(root_dir, tmp_path):
+    pytest.importorskip("mkdocs", reason="pip install 'deworldsg_ros[docs]'")
+    text = (root_dir / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = [page for entry in yaml.safe_load(text)["nav"] for page in entry.values()]
+    assert len(pages) == 8
+    assert set(pages) == {path.name for path in (root_dir / "docs").glob("*.md")}
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=root_dir, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    built = list(tmp_path.rglob("*.html"))
+    assert len(built) >= 8
+    for path in built:
+        assert not FETCHED.search(path.read_text(encoding="utf-8")), path
+    # A moving picture that a phone can load.
+    assert (tmp_path / "images" / "growing.webp").stat().st_size < 1_500_000

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from deworldsg_ros.config import Config
-from deworldsg_ros.ros.options import DebugOptions, NodeOptions, ReplayOptions
+from deworldsg_ros.ros.options import NodeOptions, ReplayOptions
 
 MAX_OPTIONS = 58
 MAX_MODULES = 220
@@ -97,6 +97,6 @@ def test_the_measuring_tool_counts_what_it_says(tool: ModuleType, tmp_path: Path
 def test_every_option_has_a_user() -> None:
     sections = msgspec.structs.fields(Config)
     count = sum(len(msgspec.structs.fields(section.type)) for section in sections)
-    for options in (NodeOptions, DebugOptions, ReplayOptions):
+    for options in (NodeOptions, ReplayOptions):
         count += len(msgspec.structs.fields(options))
     assert 40 <= count <= MAX_OPTIONS

@@ -1,15 +1,13 @@
 """Both ways to install, each into an empty folder, and what a ROS 2 user then finds there."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ament_index_python.packages import (
@@ -19,11 +17,8 @@ from ament_index_python.packages import (
 )
 
 PACKAGE = "deworldsg_ros"
-EXECUTABLES = {
-    *("segmentation_node", "lifting_node", "relation_node", "graph_node"),
-    *("deworldsg_node", "odometry_node", "replay_node", "viewer_node"),
-    *("fleet_node", "fleet_link_node", "region_node"),
-}
+SCRIPTS = Path(__file__).parents[2] / "scripts" / "ros"
+EXECUTABLES = {path.name for path in SCRIPTS.iterdir()}
 SOURCES = (
     *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"),
     *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),
@@ -43,7 +38,7 @@ class Install:
     prefix: Path
     site: Path
 
-    def environment(self) -> Mapping[str, str]:
+    def environment(self) -> dict[str, str]:
         """The environment of a shell in which the installation is sourced."""
         return {
             **os.environ,
@@ -53,19 +48,10 @@ class Install:
         }
 
 
-def run(*command: str | Path, cwd: Path, **options: object) -> str:
-    """Run a command and return its output; a failure shows the output."""
-    done = subprocess.run(
-        [str(part) for part in command],
-        cwd=cwd,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=110,
-        **options,  # type: ignore[call-overload]
-    )
-    assert done.returncode == 0, done.stdout
-    return done.stdout
+def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command; its errors are in its output."""
+    kept = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "timeout": 110}
+    return subprocess.run(list(map(str, command)), **{**kept, **options})
 
 
 def copy_sources(root: Path, target: Path) -> Path:
@@ -85,16 +71,18 @@ def install_with_pip(source: Path, folder: Path) -> Path:
     """The prefix of a `pip install .`."""
     # Without --ignore-installed pip would first uninstall the package from this environment.
     options = ("--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--ignore-installed")
-    prefix = folder / "prefix"
-    run(sys.executable, "-m", "pip", "install", *options, "--prefix", prefix, source, cwd=folder)
-    return prefix
+    pip = (sys.executable, "-m", "pip", "install", *options)
+    done = run(*pip, "--prefix", folder / "prefix", source, cwd=folder)
+    assert done.returncode == 0, done.stdout
+    return folder / "prefix"
 
 
 def install_with_colcon(source: Path, folder: Path) -> Path:
     """The prefix of a `colcon build`."""
     colcon = shutil.which("colcon", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     assert colcon is not None, "colcon is missing: scripts/test installs it"
-    run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
+    done = run(colcon, "--log-base", "log", "build", "--base-paths", source, cwd=folder)
+    assert done.returncode == 0, done.stdout
     return folder / "install" / PACKAGE
 
 
@@ -102,9 +90,7 @@ BUILDERS = {"pip": install_with_pip, "colcon": install_with_colcon}
 
 
 @pytest.fixture(scope="module", params=sorted(BUILDERS))
-def install(
-    request: pytest.FixtureRequest, root_dir: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Install:
+def install(request, root_dir, tmp_path_factory):
     """The package, installed in one of the two ways."""
     folder = tmp_path_factory.mktemp(request.param)
     prefix = BUILDERS[request.param](copy_sources(root_dir, folder / "source"), folder)
@@ -113,7 +99,7 @@ def install(
 
 
 @pytest.fixture()
-def sourced(install: Install, monkeypatch: pytest.MonkeyPatch) -> Install:
+def sourced(install, monkeypatch):
     """The installation, with this process as a shell in which it is sourced."""
     monkeypatch.setenv("AMENT_PREFIX_PATH", install.environment()["AMENT_PREFIX_PATH"])
     return install
@@ -128,13 +114,9 @@ def files_below(folder: Path) -> set[str]:
     }
 
 
-def test_ament_index_finds_the_package(sourced: Install) -> None:
+def test_ros_finds_the_files_of_the_checkout_and_each_executable_once(sourced, root_dir):
     assert get_package_prefix(PACKAGE) == str(sourced.prefix)
-    assert get_package_share_directory(PACKAGE) == str(sourced.prefix / "share" / PACKAGE)
     assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
-
-
-def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_dir: Path) -> None:
     share = Path(get_package_share_directory(PACKAGE))
     assert (share / "package.xml").is_file()
     for folder in SHARED:
@@ -142,68 +124,42 @@ def test_the_share_folder_has_the_files_of_the_checkout(sourced: Install, root_d
         if folder != "launch":
             wanted = {name for name in wanted if not name.endswith(".py")}
         assert wanted <= files_below(share / folder)
-    assert {"default.yaml", "paper.yaml", "paper_rules.yaml", "fastdds.xml"} <= files_below(
-        share / "config"
-    )
-    assert {"deworldsg.launch.py", "realsense.launch.py"} == files_below(share / "launch")
-
-
-def test_ros2_run_finds_each_executable_once(sourced: Install) -> None:
-    folder = Path(get_package_prefix(PACKAGE)) / "lib" / PACKAGE
-    assert {path.name for path in folder.iterdir()} == EXECUTABLES
+    assert files_below(share / "launch") == {"deworldsg.launch.py", "realsense.launch.py"}
+    folder = sourced.prefix / "lib" / PACKAGE
+    assert {path.name for path in folder.iterdir()} == EXECUTABLES >= {"graph_node", "replay_node"}
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
     assert {path.name for path in (sourced.prefix / "bin").iterdir()} == {"deworldsg"}
 
 
-def test_python_package_has_all_its_files(install: Install, root_dir: Path) -> None:
-    assert files_below(root_dir / PACKAGE) <= files_below(install.site / PACKAGE)
-    assert any(name.endswith(".onnx") for name in files_below(install.site / PACKAGE))
-
-
 @pytest.mark.parametrize("executable", sorted(EXECUTABLES))
-def test_executable_starts_its_node(install: Install, tmp_path: Path, executable: str) -> None:
+def test_executable_starts_its_node(install, tmp_path, executable):
     """A configuration that cannot be used ends a node at start-up, with status 2 and the reason."""
-    done = subprocess.run(
-        [install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such_thing:=1"],
-        cwd=tmp_path,
-        env=install.environment(),
-        capture_output=True,
-        text=True,
-        timeout=100,
-    )
-    assert done.returncode == 2, done.stderr
-    assert "no_such_thing" in done.stderr
+    command = (install.prefix / "lib" / PACKAGE / executable, "--ros-args", "-p", "no_such:=1")
+    done = run(*command, cwd=tmp_path, env=install.environment())
+    assert done.returncode == 2, done.stdout
+    assert "no_such" in done.stdout
 
 
-def test_deworldsg_help_lists_the_commands(install: Install, tmp_path: Path) -> None:
+def test_the_package_is_complete_and_its_command_runs(install, root_dir, tmp_path):
+    installed = files_below(install.site / PACKAGE)
+    assert files_below(root_dir / PACKAGE) <= installed
+    assert any(name.endswith(".onnx") for name in installed)
     command = install.prefix / "bin" / "deworldsg"
-    text = run(command, "--help", cwd=tmp_path, env=install.environment())
+    text = run(command, "--help", cwd=tmp_path, env=install.environment()).stdout
     for name in ("run", "demo", "convert", "info", "config", "evaluate"):
         assert re.search(rf"^ +{name} +[A-Z]", text, re.M), text
 
 
 @pytest.mark.parametrize("prefix_has_python", [True, False])
-def test_executable_prefers_the_python_of_its_prefix(
-    root_dir: Path, tmp_path: Path, prefix_has_python: bool
-) -> None:
+def test_executable_prefers_the_python_of_its_prefix(tmp_path, prefix_has_python):
     """`.venv/lib/deworldsg_ros/graph_node` works where .venv is not activated."""
-
-    def fake_python(folder: Path, name: str) -> None:
-        folder.mkdir(parents=True)
-        (folder / "python3").write_text(f'#!/bin/sh\necho {name} "$2"\n')
-        (folder / "python3").chmod(0o755)
-
     executable = tmp_path / "a prefix" / "lib" / PACKAGE / "graph_node"
     executable.parent.mkdir(parents=True)
-    shutil.copy(root_dir / "scripts" / "ros" / "graph_node", executable)
-    fake_python(tmp_path / "elsewhere", "path")
-    if prefix_has_python:
-        fake_python(tmp_path / "a prefix" / "bin", "prefix")
-    done = subprocess.run(
-        [executable, "an argument"],
-        env={"PATH": f"{tmp_path / 'elsewhere'}:/usr/bin:/bin"},
-        capture_output=True,
-        text=True,
-        timeout=20,
-    )
+    shutil.copy(SCRIPTS / "graph_node", executable)
+    pythons = {"path": tmp_path / "elsewhere", "prefix": tmp_path / "a prefix" / "bin"}
+    for name, folder in list(pythons.items())[: 1 + prefix_has_python]:
+        folder.mkdir()
+        (folder / "python3").write_text(f'#!/bin/sh\necho {name} "$2"\n')
+        (folder / "python3").chmod(0o755)
+    done = run(executable, "an argument", env={"PATH": f"{pythons['path']}:/usr/bin:/bin"})
     assert done.stdout == f"{'prefix' if prefix_has_python else 'path'} an argument\n"

@@ -1,13 +1,9 @@
 """Package metadata that stands in more than one file agrees."""
 
-from __future__ import annotations
-
-import os
 import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from importlib.metadata import metadata, requires, version
 from pathlib import Path
 
 import pytest
@@ -19,11 +15,8 @@ from deworldsg_ros.config import Config, load_config, to_mapping
 ROS_NAMES = r"rclpy|tf2_\w+|launch\w*|ament_\w+|\w+_(msgs|srvs|interfaces)"
 # Modules whose distribution has another name.
 DISTRIBUTIONS = {
-    "foxglove": "foxglove-sdk",
-    "zenoh": "eclipse-zenoh",
-    "cv2": "opencv-python-headless",
-    "yaml": "pyyaml",
-    "huggingface_hub": "huggingface-hub",
+    **{"foxglove": "foxglove-sdk", "zenoh": "eclipse-zenoh", "cv2": "opencv-python-headless"},
+    **{"yaml": "pyyaml", "huggingface_hub": "huggingface-hub"},
 }
 
 
@@ -36,66 +29,46 @@ def requirements(root: Path, *extras: str) -> dict[str, str]:
     return {re.split(r"[<>=!]", line)[0].lower(): line for line in done.stdout.split()}
 
 
-def test_versions_agree(root_dir: Path) -> None:
+def test_versions_descriptions_licences_and_ros_packages_agree(root_dir):
     manifest = ElementTree.parse(root_dir / "package.xml").getroot()
-    assert manifest.findtext("version") == deworldsg_ros.__version__
-    citation = yaml.safe_load((root_dir / "CITATION.cff").read_text(encoding="utf-8"))
-    assert citation["version"] == deworldsg_ros.__version__
-    changelog = (root_dir / "CHANGELOG.md").read_text(encoding="utf-8")
-    newest = re.search(r"^## \[(\d[^\]]*)\]", changelog, re.M)
-    assert newest is not None and newest.group(1) == deworldsg_ros.__version__
-
-
-def test_descriptions_and_licences_agree(root_dir: Path) -> None:
-    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
-    pyproject = (root_dir / "pyproject.toml").read_text(encoding="utf-8")
-    assert f'description = "{(manifest.findtext("description") or "").rstrip(".")}"' in pyproject
-    setup = (root_dir / "setup.py").read_text(encoding="utf-8")
-    assert manifest.findtext("license") == "Apache-2.0" and 'license="Apache-2.0"' in setup
-
-
-def test_package_xml_declares_every_ros_package_that_is_imported(root_dir: Path) -> None:
-    manifest = ElementTree.parse(root_dir / "package.xml").getroot()
-    assert manifest.findtext("name") == "deworldsg_ros"
-    assert manifest.findtext("export/build_type") == "ament_python"
+    texts = {
+        name: (root_dir / name).read_text(encoding="utf-8")
+        for name in ("CITATION.cff", "CHANGELOG.md", "pyproject.toml", "setup.py")
+    }
+    newest = re.search(r"^## \[(\d[^\]]*)\]", texts["CHANGELOG.md"], re.M)
+    cited = yaml.safe_load(texts["CITATION.cff"])["version"]
+    assert {manifest.findtext("version"), cited, newest[1]} == {deworldsg_ros.__version__}
+    described = (manifest.findtext("description") or "").rstrip(".")
+    assert f'description = "{described}"' in texts["pyproject.toml"]
+    assert manifest.findtext("license") == "Apache-2.0"
+    assert 'license="Apache-2.0"' in texts["setup.py"]
     declared = {element.text for element in manifest.findall("exec_depend")}
     imported = {name for name in imported_modules(root_dir) if re.fullmatch(ROS_NAMES, name)}
-    assert {"rclpy", "sensor_msgs"} <= imported
-    assert imported <= declared
+    assert {"rclpy", "sensor_msgs"} <= imported <= declared
 
 
 def imported_modules(root: Path) -> set[str]:
     """Top-level names of everything that the package imports."""
-    imported: set[str] = set()
-    for path in (root / "deworldsg_ros").rglob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        imported |= set(
-            re.findall(r"^ *(?:from|import) (\w+)(?=[\w.]* import |$| as )", text, re.M)
-        )
-    return imported
+    texts = [path.read_text(encoding="utf-8") for path in (root / "deworldsg_ros").rglob("*.py")]
+    found = r"^ *(?:from|import) (\w+)(?=[\w.]* import |$| as )"
+    return {name for text in texts for name in re.findall(found, text, re.M)}
 
 
-def test_every_imported_library_is_a_requirement(root_dir: Path) -> None:
-    known = {
-        *requirements(root_dir),
-        *requirements(root_dir, "models", "cluster", "mcp", "networkx", "fleet", "store"),
-        *requirements(root_dir, "view", "foxglove"),
-    }
+def test_every_imported_library_is_a_requirement(root_dir):
+    extras = ("models", "cluster", "mcp", "networkx", "fleet", "store", "view", "foxglove")
     libraries = {
         DISTRIBUTIONS.get(name, name).lower()
-        for name in imported_modules(root_dir)
-        if name not in sys.stdlib_module_names
-        and name not in ("deworldsg_ros", "__future__")
-        and not re.fullmatch(ROS_NAMES, name)
+        for name in imported_modules(root_dir) - set(sys.stdlib_module_names)
+        if name not in ("deworldsg_ros", "__future__") and not re.fullmatch(ROS_NAMES, name)
     }
     assert {"numpy", "msgspec", "torch"} <= libraries
-    assert libraries <= known
+    assert libraries <= {*requirements(root_dir), *requirements(root_dir, *extras)}
 
 
 @pytest.mark.parametrize(
     "name", ["default.yaml", "paper.yaml", "paper_rules.yaml", "released.yaml"]
 )
-def test_a_shipped_configuration_contains_only_changed_values(root_dir: Path, name: str) -> None:
+def test_a_shipped_configuration_contains_only_changed_values(root_dir, name):
     path = root_dir / "config" / name
     content = yaml.safe_load(path.read_text(encoding="utf-8"))["/**"]["ros__parameters"]
     content.pop("use_sim_time", None)
@@ -106,22 +79,10 @@ def test_a_shipped_configuration_contains_only_changed_values(root_dir: Path, na
             assert loaded[section][field] == value != default[section][field], (section, field)
 
 
-def test_run_time_requirements_are_bounded_and_without_torch(root_dir: Path) -> None:
+def test_run_time_requirements_are_bounded_and_without_torch(root_dir):
     lines = requirements(root_dir)
     assert {"numpy", "scipy", "rosbags"} <= set(lines)
     assert all(re.fullmatch(r"[\w.-]+>=[\d.]+,<[\d.]+", line) for line in lines.values())
     assert not {"torch", "transformers"} & set(lines)
-
-
-def test_an_unknown_extra_is_refused(root_dir: Path) -> None:
     with pytest.raises(subprocess.CalledProcessError):
         requirements(root_dir, "no-such-extra")
-
-
-def test_metadata_of_the_installed_package_names_the_requirements(root_dir: Path) -> None:
-    if "VIRTUAL_ENV" not in os.environ:
-        pytest.skip("deworldsg_ros is installed where scripts/test runs the tests")
-    assert version("deworldsg_ros") == deworldsg_ros.__version__
-    assert metadata("deworldsg_ros")["Summary"].startswith("Live 3D semantic scene graphs")
-    names = {re.split(r"[<>=!~;\[ ]", line)[0].lower() for line in requires("deworldsg_ros") or []}
-    assert set(requirements(root_dir)) <= names

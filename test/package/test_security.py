@@ -1,7 +1,5 @@
 """No weights that can contain code, no server that strangers can reach."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 from collections.abc import Iterator
@@ -32,7 +30,7 @@ def calls(tree: ast.Module) -> Iterator[tuple[str, str, ast.Call]]:
             yield ast.unparse(node.func.value), node.func.attr, node
 
 
-def test_weights_are_read_as_safetensors_or_as_tensors_alone(root_dir: Path) -> None:
+def test_weights_are_read_as_safetensors_or_as_tensors_alone(root_dir):
     loads = []
     for name, tree in sources(root_dir):
         for owner, called, node in calls(tree):
@@ -47,7 +45,7 @@ def test_weights_are_read_as_safetensors_or_as_tensors_alone(root_dir: Path) -> 
     assert any("checkpoints" in name for name in loads)
 
 
-def test_the_package_runs_no_code_of_a_file(root_dir: Path) -> None:
+def test_the_package_runs_no_code_of_a_file(root_dir):
     for name, tree in sources(root_dir):
         if not name.startswith("deworldsg_ros/"):  # others read pickles that they wrote
             continue
@@ -63,15 +61,12 @@ def test_the_package_runs_no_code_of_a_file(root_dir: Path) -> None:
             assert (owner, called) != ("yaml", "unsafe_load"), f"{name}:{node.lineno}"
 
 
-def test_no_server_listens_to_other_machines_by_default(root_dir: Path) -> None:
+def test_servers_listen_to_this_machine_alone_by_default(root_dir):
     """An address for all machines stands in texts at most."""
     for name, tree in sources(root_dir):
         for node in ast.walk(tree):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 assert node.value not in ANYWHERE, f"{name}:{node.lineno}"
-
-
-def test_servers_listen_to_this_machine_alone() -> None:
     assert FleetOptions().listen == "tcp/127.0.0.1:7447"
     assert ViewerOptions().host == "127.0.0.1"
     assert inspect.signature(view).parameters["host"].default == "127.0.0.1"

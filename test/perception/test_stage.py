@@ -1,10 +1,12 @@
-"""The stage: composition, limits, counted drops, configuration."""
+"""The stage: composition, limits, counted drops, failing backends, configuration."""
 
-from __future__ import annotations
+import sys
+from collections import Counter
 
-import msgspec
+import cv2
 import numpy as np
 import pytest
+from support import failing_backend
 from support.perception import (
     CUP_ON_TABLE,
     HEIGHT,
@@ -20,25 +22,21 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception, build_perception
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
-from deworldsg_ros.scene.camera import RgbdFrame
-from deworldsg_ros.scene.errors import ConfigurationError
+from deworldsg_ros.ros.health import REASONS
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 from deworldsg_ros.scene.vocabulary import (
-    COCO_CLASSES,
-    PREDICATE_SETS,
     REPLICA_SSG_PREDICATES,
-    SCANNET_CLASSES,
-    SCANNET_PREDICATES,
-    VISUAL_GENOME_CLASSES,
 )
 
 
 class ListedDetector:
     """Returns the detections that it was made with."""
 
-    classes = ("table", "cup", "person")
     default_score_threshold = 0.45
 
-    def __init__(self, boxes, classes, scores):
+    def __init__(self, boxes, classes, scores, names=("table", "cup", "person")):
+        self.classes = names
         self.boxes = np.array(boxes, dtype=float).reshape(-1, 4)
         self.probabilities = np.full((len(scores), 3), 0.1)
         self.probabilities[np.arange(len(scores)), classes] = 0.8
@@ -51,20 +49,14 @@ class ListedDetector:
         return Detections(self.boxes[keep], self.probabilities[keep], self.scores[keep])
 
 
-def camera_pose():
-    pitch = np.radians(30.0)
-    pose = np.eye(4)
-    pose[:3, 0] = [1, 0, 0]
-    pose[:3, 1] = [0, -np.sin(pitch), -np.cos(pitch)]
-    pose[:3, 2] = [0, np.cos(pitch), -np.sin(pitch)]
-    pose[:3, 3] = [0, 0, 1.5]
-    return pose
-
-
-def table_and_cup():
-    rgb, depth_m, owner = render([TABLE_TOP, CUP_ON_TABLE], 0.002)
-    frame = RgbdFrame(7, rgb, depth_m, INTRINSICS, camera_pose())
-    return frame, box_of(owner > 0), box_of(owner == 2), owner
+RGB, DEPTH_M, OWNER = render([TABLE_TOP, CUP_ON_TABLE], 0.002)
+TABLE, CUP = box_of(OWNER > 0), box_of(OWNER == 2)
+PITCH = np.radians(30.0)
+T_CAMERA = np.eye(4)
+T_CAMERA[:3, 1] = 0, -np.sin(PITCH), -np.cos(PITCH)
+T_CAMERA[:3, 2] = 0, np.cos(PITCH), -np.sin(PITCH)
+T_CAMERA[:3, 3] = 0, 0, 1.5
+FRAME = RgbdFrame(7, RGB, DEPTH_M, INTRINSICS, T_CAMERA)
 
 
 def stage(detector, **settings):
@@ -72,138 +64,194 @@ def stage(detector, **settings):
     return Perception(detector, RgbdSegmenter(), head, PerceptionConfig(**settings), world_up="z")
 
 
+def perceive(boxes, classes, scores, **settings):
+    return stage(ListedDetector(boxes, classes, scores), **settings).perceive(FRAME)
+
+
 def test_a_table_and_a_cup():
-    frame, table, cup, owner = table_and_cup()
     # Worst first: the stage orders.
-    found = stage(ListedDetector([table, cup], [0, 1], [0.6, 0.9])).perceive(frame)
+    found, again = (perceive([TABLE, CUP], [0, 1], [0.6, 0.9]) for _ in range(2))
     graph = found.frame_graph
     assert graph.scores.tolist() == [0.9, 0.6]
-    assert graph.stamp_ns == 7 and (graph.width, graph.height) == (WIDTH, HEIGHT)
+    assert (graph.stamp_ns, graph.width, graph.height) == (7, WIDTH, HEIGHT)
     assert graph.vocabulary.predicates == REPLICA_SSG_PREDICATES
     for label, value in ((1, 2), (2, 1)):
-        mask, truth = found.instances == label, owner == value
+        mask, truth = found.instances == label, value == OWNER
         assert (mask & truth).sum() / (mask | truth).sum() > 0.85
-    relations = {
-        tuple(pair): REPLICA_SSG_PREDICATES[row.argmax()]
-        for pair, row in zip(graph.relations.pairs.tolist(), graph.relations.logits)
-    }
-    assert relations[0, 1] == "on"
+    row = graph.relations.pairs.tolist().index([0, 1])
+    assert REPLICA_SSG_PREDICATES[graph.relations.logits[row].argmax()] == "on"
     assert found.drops == {}
-
-
-def test_nothing_detected():
-    frame, *_ = table_and_cup()
-    found = stage(ListedDetector([], [], [])).perceive(frame)
-    assert len(found.frame_graph) == 0 and not found.instances.any()
-    assert found.instances.shape == SHAPE and found.instances.dtype == np.uint16
-    assert found.frame_graph.relations.logits.shape == (0, 50)
-
-
-def test_dropped_detections_are_counted():
-    frame, table, cup, _ = table_and_cup()
-    boxes = [table, cup, [400, 10, 500, 60], [10, 10, 10.5, 80]]
-    perceived = stage(ListedDetector(boxes, [0, 1, 2, 2], [0.6, 0.9, 0.95, 0.5])).perceive(frame)
-    assert perceived.drops == {"box_too_small": 2}
-    assert perceived.frame_graph.scores.tolist() == [0.9, 0.6]
-
-
-def test_the_best_50_objects_are_kept():
-    frame, *_ = table_and_cup()
-    corners = [(30 * (k % 10), 30 * (k // 10)) for k in range(52)]
-    boxes = [[x, y, x + 20, y + 20] for x, y in corners]
-    scores = np.linspace(0.5, 0.9, 52)
-    perceived = stage(ListedDetector(boxes, [2] * 52, scores)).perceive(frame)
-    assert perceived.drops == {"over_max_objects": 2}
-    assert perceived.frame_graph.scores.tolist() == scores[:1:-1].tolist()
-
-
-def test_boxes_are_clipped_to_the_image():
-    frame, *_ = table_and_cup()
-    found = stage(ListedDetector([[-20, -30, 60, 300]], [0], [0.9])).perceive(frame)
+    assert np.array_equal(again.instances, found.instances)
+    assert np.array_equal(again.frame_graph.relations.logits, graph.relations.logits)
+    without = perceive([TABLE, CUP], [0, 1], [0.6, 0.9], max_relations=0)
+    assert without.frame_graph.relations.logits.shape == (0, 50)
+    # Boxes are clipped to the image.
+    found = perceive([[-20, -30, 60, 300]], [0], [0.9])
     assert found.frame_graph.boxes_xyxy.tolist() == [[0, 0, 60, HEIGHT - 1]]
 
 
-def test_a_box_that_fills_the_image_is_no_object():
-    frame, *_ = table_and_cup()
-    near = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
-    far = [*near[:3], 0.9 * HEIGHT]
-    detector = ListedDetector([near, far], [0, 1], [0.9, 0.8])
-    perceived = stage(detector).perceive(frame)
-    assert perceived.drops == {"box_is_the_view": 1}
-    assert perceived.frame_graph.scores.tolist() == [0.8]
-    perceived = stage(detector, refine_detections=False).perceive(frame)
-    assert perceived.frame_graph.scores.tolist() == [0.9, 0.8]
+VIEW = [0.03 * WIDTH, 0.03 * HEIGHT, 0.97 * WIDTH, 0.97 * HEIGHT]
 
 
-def test_relations_can_be_off():
-    frame, table, cup, _ = table_and_cup()
-    found = stage(ListedDetector([table, cup], [0, 1], [0.6, 0.9]), max_relations=0)
-    assert len(found.perceive(frame).frame_graph.relations.pairs) == 0
+@pytest.mark.parametrize(
+    ("boxes", "classes", "scores", "drops", "kept"),
+    [
+        ([], [], [], {}, []),
+        ([TABLE, CUP], [0, 0], [0.6, 0.9], {"detected_twice": 1}, [0.9]),
+        ([TABLE, [400, 10, 500, 60]], [0, 1], [0.6, 0.95], {"box_too_small": 1}, [0.6]),
+        ([TABLE, [10, 10, 10.5, 80]], [0, 1], [0.6, 0.9], {"box_too_small": 1}, [0.6]),
+        ([VIEW, [*VIEW[:3], 0.9 * HEIGHT]], [0, 1], [0.9, 0.8], {"box_is_the_view": 1}, [0.8]),
+        (
+            [[x, y, x + 20, y + 20] for y in range(0, 180, 30) for x in range(0, 300, 30)][:52],
+            [2] * 52,
+            np.linspace(0.5, 0.9, 52),
+            {"over_max_objects": 2},
+            np.linspace(0.5, 0.9, 52)[:1:-1],
+        ),
+    ],
+)
+def test_dropped_detections_are_counted(boxes, classes, scores, drops, kept):
+    found = perceive(boxes, classes, scores)
+    assert found.drops == drops
+    assert found.frame_graph.scores.tolist() == list(kept)
+    assert found.instances.shape == SHAPE and found.instances.dtype == np.uint16
 
 
 @pytest.mark.parametrize(("configured", "used"), [(-1.0, 0.45), (0.7, 0.7), (0.0, 0.0)])
 @pytest.mark.parametrize(("refine", "fraction"), [(True, 0.5), (False, 1.0)])
 def test_threshold_is_that_of_the_detector_unless_configured(configured, used, refine, fraction):
-    frame, *_ = table_and_cup()
     detector = ListedDetector([], [], [])
     perception = stage(detector, score_threshold=configured, refine_detections=refine)
-    perception.perceive(frame)
+    perception.perceive(FRAME)
     assert detector.thresholds == [used * fraction] and perception.score_threshold == used
 
 
 @pytest.mark.parametrize(("refine", "taken"), [(True, 0.0), (False, 1.0)])
-def test_a_weakly_detected_cup_is_no_object_and_no_part_of_the_table(refine, taken):
-    frame, table, cup, owner = table_and_cup()
-    detector = ListedDetector([table, cup], [0, 1], [0.6, 0.3])
-    perceived = stage(detector, refine_detections=refine).perceive(frame)
-    assert perceived.frame_graph.scores.tolist() == [0.6] and perceived.drops == {}
-    assert (perceived.instances[owner == 2] > 0).mean() == pytest.approx(taken, abs=0.1)
+def test_refined_detections_leave_out_weak_objects_and_the_view(refine, taken):
+    found = perceive([TABLE, CUP], [0, 1], [0.6, 0.3], refine_detections=refine)
+    assert found.frame_graph.scores.tolist() == [0.6] and found.drops == {}
+    assert (found.instances[OWNER == 2] > 0).mean() == pytest.approx(taken, abs=0.1)
+    assert len(perceive([VIEW], [0], [0.9], refine_detections=refine).frame_graph) == (not refine)
 
 
-def test_perception_is_deterministic():
-    frame, table, cup, _ = table_and_cup()
-    detector = ListedDetector([table, cup], [0, 1], [0.6, 0.9])
-    first, second = stage(detector).perceive(frame), stage(detector).perceive(frame)
-    assert np.array_equal(first.instances, second.instances)
-    assert np.array_equal(first.frame_graph.relations.logits, second.frame_graph.relations.logits)
+def with_backend(failing="", times=1):
+    backend, shape = failing_backend.Backend(failing), failing_backend.SHAPE
+    perception = Perception(backend, backend, backend, PerceptionConfig(), world_up="z")
+    intrinsics = Intrinsics(40.0, 40.0, 24.5, 19.5, shape[1], shape[0])
+    rgb, depth_m = np.zeros((*shape, 3), np.uint8), np.ones(shape, np.float32)
+    for stamp_ns in range(times):
+        found = perception.perceive(RgbdFrame(stamp_ns, rgb, depth_m, intrinsics, np.eye(4)))
+    return found, backend
 
 
-def test_the_configured_stage_runs():
-    frame, *_ = table_and_cup()
-    perception = build_perception(PerceptionConfig(predicate_set="3dssg", threads=1))
-    perceived = perception.perceive(frame)
-    assert perception.vocabulary.classes == COCO_CLASSES
-    assert perceived.frame_graph.relations.logits.shape[1] == 7
+def test_a_backend_that_fails_loses_only_its_own_results(caplog):
+    found, backend = with_backend()
+    assert len(found.frame_graph) == 3 and len(found.frame_graph.relations.pairs) == 1
+    assert found.drops == {} and found.failures == {}
+    # The features are sorted by score together with their objects.
+    assert backend.features.tolist() == [[2, 3], [4, 5], [0, 1]]
 
+    found, _ = with_backend("relation_head", times=3)
+    assert len(found.frame_graph) == 3 and found.instances.any()
+    assert found.frame_graph.relations.logits.shape == (0, 2)
+    assert found.drops == {"relation_head_error": 3}
+    assert "CUDA out of memory in the relation head" in found.failures["relation_head_error"]
+    # It is logged once, with its traceback.
+    assert len(caplog.records) == 1
+    assert "the relation head failed" in caplog.text and "Traceback" in caplog.text
 
-@pytest.mark.parametrize("field", ["detector", "segmenter", "relation_head"])
-def test_an_unknown_backend_is_refused(field):
-    config = msgspec.structs.replace(PerceptionConfig(), **{field: "magic"})
-    with pytest.raises(ConfigurationError, match=f"perception.{field} is 'magic', expected one of"):
-        build_perception(config)
+    found, _ = with_backend("segmenter")
+    assert len(found.frame_graph) == 0 and not found.instances.any()
+    assert found.instances.shape == failing_backend.SHAPE and found.instances.dtype == np.uint16
+    assert found.drops == {"segmenter_error": 3}
+    assert list(found.failures) == ["segmenter_error"]
 
-
-def test_vocabularies_are_the_published_ones():
-    assert len(COCO_CLASSES) == len(set(COCO_CLASSES)) == 80
-    assert len(VISUAL_GENOME_CLASSES) == len(set(VISUAL_GENOME_CLASSES)) == 150
-    assert len(SCANNET_CLASSES) == len(set(SCANNET_CLASSES)) == 20
-    assert {name: len(p) for name, p in PREDICATE_SETS.items()} == {"replica_ssg": 50, "3dssg": 7}
-    assert set(
-        ["above", "against", "attached to", "has", "in", "near", "on", "under", "with"]
-    ) <= set(REPLICA_SSG_PREDICATES)
-    assert sorted(SCANNET_PREDICATES) == list(SCANNET_PREDICATES)
+    with pytest.raises(RefusedInput, match="CUDA out of memory") as refusal:
+        with_backend("detector")
+    assert refusal.value.reason == "detector_error"
+    assert {"relation_head_error", "segmenter_error", "detector_error"} <= REASONS.keys()
 
 
 @pytest.mark.parametrize(
-    ("classes", "reason"),
+    ("settings", "offender"),
     [
-        (("table", "cup\x1b[2J", "person"), "contains a control character"),
-        (("table", "c" * 257, "person"), "of 257 characters: expected at most 256"),
-        (tuple(map(str, range(8193))), "8193 names: expected at most 8192"),
+        ({"detector": "magic"}, "perception.detector is 'magic'"),
+        ({"segmenter": "magic"}, "perception.segmenter is 'magic'"),
+        ({"relation_head": "magic"}, "perception.relation_head is 'magic'"),
+        # The geometric head has no predicates of its own.
+        ({"predicate_set": "checkpoint", "threads": 1}, "'checkpoint'.*'geometric'"),
     ],
 )
-def test_names_of_a_model_that_no_message_may_contain_are_refused(classes, reason) -> None:
-    detector = ListedDetector([], [], [])
-    detector.classes = classes
-    with pytest.raises(ConfigurationError, match=f"classes of the models: .*{reason}"):
+def test_an_unknown_backend_is_refused(settings, offender):
+    with pytest.raises(ConfigurationError, match=offender):
+        build_perception(PerceptionConfig(**settings))
+
+
+def test_detections_have_one_row_of_features_per_object():
+    with pytest.raises(ValueError, match="2 scores, 1 features"):
+        Detections(np.zeros((2, 4)), np.ones((2, 1)), np.zeros(2), np.zeros((1, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("field", "name"), [("detector", "rtdetr"), ("segmenter", "sam2"), ("segmenter", "sam")]
+)
+def test_without_torch_the_error_names_the_package_to_install(field, name, monkeypatch):
+    for module in ("rtdetr", "sam"):
+        monkeypatch.setitem(sys.modules, f"deworldsg_ros.perception.backends.{module}", None)
+    with pytest.raises(ConfigurationError, match=f"'{name}'.*pip install torch"):
+        build_perception(PerceptionConfig(**{field: name}))
+
+
+@pytest.mark.parametrize(
+    ("names", "offender"),
+    [
+        (("table", "cup\x1b[2J", "person"), "control character"),
+        (("table", "c" * 257, "person"), "257 characters"),
+        (tuple(map(str, range(8193))), "8193 names"),
+    ],
+)
+def test_names_of_a_model_that_no_message_may_contain_are_refused(names, offender):
+    detector = ListedDetector([], [], [], names)
+    with pytest.raises(ConfigurationError, match=f"classes of the models: .*{offender}"):
         Perception(detector, RgbdSegmenter(), GeometricRelationHead(("on",)), PerceptionConfig())
+
+
+KINECT = Intrinsics(528.408586, 528.408586, 320.3179, 236.720192, 640, 480)
+
+
+def kinect_frame(path):
+    rgb = cv2.cvtColor(cv2.imread(f"{path}.color.jpg"), cv2.COLOR_BGR2RGB)
+    depth_m = cv2.imread(f"{path}.depth.png", cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
+    return RgbdFrame(0, rgb, depth_m, KINECT, np.loadtxt(f"{path}.pose.txt"))
+
+
+def test_the_objects_of_the_kitchen_and_cups_on_the_table_are_found(shared_dir):
+    folder = shared_dir / "data" / "redkitchen"
+    if not folder.is_dir():
+        pytest.skip("no recording of the kitchen")
+    perception = build_perception(PerceptionConfig())
+    frames_with, cups, predicates = Counter(), 0, Counter()
+    for number in range(240, 500, 20):
+        seen = kinect_frame(folder / f"frame-{number:06d}")
+        found = perception.perceive(seen)
+        graph = found.frame_graph
+        names = [graph.vocabulary.classes[k] for k in graph.class_probabilities.argmax(1)]
+        frames_with.update(set(names))
+        for row, name in enumerate(names):
+            mask = (found.instances == row + 1) & (seen.depth_m > 0)
+            # The mask of a cup excludes the table.
+            if name == "cup" and mask.sum() > 100:
+                low, high = np.percentile(seen.depth_m[mask], [10, 90])
+                assert high - low < 0.15
+                cups += 1
+        for (s, o), logits in zip(graph.relations.pairs, graph.relations.logits):
+            if (names[s], names[o]) == ("cup", "dining table"):
+                predicates[graph.vocabulary.predicates[logits.argmax()]] += 1
+    for name in ("chair", "dining table", "cup", "tv"):
+        assert frames_with[name] >= 3, frames_with
+    # And little that is not there.
+    there = {"chair", "dining table", "cup", "tv", "book", "sink", "bottle", "bowl", "remote"}
+    invented = sum(count for name, count in frames_with.items() if name not in there)
+    assert invented <= 0.1 * frames_with.total(), frames_with
+    assert cups >= 5
+    assert predicates["on"] >= 3 and predicates.most_common(1)[0][0] == "on", predicates

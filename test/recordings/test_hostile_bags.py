@@ -1,54 +1,27 @@
 """A bag is data: it runs no program, fills no memory, and no file of it leads to another."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from pathlib import Path
-from typing import Any
 
 import pytest
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from support.recordings import camera_items, stamp_ns, write_bag
+from rosbags.rosbag2 import CompressionMode
+from support.recordings import STRING, camera_items, read_bag, stamp_ns, text_items, write_bag
 
 from deworldsg_ros.recordings.bags import storage
-from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage, salvage_sqlite
+from deworldsg_ros.recordings.bags.storage import RawBag, salvage_sqlite
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.source import CAMERA_INFO, POSE_STAMPED, typestore
 from deworldsg_ros.recordings.writer import write_mcap
 from deworldsg_ros.scene.errors import RecordingError
 
-STRING = "std_msgs/msg/String"
 COUNT = 4
 
 
-def read(path: Path) -> list[RawMessage]:
-    """All messages."""
-    bag = RawBag(path)
-    try:
-        return list(bag.messages([topic.key for topic in bag.topics]))
-    finally:
-        bag.close()
-
-
-def losses_of(path: Path) -> str:
-    """The notes on a bag, such as what was lost, after all its messages were read."""
-    bag = RawBag(path)
-    list(bag.messages([topic.key for topic in bag.topics]))
-    bag.close()
-    return "; ".join(bag.losses)
-
-
-def text_bag(folder: Path, plugin: StoragePlugin, mode: CompressionMode, times: list[int]) -> Path:
+def text_bag(folder: Path, storage: str, mode: CompressionMode, times: list[int]) -> Path:
     """A bag of texts of 600 kB, two in a chunk, which pack to almost nothing."""
-    writer = Writer(folder, version=9, storage_plugin=plugin)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    text = typestore().types[STRING](data="x" * 600_000)
-    with writer:
-        connection = writer.add_connection("/s", STRING, typestore=typestore())
-        for time_ns in times:
-            writer.write(connection, time_ns, bytes(typestore().serialize_cdr(text, STRING)))
-    return folder
+    items = text_items((time_ns, "x" * 600_000) for time_ns in times)
+    return write_bag(folder, items, storage, mode)
 
 
 # --- SQLite ----------------------------------------------------------------------------------
@@ -75,9 +48,7 @@ PROGRAMS = {
 
 @pytest.mark.parametrize("program", PROGRAMS)
 @pytest.mark.parametrize("place", ["folder", "folder, other name", "salvaged", "file"])
-def test_a_database_that_computes_its_rows_is_refused(
-    tmp_path: Path, program: str, place: str
-) -> None:
+def test_a_database_that_computes_its_rows_is_refused(tmp_path, program, place):
     bag = write_bag(tmp_path / "bag", camera_items(2), "sqlite3")
     file = bag / "bag.db3"
     with sqlite3.connect(file) as database:
@@ -89,20 +60,21 @@ def test_a_database_that_computes_its_rows_is_refused(
         (bag / "metadata.yaml").write_text(metadata.replace("bag.db3", "notes.txt"))
     if place == "salvaged":
         (bag / "metadata.yaml").unlink()
-    with pytest.raises(RecordingError, match="is computed, by a view"):
-        read(file if place == "file" else bag)
+    with pytest.raises(RecordingError, match="is computed"):
+        read_bag(file if place == "file" else bag)
 
 
 @pytest.mark.parametrize("name", ["a#1.db3", "new?mode=rwc&x=.db3", "..%2Foutside%2Foutside.db3"])
-def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
+def test_a_database_is_the_file_of_its_name(tmp_path, name):
     write_bag(tmp_path / "outside", camera_items(1), "sqlite3")
     bag = write_bag(tmp_path / "bag", camera_items(COUNT), "sqlite3")
     bag = bag.rename(tmp_path / "50%2Fb #1?mode=rwc&x=")
     file, metadata = (bag / "bag.db3").rename(bag / name), bag / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("bag.db3", name))
     before = sorted(tmp_path.rglob("*"))
-    assert len(read(bag)) == len(read(file)) == 4 * COUNT
-    assert not losses_of(bag)
+    (messages, losses), (of_file, _) = read_bag(bag), read_bag(file)
+    assert len(messages) == len(of_file) == 4 * COUNT
+    assert not losses
     assert len(list(salvage_sqlite(file, print))) == 4 * COUNT
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -110,78 +82,51 @@ def test_a_database_is_the_file_of_its_name(tmp_path: Path, name: str) -> None:
 # --- zstd ------------------------------------------------------------------------------------
 
 
-def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag = text_bag(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE, [1, 2, 3])
-    assert [message.log_time_ns for message in read(bag)] == [1, 2, 3]
+def test_a_compressed_file_unpacks_to_a_multiple_of_its_size(tmp_path, monkeypatch):
+    bag = text_bag(tmp_path / "bag", "sqlite3", CompressionMode.FILE, [1, 2, 3])
+    assert [message.log_time_ns for message in read_bag(bag)[0]] == [1, 2, 3]
     monkeypatch.setattr(storage, "MIN_FILE_BYTES", 1_000_000)
-    with pytest.raises(RecordingError, match="unpacks to more than 1000000 bytes; if you trust"):
-        read(bag)
+    with pytest.raises(RecordingError, match="more than 1000000 bytes"):
+        read_bag(bag)
 
 
-@pytest.mark.parametrize("plugin", StoragePlugin)
-def test_a_compressed_message_unpacks_to_a_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plugin: StoragePlugin
-) -> None:
+@pytest.mark.parametrize("plugin", ["mcap", "sqlite3"])
+def test_a_compressed_message_unpacks_to_a_limit(tmp_path, monkeypatch, plugin):
     bag = text_bag(tmp_path / "bag", plugin, CompressionMode.MESSAGE, [1, 2])
-    whole = read(bag)
+    whole, _ = read_bag(bag)
     assert [len(message.data) for message in whole] == [600_009] * 2
-    metadata = bag / "metadata.yaml"
-    metadata.rename(tmp_path / "metadata.yaml")
-    assert read(bag) == whole
-    (tmp_path / "metadata.yaml").rename(metadata)
+    metadata = (bag / "metadata.yaml").rename(tmp_path / "metadata.yaml")
+    assert read_bag(bag)[0] == whole
+    metadata.rename(bag / "metadata.yaml")
     monkeypatch.setattr(storage, "MAX_CHUNK_BYTES", 500_000)
-    assert read(bag) == []
-    assert (
-        "compressed messages are damaged and lost (a message is cut, or unpacks to more than "
-        in (losses_of(bag))
-    )
+    messages, losses = read_bag(bag)
+    assert messages == [] and "unpacks to more than" in losses[0]
 
 
-def test_chunks_that_overlap_in_time_are_few(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    one_by_one = text_bag(
-        tmp_path / "a", StoragePlugin.MCAP, CompressionMode.STORAGE, list(range(12))
+def test_chunks_that_overlap_in_time_are_few(tmp_path, monkeypatch):
+    orders = {"a": list(range(12)), "b": [0, 9, 1, 8, 2, 7, 3, 6]}
+    one_by_one, overlapping = (
+        text_bag(tmp_path / name, "mcap", CompressionMode.STORAGE, times)
+        for name, times in orders.items()
     )
-    overlapping = text_bag(
-        tmp_path / "b", StoragePlugin.MCAP, CompressionMode.STORAGE, [0, 9, 1, 8, 2, 7, 3, 6]
-    )
-    assert len(read(overlapping)) == 8
+    assert len(read_bag(overlapping)[0]) == 8
     monkeypatch.setattr(storage, "MAX_BYTES_AT_ONCE", 4_000_000)
-    assert len(read(one_by_one)) == 12
+    assert len(read_bag(one_by_one)[0]) == 12
     for path in (overlapping, overlapping / "b.mcap"):
-        with pytest.raises(RecordingError, match=r"4800\d+ bytes would be unpacked at once"):
-            read(path)
+        with pytest.raises(RecordingError, match=r"4800\d+ bytes"):
+            read_bag(path)
 
 
-def test_bytes_of_chunks_at_once() -> None:
-    assert storage.bytes_at_once([]) == 0
-    assert storage.bytes_at_once([(0, 1, 5), (2, 3, 7), (4, 5, 6)]) == 7
-    # A chunk ends after the message at its end.
-    assert storage.bytes_at_once([(0, 2, 5), (2, 3, 7), (4, 5, 6)]) == 12
-    assert storage.bytes_at_once([(0, 9, 1)] * 5 + [(7, 6, 2)]) == 7
-
-
-def test_empty_records_of_a_chunk_end_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[int] = []
-    take = storage._Tables.take
-
-    def count(self: Any, opcode: int, content: bytes) -> Any:
-        taken.append(opcode)
-        return take(self, opcode, content)
-
-    monkeypatch.setattr(storage._Tables, "take", count)
+def test_empty_records_of_a_chunk_end_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(storage._Tables, "take", None)  # no record is looked at
     size = 9 * 1000
     packed = storage.zstd.compress(bytes(size))
     chunk = struct.pack("<QQQI", 0, 1, size, 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
     path = tmp_path / "zeros.mcap"
     record = struct.pack("<BQ", storage.CHUNK, len(chunk + packed)) + chunk + packed
     path.write_bytes(storage.MAGIC + record)
-    with pytest.raises(RecordingError, match="no message could be read"):
+    with pytest.raises(RecordingError, match="no message"):
         RawBag(path)
-    assert not taken
 
 
 # --- topics of two types -----------------------------------------------------------------------
@@ -191,30 +136,19 @@ RGB = "/camera/color/image_raw/compressed"
 INFO = "/camera/color/camera_info"
 
 
-@pytest.mark.parametrize("storage", list(StoragePlugin))
+@pytest.mark.parametrize("plugin", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("has_metadata", [True, False])
 @pytest.mark.parametrize(
     ("topic", "other"),
     [(DEPTH, CAMERA_INFO), ("/camera/pose", CAMERA_INFO), (INFO, POSE_STAMPED),
      (RGB, POSE_STAMPED), (RGB, STRING)],
 )  # fmt: skip
-def test_a_topic_of_two_types_is_read_by_one(
-    tmp_path: Path, storage: StoragePlugin, has_metadata: bool, topic: str, other: str
-) -> None:
+def test_a_topic_of_two_types_is_read_by_one(tmp_path, plugin, has_metadata, topic, other):
     items = camera_items(COUNT)
     messages = {msgtype: message for _, msgtype, _, message in items}
     messages[STRING] = typestore().types[STRING](data="x" * 50)
-    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
-        connections = {
-            key: writer.add_connection(*key, typestore=typestore())
-            for key in [(topic, other), *sorted({(name, kind) for name, kind, _, _ in items})]
-        }
-        for time_ns in map(stamp_ns, range(COUNT)):
-            data = bytes(typestore().serialize_cdr(messages[other], other))
-            writer.write(connections[topic, other], time_ns, data)
-        for name, kind, time_ns, message in items:
-            data = bytes(typestore().serialize_cdr(message, kind))
-            writer.write(connections[name, kind], time_ns, data)
+    wrong = [(topic, other, stamp_ns(index), messages[other]) for index in range(COUNT)]
+    write_bag(tmp_path / "bag", [*wrong, *items], plugin)
     if not has_metadata:
         (tmp_path / "bag" / "metadata.yaml").unlink()
     recording = open_recording(tmp_path / "bag")

@@ -1,7 +1,5 @@
 """Sizes, depths, numbers and text of files from outside are checked before work is done."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import struct
@@ -9,6 +7,7 @@ import zlib
 from pathlib import Path
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 from support.images import SCAN, many_scans
@@ -23,13 +22,17 @@ from deworldsg_ros.recordings.folders.frame_files import COLOR_NAME
 from deworldsg_ros.scene.errors import ConfigurationError, EvaluationError
 from deworldsg_ros.streams.images import decode, encoded_size
 
+YAML = (
+    *("[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45"),
+    *("x: " + "1" * 5000, "\udcff", "a: b: c"),
+)
+JSON = ("[" * 100_000, '"\\ud800"', "{", "1" * 5000)
+STAMPS = ("1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x")
+OPTIONS = (".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff")
 
-@pytest.mark.parametrize(
-    "text",
-    ["[" * 100_000, "- " * 100_000, "? " * 100_000, "a: &a [1]\nb: *a", "x: 2020-13-45",
-     "x: " + "1" * 5000, "\udcff", "a: b: c"],
-)  # fmt: skip
-def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
+
+@pytest.mark.parametrize("text", YAML)
+def test_yaml_is_bounded_and_has_one_error(tmp_path, text):
     content = text.encode(errors="surrogateescape")
     with pytest.raises(ValueError, match=r"\w"):
         parse_yaml(content)
@@ -38,87 +41,85 @@ def test_yaml_is_bounded_and_has_one_error(tmp_path: Path, text: str) -> None:
         effective_config(tmp_path / "config.yaml")
 
 
-@pytest.mark.parametrize("value", [".inf", ".nan", "1e400", "[" * 1000, "1" * 5000, "\udcff"])
-def test_options_are_finite_numbers(value: str) -> None:
+@pytest.mark.parametrize(
+    ("reader", "text"),
+    [*((parse_any_json, text) for text in JSON), *((stamp_ns_from_text, text) for text in STAMPS)],
+)
+def test_json_and_stamps_have_one_error(reader, text):
+    with pytest.raises(ValueError):
+        reader(text.encode() if reader is parse_any_json else text)
+
+
+@pytest.mark.parametrize("value", OPTIONS)
+def test_options_are_finite_numbers(value):
     with pytest.raises(ConfigurationError, match="--set"):
         effective_config(None, [f"inputs.max_depth_m={value}"])
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '"\\ud800"', "{", "1" * 5000])
-def test_json_has_one_error(text: str) -> None:
-    with pytest.raises(ValueError):
-        parse_any_json(text.encode())
+@pytest.mark.parametrize(
+    ("pattern", "name"),
+    [(COLOR_NAME, "frame-000001.color.jpg"), (FRAME_NAME, "frame-000001.pose.txt")],
+)
+def test_a_line_feed_ends_no_file_name(pattern, name):
+    assert pattern.match(name)
+    assert not pattern.match(f"{name}\n")
 
 
-@pytest.mark.parametrize("text", ["1e9999999", "1e400", "nan", "-inf", "sNaN", "2147483648", "x"])
-def test_stamps_have_32_bit_seconds(text: str) -> None:
-    with pytest.raises(ValueError, match="expected seconds"):
-        stamp_ns_from_text(text)
-    assert stamp_ns_from_text("1305031102.175304") == 1305031102175304000
-
-
-def png(width: int, height: int) -> bytes:
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))]
-    chunks += [(b"IDAT", zlib.compress(bytes(1 << 20))), (b"IEND", b"")]
-    packed = b"\x89PNG\r\n\x1a\n"
-    for kind, data in chunks:
-        packed += struct.pack(">I", len(data)) + kind + data
-        packed += struct.pack(">I", zlib.crc32(kind + data))
-    return packed
-
-
-def test_a_line_feed_ends_no_file_name() -> None:
-    for pattern, name in (
-        (COLOR_NAME, "frame-000001.color.jpg"),
-        (FRAME_NAME, "frame-000001.pose.txt"),
+def test_the_size_of_an_image_is_known_before_it_is_decoded():
+    content = b"\x89PNG\r\n\x1a\n"
+    for kind, data in (
+        (b"IHDR", struct.pack(">IIBBBBB", 65535, 65535, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(bytes(1 << 20))),
+        (b"IEND", b""),
     ):
-        assert pattern.match(name)
-        assert not pattern.match(f"{name}\n")
-
-
-def test_the_size_of_an_image_is_known_before_it_is_decoded() -> None:
-    content = png(65535, 65535)
+        content += struct.pack(">I", len(data)) + kind + data
+        content += struct.pack(">I", zlib.crc32(kind + data))
     assert encoded_size(content) == (65535, 65535) and len(content) < 5000
-    with pytest.raises(ValueError, match="65535x65535 pixels: expected at most"):
-        decode(content, cv2.IMREAD_UNCHANGED)
-    for other in (b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
+    for other in (content, b"", b"GIF89a", b"\xff\xd8\xff", b"P5 1 1"):
         with pytest.raises(ValueError):
             decode(other, cv2.IMREAD_UNCHANGED)
 
 
-def test_a_jpeg_has_a_bounded_number_of_scans() -> None:
+def test_a_jpeg_has_a_bounded_number_of_scans():
     pixels = np.full((64, 64, 3), 128, np.uint8)
     content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     assert content.count(SCAN) == 10 and decode(content, cv2.IMREAD_COLOR).shape == (64, 64, 3)
-    with pytest.raises(ValueError, match="it has 101 scans: expected at most 100"):
+    with pytest.raises(ValueError, match="101 scans"):
         decode(many_scans(content, 101), cv2.IMREAD_COLOR)
     decode(memoryview(many_scans(content, 100)), cv2.IMREAD_COLOR)
 
 
-def test_pickles_of_shared_lists_and_large_memos_are_refused() -> None:
+def nested(depth: int) -> list:
     item: list = []
-    for _ in range(60):
+    for _ in range(depth):
         item = [item, item]
-    with pytest.raises(EvaluationError, match="stands for more than"):
-        load_pickle(pickle.dumps(item), "x.pkl")
-    itself: list = []
-    itself.append(itself)
-    with pytest.raises(EvaluationError, match="contains itself"):
-        load_pickle(pickle.dumps(itself), "x.pkl")
-    with pytest.raises(EvaluationError, match="memo index"):
-        load_pickle(b"]r\xff\xff\xff\x7f.", "x.pkl")
+    return item
 
 
-def test_predictions_of_many_classes_are_refused(tmp_path: Path) -> None:
+def in_itself() -> list:
+    item: list = []
+    item.append(item)
+    return item
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (pickle.dumps(nested(60)), "stands for more than"),
+        (pickle.dumps(in_itself()), "contains itself"),
+        (b"]r\xff\xff\xff\x7f.", "memo index"),
+        (b'{"num_classes": 1000000000000, "num_predicates": 1, "scans": {}}', "10000"),
+    ],
+    ids=["shared lists", "itself", "large memo", "many classes"],
+)
+def test_predictions_without_end_are_refused(tmp_path, content, words):
     path = tmp_path / "predictions.json"
-    path.write_text('{"num_classes": 1000000000000, "num_predicates": 1, "scans": {}}')
-    with pytest.raises(EvaluationError, match="expected 0 to 10000"):
-        read_predictions(path)
+    path.write_bytes(content)
+    with pytest.raises(EvaluationError, match=words):
+        read_predictions(path) if content[:1] == b"{" else load_pickle(content, "x.pkl")
 
 
-def test_chunks_unpack_to_what_they_declare() -> None:
-    import lz4.frame
-
+def test_chunks_unpack_to_what_they_declare():
     bound_decompression()
     packed = lz4.frame.compress(bytes(1 << 24))
     assert decompress("lz4", packed, 1 << 24) == bytes(1 << 24)
@@ -127,7 +128,7 @@ def test_chunks_unpack_to_what_they_declare() -> None:
             decompress("lz4", packed, size)
 
 
-def test_only_regular_files_of_a_size_are_read(tmp_path: Path) -> None:
+def test_only_regular_files_of_a_size_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "large").write_bytes(bytes(9))
     (tmp_path / "good").write_bytes(b"12345678")

@@ -25,6 +25,7 @@ from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import pairs
 from deworldsg_ros.relations.beliefs import MIN_RELATED, PredictedPrior
+from deworldsg_ros.relations.geometry import MIN_SHAPE_POINTS
 from deworldsg_ros.relations.pairs import (
     FLOOR_QUANTILE,
     FLOOR_STEP_M,
@@ -33,7 +34,6 @@ from deworldsg_ros.relations.pairs import (
     stepped_up,
 )
 from deworldsg_ros.relations.physics import load_physics_model
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS
 from deworldsg_ros.relations.states import (
     BELIEF,
     NONE,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from support.gaussians import moments
-from support.merging import random_covariances, random_pose, seeds
+from support.merging import moments, random_covariances, random_pose, seeds
 
 from deworldsg_ros.scene import gaussian
 

@@ -1,15 +1,26 @@
-"""A headless Chromium for tests of pages; the first use installs it where it can."""
+"""A headless Chromium for tests of pages; the first use installs it where it can.
+
+Software rendering takes seconds a frame on a busy machine. So `Screen` looks again until what is
+expected is there.
+"""
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
+import socket
 import subprocess
-from collections.abc import Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from deworldsg_ros.view.colours import class_colours, to_rgb
 
 # Software rendering of WebGL; no request to any host but the page's.
 FLAGS = (
@@ -18,6 +29,9 @@ FLAGS = (
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
 INSTALL_LIMIT_S = 300
+LIMIT_S = 120.0
+# Colours that look the same: lines are blended with what is behind them.
+SAME = 30
 
 
 def chromium() -> str:
@@ -69,3 +83,85 @@ def opened_page(
         assert errors == []
     finally:
         context.close()
+
+
+def pixels_of(shot: bytes) -> np.ndarray:
+    """A screenshot as (H, W, 3)."""
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
+
+
+class Screen:
+    """The page of the live viewer.
+
+    Args:
+        page: of playwright.
+        viewer: the viewer.
+        labels: the classes of its graph.
+    """
+
+    def __init__(self, page: Any, viewer: Any, labels: list[str]) -> None:
+        self.page, self.viewer = page, viewer
+        self._colours = class_colours(labels)
+
+    def until(self, holds: Callable[[], bool], what: str) -> None:
+        """Wait until a condition holds."""
+        end_s = time.monotonic() + LIMIT_S
+        while not holds():
+            assert time.monotonic() < end_s, what
+            self.page.wait_for_timeout(200)
+
+    def pixels(self) -> np.ndarray:
+        """The scene (H, W, 3), without the panel at its right."""
+        shot = self.page.screenshot(timeout=1000 * LIMIT_S)
+        return pixels_of(shot)[:, : int(self.camera.width)]
+
+    @property
+    def camera(self) -> Any:
+        """The camera of the one browser."""
+        from deworldsg_ros.view.live.scene import camera_of
+
+        (client,) = self.viewer._server.get_clients().values()
+        return camera_of(client)
+
+    def _shows(self, label: str) -> bool:
+        away = self.pixels() - 255 * np.array(to_rgb(self._colours[label]))
+        return bool(np.abs(away).max(axis=2).min() < SAME)
+
+    def draws(self, *labels: str) -> None:
+        """Wait until objects of just these classes are drawn, in their colours."""
+        self.until(lambda: set(filter(self._shows, self._colours)) == set(labels), f"only {labels}")
+
+    def says(self, text: str) -> None:
+        """Wait until the panel has a text."""
+        self.page.get_by_text(text).first.wait_for()
+
+    def open(self, *folders: str) -> None:
+        """Open folders of the panel."""
+        for folder in folders:
+            self.page.get_by_text(folder, exact=True).first.click()
+
+    def click_at(self, point: Any) -> None:
+        """Click a point (3,) of the world."""
+        (place,), _ = self.camera.project(np.array([point], float))
+        self.page.mouse.click(*place.tolist())
+
+
+def free_port() -> int:
+    """A port of this machine on which nobody listens."""
+    with closing(socket.create_server(("127.0.0.1", 0))) as holder:
+        return int(holder.getsockname()[1])
+
+
+@contextmanager
+def shown_viewer(
+    of: Any, graph: Any, labels: list[str], width: int = 900, height: int = 600
+) -> Iterator[Screen]:
+    """The page of a live viewer of a graph with these classes."""
+    from deworldsg_ros.view.live.server import Viewer
+
+    with closing(Viewer("127.0.0.1", free_port(), "")) as viewer:
+        viewer.reset(graph)
+        with opened_page(of, viewer.url, width, height) as page:
+            page.set_default_timeout(1000 * LIMIT_S)
+            page.wait_for_selector("canvas")
+            yield Screen(page, viewer, labels)

@@ -16,22 +16,17 @@ from deworldsg_ros.config import RelationsConfig  # noqa: E402
 from deworldsg_ros.relations.world_model import ClipRequest, PairContext  # noqa: E402
 
 CLIP_LENGTH = 4
+SMALL = {"hidden_size": 48, "num_attention_heads": 4, "num_hidden_layers": 2}
 
 
 def save_vjepa2(folder, seed=0, **changes):
     """Save a V-JEPA 2 with 48 features and 32 pixels and return its folder."""
     torch.manual_seed(seed)
+    predictor = {"hidden_size": 48, "num_attention_heads": 4, "num_hidden_layers": 1}
     settings = {
-        "crop_size": 32,
-        "frames_per_clip": 64,
-        "hidden_size": 48,
-        "num_attention_heads": 4,
-        "num_hidden_layers": 2,
-        "pred_hidden_size": 48,
-        "pred_num_attention_heads": 4,
-        "pred_num_hidden_layers": 1,
+        **{"crop_size": 32, "frames_per_clip": 64, "num_pooler_layers": 1, **SMALL},
+        **{f"pred_{name}": value for name, value in predictor.items()},
         "pred_num_mask_tokens": 2,
-        "num_pooler_layers": 1,
     }
     config = transformers.VJEPA2Config(**{**settings, **changes})
     transformers.VJEPA2Model(config).save_pretrained(folder)
@@ -41,13 +36,7 @@ def save_vjepa2(folder, seed=0, **changes):
 def save_dinov2(folder, seed=0, **changes):
     """Save a DINOv2 with 48 features and 56 pixels and return its folder."""
     torch.manual_seed(seed)
-    settings = {
-        "hidden_size": 48,
-        "num_attention_heads": 4,
-        "num_hidden_layers": 2,
-        "image_size": 56,
-    }
-    config = transformers.Dinov2Config(**{**settings, **changes})
+    config = transformers.Dinov2Config(**{**SMALL, "image_size": 56, **changes})
     transformers.Dinov2Model(config).save_pretrained(folder)
     return folder
 

@@ -1,4 +1,4 @@
-"""Runs the command line in its own process, as a user does."""
+"""Runs commands: in a process of their own, as a user does, or in this one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from deworldsg_ros.recordings.source import Source
-from deworldsg_ros.recordings.writer import write_mcap
+from typer.testing import CliRunner, Result
+
+from deworldsg_ros.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO_ROOM = ROOT / "bags" / "demo_room"
@@ -52,20 +53,21 @@ def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
     )
 
 
-def first_frames(source: Source, count: int, path: Path) -> Path:
-    """Write the first frames of a recording to an MCAP file and return its path."""
+def invoke(*words: object) -> Result:
+    """Run a command in this process."""
+    return CliRunner().invoke(app, [str(word) for word in words])
 
-    def messages():
-        last_ns = None
-        stamps = set()
-        for message in source.raw_messages():
-            stamps.add(message.stamp_ns)
-            if len(stamps) > count:
-                last_ns = message.stamp_ns
-                break
-            yield message
-        assert last_ns is not None
 
-    write_mcap(messages(), path)
-    source.close()
-    return path
+def printed(*words: object) -> str:
+    """What a command prints that ends well."""
+    result = invoke(*words)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def refusal(*words: object) -> str:
+    """The error of a command that ends with code 2, without a traceback."""
+    result = invoke(*words)
+    assert result.exit_code == 2, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    return result.stderr

@@ -7,23 +7,15 @@ import select
 import socket
 import threading
 
-CHUNK_BYTES = 1 << 16
-
 
 class CutLink:
-    """Forwards connections to a port of this machine.
-
-    Attributes:
-        port: where to connect to.
-        is_cut: nothing is forwarded while this is set.
-    """
+    """Forwards connections on `port` to a port of this machine, but not while `is_cut` is set."""
 
     def __init__(self, to_port: int) -> None:
         self._to_port = to_port
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = self._listener.getsockname()[1]
-        self.is_cut = threading.Event()
-        self._closed = threading.Event()
+        self.is_cut, self._closed = threading.Event(), threading.Event()
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
@@ -39,17 +31,18 @@ class CutLink:
 
     def _forward(self, near: socket.socket) -> None:
         with near, contextlib.suppress(OSError):
-            while self.is_cut.is_set() and not self._closed.wait(0.1):
-                pass
+            self._wait_while_cut()
             far = socket.create_connection(("127.0.0.1", self._to_port), timeout=5)
             with far:
                 other = {near: far, far: near}
                 while not self._closed.is_set():
-                    if self.is_cut.is_set():
-                        self._closed.wait(0.1)
-                        continue
+                    self._wait_while_cut()
                     for ready in select.select([near, far], [], [], 0.1)[0]:
-                        data = ready.recv(CHUNK_BYTES)
+                        data = ready.recv(1 << 16)
                         if not data:
                             return
                         other[ready].sendall(data)
+
+    def _wait_while_cut(self) -> None:
+        while self.is_cut.is_set() and not self._closed.wait(0.1):
+            pass

@@ -37,16 +37,13 @@ def write_json(path: Path, content: Any) -> None:
     path.write_text(json.dumps(content))
 
 
-def write_ply(
-    path: Path, points: np.ndarray, ids: np.ndarray, form: str = "ascii", dtype: str = "float"
-) -> None:
-    """Write a PLY file with another element before the vertices and faces after them."""
+def write_ply(path: Path, points: np.ndarray, ids: np.ndarray, form: str = "ascii") -> None:
+    """Write a PLY file, ascii or binary_little_endian, with elements around the vertices."""
     header = (
         f"ply\nformat {form} 1.0\ncomment made by a test\n"
         "element sensor 1\nproperty list uchar int numbers\n"
-        f"element vertex {len(points)}\n"
-        + "".join(f"property {dtype} {axis}\n" for axis in "xyz")
-        + "property uchar red\nproperty ushort objectId\n"
+        f"element vertex {len(points)}\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty ushort objectId\n"
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,16 +51,10 @@ def write_ply(
         rows = [f"{x!r} {y!r} {z!r} 7 {i}" for (x, y, z), i in zip(points.tolist(), ids.tolist())]
         path.write_text(header + "2 5 6\n" + "\n".join(rows) + "\n3 0 0 0\n")
         return
-    order = "<" if form == "binary_little_endian" else ">"
-    kind = order + ("f4" if dtype == "float" else "f8")
-    table = np.zeros(
-        len(points), [("x", kind), ("y", kind), ("z", kind), ("red", "u1"), ("id", order + "u2")]
-    )
-    for axis, name in enumerate("xyz"):
-        table[name] = points[:, axis]
-    table["id"] = ids
-    before = b"\x02" + np.array([5, 6], order + "i4").tobytes()
-    after = b"\x03" + np.array([0, 0, 0], order + "i4").tobytes()
+    table = np.zeros(len(points), [("points", "<f4", 3), ("red", "u1"), ("id", "<u2")])
+    table["points"], table["id"] = points, ids
+    before = b"\x02" + np.array([5, 6], "<i4").tobytes()
+    after = b"\x03" + np.array([0, 0, 0], "<i4").tobytes()
     path.write_bytes(header.encode() + before + table.tobytes() + after)
 
 

@@ -1,6 +1,10 @@
-"""A test double of the detector, the segmenter and the relation head. Each can fail."""
+"""A test double of the detector, the segmenter and the relation head. Each can fail or hang."""
 
 from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,20 +14,39 @@ from deworldsg_ros.scene.frame_graph import Relations
 SHAPE = (40, 50)
 
 
+@dataclass
+class Faults:
+    """The next calls of a model: how many raise, and how long the first other one takes."""
+
+    raises: int = 0
+    hang_s: float = 0.0
+
+    def work(self):
+        if self.raises:
+            self.raises -= 1
+            raise RuntimeError("injected fault")
+        pause_s, self.hang_s = self.hang_s, 0.0
+        time.sleep(min(pause_s, threading.TIMEOUT_MAX))
+
+
 class Backend:
-    """All three backends in one class. The part named `failing` raises."""
+    """All three backends in one class. The part named `failing` raises; `faults` are by part."""
 
     classes = ("table", "cup")
     predicates = ("on", "near")
     default_score_threshold = 0.5
 
-    def __init__(self, failing=""):
+    def __init__(self, failing="", **faults):
         self.failing = failing
+        self.faults = faults
         self.features = None
 
     def _work(self, part):
+        if part in self.faults:
+            self.faults[part].work()
         if self.failing == part:
-            raise RuntimeError(f"CUDA out of memory in the {part}")
+            name = part.replace("_", " ")
+            raise RuntimeError(f"CUDA out of memory in the {name}")
 
     def detect(self, rgb, score_threshold):
         self._work("detector")
@@ -37,6 +60,6 @@ class Backend:
         return [MaskPatch(3 * row, 2, np.ones((3, 4), bool)) for row in range(len(boxes_xyxy))]
 
     def relate(self, objects, max_relations):
-        self._work("relation head")
+        self._work("relation_head")
         self.features = objects.features
         return Relations(np.array([[0, 1]]), np.zeros((1, 2)), np.ones(1))

@@ -10,8 +10,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
@@ -41,9 +43,13 @@ SUBSCRIBERS = {Role.RGB: 1, Role.DEPTH: 2, Role.CAMERA_INFO: 2, Role.POSE: 2}
 
 
 class NodeProcess:
-    """One node process."""
+    """One node process; `with` ends it."""
 
-    def __init__(self, name: str, folder: Path, *arguments: str) -> None:
+    def __init__(
+        self, name: str, folder: Path, *arguments: str, parameters: dict[str, Any] | None = None
+    ) -> None:
+        values = [f"{key}:={value}" for key, value in (parameters or {}).items()]
+        given = ["--ros-args", *(word for value in values for word in ("-p", value))]
         self.name = name
         self.log_path = folder / f"{name}.log"
         # This checkout precedes the paths of a sourced ROS 2.
@@ -53,11 +59,17 @@ class NodeProcess:
             "PYTHONPATH": python_path,
             "ROS_LOG_DIR": str(folder / "ros"),
         }
-        command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *arguments]
+        command = [sys.executable, "-m", f"deworldsg_ros.nodes.{name}", *given, *arguments]
         with self.log_path.open("w") as log:
             self._process = subprocess.Popen(
                 command, env=environment, cwd=folder, stdout=log, stderr=subprocess.STDOUT
             )
+
+    def __enter__(self) -> NodeProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
 
     @property
     def log(self) -> str:
@@ -79,12 +91,6 @@ class NodeProcess:
         """Process id."""
         return self._process.pid
 
-    @property
-    def cpu_s(self) -> float:
-        """Processor time so far, seconds."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
     def wait(self, limit_s: float) -> int:
         """Wait for the end of the process; returns its exit code."""
         return self._process.wait(limit_s)
@@ -103,6 +109,12 @@ class NodeProcess:
             self._process.send_signal(number)
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(5)
+
+
+def run_to_end(name: str, folder: Path, *arguments: str, **options: Any) -> tuple[int, str]:
+    """Exit code and output of a node that ends by itself."""
+    with NodeProcess(name, folder, *arguments, **options) as node:
+        return node.wait(60.0), node.log
 
 
 def wait_until(condition: Callable[[], bool], limit_s: float, what: str) -> None:
@@ -141,16 +153,31 @@ class Peer:
         for executor in (self._executor, *self.also_spin):
             executor.spin_once(timeout_sec=0.01)
 
+    def listen(
+        self, kind: type, topic: str, depth: int = 100, *, latched: bool = False
+    ) -> list[Any]:
+        """A list that receives the messages of a topic."""
+        messages: list[Any] = []
+        profile = reliable(depth, latched=latched)
+        self.node.create_subscription(kind, topic, messages.append, profile)
+        return messages
+
     def collect(self, topic: str, depth: int = 100, *, latched: bool = False) -> list[str]:
         """A list that receives the texts of a topic."""
         texts: list[str] = []
+        profile = reliable(depth, latched=latched)
         self.node.create_subscription(
-            String,
-            topic,
-            lambda message: texts.append(message.data),
-            reliable(depth, latched=latched),
+            String, topic, lambda message: texts.append(message.data), profile
         )
         return texts
+
+    def statuses(self) -> list[DiagnosticStatus]:
+        """A list that receives the diagnostics of all nodes."""
+        statuses: list[DiagnosticStatus] = []
+        self.node.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 50
+        )
+        return statuses
 
     def close(self) -> None:
         """End the node and its context."""

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
+from support.failing_backend import Backend
 from support.nodes import Peer
 
 from deworldsg_ros.nodes.graph_node import GraphNode
+from deworldsg_ros.perception import Perception
+from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
 from deworldsg_ros.streams.images import fill_image
@@ -107,22 +113,58 @@ def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
     )
 
 
+def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
+    """A chair and a cup beside it."""
+    message = local_graph(stamp_ns)
+    message.predicates = ["on", "under", "near"]
+    (chair,) = message.objects
+    cup = {"instance": 2, "class_probabilities": [0.1, 0.9], "mean_m": [0.1, 0.0, 1.0]}
+    message.objects.append(msgspec.structs.replace(chair, **cup))
+    return message
+
+
 def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
     return wire.RelationEvidenceMessage(
         **schema(wire.RelationEvidenceMessage, stamp_ns, "map"), source="none", pairs=[]
     )
 
 
+def overrides(parameters: dict[str, Any]) -> list[Parameter]:
+    return [Parameter(name, value=value) for name, value in parameters.items()]
+
+
+@contextlib.contextmanager
+def alone(make: type[StageNode], parameters: dict[str, Any] | None = None) -> Iterator[Any]:
+    """A node that nobody spins, for its methods."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    try:
+        node = make(context=context, parameter_overrides=overrides(parameters or {}))
+        try:
+            yield node
+        finally:
+            node.close()
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown(context=context)
+
+
 class Bench:
-    """A node in the process of the test, and a peer with publishers on its input topics."""
+    """A node in the process of the test, and a peer with publishers on its input topics.
+
+    `parameters` are the node's overrides, by name; `with` closes both.
+    """
 
     def __init__(
         self,
         make: type[StageNode],
         topics: dict[str, type],
         qos: QoSProfile | None = None,
+        parameters: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
+        if parameters is not None:
+            options["parameter_overrides"] = overrides(parameters)
         self.peer = Peer("bench")
         # The node has its own context, because a context allows one message type per topic.
         self._context = rclpy.Context()
@@ -142,6 +184,12 @@ class Bench:
             "the node to subscribe",
         )
 
+    def __enter__(self) -> Bench:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def send(self, **messages: Any) -> None:
         """Publish messages. A keyword is a topic with __ for /."""
         for name, message in messages.items():
@@ -150,6 +198,11 @@ class Bench:
             elif isinstance(message, str):
                 message = String(data=message)
             self._publishers[name.replace("__", "/")].publish(message)
+
+    def send_made(self, **makers: Callable[[int], Any] | None) -> None:
+        """Publish what functions of the next stamp make; None = nothing."""
+        stamp_ns = self.next_stamp()
+        self.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
 
     def next_stamp(self) -> int:
         """The stamp of the next frame, nanoseconds."""
@@ -183,9 +236,8 @@ class Bench:
 
 
 def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
-    made = Bench(make, topics)
-    yield made
-    made.close()
+    with Bench(make, topics) as made:
+        yield made
 
 
 CAMERA = {
@@ -194,22 +246,42 @@ CAMERA = {
     "rgb/camera_info": CameraInfo,
     "camera/pose": PoseStamped,
 }
+# What relation_node listens to.
+PAIRING = {"rgb/image_raw": Image, "deworldsg/local_graph": String}
+
+
+# Makers of the messages of a complete frame, functions of the stamp.
+FRAME = {
+    "rgb__camera_info": camera_info,
+    "camera__pose": pose,
+    "depth__image_raw": depth,
+    "rgb__image_raw": rgb,
+}
 
 
 def send_frame(at: Bench, **changes: Any) -> None:
-    """Send a complete frame.
+    """Send a complete frame; `changes` replaces makers, None omits the message."""
+    at.send_made(**{**FRAME, **changes})
 
-    `changes` replaces the maker of a message (a function of the stamp); None omits the message.
-    """
+
+def send_pair(at: Bench) -> int:
+    """Send an image and a local graph of two objects; returns their stamp."""
     stamp_ns = at.next_stamp()
-    makers = {
-        "rgb__camera_info": camera_info,
-        "camera__pose": pose,
-        "depth__image_raw": depth,
-        "rgb__image_raw": rgb,
-        **changes,
-    }
-    at.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
+    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
+    return stamp_ns
+
+
+def fake_perception(patch: pytest.MonkeyPatch) -> Backend:
+    """Nodes are made with this test double of all models."""
+    backend = Backend()
+    patch.setattr(
+        models,
+        "build_perception",
+        lambda config, *, world_up: Perception(
+            backend, backend, backend, config, world_up=world_up
+        ),
+    )
+    return backend
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:

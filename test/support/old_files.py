@@ -1,7 +1,5 @@
 """Arrays of graphs and maps as earlier releases wrote them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from deworldsg_ros.recordings import source as ros
+from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
 from deworldsg_ros.recordings.source import RoleMessage, typestore
 from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
 
@@ -19,6 +21,7 @@ INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, WIDTH, HEIGHT)
 STEP_NS = 100_000_000
 T0_NS = 5_000_000_000
 CAMERA, WORLD = "camera_optical", "map"
+STRING = "std_msgs/msg/String"
 
 
 def stamp_ns(index: int) -> int:
@@ -39,7 +42,7 @@ def depth_mm(index: int) -> np.ndarray:
     return depth
 
 
-def pose(index: int) -> np.ndarray:
+def pose(index: float) -> np.ndarray:
     quat = np.array([0.01 * index, 0.2, -0.1, 0.9])
     return pose_from_quaternion(np.array([0.05 * index, 0.1, 1.2]), quat / np.linalg.norm(quat))
 
@@ -127,23 +130,44 @@ def camera_items(count: int, *, compressed: bool = True, with_pose: bool = True)
     return items
 
 
-def write_bag(folder: Path, items: Iterable[Item], storage: str = "mcap") -> Path:
+def write_bag(
+    folder: Path,
+    items: Iterable[Item],
+    storage: str = "mcap",
+    compression: CompressionMode = CompressionMode.NONE,
+) -> Path:
     """Write a rosbag2 folder. The messages of the items may be serialized."""
-    plugin = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]
-    connections: dict[str, Any] = {}
-    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+    connections: dict[tuple[str, str], Any] = {}
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if compression is not CompressionMode.NONE:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
         for topic, msgtype, time_ns, message in items:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, msgtype, typestore=typestore())
+            key = topic, msgtype
+            if key not in connections:
+                connections[key] = writer.add_connection(*key, typestore=typestore())
             if not isinstance(message, bytes):
                 message = bytes(typestore().serialize_cdr(message, msgtype))
-            writer.write(connections[topic], time_ns, message)
+            writer.write(connections[key], time_ns, message)
     return folder
+
+
+def text_items(texts: Iterable[tuple[int, str]]) -> list[Item]:
+    """Texts on the topic /s, with their times."""
+    made = typestore().types[STRING]
+    return [("/s", STRING, time_ns, made(data=text)) for time_ns, text in texts]
+
+
+def read_bag(path: Path, topic: str | None = None) -> tuple[list[RawMessage], list[str]]:
+    """Messages of one topic or of all, and notes, such as what was lost."""
+    with closing(RawBag(path)) as bag:
+        keys = [item.key for item in bag.topics if topic in (None, item.name)]
+        return list(bag.messages(keys)), bag.losses
 
 
 def write_seven_scenes(folder: Path, count: int) -> Path:
     """Write a folder in the layout of 7-Scenes with registered depth. Every 4th frame exists."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     K = INTRINSICS.matrix
     (folder / "camera-intrinsics.txt").write_text("\n".join(" ".join(map(str, r)) for r in K))
     for index in range(count):
@@ -152,4 +176,38 @@ def write_seven_scenes(folder: Path, count: int) -> Path:
         stem.with_suffix(".color.jpg").write_bytes(encoded(bgr, ".jpg"))
         stem.with_suffix(".depth.png").write_bytes(encoded(depth_mm(index)))
         np.savetxt(stem.with_suffix(".pose.txt"), pose(index), "%.9g")
+    return folder
+
+
+TUM_T0_NS = 1305031102175304000  # more digits than a float64 has
+
+
+def write_tum(
+    folder: Path,
+    count: int = 4,
+    *,
+    depth_offset_ns: int = 5_000_000,
+    pose_step_ns: int = 50_000_000,
+) -> Path:
+    """Write a folder in the layout of TUM. Poses are not at the times of the images."""
+    rows: dict[str, list[tuple[int, str]]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    for index in range(count):
+        depth = np.full((HEIGHT, WIDTH), 5000 + 50 * index, np.uint16)
+        depth[0] = 0
+        time_ns = TUM_T0_NS + index * STEP_NS
+        bgr = np.ascontiguousarray(rgb_pixels(index)[:, :, ::-1])
+        images = (("rgb", bgr, time_ns), ("depth", depth, time_ns + depth_offset_ns))
+        for name, pixels, at_ns in images:
+            (folder / name / f"{index}.png").write_bytes(encoded(pixels))
+            rows[name].append((at_ns, f"{name}/{index}.png"))
+    for number in range(-1, 2 * count + 2):
+        time_ns = TUM_T0_NS + number * pose_step_ns + 20_000_000
+        T = pose((time_ns - TUM_T0_NS) / STEP_NS)
+        values = [*T[:3, 3], *quaternion_from_rotation(T[:3, :3])]
+        rows["groundtruth"].append((time_ns, " ".join(f"{value:.9f}" for value in values)))
+    for name, lines in rows.items():
+        text = [f"{ns // 10**9}.{ns % 10**9:09d} {content}" for ns, content in lines]
+        (folder / f"{name}.txt").write_text("\n".join(["# timestamp and content", *text]) + "\n")
     return folder

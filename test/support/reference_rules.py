@@ -1,7 +1,5 @@
 """The rules of `relations.rules` for all pairs at once, in plain NumPy: slow and obvious."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import expit
 
@@ -76,19 +74,7 @@ def near_probabilities(
     """Probability that two objects are near, if no more specific relation holds between them.
 
     Both stand on one support, within reach, and each is among the nearest neighbours of the other.
-
-    Args:
-        pairs: (m, 2) objects.
-        carried: (m, 2) probability that the first rests on the second, and the opposite.
-        on_floor: (n,) probability that an object stands on the floor.
-        gaps_m: (m,) horizontal gap of the bounds.
-        bottom_steps_m: (m,) difference of the heights of the bottoms.
-        centre_steps_m: (m,) horizontal distance of the centres.
-        unrelated: (m,) probability that no more specific relation holds.
-        table_and_seat: (m,) bool; a table and a seat, in any order.
-
-    Returns:
-        (m,) from 0 to `NEAR_CERTAINTY`.
+    The arrays are as in `BELIEF`; `unrelated` is (m,) the probability of no specific relation.
     """
     supports = np.zeros((len(on_floor), len(on_floor)))
     first, second = pairs.T

@@ -109,6 +109,34 @@ def save_paper_checkpoint(folder, card_changes=None, **changes):
     return folder
 
 
+# Of all segmenters. The image has 128 pixels, and 112 for SAM 3.
+PROMPT = {"hidden_size": 32, "image_size": 128, "mask_input_channels": 4}
+DECODER = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
+# Of SAM 2 and 3 for videos.
+MEMORY = {
+    "memory_attention_hidden_size": 32,
+    "memory_attention_feed_forward_hidden_size": 32,
+    "memory_encoder_hidden_size": 32,
+    "memory_encoder_output_channels": 16,
+    "mask_downsampler_embed_dim": 32,
+    "memory_fuser_embed_dim": 32,
+    "memory_fuser_intermediate_dim": 32,
+}
+
+
+def save_segmenter(folder, family, config):
+    """Save a segmenter with masks that have some pixels, but not all."""
+    torch.manual_seed(0)
+    model = family(config)
+    decoder = getattr(model, "tracker_model", model).mask_decoder
+    with torch.no_grad():
+        for name, value in decoder.named_parameters():
+            if "norm" not in name:
+                value.normal_(0, 0.3)
+    model.save_pretrained(folder)
+    return folder
+
+
 def sam2_config(video=False):
     """Configuration of a small SAM 2, in the format of images or videos."""
     backbone = {
@@ -126,40 +154,24 @@ def sam2_config(video=False):
         backbone_feature_sizes=[[32, 32], [16, 16], [8, 8]],
         fpn_hidden_size=32,
     )
-    prompt = {"hidden_size": 32, "image_size": 128, "patch_size": 16, "mask_input_channels": 4}
-    decoder = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
     parts = {
         "vision_config": vision,
-        "prompt_encoder_config": prompt,
-        "mask_decoder_config": decoder,
+        "prompt_encoder_config": {**PROMPT, "patch_size": 16},
+        "mask_decoder_config": DECODER,
     }
     if not video:
         return transformers.Sam2Config(**parts)
-    return transformers.Sam2VideoConfig(
-        **parts,
-        image_size=128,
-        memory_attention_hidden_size=32,
-        memory_attention_feed_forward_hidden_size=32,
-        memory_encoder_hidden_size=32,
-        memory_encoder_output_channels=16,
-        mask_downsampler_embed_dim=32,
-        memory_fuser_embed_dim=32,
-        memory_fuser_intermediate_dim=32,
-    )
+    return transformers.Sam2VideoConfig(**parts, image_size=128, **MEMORY)
 
 
 def save_sam2(folder, video=False):
     """Save a small SAM 2, in the format of images or videos."""
-    torch.manual_seed(0)
     family = transformers.Sam2VideoModel if video else transformers.Sam2Model
-    model = family(sam2_config(video))
-    _randomise_decoder(model)
-    model.save_pretrained(folder)
-    return folder
+    return save_segmenter(folder, family, sam2_config(video))
 
 
-def sam3_parts():
-    """Configurations of the parts of a small SAM 3: vision, prompt encoder, mask decoder."""
+def save_sam3(folder, video=False):
+    """Save a small SAM 3: its tracker alone, or detector and tracker as published."""
     vision = {
         "backbone_config": {
             **{"model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 64},
@@ -169,95 +181,53 @@ def sam3_parts():
         "fpn_hidden_size": 32,
         "backbone_feature_sizes": [[32, 32], [16, 16], [8, 8]],
     }
-    prompt = {"hidden_size": 32, "image_size": 112, "patch_size": 14, "mask_input_channels": 4}
-    decoder = {"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32}
-    return vision, prompt, decoder
-
-
-def save_sam3(folder, video=False):
-    """Save a small SAM 3: its tracker alone, or detector and tracker as published."""
-    torch.manual_seed(0)
-    vision, prompt, decoder = sam3_parts()
-    if video:
-        small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
-        config = transformers.Sam3VideoConfig(
-            detector_config=transformers.Sam3Config(
-                vision_config=transformers.Sam3VisionConfig(**vision),
-                text_config={
-                    **{**small, "num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99},
-                    "model_type": "clip_text_model",
-                },
-                geometry_encoder_config={**small, "num_layers": 1},
-                detr_encoder_config={**small, "num_layers": 1},
-                detr_decoder_config={**small, "num_layers": 1, "num_queries": 4},
-                mask_decoder_config={"hidden_size": 32, "num_attention_heads": 2},
-            ),
-            tracker_config=transformers.Sam3TrackerVideoConfig(
-                vision_config=transformers.Sam3VisionConfig(**vision),
-                prompt_encoder_config=prompt,
-                mask_decoder_config=decoder,
-                **{"memory_attention_hidden_size": 32, "memory_attention_num_layers": 1},
-                **{"memory_attention_feed_forward_hidden_size": 32},
-                **{"memory_encoder_hidden_size": 32, "memory_encoder_output_channels": 16},
-                **{"mask_downsampler_embed_dim": 32, "memory_fuser_embed_dim": 32},
-                **{"memory_fuser_intermediate_dim": 32, "memory_attention_rope_feat_sizes": [8, 8]},
-            ),
-        )
-        config.image_size = prompt["image_size"]  # of all parts
-        model = transformers.Sam3VideoModel(config)
-        _randomise_decoder(model.tracker_model)
-    else:
-        model = transformers.Sam3TrackerModel(
-            transformers.Sam3TrackerConfig(
-                vision_config=transformers.Sam3VisionConfig(**vision),
-                prompt_encoder_config=prompt,
-                mask_decoder_config=decoder,
-            )
-        )
-        _randomise_decoder(model)
-    model.save_pretrained(folder)
-    return folder
+    tracker = {
+        "vision_config": transformers.Sam3VisionConfig(**vision),
+        "prompt_encoder_config": {**PROMPT, "image_size": 112, "patch_size": 14},
+        "mask_decoder_config": DECODER,
+    }
+    if not video:
+        config = transformers.Sam3TrackerConfig(**tracker)
+        return save_segmenter(folder, transformers.Sam3TrackerModel, config)
+    small = {"hidden_size": 32, "intermediate_size": 32, "num_attention_heads": 2}
+    text = {"num_hidden_layers": 1, "projection_dim": 32, "vocab_size": 99}
+    config = transformers.Sam3VideoConfig(
+        detector_config=transformers.Sam3Config(
+            vision_config=transformers.Sam3VisionConfig(**vision),
+            text_config={**small, **text, "model_type": "clip_text_model"},
+            geometry_encoder_config={**small, "num_layers": 1},
+            detr_encoder_config={**small, "num_layers": 1},
+            detr_decoder_config={**small, "num_layers": 1, "num_queries": 4},
+            mask_decoder_config={"hidden_size": 32, "num_attention_heads": 2},
+        ),
+        tracker_config=transformers.Sam3TrackerVideoConfig(
+            **tracker,
+            **MEMORY,
+            memory_attention_num_layers=1,
+            memory_attention_rope_feat_sizes=[8, 8],
+        ),
+    )
+    config.image_size = 112  # of all parts
+    return save_segmenter(folder, transformers.Sam3VideoModel, config)
 
 
 def sam_config():
     """Configuration of a small SAM."""
+    vision = {
+        **{"hidden_size": 24, "output_channels": 32, "num_pos_feats": 16, "num_hidden_layers": 2},
+        **{"num_attention_heads": 2, "image_size": 128, "window_size": 4, "mlp_dim": 48},
+        "global_attn_indexes": [1],
+    }
     return transformers.SamConfig(
-        vision_config={
-            "hidden_size": 24,
-            "output_channels": 32,
-            "num_pos_feats": 16,
-            "num_hidden_layers": 2,
-            "num_attention_heads": 2,
-            "image_size": 128,
-            "window_size": 4,
-            "global_attn_indexes": [1],
-            "mlp_dim": 48,
-        },
-        prompt_encoder_config={
-            "hidden_size": 32,
-            "image_size": 128,
-            "image_embedding_size": 8,
-            "mask_input_channels": 4,
-        },
-        mask_decoder_config={"hidden_size": 32, "mlp_dim": 48, "iou_head_hidden_dim": 32},
+        vision_config=vision,
+        prompt_encoder_config={**PROMPT, "image_embedding_size": 8},
+        mask_decoder_config=DECODER,
     )
 
 
 def save_sam(folder):
     """Save a small SAM."""
-    torch.manual_seed(0)
-    model = transformers.SamModel(sam_config())
-    _randomise_decoder(model)
-    model.save_pretrained(folder)
-    return folder
-
-
-def _randomise_decoder(model):
-    """Set weights that give masks with some pixels, but not all."""
-    with torch.no_grad():
-        for name, value in model.mask_decoder.named_parameters():
-            if "norm" not in name:
-                value.normal_(0, 0.3)
+    return save_segmenter(folder, transformers.SamModel, sam_config())
 
 
 def segmented(class_names, scores, features=None):

@@ -1,7 +1,5 @@
 """Names come from models and files: every output shows them as text, whatever they contain."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -12,26 +10,35 @@ from support.view import make_edge, make_graph, make_node
 
 from deworldsg_ros.cli import outputs
 from deworldsg_ros.cli.models import inspect_file
+from deworldsg_ros.client.objects import relation_of, scene_object
 from deworldsg_ros.evaluation.reports import plot_classes, print_protocol
 from deworldsg_ros.evaluation.scoring import Count, ProtocolResult
 from deworldsg_ros.view import page, picture, table
+from deworldsg_ros.view.live.details import note_html, object_html
+from deworldsg_ros.wire.messages import Belief
 
 LABELS = [
     "$\\foo$", "$", "$$x^{$", "__THREE__", "__GRAPH__", "__PAGE__", "[/foo]", "[bold]",
     "[link=x]",
-    "</script><script>alert(1)</script>", "\\u003c", "%s {0}", "a\nb", "\x1b[31m", "\u202e", "",
+    "</script><script>alert(1)</script>", '"><img src=x onerror=1>', "&lt;", "\\u003c",
+    "%s {0}", "a\nb", "\x1b[31m", "\u202e", "",
     "é" * 90,
 ]  # fmt: skip
 
 
-def graph_of(*labels: str, frame_id: str = "map"):
-    nodes = [make_node(1, labels[0]), make_node(2, labels[-1], (0.5, 0, 0))]
-    return make_graph(nodes, [make_edge(1, 2, labels[0])], frame_id)
+def graph_of(label: str, frame_id: str = "map"):
+    nodes = [make_node(1, label), make_node(2, "table", (0.5, 0, 0))]
+    return make_graph(nodes, [make_edge(1, 2, label)], frame_id)
+
+
+def console() -> tuple[Console, io.StringIO]:
+    output = io.StringIO()
+    return Console(file=output, width=200, markup=False), output
 
 
 def printed(graph) -> str:
-    output = io.StringIO()
-    table.print_graph(Console(file=output, width=200, markup=False), graph)
+    terminal, output = console()
+    table.print_graph(terminal, graph)
     return output.getvalue()
 
 
@@ -39,42 +46,22 @@ def is_text(printed_text: str) -> bool:
     return printed_text.replace("\n", "").isprintable()
 
 
-@pytest.mark.parametrize("label", LABELS)
-def test_tables_show_any_label_as_text(label):
-    assert is_text(printed(graph_of(label, "table")))
-
-
-def test_names_of_parameters_and_scores_are_text(tmp_path):
-    header = json.dumps({"a\x1b[2J": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}})
-    content = len(header).to_bytes(8, "little") + header.encode() + bytes(4)
-    (tmp_path / "model.safetensors").write_bytes(content)
-    output = io.StringIO()
-    console = Console(file=output, width=200, markup=False)
-    inspect_file(tmp_path, console)
-    count = Count(1, 2)
-    classes = {"b\x1b[2J": count}
-    result = ProtocolResult(count, count, count, classes, classes, [])
-    print_protocol(console, result, "title \x1b[2J")
-    assert output.getvalue().count("u001b[2J") == 4
-    assert is_text(output.getvalue())
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """The page of a graph of usual names."""
+    path = tmp_path_factory.mktemp("plain") / "graph.html"
+    page.write(graph_of("cup"), path)
+    return path.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("label", LABELS)
-def test_the_picture_draws_any_label(tmp_path, label):
-    picture.draw(graph_of(label), tmp_path / "top.png")
+def test_tables_picture_and_page_show_any_label_as_text(tmp_path, plain, label):
+    graph = graph_of(label)
+    assert is_text(printed(graph))
+    picture.draw(graph, tmp_path / "top.png")
     assert (tmp_path / "top.png").stat().st_size > 1000
-
-
-def test_a_dollar_is_a_dollar_in_plots(tmp_path):
-    plot_classes(tmp_path / "classes.png", {"$\\foo$": Count(1, 2)}, "$\\bar$")
-
-
-@pytest.mark.parametrize("label", LABELS)
-def test_the_page_stays_whole_with_any_label(tmp_path, label):
-    page.write(graph_of(label, "table"), tmp_path / "graph.html")
+    page.write(graph, tmp_path / "graph.html")
     html = (tmp_path / "graph.html").read_text(encoding="utf-8")
-    page.write(graph_of("cup", "table"), tmp_path / "plain.html")
-    plain = (tmp_path / "plain.html").read_text(encoding="utf-8")
     assert html.count("</script>") == plain.count("</script>")
     assert abs(len(html) - len(plain)) < 10_000, "a part of the page is there twice, or missing"
     found = re.search(r'^.*"frame_id": "map", "nodes".*$', html, re.MULTILINE)
@@ -83,15 +70,41 @@ def test_the_page_stays_whole_with_any_label(tmp_path, label):
     assert details["nodes"][0]["label"] == label
 
 
+@pytest.mark.parametrize("label", [label for label in LABELS if set(label) & set("<>&")])
+def test_details_of_the_viewer_show_any_label_as_text(label):
+    doubtful = make_node(2, "cup", classes=[Belief("cup", 0.5), Belief(label, 0.4)])
+    nodes = (make_node(1, label), doubtful)
+    items = [scene_object(node, "map", (0.0, 0.0, 1.0)) for node in nodes]
+    relation = relation_of(make_edge(1, 2, label), *items, None)
+    html = "".join(object_html(item, [relation], None) for item in items) + note_html([label])
+    assert label not in html
+    assert "<script" not in html and "<img" not in html
+
+
+def test_names_of_parameters_and_scores_are_text(tmp_path):
+    header = json.dumps({"a\x1b[2J": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}})
+    content = len(header).to_bytes(8, "little") + header.encode() + bytes(4)
+    (tmp_path / "model.safetensors").write_bytes(content)
+    terminal, output = console()
+    inspect_file(tmp_path, terminal)
+    count = Count(1, 2)
+    classes = {"b\x1b[2J": count}
+    print_protocol(
+        terminal, ProtocolResult(count, count, count, classes, classes, []), "title \x1b[2J"
+    )
+    assert output.getvalue().count("u001b[2J") == 4
+    assert is_text(output.getvalue())
+    plot_classes(tmp_path / "classes.png", {"$\\foo$": count}, "$\\bar$")
+
+
 @pytest.mark.parametrize("name", ["[/foo]", "[bold]x", "/robot[0]/map", "[/]"])
 def test_brackets_in_frames_paths_and_notes_are_text(tmp_path, name):
-    assert name in printed(graph_of("cup", "table", frame_id=name)).replace("\n", "")
-    output = io.StringIO()
-    console = Console(file=output, width=200, markup=False)
+    assert name in printed(graph_of("cup", name)).replace("\n", "")
+    terminal, output = console()
     folder = tmp_path / name.replace("/", "-")
     folder.mkdir()
     (folder / "run.json").write_text("{}")
-    outputs.print_files(console, folder)
-    outputs.print_drops(console, [name], {"recording": {name: 1}}, {name: name})
+    outputs.print_files(terminal, folder)
+    outputs.print_drops(terminal, [name], {"recording": {name: 1}}, {name: name})
     text = output.getvalue().replace(str(folder), "FOLDER")
     assert text.count("FOLDER") == 2 and text.count(name) == 3

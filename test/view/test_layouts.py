@@ -1,7 +1,5 @@
 """The files for RViz and Foxglove name the topics that exist, with the QoS of their publishers."""
 
-from __future__ import annotations
-
 import json
 
 import yaml
@@ -25,8 +23,7 @@ def test_rviz_shows_every_namespace_and_receives_the_latched_message(root_dir):
 
 
 def test_foxglove_shows_the_topics_of_the_server_and_of_the_bridge(root_dir):
-    path = root_dir / "config" / "foxglove_layout.json"
-    layout = json.loads(path.read_text(encoding="utf-8"))
+    layout = json.loads((root_dir / "config" / "foxglove_layout.json").read_text("utf-8"))
     source = (root_dir / "deworldsg_ros" / "view" / "live" / "foxglove.py").read_text("utf-8")
     topics = layout["configById"]["3D!graph"]["topics"]
     for topic in set(topics) - {"/scene_graph/markers"}:

@@ -68,27 +68,6 @@ def _down_in_image(up_camera: Float64) -> tuple[int, int]:
 
 
 @kernel
-def _rise(height: Float64, depth: float, v: int, u: int) -> float:
-    """Height of pixel (u, v) at a depth over the camera, metres."""
-    return depth * (height[0] * u + height[1] * v + height[2])
-
-
-@kernel
-def _pixel_beneath(
-    depth_m: Float32, instances: UInt16, v: int, u: int, down: tuple[int, int]
-) -> tuple[int, int]:
-    """The first pixel below the edge at (u, v) with depth that is not of the same object.
-
-    It is (v, u) itself if none is within reach.
-    """
-    for step in range(1 + BORDER_PX, 1 + REACH_PX):
-        y, x = v + step * down[0], u + step * down[1]
-        if instances[y, x] != instances[v, u] and depth_m[y, x] > 0:
-            return y, x
-    return v, u
-
-
-@kernel
 def _surfaces_beneath(
     depth_m: Float32,
     instances: UInt16,
@@ -111,14 +90,20 @@ def _surfaces_beneath(
             y, x = v - BORDER_PX * down[0], u - BORDER_PX * down[1]
             z, low = depth_m[y, x], low_m[label - 1]
             inside = instances[y, x] == label and z > 0
-            if not inside or _rise(height, z, y, x) > low + HEIGHT_M:
+            if not inside or z * (height[0] * x + height[1] * y + height[2]) > low + HEIGHT_M:
                 continue
-            y, x = _pixel_beneath(depth_m, instances, v, u, down)
-            other, other_z = instances[y, x], depth_m[y, x]
+            # The first pixel below the edge with depth that is not of the same object.
+            other, other_z = label, z
+            for step in range(1 + BORDER_PX, 1 + REACH_PX):
+                y, x = v + step * down[0], u + step * down[1]
+                if instances[y, x] != label and depth_m[y, x] > 0:
+                    other, other_z = instances[y, x], depth_m[y, x]
+                    break
             if other == label or other_z < z - DEPTH_STEP_M:
                 continue  # something in front hides the bottom
             edge[label - 1] += 1.0
-            level = abs(_rise(height, other_z, y, x) - low) < HEIGHT_M
+            rise = other_z * (height[0] * x + height[1] * y + height[2])
+            level = abs(rise - low) < HEIGHT_M
             if level and other_z < z + DEPTH_STEP_M and 0 < other <= count:
                 beneath[label - 1, other - 1] += 1.0
     for row in range(count):
@@ -141,28 +126,26 @@ CANDIDATES_PER_POINT = 3
 
 
 @kernel
-def _is_inner(
-    depth_m: Float32, instances: UInt16, y: int, x: int, margin: int, step_m: float
-) -> bool:
+def _is_inner(depth_m: Float32, instances: UInt16, y: int, x: int, step_m: float) -> bool:
     """Whether a pixel lies inside its mask and on one surface with the pixels around it.
 
-    All pixels within `margin` have its label. Along the row and along the column, its depth is
+    All pixels within `BORDER_PX` have its label. Along the row and along the column, its depth is
     within `step_m` of the mean of the two pixels at that distance: on a plane, however slanted, it
     equals their mean. A neighbour without depth, or outside the image, does not count.
     """
     height, width = instances.shape
     label = instances[y, x]
-    for row in range(max(y - margin, 0), min(y + margin + 1, height)):
-        for column in range(max(x - margin, 0), min(x + margin + 1, width)):
+    for row in range(max(y - BORDER_PX, 0), min(y + BORDER_PX + 1, height)):
+        for column in range(max(x - BORDER_PX, 0), min(x + BORDER_PX + 1, width)):
             if instances[row, column] != label:
                 return False
     depth = depth_m[y, x]
-    if margin <= y < height - margin:
-        a, b = depth_m[y - margin, x], depth_m[y + margin, x]
+    if BORDER_PX <= y < height - BORDER_PX:
+        a, b = depth_m[y - BORDER_PX, x], depth_m[y + BORDER_PX, x]
         if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
             return False
-    if margin <= x < width - margin:
-        a, b = depth_m[y, x - margin], depth_m[y, x + margin]
+    if BORDER_PX <= x < width - BORDER_PX:
+        a, b = depth_m[y, x - BORDER_PX], depth_m[y, x + BORDER_PX]
         if a > 0 and b > 0 and abs(0.5 * (a + b) - depth) > step_m:
             return False
     return True
@@ -203,7 +186,7 @@ def sample_pixels(
                 slot = ends[row] - quotas[row] + taken[row]
                 candidates[slot, 0], candidates[slot, 1] = y, x
                 step_m = SURFACE_STEP_M + SURFACE_STEP_PER_M * depth_m[y, x] ** 2
-                inner[slot] = _is_inner(depth_m, instances, y, x, BORDER_PX, step_m)
+                inner[slot] = _is_inner(depth_m, instances, y, x, step_m)
                 taken[row] += 1
             seen[row] += 1
     pixels = np.empty((count * most, 2), np.int64)

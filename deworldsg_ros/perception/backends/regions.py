@@ -34,9 +34,10 @@ MIN_CELLS = 3
 MAX_DEPTH_M = 1000.0
 # The slope of the depth is measured this far to either side, against the noise of the sensor.
 SLOPE_REACH_CELLS = 2
-# Counting sort of the edge weights: 64 bins per unit; differences below 1/64 do not matter.
+# Counting sort of the edge weights: 64 bins per unit; differences below 1/64 do not matter. (Numba
+# would compile a kernel once more for a literal number.)
 BINS_PER_UNIT = 64.0
-WEIGHT_BINS = 512
+WEIGHT_BINS = np.int64(512)
 
 
 @dataclass(frozen=True)
@@ -176,34 +177,27 @@ def _edge_weights(lab: Float32, points: Float32, normals: Float32) -> Float32:
     weights = np.empty((2, height, width), np.float32)
     for y in range(height):
         for x in range(width):
-            weights[0, y, x] = weights[1, y, x] = np.inf
-            if x + 1 < width:
-                weights[0, y, x] = _edge_weight(lab, points, normals, y, x, y, x + 1)
-            if y + 1 < height:
-                weights[1, y, x] = _edge_weight(lab, points, normals, y, x, y + 1, x)
+            for direction in range(2):
+                v, u = y + direction, x + 1 - direction
+                if v == height or u == width:
+                    weights[direction, y, x] = np.inf
+                    continue
+                square = np.float32(0.0)
+                for k in range(3):
+                    d = (lab[y, x, k] - lab[v, u, k]) / np.float32(COLOUR_STEP)
+                    square += d * d
+                here, there = points[y, x, 2], points[v, u, 2]
+                if here > 0 and there > 0:
+                    d = (here - there) / (np.float32(DEPTH_STEP) * min(here, there))
+                    square += d * d
+                    cosine = np.float32(0.0)
+                    for k in range(3):
+                        cosine += normals[y, x, k] * normals[v, u, k]
+                    square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
+                elif here > 0 or there > 0:
+                    square += np.float32(HOLE_STEP * HOLE_STEP)
+                weights[direction, y, x] = np.sqrt(square)
     return weights
-
-
-@kernel
-def _edge_weight(
-    lab: Float32, points: Float32, normals: Float32, y: int, x: int, v: int, u: int
-) -> float:
-    """Weight of the edge between the cells (y, x) and (v, u)."""
-    square = np.float32(0.0)
-    for k in range(3):
-        d = (lab[y, x, k] - lab[v, u, k]) / np.float32(COLOUR_STEP)
-        square += d * d
-    here, there = points[y, x, 2], points[v, u, 2]
-    if here > 0 and there > 0:
-        d = (here - there) / (np.float32(DEPTH_STEP) * min(here, there))
-        square += d * d
-        cosine = np.float32(0.0)
-        for k in range(3):
-            cosine += normals[y, x, k] * normals[v, u, k]
-        square += (np.float32(1.0) - cosine) / np.float32(NORMAL_STEP)
-    elif here > 0 or there > 0:
-        square += np.float32(HOLE_STEP * HOLE_STEP)
-    return np.sqrt(square)
 
 
 @kernel
@@ -225,8 +219,14 @@ def _merge(weights: Float32) -> tuple[Int32, int]:
     _, height, width = weights.shape
     cells = height * width
     flat = weights.reshape(2 * cells)
-    order = _order_edges(flat)
-    total = len(order)
+    # The edges in the order of their weights, up to the width of a bin.
+    bins, order, total = np.empty(2 * cells, np.int32), np.empty(2 * cells, np.int32), 0
+    for edge in range(2 * cells):
+        if flat[edge] != np.inf:
+            bins[edge] = min(int(flat[edge] * BINS_PER_UNIT), WEIGHT_BINS - 1)
+            order[total] = edge
+            total += 1
+    order = _sorted(bins, order[:total], WEIGHT_BINS)
     parent, size = np.empty(cells, np.int32), np.empty(cells, np.int32)
     for cell in range(cells):
         parent[cell], size[cell] = cell, 1
@@ -261,45 +261,31 @@ def _merge(weights: Float32) -> tuple[Int32, int]:
             size[a] += size[b]
             internal[a] = weight
         total = left
-    labels, count = _number_regions(parent)
+    # The regions are numbered in scan order.
+    labels, numbers, count = np.empty(cells, np.int32), np.zeros(cells, np.int32), 0
+    for cell in range(cells):
+        root = _root(parent, cell)
+        if numbers[root] == 0:
+            count += 1
+            numbers[root] = count
+        labels[cell] = numbers[root] - 1
     return labels.reshape(height, width), count
 
 
 @kernel
-def _order_edges(flat: Float32) -> Int32:
-    """Indices of the finite weights, in ascending order up to the bin width."""
-    start = np.zeros(WEIGHT_BINS + 1, np.int32)
-    bins = np.empty(len(flat), np.int16)
-    for edge in range(len(flat)):
-        weight = flat[edge]
-        if weight == np.inf:
-            bins[edge] = -1
-            continue
-        bins[edge] = min(int(weight * BINS_PER_UNIT), WEIGHT_BINS - 1)
-        start[bins[edge] + 1] += 1
-    for b in range(WEIGHT_BINS):
-        start[b + 1] += start[b]
-    order = np.empty(start[WEIGHT_BINS], np.int32)
-    for edge in range(len(flat)):
-        if bins[edge] >= 0:
-            order[start[bins[edge]]] = edge
-            start[bins[edge]] += 1
-    return order
-
-
-@kernel
-def _number_regions(parent: Int32) -> tuple[Int32, int]:
-    """Region of each cell, numbered from 0 in scan order, and the number of regions."""
-    labels = np.empty(len(parent), np.int32)
-    number = np.zeros(len(parent), np.int32)
-    count = 0
-    for cell in range(len(parent)):
-        root = _root(parent, cell)
-        if number[root] == 0:
-            count += 1
-            number[root] = count
-        labels[cell] = number[root] - 1
-    return labels, count
+def _sorted(keys: Int32, order: Int32, count: int | np.int64) -> Int32:
+    """The indices in `order`, in ascending order of their keys in [0, count); stable."""
+    start = np.zeros(count + 1, np.int32)
+    for i in range(len(order)):
+        start[keys[order[i]] + 1] += 1
+    for key in range(count):
+        start[key + 1] += start[key]
+    result = np.empty(len(order), np.int32)
+    for i in range(len(order)):
+        key = keys[order[i]]
+        result[start[key]] = order[i]
+        start[key] += 1
+    return result
 
 
 @kernel
@@ -326,13 +312,24 @@ def _region_sums(
 @kernel
 def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float64]:
     """Adjacent regions (m, 2) int32, in order, and the mean edge weight (m,) along each border."""
-    first, second, values = _border_edges(labels, weights)
-    found = len(values)
-    # Counting sorts: edges in order of both regions, and in scan order along one border.
-    order = np.empty(found, np.int32)
-    for edge in range(found):
-        order[edge] = edge
-    order = _sorted(first, _sorted(second, order, count), count)
+    height, width = labels.shape
+    # The edges between regions: the two regions, the lower one first, and the weight.
+    first = np.empty(2 * height * width, np.int32)
+    second, order = np.empty(len(first), np.int32), np.empty(len(first), np.int32)
+    values, found = np.empty(2 * height * width, np.float32), 0
+    for y in range(height):
+        for x in range(width):
+            a = labels[y, x]
+            for direction in range(2):
+                v = y + direction
+                u = x + 1 - direction
+                if v < height and u < width and labels[v, u] != a:
+                    b = labels[v, u]
+                    first[found], second[found] = min(a, b), max(a, b)
+                    values[found], order[found] = weights[direction, y, x], found
+                    found += 1
+    # In the order of both regions, and in scan order along one border.
+    order = _sorted(first, _sorted(second, order[:found], count), count)
     pairs, means = np.empty((found, 2), np.int32), np.empty(found, np.float64)
     last, total, edges = -1, 0.0, 0
     for i in range(found):
@@ -346,41 +343,3 @@ def adjacency(labels: Int32, count: int, weights: Float32) -> tuple[Int32, Float
         edges += 1
         means[last] = total / edges
     return pairs[: last + 1], means[: last + 1]
-
-
-@kernel
-def _sorted(keys: Int32, order: Int32, count: int) -> Int32:
-    """The indices in `order`, in ascending order of their keys in [0, count); stable."""
-    start = np.zeros(count + 1, np.int32)
-    for i in range(len(order)):
-        start[keys[order[i]] + 1] += 1
-    for key in range(count):
-        start[key + 1] += start[key]
-    result = np.empty(len(order), np.int32)
-    for i in range(len(order)):
-        key = keys[order[i]]
-        result[start[key]] = order[i]
-        start[key] += 1
-    return result
-
-
-@kernel
-def _border_edges(labels: Int32, weights: Float32) -> tuple[Int32, Int32, Float32]:
-    """Edges between regions, (k,) each: the two regions, the lower one first, and the weight."""
-    height, width = labels.shape
-    first = np.empty(2 * height * width, np.int32)
-    second = np.empty(2 * height * width, np.int32)
-    values = np.empty(2 * height * width, np.float32)
-    found = 0
-    for y in range(height):
-        for x in range(width):
-            a = labels[y, x]
-            for direction in range(2):
-                v = y + direction
-                u = x + 1 - direction
-                if v < height and u < width and labels[v, u] != a:
-                    b = labels[v, u]
-                    first[found], second[found] = min(a, b), max(a, b)
-                    values[found] = weights[direction, y, x]
-                    found += 1
-    return first[:found], second[:found], values[:found]

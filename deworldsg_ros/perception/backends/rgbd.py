@@ -58,8 +58,8 @@ TIGHTNESS_WEIGHT = 1.0
 FILL_EXPECTED = 0.4
 FILL_WEIGHT = 0.5
 
-# `valid`, `flatness`, `point`, `normal` and `lab` of `Regions`.
-_Planes = tuple[Float64, Float64, Float64, Float64, Float64]
+# `Regions` from `lab` on.
+_Surfaces = tuple[Float64, Float64, Float64, Float64, Float64, Int32, Float64]
 
 
 def cut_boxes(regions: Regions, boxes_cells: Int64) -> Int32:
@@ -91,9 +91,7 @@ def _cut_box(regions: Regions, box: Int64, owner: Int32, row: int) -> None:
         return
     background = free & ~candidate & (loosely <= INSIDE_FRACTION * area)
     distance = np.where(background, 0.0, np.inf)
-    planes = regions.valid, regions.flatness, regions.point, regions.normal, regions.lab
-    _reach_by_planes(planes, members, distance, owner)
-    _reach_by_borders(regions.pairs, regions.strength, distance, owner)
+    _spread(regions[2:], members, distance, owner)
     distance = np.minimum(distance, MAX_DISTANCE)
     order = members[np.argsort(-distance[members], kind="stable")]
     x1, y1, x2, y2 = box.tolist()
@@ -103,12 +101,12 @@ def _cut_box(regions: Regions, box: Int64, owner: Int32, row: int) -> None:
 
 
 @kernel
-def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int32, Int32, Int32]:
+def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int64, Int64, Int64]:
     """For each region: its cells in the box, and in the box with slack; its bounds in the box."""
     x1, y1, x2, y2 = box[0], box[1], box[2], box[3]
     rows, columns = labels.shape
-    inside, loosely = np.zeros(count, np.int32), np.empty(count, np.int32)
-    bounds = np.zeros((count, 4), np.int32)
+    inside, loosely = np.zeros(count, np.int64), np.empty(count, np.int64)
+    bounds = np.zeros((count, 4), np.int64)
     for y in range(y1, y2 + 1):
         for x in range(x1, x2 + 1):
             r = labels[y, x]
@@ -130,46 +128,30 @@ def _count_inside(labels: Int32, count: int, box: Int64) -> tuple[Int32, Int32, 
 
 
 @kernel
-def _reach_by_planes(planes: _Planes, members: Int64, distance: Float64, owner: Int32) -> None:
-    """Lower the distance of members that continue a plane of the background."""
-    valid, flatness, _, _, _ = planes
+def _spread(surfaces: _Surfaces, members: Int64, distance: Float64, owner: Int32) -> None:
+    """Lower the distances of regions to the costs of their paths from the background."""
+    lab, valid, point, normal, flatness, pairs, strength = surfaces
+    # To members that continue a plane of the background.
     for q in range(len(valid)):
-        if distance[q] > 0.0 or owner[q] >= 0:
+        is_plane = valid[q] >= PLANE_MIN_CELLS and flatness[q] >= PLANE_MIN_FLATNESS
+        if distance[q] > 0.0 or owner[q] >= 0 or not is_plane:
             continue
-        if valid[q] >= PLANE_MIN_CELLS and flatness[q] >= PLANE_MIN_FLATNESS:
-            _reach_by_plane(planes, q, members, distance)
-
-
-@kernel
-def _reach_by_plane(planes: _Planes, q: int, members: Int64, distance: Float64) -> None:
-    """Lower the distance of members that continue the plane of region q."""
-    valid, _, point, normal, lab = planes
-    for r in members:
-        if valid[r] < POINT_MIN_CELLS:
-            continue
-        offset = 0.0
-        for k in range(3):
-            offset += (point[r, k] - point[q, k]) * normal[q, k]
-        noise_m = PLANE_NOISE_M + PLANE_NOISE_PER_M2 * point[r, 2] ** 2
-        offset = abs(offset) / noise_m
-        if offset > PLANE_MAX_OFFSET:
-            continue
-        cosine = 0.0
-        colour = 0.0
-        for k in range(3):
-            cosine += normal[r, k] * normal[q, k]
-            colour += ((lab[r, k] - lab[q, k]) / PLANE_COLOUR) ** 2
-        angle = PLANE_ANGLE_WEIGHT * (1.0 - cosine)
-        cost = np.sqrt(PLANE_OFFSET_WEIGHT * offset * offset + angle + colour)
-        distance[r] = min(distance[r], PLANE_COST + cost)
-
-
-@kernel
-def _reach_by_borders(pairs: Int32, strength: Float64, distance: Float64, owner: Int32) -> None:
-    """Shortest paths from the background over the borders (Bellman-Ford)."""
-    # Borders within the background have no effect.
-    relevant = np.empty(len(pairs), np.int32)
-    found = 0
+        for r in members:
+            if valid[r] < POINT_MIN_CELLS:
+                continue
+            offset = cosine = colour = 0.0
+            for k in range(3):
+                offset += (point[r, k] - point[q, k]) * normal[q, k]
+                cosine += normal[r, k] * normal[q, k]
+                colour += ((lab[r, k] - lab[q, k]) / PLANE_COLOUR) ** 2
+            offset = abs(offset) / (PLANE_NOISE_M + PLANE_NOISE_PER_M2 * point[r, 2] ** 2)
+            if offset > PLANE_MAX_OFFSET:
+                continue
+            angle = PLANE_ANGLE_WEIGHT * (1.0 - cosine)
+            cost = np.sqrt(PLANE_OFFSET_WEIGHT * offset * offset + angle + colour)
+            distance[r] = min(distance[r], PLANE_COST + cost)
+    # Shortest paths over the borders (Bellman-Ford). Those within the background have no effect.
+    relevant, found = np.empty(len(pairs), np.int32), 0
     for i in range(len(pairs)):
         a, b = pairs[i, 0], pairs[i, 1]
         if owner[a] < 0 and owner[b] < 0 and (distance[a] > 0.0 or distance[b] > 0.0):
@@ -192,7 +174,7 @@ def _reach_by_borders(pairs: Int32, strength: Float64, distance: Float64, owner:
 
 @kernel
 def _best_cut(
-    order: Int64, distance: Float64, area: Float64, bounds: Int32, free: float, box_area: int
+    order: Int64, distance: Float64, area: Float64, bounds: Int64, free: float, box_area: int
 ) -> int:
     """How many of the regions in `order`, farthest first, are the object."""
     total, total_square = 0.0, 0.0
@@ -277,7 +259,12 @@ def upsample_labels(
             for x in range(width):
                 result[y, x] = result[top, x]
         for u in range(columns):
-            if _is_uniform(labels, v, u):
+            is_uniform = True
+            for dv, du in CANDIDATES:
+                b, a = v + dv, u + du
+                if 0 <= b < rows and 0 <= a < columns and labels[b, a] != labels[v, u]:
+                    is_uniform = False
+            if is_uniform:
                 continue
             before = (v > 0) + (u > 0)
             count = 1 + before + (u < columns - 1) + (v < rows - 1)
@@ -298,17 +285,6 @@ def upsample_labels(
             candidates = (near, centres, near_labels, count, before)
             _choose(candidates, along, rgb, depth_m, pixels, result)
     return result
-
-
-@kernel
-def _is_uniform(labels: Int32, v: int, u: int) -> bool:
-    """Whether all candidates of the pixels of cell (v, u) have one label."""
-    rows, columns = labels.shape
-    for dv, du in CANDIDATES:
-        b, a = v + dv, u + du
-        if 0 <= b < rows and 0 <= a < columns and labels[b, a] != labels[v, u]:
-            return False
-    return True
 
 
 @kernel

@@ -1,47 +1,34 @@
-"""RT-DETR and RT-DETRv2: scores, boxes, preprocessing, layers, and checkpoints that are refused."""
-
-from __future__ import annotations
+"""RT-DETR, RT-DETRv2 and EGTR: parity with the networks, and checkpoints that are refused."""
 
 import json
 import shutil
-from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
-from support.torch_models import (
-    CLASSES,
-    IMAGENET,
-    LAYERS,
-    QUERIES,
-    WIDTH,
-    image,
-    random_rtdetr,
-    save_rtdetr,
-    settings,
-    torch,
-)
+from support import torch_models as models
+from support.torch_models import CLASSES, LAYERS, PREDICATES, QUERIES, image, settings, torch
 
-from deworldsg_ros.checkpoints.cards import (
-    DETECTOR_CARD,
-    CheckpointCard,
-    read_detector_card,
-    write_detector_card,
-)
-from deworldsg_ros.perception.backends.rtdetr import RtDetrDetector
+from deworldsg_ros.checkpoints import cards
+from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
+from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
+from deworldsg_ros.perception import build_perception
+from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
+from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
-
-SOFTMAX = CheckpointCard(class_scores="softmax")
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     root = tmp_path_factory.mktemp("rtdetr")
+    softmax = CheckpointCard(class_scores="softmax")
     return {
-        "v1": save_rtdetr(root / "v1", 1),
-        "v2": save_rtdetr(root / "v2", 2),
-        "softmax": save_rtdetr(root / "softmax", 1, card=SOFTMAX, normalise=True),
+        "v1": models.save_rtdetr(root / "v1", 1),
+        "v2": models.save_rtdetr(root / "v2", 2),
+        "softmax": models.save_rtdetr(root / "softmax", 1, card=softmax, normalise=True),
+        "paper": models.save_paper_checkpoint(root / "paper"),
     }
 
 
@@ -49,23 +36,27 @@ def detector(folder, **changes):
     return RtDetrDetector(settings(detector_path=str(folder), **changes))
 
 
-def with_card(folder, tmp_path, **fields):
-    """A copy of a checkpoint with another card."""
-    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
-    write_detector_card(copy / DETECTOR_CARD, CheckpointCard(**fields))
-    return copy
+@pytest.fixture
+def copy(folders, tmp_path):
+    """A copy of a checkpoint that a test may change."""
+    return shutil.copytree(folders["v1"], tmp_path / "copy")
 
 
-def reference(folder, rgb, *, normalise=False, version=1):
+def with_card(folder, **fields):
+    cards.write_detector_card(folder / DETECTOR_CARD, CheckpointCard(**fields))
+    return folder
+
+
+def reference(rgb, *, normalise=False, version=1):
     """Logits and boxes of the network that was saved, by a loop over its own modules."""
-    model = random_rtdetr(version)
+    model = models.random_rtdetr(version)
     pixels = torch.from_numpy(rgb.astype(np.float32)).permute(2, 0, 1)[None]
     pixels = torch.nn.functional.interpolate(
         pixels, size=(64, 64), mode="bilinear", antialias=True, align_corners=False
     )
     pixels = pixels / 255
     if normalise:
-        mean, std = (torch.tensor(IMAGENET[key])[:, None, None] for key in IMAGENET)
+        mean, std = (torch.tensor(models.IMAGENET[key])[:, None, None] for key in models.IMAGENET)
         pixels = (pixels - mean) / std
     with torch.no_grad():
         return model(pixels)
@@ -75,7 +66,7 @@ def reference(folder, rgb, *, normalise=False, version=1):
 def test_all_detections_equal_the_queries_of_the_network(folders, version):
     rgb = image(48, 96)
     found = detector(folders[f"v{version}"]).detect(rgb, 0.0)
-    output = reference(folders, rgb, version=version)
+    output = reference(rgb, version=version)
     scores = output.logits[0].sigmoid().amax(-1)
     order = torch.argsort(scores, descending=True, stable=True)
     assert len(found) == QUERIES
@@ -89,178 +80,253 @@ def test_all_detections_equal_the_queries_of_the_network(folders, version):
 
 
 def test_softmax_scores_are_the_distributions_maxima(folders):
-    rgb = image()
-    found = detector(folders["softmax"]).detect(rgb, 0.0)
-    output = reference(folders, rgb, normalise=True)
+    found = detector(folders["softmax"]).detect(image(), 0.0)
+    output = reference(image(), normalise=True)
     expected = output.logits[0].softmax(-1).amax(-1).sort(descending=True).values
     assert np.allclose(found.scores, expected, atol=1e-5)
     assert np.allclose(found.scores, found.class_probabilities.max(axis=1), atol=1e-6)
 
 
-def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scores(
-    folders, tmp_path
-):
-    sharp = detector(with_card(folders["v1"], tmp_path, temperature=0.25)).detect(image(), 0.0)
+def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scores(folders, copy):
     plain = detector(folders["v1"]).detect(image(), 0.0)
-    for found in (sharp, plain):
-        assert np.allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-12)
+    sharp = detector(with_card(copy, temperature=0.25)).detect(image(), 0.0)
+    p, q = plain.class_probabilities, sharp.class_probabilities
+    assert np.allclose([p.sum(axis=1), q.sum(axis=1)], 1, atol=1e-12)
     assert np.array_equal(sharp.scores, plain.scores)
-    assert np.array_equal(
-        sharp.class_probabilities.argmax(axis=1), plain.class_probabilities.argmax(axis=1)
-    )
-    assert (sharp.class_probabilities.max(1) >= plain.class_probabilities.max(1)).all()
+    assert np.array_equal(q.argmax(axis=1), p.argmax(axis=1))
+    assert (q.max(axis=1) >= p.max(axis=1)).all()
 
 
-def test_threshold_keeps_the_best_in_order(folders):
-    every = detector(folders["v1"]).detect(image(), 0.0)
+def test_threshold_keeps_the_best_in_order(folders, copy):
+    found = detector(folders["v1"])
+    every = found.detect(image(), 0.0)
+    assert every.features is None  # without a relation head
     threshold = float(np.median(every.scores))
-    kept = detector(folders["v1"]).detect(image(), threshold)
+    kept = found.detect(image(), threshold)
     assert 0 < len(kept) < len(every)
     assert np.array_equal(kept.scores, every.scores[every.scores >= threshold])
-    none = detector(folders["v1"]).detect(image(), 1.0)
-    assert len(none) == 0 and none.class_probabilities.shape == (0, len(CLASSES))
+    assert found.detect(image(), 1.0).class_probabilities.shape == (0, len(CLASSES))
+    # The default is that of the card or of the kind of scores.
+    assert found.default_score_threshold == 0.5
+    assert detector(folders["softmax"]).default_score_threshold == 0.7
+    own = with_card(copy, class_scores="softmax", score_threshold=0.3)
+    assert detector(own).default_score_threshold == 0.3
 
 
 @pytest.mark.parametrize("layers", [1, 3])
-def test_fewer_decoder_layers_give_the_intermediate_output(folders, tmp_path, layers):
-    rgb = image()
-    folder = with_card(folders["v1"], tmp_path, decoder_layers=layers)
-    found = detector(folder).detect(rgb, 0.0)
-    inner = reference(folders, rgb).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
+def test_fewer_decoder_layers_give_the_intermediate_output(copy, layers):
+    found = detector(with_card(copy, decoder_layers=layers)).detect(image(), 0.0)
+    inner = reference(image()).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
     assert np.allclose(found.scores, inner.sort(descending=True).values, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("card", "threshold"),
-    [
-        ({}, 0.5),
-        ({"class_scores": "sigmoid"}, 0.5),
-        ({"class_scores": "softmax"}, 0.7),
-        ({"class_scores": "softmax", "score_threshold": 0.3}, 0.3),
-    ],
-)
-def test_default_threshold_is_that_of_the_card_or_the_kind_of_scores(
-    folders, tmp_path, card, threshold
-):
-    folder = with_card(folders["v1"], tmp_path, **card)
-    assert detector(folder).default_score_threshold == threshold
-
-
-def test_queries_are_recorded_only_on_request(folders):
-    watched = detector(folders["v1"])
-    assert watched.detect(image(), 0.0).features is None
-    watched.record_queries()
-    watched.record_queries()
-    found = watched.detect(image(), 0.0)
-    assert found.features.shape == (QUERIES, 2 * LAYERS + 1, WIDTH)
-    assert found.features.dtype == np.float32
-    # The last slot is what the class head reads.
-    head = random_rtdetr().model.decoder.class_embed[-1]
-    scores = head(torch.from_numpy(found.features[:, -1])).sigmoid().amax(-1)
-    assert np.allclose(scores.detach(), found.scores, atol=1e-5)
-    kept = found.take(np.array([3, 1]))
-    assert np.array_equal(kept.features, found.features[[3, 1]])
-
-
-def test_read_only_images_and_other_image_sizes_work(folders):
+def test_other_images_and_half_precision_run_through(folders):
     found = detector(folders["v1"])
-    rgb = image(120, 160)
-    rgb.flags.writeable = False
-    assert len(found.detect(rgb, 0.0)) == QUERIES
-    assert len(found.detect(image(33, 47), 0.0)) == QUERIES
-
-
-def test_half_precision_runs_through(folders):
-    found = detector(folders["v1"])
-    exact = found.detect(image(), 0.0)
+    exact = found.detect(image(), 0.0).scores
+    read_only = image(33, 47)
+    read_only.flags.writeable = False
+    assert len(found.detect(read_only, 0.0)) == QUERIES
     found.model, found.dtype = found.model.half(), torch.float16
-    assert np.allclose(found.detect(image(), 0.0).scores, exact.scores, atol=0.05)
+    assert np.allclose(found.detect(image(), 0.0).scores, exact, atol=0.05)
 
 
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path):
-    from support.torch_models import save_sam
+def naive(network, features, classes=None):
+    """The head as it is printed: every pair's sources side by side, all of them at once."""
+    layers = (features.shape[1] - 1) // 2
+    count = len(features)
+    sources = []
+    for slot in range(layers + 1):
+        last = slot == layers
+        make_q = network.final_sub_proj if last else network.proj_q[slot]
+        make_k = network.final_obj_proj if last else network.proj_k[slot]
+        q = make_q(features[:, -1 if last else slot])
+        k = make_k(features[:, -1 if last else layers + slot])
+        pair = torch.cat([q[:, None].expand(-1, count, -1), k[None].expand(count, -1, -1)], -1)
+        sources.append(pair)
+    sources = torch.stack(sources, dim=2)
+    gates = torch.sigmoid(network.rel_predictor_gate(sources))
+    pairs = (gates * sources).sum(dim=2)
 
-    with pytest.raises(
-        ConfigurationError, match="is a checkpoint of sam: expected rt_detr or rt_detr_v2"
-    ):
-        detector(save_sam(tmp_path))
+    def perceptron(part):
+        first, second, last = part.layers
+        return last(torch.relu(second(torch.relu(first(pairs)))))
 
-
-@pytest.mark.parametrize(
-    ("path", "message"),
-    [
-        ("", "detector_path is empty: set it to the folder or hub id"),
-        ("/no/such/folder", "there is no such folder; expected a folder with config.json"),
-        ("nobody/nothing-of-that-name", "run `hf download nobody/nothing-of-that-name`, or name a"),
-    ],
-)
-def test_a_missing_checkpoint_is_refused(path, message):
-    with pytest.raises(ConfigurationError, match=message):
-        detector(path)
-
-
-def test_missing_and_damaged_weights_are_refused(folders, tmp_path):
-    (tmp_path / "config.json").write_bytes((folders["v1"] / "config.json").read_bytes())
-    with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        detector(tmp_path)
-    (tmp_path / "model.safetensors").write_bytes(b"no tensors")
-    with pytest.raises(ConfigurationError, match="cannot be loaded"):
-        detector(tmp_path)
+    relations = perceptron(network.rel_predictor)
+    if classes is not None:
+        for i, subject in enumerate(classes):
+            for j, target in enumerate(classes):
+                relations[i, j] += network.triplet_dist[subject, target]
+    return relations, perceptron(network.connectivity_layer)[..., 0]
 
 
-def test_missing_parameters_are_named(folders, tmp_path):
-    from safetensors.torch import load_file, save_file
-
-    for name in ("config.json", "preprocessor_config.json"):
-        (tmp_path / name).write_bytes((folders["v1"] / name).read_bytes())
-    weights = load_file(folders["v1"] / "model.safetensors")
-    gone = next(name for name in weights if name.endswith("enc_score_head.weight"))
-    del weights[gone]
-    save_file(weights, tmp_path / "model.safetensors", metadata={"format": "pt"})
-    with pytest.raises(ConfigurationError, match="lacks 1 parameters .*enc_score_head.weight"):
-        detector(tmp_path)
-
-
-def test_missing_cuda_is_refused(folders, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ConfigurationError, match="perception.device is 'cuda' .*'auto' or 'cpu'"):
-        detector(folders["v1"], device="cuda")
+@pytest.mark.parametrize("bias", [False, True])
+@pytest.mark.parametrize("used", [1, LAYERS - 1, LAYERS])
+@torch.no_grad()
+def test_relations_of_kept_queries_equal_those_of_all_queries(used, bias):
+    network = models.random_head().double()
+    generator = torch.Generator().manual_seed(used)
+    features = torch.randn(40, 2 * used + 1, models.WIDTH, generator=generator, dtype=torch.float64)
+    classes = torch.randint(0, len(CLASSES), (40,), generator=generator)
+    relations, connectivity = naive(network, features, classes if bias else None)
+    kept = torch.tensor([31, 2, 17, 5, 0, 39])
+    found = network(features[kept], classes[kept] if bias else None)
+    assert torch.allclose(found[0], relations[kept][:, kept], atol=1e-9, rtol=0)
+    assert torch.allclose(found[1], connectivity[kept][:, kept], atol=1e-9, rtol=0)
+    # A head that ignored its input would pass all of that.
+    assert relations.std() > 0.1 and connectivity.std() > 0.01
 
 
-def test_out_of_memory_at_start_up_names_a_remedy(folders, monkeypatch):
+@torch.no_grad()
+def test_the_backend_over_the_detector_equals_the_naive_head_in_float32(folders):
+    found_by = detector(folders["paper"])
+    head = EgtrRelationHead(settings(predicate_set="checkpoint"), found_by)
+    every = found_by.detect(image(), 0.0)
+    assert every.features.shape == (QUERIES, 2 * LAYERS + 1, models.WIDTH)
+    # The last slot is what the class head reads.
+    logits = found_by.model.model.decoder.class_embed[-1](torch.from_numpy(every.features[:, -1]))
+    assert np.allclose(logits.softmax(-1).amax(-1), every.scores, atol=1e-5)
+    classes = every.class_probabilities.argmax(axis=1)
+    features = torch.from_numpy(every.features)
+    relations, connectivity = naive(models.random_head(), features, torch.from_numpy(classes))
+
+    def relate(kept, top):
+        names = [CLASSES[c] for c in kept.class_probabilities.argmax(axis=1)]
+        return head.relate(models.segmented(names, kept.scores, kept.features), top)
+
+    kept = every.take(np.arange(0, QUERIES, 4))
+    top = len(kept) * (len(kept) - 1)
+    found = relate(kept, top)
+    assert len(found.pairs) == top and len(set(map(tuple, found.pairs.tolist()))) == top
+    subjects, objects = 4 * found.pairs.T
+    # float32: logits reach 20, and the order of the sums differs from processor to processor.
+    expected = relations[subjects, objects].numpy()
+    assert np.allclose(found.logits, expected, rtol=1e-5, atol=5e-5)
+    ranks = (relations.sigmoid().amax(-1) * connectivity.sigmoid())[subjects, objects].numpy()
+    expected = ranks * every.scores[subjects] * every.scores[objects]
+    assert np.abs(found.scores - expected).max() < 1e-6
+    assert (np.diff(found.scores) <= 0).all()
+    assert np.array_equal(relate(kept, 3).pairs, found.pairs[:3])
+    # Few objects, and no features.
+    for count in (0, 1):
+        assert relate(every.take(slice(count)), 10).logits.shape == (0, len(PREDICATES))
+    assert sorted(relate(every.take(slice(2)), 10).pairs.tolist()) == [[0, 1], [1, 0]]
+    with pytest.raises(ValueError, match="without query features"):
+        head.relate(models.segmented(CLASSES[:2], every.scores[:2]), 5)
+
+
+def stage(folder, world_up="auto", **changes):
+    names = {"detector": "rtdetr", "relation_head": "egtr", "predicate_set": "checkpoint"}
+    config = settings(**{**names, "detector_path": str(folder), **changes})
+    return build_perception(config, world_up=world_up)
+
+
+def test_rtdetr_sam2_and_egtr_as_one_stage(folders, tmp_path):
+    # Random weights put their boxes anywhere: they are not refined.
+    limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
+    segmenter = {"segmenter": "sam2", "segmenter_path": str(models.save_sam2(tmp_path))}
+    perception = stage(folders["paper"], "z", **segmenter, **limits)
+    depth_m = np.full((48, 64), 1.5, np.float32)
+    frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
+    seen, again = perception.perceive(frame), perception.perceive(frame)
+    vocabulary = perception.vocabulary
+    assert (vocabulary.classes, vocabulary.predicates) == (CLASSES, PREDICATES)
+    count = len(seen.frame_graph)
+    assert 2 <= count <= QUERIES
+    assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
+    assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
+    assert np.array_equal(again.instances, seen.instances)
+    assert np.array_equal(again.frame_graph.relations.logits, seen.frame_graph.relations.logits)
+
+
+def refused(match, build, *arguments, **changes):
+    with pytest.raises(ConfigurationError, match=match):
+        build(*arguments, **changes)
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(folders, tmp_path, monkeypatch):
+    refused("detector_path is empty", detector, "")
+    refused("no such folder", detector, "/no/such/folder")
+    refused("hf download nobody/nothing", detector, "nobody/nothing")
+    refused("sam: expected rt_detr or rt_detr_v2", detector, models.save_sam(tmp_path / "sam"))
+    nameless = models.save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
+    refused("does not name its 3 classes", detector, nameless)
+    short = models.save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
+    refused("names 1 classes, .* 6", detector, short)
+
     def full(*arguments):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
 
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    refused("perception.device is 'cuda'", detector, folders["v1"], device="cuda")
     monkeypatch.setattr(RtDetrDetector, "_forward", full)
-    with pytest.raises(ConfigurationError, match="out of memory .* smaller perception.detector_p"):
-        detector(folders["v1"])
+    refused("out of memory .* smaller perception.detector_p", detector, folders["v1"])
 
 
-def test_more_decoder_layers_than_the_network_has_are_refused(folders, tmp_path):
-    message = "decoder_layers in deworldsg.json is 9, expected at most the 4 of the network"
-    with pytest.raises(ConfigurationError, match=message):
-        detector(with_card(folders["v1"], tmp_path, decoder_layers=9))
+def test_missing_and_damaged_files_are_refused(copy):
+    from safetensors.torch import load_file, save_file
+
+    refused(r"deworldsg\.json is 9, .* 4", detector, with_card(copy, decoder_layers=9))
+    (copy / DETECTOR_CARD).write_text('{"class_scores": "argmax"}')
+    refused(r"deworldsg\.json: .*argmax", detector, copy)
+    (copy / DETECTOR_CARD).unlink()
+    assert cards.read_detector_card(None) == CheckpointCard()
+    preprocessing = copy / "preprocessor_config.json"
+    text = preprocessing.read_text()
+    preprocessing.unlink()
+    detector(copy)  # with the default values
+    wrong = {**json.loads(text), "do_normalize": True, "image_mean": [0.5]}
+    preprocessing.write_text(json.dumps(wrong))
+    refused(r"preprocessor_config\.json: ", detector, copy)
+    preprocessing.write_text(text)
+    model = copy / "model.safetensors"
+    weights = load_file(model)
+    gone = next(name for name in weights if name.endswith("enc_score_head.weight"))
+    del weights[gone]
+    save_file(weights, model, metadata={"format": "pt"})
+    refused(r"lacks 1 parameters .*enc_score_head\.weight", detector, copy)
+    model.write_bytes(b"no tensors")
+    refused("cannot be loaded", detector, copy)
+    model.unlink()
+    refused("cannot be loaded", detector, copy)
 
 
-def test_unnamed_and_miscounted_classes_are_refused(tmp_path):
-    nameless = save_rtdetr(tmp_path / "a", labels=[f"LABEL_{i}" for i in range(3)])
-    with pytest.raises(ConfigurationError, match="does not name its 3 classes"):
-        detector(nameless)
-    short = save_rtdetr(tmp_path / "b", card=CheckpointCard(classes=("bed",)))
-    with pytest.raises(ConfigurationError, match="names 1 classes, expected one for each of its 6"):
-        detector(short)
+def test_a_relation_head_that_does_not_fit_is_refused(folders, copy, tmp_path):
+    from safetensors.torch import save_file
+
+    refused("'rtdetr'", stage, "", detector="nanodet")
+    refused("no egtr_head.safetensors", stage, folders["v1"])
+    refused("'3dssg'", stage, folders["paper"], predicate_set="3dssg")
+    fewer = models.save_paper_checkpoint(tmp_path / "a", labels=CLASSES[:4])
+    refused("has 4 classes.* 7", stage, fewer)
+    counted = models.save_paper_checkpoint(tmp_path / "b", {"predicates": ("on",)})
+    refused("deworldsg.json of .* names 1 predicates", stage, counted)
+    deeper = models.save_paper_checkpoint(tmp_path / "c", decoder_layers=LAYERS + 1)
+    refused("has 5 layers of 32 .* 4 layers of 32", stage, deeper)
+    # The head accepts a detector with fewer layers.
+    card = cards.read_detector_card(deeper / DETECTOR_CARD)
+    card = msgspec.structs.replace(card, decoder_layers=3)
+    cards.write_detector_card(deeper / DETECTOR_CARD, card)
+    stage(deeper)
+    with_card(copy, predicates=PREDICATES, frequency_bias=True)
+    (copy / "egtr_head.safetensors").write_bytes(b"damaged")
+    refused(r"egtr_head\.safetensors cannot be read", stage, copy)
+    parameters = models.random_head().state_dict()
+    del parameters["triplet_dist"], parameters["rel_dist"]
+    save_file(parameters, copy / "egtr_head.safetensors")
+    refused("no class-pair statistics .* `frequency_bias`", stage, copy)
 
 
-def test_damaged_cards_and_preprocessing_are_refused(folders, tmp_path):
-    card = tmp_path / "deworldsg.json"
-    card.write_text('{"class_scores": "argmax"}')
-    with pytest.raises(ConfigurationError, match="deworldsg.json: .*argmax"):
-        read_detector_card(card)
-    assert read_detector_card(None) == CheckpointCard()
-    for name in ("config.json", "model.safetensors"):
-        (tmp_path / name).write_bytes((folders["v1"] / name).read_bytes())
-    card.unlink()
-    wrong = {"size": {"height": 64, "width": 64}, "do_normalize": True, "image_mean": [0.5]}
-    (tmp_path / "preprocessor_config.json").write_text(json.dumps(wrong))
-    with pytest.raises(ConfigurationError, match="preprocessor_config.json: "):
-        detector(tmp_path)
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("proj_q.1.weight", None, r"missing \(proj_q.1.weight\)"),
+        ("rel_predictor.layers.2.weight", None, r"missing \(rel_predictor.layers.2.weight\)"),
+        ("proj_v.0.weight", torch.zeros(2), r"unknown \(proj_v.0.weight\)"),
+        ("rel_predictor_gate.bias", torch.zeros(2), "size mismatch for rel_predictor_gate.bias"),
+        ("triplet_dist", torch.zeros(2, 2), r"triplet_dist has shape \(2, 2\)"),
+    ],
+)
+def test_a_head_with_other_parameters_is_refused_by_name(name, value, message):
+    parameters = {**models.random_head().state_dict(), name: value}
+    parameters = {name: value for name, value in parameters.items() if value is not None}
+    refused(message, EgtrNetwork.for_parameters, parameters, "head.safetensors")

@@ -1,7 +1,5 @@
 """PLY files: refusals, and rows that are read as declared."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -44,43 +42,37 @@ def test_columns_have_the_declared_types(tmp_path, form, values):
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("count", [3, 10**15])
-def test_a_count_beyond_the_end_of_the_file_is_refused_before_it_is_allocated(
-    tmp_path, form, count
-):
+def test_a_count_beyond_the_end_is_refused_before_it_is_allocated(tmp_path, form, count):
     path = write(tmp_path, header(form, count).encode() + rows(form, [(1.0, 1), (2.0, 2)]))
-    with pytest.raises(RecordingError, match=f"2 of {count} rows of the element vertex"):
+    with pytest.raises(RecordingError, match=f"2 of {count} rows"):
         read_vertices(path, NAMES)
 
 
 @pytest.mark.parametrize("count_type", ["uchar", "char", "uint"])
 @pytest.mark.parametrize("data", [b"", b"\x02", b"\xff\xff\xff\xff\xff"])
-def test_lists_before_the_vertices_that_pass_the_end_of_the_file_are_refused(
-    tmp_path, count_type, data
-):
-    text = header("binary_little_endian", 1).replace(
-        "element vertex",
-        f"element face {10**15}\nproperty list {count_type} int corners\nelement vertex",
-    )
-    with pytest.raises(RecordingError, match="rows of the element face"):
+def test_lists_that_pass_the_end_of_the_file_are_refused(tmp_path, count_type, data):
+    faces = f"element face {10**15}\nproperty list {count_type} int corners\nelement vertex"
+    text = header("binary_little_endian", 1).replace("element vertex", faces)
+    with pytest.raises(RecordingError, match="element face"):
         read_vertices(write(tmp_path, text.encode() + data), NAMES)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is no PLY file"),
-        ("# a note", "is no PLY file"),
-        (header().replace("format ascii 1.0\n", ""), "has no format"),
+        ("", "no PLY file"),
+        ("# a note", "no PLY file"),
+        (header().replace("format ascii 1.0\n", ""), "no format"),
         (header().replace("vertex", "corner"), "no element vertex"),
-        (header(count=-1), "'element vertex -1' is not understood"),
-        (header(count="many"), "'element vertex many' is not understood"),
-        (header(properties="float x\nhalf id"), "'property half id' is not understood"),
-        (header(properties="float x\nlist float int id"), "'property list float int id' is not"),
-        (header(properties="float x"), "no property id; expected x, id"),
-        (header(properties="float x\nlist uchar int id"), "expected distinct scalars"),
-        (header(properties="float x\nint id\nint id"), "expected distinct scalars"),
-        (header() + "1 2\n3\n", "does not have 2 numbers"),
-        (header() + "1 2\n3 four\n", "does not have 2 numbers"),
+        (header(count=-1), "'element vertex -1'"),
+        (header(count="many"), "'element vertex many'"),
+        (header(properties="float x\nhalf id"), "'property half id'"),
+        (header(properties="float x\nlist float int id"), "'property list float int id'"),
+        (header(properties="float x"), "no property id"),
+        (header(properties="float x\nlist uchar int id"), "distinct scalars"),
+        (header(properties="float x\nint id\nint id"), "distinct scalars"),
+        (header() + "1 2\n3\n", "2 numbers"),
+        (header() + "1 2\n3 four\n", "2 numbers"),
     ],
 )
 def test_a_bad_file_is_refused_by_name(tmp_path, text, message):

@@ -1,14 +1,11 @@
 """7-Scenes folders: registered, and as Microsoft distributes them."""
 
-from __future__ import annotations
-
-import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.recordings import (
-    HEIGHT,
     INTRINSICS,
-    WIDTH,
     depth_mm,
     encoded,
     pose,
@@ -22,13 +19,10 @@ from deworldsg_ros.recordings.folders.seven_scenes import (
     COLOR_FX_FY_CX_CY,
     DEPTH_FX_FY_CX_CY,
     FIRST_STAMP_NS,
+    register_depth,
 )
-from deworldsg_ros.recordings.recording import detect_kind, open_recording, open_source
-from deworldsg_ros.recordings.writer import write_mcap
+from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.errors import RecordingError
-
-COUNT = 5
 
 
 def frames_of(path, **options):
@@ -36,81 +30,25 @@ def frames_of(path, **options):
     return list(recording.frames()), recording
 
 
-def test_registered_frames_with_their_times_and_poses(tmp_path):
-    folder = write_seven_scenes(tmp_path / "kitchen", COUNT)
-    assert detect_kind(folder) == "7scenes"
-    frames, recording = frames_of(folder)
-    assert len(frames) == recording.frame_count == COUNT
-    for index, frame in enumerate(frames):
-        # Every fourth frame of 30 Hz.
-        assert frame.stamp_ns == FIRST_STAMP_NS + round(index * 4e9 / 30)
+@pytest.mark.parametrize(("options", "step_ns"), [({}, 4e9 / 30), ({"rate_hz": 10.0}, 1e8)])
+def test_registered_frames_with_their_times_and_poses(tmp_path, options, step_ns):
+    frames, _ = frames_of(write_seven_scenes(tmp_path / "kitchen", 5), **options)
+    assert len(frames) == 5
+    for index, frame in enumerate(frames):  # every fourth frame of 30 Hz
+        assert frame.stamp_ns == FIRST_STAMP_NS + round(index * step_ns)
         assert frame.intrinsics == INTRINSICS
         np.testing.assert_allclose(frame.T_world_camera, pose(index), atol=1e-7)
         np.testing.assert_allclose(frame.depth_m, depth_mm(index) * 1e-3, atol=1e-6)
         assert np.abs(frame.rgb.astype(int) - rgb_pixels(index)).mean() < 4  # JPEG
 
 
-def test_the_rate_option_replaces_the_rate_of_the_sensor(tmp_path):
-    frames, _ = frames_of(write_seven_scenes(tmp_path / "k", COUNT), rate_hz=10.0)
-    assert [frame.stamp_ns - FIRST_STAMP_NS for frame in frames] == [
-        index * 10**8 for index in range(COUNT)
-    ]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "nan nan nan nan\n" * 4,
-        "-1.#IND -1.#IND 0 0\n" * 4,
-        "1 0 0 0\n0 1 0 0\n0 0 1 0",
-        "0 0 0 0\n" * 4,
-        "1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1",
-        "",
-    ],
-)
-def test_frames_with_an_invalid_pose_are_dropped_and_counted(tmp_path, text):
-    folder = write_seven_scenes(tmp_path / "k", COUNT)
-    (folder / "frame-000008.pose.txt").write_text(text)
-    frames, recording = frames_of(folder)
-    assert len(frames) == COUNT - 1
-    assert recording.drops == {"invalid_pose": 1}
-
-
-def test_frames_with_missing_or_broken_files_are_dropped_and_the_files_named(tmp_path):
-    folder = write_seven_scenes(tmp_path / "k", COUNT)
-    (folder / "frame-000004.depth.png").unlink()
-    (folder / "frame-000012.color.jpg").write_bytes(b"no image")
-    frames, recording = frames_of(folder)
-    assert len(frames) == COUNT - 2
-    assert recording.drops["missing_file"] == 1
-    assert recording.drops["decode_failed"] == 1
-    assert any("frame-000004.depth.png" in loss for loss in recording.losses)
-
-
-def test_a_folder_and_its_converted_bag_give_equal_frames(tmp_path):
-    folder = write_seven_scenes(tmp_path / "k", COUNT)
-    write_mcap(open_source(folder).raw_messages(), tmp_path / "k.mcap")
-    ours, theirs = frames_of(folder)[0], list(open_recording(tmp_path / "k.mcap").frames())
-    assert len(ours) == len(theirs) == COUNT
-    for a, b in zip(ours, theirs):
-        assert (a.stamp_ns, a.intrinsics, a.frame_id) == (b.stamp_ns, b.intrinsics, b.frame_id)
-        np.testing.assert_array_equal(a.rgb, b.rgb)
-        np.testing.assert_array_equal(a.depth_m, b.depth_m)
-        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
-
-
-def test_a_folder_of_several_sequences_is_refused_with_their_names(tmp_path):
-    for name in ("seq-01", "seq-02"):
-        write_seven_scenes(tmp_path / name, 1)
-    with pytest.raises(RecordingError, match="seq-01, seq-02"):
-        open_recording(tmp_path)
-
-
-def test_intrinsics_that_are_no_matrix_are_refused_by_name(tmp_path):
-    folder = write_seven_scenes(tmp_path / "k", 1)
-    (folder / "camera-intrinsics.txt").write_text("525 525")
-    with pytest.raises(RecordingError, match=r"camera-intrinsics\.txt.*3x3"):
-        open_recording(folder)
+@pytest.mark.slow
+def test_the_real_kitchen_is_read_whole(shared_dir):
+    frames, recording = frames_of(shared_dir / "data" / "redkitchen")
+    assert len(frames) == 250
+    assert not recording.drops
+    assert frames[0].rgb.shape == (480, 640, 3)
+    assert 0.4 < np.median(frames[0].depth_m[frames[0].depth_m > 0]) < 4
 
 
 # The original layout: a wall at a known distance, seen by the Kinect's two cameras.
@@ -124,16 +62,15 @@ def write_original(folder, count=2):
     folder.mkdir()
     depth_camera = Intrinsics(*DEPTH_FX_FY_CX_CY, *SIZE)
     color_camera = Intrinsics(*COLOR_FX_FY_CX_CY, *SIZE)
-    z = WALL_MM * 1e-3
 
     def edge_column(camera, offset_m):
-        return camera.fx * (EDGE_X_M - offset_m) / z + camera.cx
+        return int(camera.fx * (EDGE_X_M - offset_m) / (WALL_MM * 1e-3) + camera.cx)
 
     depth = np.full((480, 640), WALL_MM, np.uint16)
-    depth[:, int(edge_column(depth_camera, 0.0)) :] = WALL_MM + 1000
+    depth[:, edge_column(depth_camera, 0.0) :] = WALL_MM + 1000
     depth[:40] = 65535
     color = np.zeros((480, 640, 3), np.uint8)
-    color[:, : int(edge_column(color_camera, BASELINE_M))] = 255
+    color[:, : edge_column(color_camera, BASELINE_M)] = 255
     for index in range(count):
         stem = folder / f"frame-{index:06d}"
         stem.with_suffix(".color.png").write_bytes(encoded(color))
@@ -148,15 +85,13 @@ def test_original_layout_is_registered_with_the_known_calibration(tmp_path):
     assert not recording.drops
     frame = frames[0]
     assert (frame.intrinsics.fx, frame.intrinsics.cx) == (528.41, 320.32)
-    # 65535 is no depth of 65 m.
-    assert frame.depth_m.max() < 3.1
+    assert frame.depth_m.max() < 3.1, "65535 is no depth of 65 m"
     row = frame.depth_m[240]
     assert set(np.round(row[row > 0], 2)) == {2.0, 3.0}
     # The edge is where colour has it: white is near, black is far.
-    near_m = row[(frame.rgb[240, :, 0] > 128) & (row > 0)]
-    assert (near_m < 2.5).mean() > 0.99
-    far_m = row[(frame.rgb[240, :, 0] < 128) & (row > 0)]
-    assert (far_m > 2.5).mean() > 0.98
+    white = frame.rgb[240, :, 0] > 128
+    assert (row[white & (row > 0)] < 2.5).mean() > 0.99
+    assert (row[~white & (row > 0)] > 2.5).mean() > 0.98
     # The depth camera sees less than the colour camera, on the right even less.
     valid = np.flatnonzero(row)
     assert 0 < valid[0] < SIZE[0] - 1 - valid[-1] < 60
@@ -173,16 +108,36 @@ def test_the_intrinsics_option_implies_registered_depth(tmp_path):
     assert (frames[0].depth_m[240] > 0).all()
 
 
-@pytest.mark.slow
-def test_the_real_kitchen_is_read_whole(shared_dir):
-    frames, recording = frames_of(shared_dir / "data" / "redkitchen")
-    assert len(frames) == 250
-    assert not recording.drops
-    assert frames[0].rgb.shape == (480, 640, 3)
-    assert 0.4 < np.median(frames[0].depth_m[frames[0].depth_m > 0]) < 4
+# --- depth projected into the colour camera ----------------------------------------------------
+
+CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 
 
-def test_support_images_have_the_properties_that_the_tests_assume():
-    assert rgb_pixels(0).shape == (HEIGHT, WIDTH, 3)
-    decoded = cv2.imdecode(np.frombuffer(encoded(depth_mm(3)), np.uint8), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(decoded, depth_mm(3))
+def moved(x_m=0.0, z_m=0.0):
+    T = np.eye(4)
+    T[0, 3], T[2, 3] = x_m, z_m
+    return T
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_same_camera_sees_the_same_image(seed):
+    rng = np.random.default_rng(seed)
+    depth = rng.integers(2, 60000, (30, 40)).astype(np.uint16)
+    depth[rng.random((30, 40)) < rng.choice([0.3, 1.0])] = 0
+    np.testing.assert_array_equal(register_depth(depth, CAMERA, CAMERA, np.eye(4)), depth)
+
+
+def test_a_wall_is_displaced_by_its_disparity_on_the_grid_of_the_colour_camera():
+    wall = np.full((30, 40), 1000, np.uint16)
+    # 0.1 m at 1 m with f = 50: five columns to the left in a camera that stands to the right.
+    out = register_depth(wall, CAMERA, CAMERA, moved(-0.1))
+    assert (out[:, :35] == 1000).all()
+    assert not out[:, 35:].any()
+    assert not register_depth(wall, CAMERA, CAMERA, moved(z_m=-1.5)).any()
+    assert not register_depth(wall, CAMERA, CAMERA, moved(9.0)).any()
+    # Half the focal length: half the extent, around the centre.
+    out = register_depth(wall, CAMERA, Intrinsics(25.0, 25.0, 39.5, 29.5, 80, 60), np.eye(4))
+    assert out.shape == (60, 80)
+    rows, columns = np.nonzero(out)
+    assert np.ptp(columns) + 1 == 20
+    assert np.ptp(rows) + 1 in (15, 16)

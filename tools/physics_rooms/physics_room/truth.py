@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from deworldsg_ros.relations.rules import NEAR_FLOOR_M, NEAR_SUPPORT_M, NEAREST, SEAT_GAP_M
+
 from .bodies import Bodies
 from .holding import MIN_UPWARD, Holding
 from .labels import CHAIRS, SEATS, TABLES, visual_genome
@@ -25,9 +27,8 @@ AGAINST_SHARE, AGAINST_HEIGHT_M = 0.5, 0.3
 SKEW_RAD = np.deg2rad(15)
 OVER_SHARE, OVER_LOW_M, OVER_HIGH_M = 0.5, -0.02, 1.2
 OVER_UNCLEAR = (0.38, 0.62)
-WITH_GAP_M = 0.35
-FLOOR_GAP_M, SUPPORT_GAP_M, LEVEL_M = 0.5, 0.10, 0.04
-NEAREST = 2
+# The rule in the package allows more, because neighbours hide bottoms.
+LEVEL_M = 0.04
 
 PREDICATES = {
     "above": 0,
@@ -196,20 +197,20 @@ class Judge:
         for table in (i for i in floor if i.label in TABLES):
             for seat in (i for i in floor if i.label in CHAIRS):
                 distance = self.bodies.gap(table, seat)
-                if distance <= WITH_GAP_M:
+                if distance <= SEAT_GAP_M:
                     self.truth.say(table, "with", seat)
                     self.truth.say(seat, "near", table)
-                elif distance <= WITH_GAP_M + 0.04:
+                elif distance <= SEAT_GAP_M + 0.04:
                     self._doubt(table, seat)
 
     def _near(self, floor: list[Item]) -> None:
-        groups: list[tuple[list[Item], float]] = [(floor, FLOOR_GAP_M)]
+        groups: list[tuple[list[Item], float]] = [(floor, NEAR_FLOOR_M)]
         by_parent: dict[int, list[Item]] = {}
         for item in self.items:
             parent = self.parent.get(item.number)
             if parent is not None and item.kind in ("small", "screen") and item.anchor == "free":
                 by_parent.setdefault(parent, []).append(item)
-        groups += [(group, SUPPORT_GAP_M) for group in by_parent.values()]
+        groups += [(group, NEAR_SUPPORT_M) for group in by_parent.values()]
         for group, reach in groups:
             self._near_group([i for i in group if i.number in self.visible], reach)
 

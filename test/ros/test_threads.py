@@ -1,0 +1,182 @@
+"""Threads of the nodes: their queues, the times of updates, and the one that writes the map."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy")
+
+from deworldsg_ros.ros import graph_keeper
+from deworldsg_ros.ros.graph_keeper import MapKeeper
+from deworldsg_ros.ros.threads import RATE_SLACK, UpdateTimes, Worker
+from deworldsg_ros.scene.errors import ConfigurationError
+
+LIMIT_S = 30.0
+
+
+class Held:
+    """A worker that notes its items; it does not begin before `begin` is set."""
+
+    def __init__(self, size: int = 9, **options) -> None:
+        self.begin, self.done, self.overruns = threading.Event(), [], []
+        self.worker = Worker(
+            "test", self._work, size=size, on_overrun=self.overruns.append, **options
+        )
+
+    def _work(self, item: int) -> None:
+        assert self.begin.wait(LIMIT_S)
+        self.done.append(item)
+
+    def submit(self, *items: int) -> None:
+        for item in items:
+            self.worker.submit(item)
+
+    def submit_first(self) -> None:
+        """Submit an item and wait until the thread has taken it."""
+        self.worker.submit(0)
+        while self.worker.waiting:
+            time.sleep(0.001)
+
+    def finish(self) -> None:
+        self.begin.set()
+        assert self.worker.wait_idle(LIMIT_S)
+
+
+def test_a_worker_keeps_the_order_and_drops_the_oldest():
+    held = Held(3)
+    held.submit_first()
+    held.submit(1, 2, 3, 4, 5)
+    assert (held.worker.waiting, held.overruns) == (3, [1, 2])
+    assert not held.worker.wait_idle(0.0)
+    held.finish()
+    assert held.done == [0, 3, 4, 5]
+    assert held.worker.stop(LIMIT_S)
+
+
+def test_a_worker_stops_with_items_in_its_queue():
+    held = Held()
+    held.submit_first()
+    held.submit(1, 2, 3, 4)
+    assert not held.worker.stop(0.01)
+    held.begin.set()
+    assert held.worker.stop(LIMIT_S)
+    assert len(held.done) <= 1
+
+
+def test_a_worker_calls_again_after_the_time_that_was_asked_for():
+    calls, enough = [], threading.Event()
+
+    def after() -> float | None:
+        calls.append(len(calls))
+        if len(calls) < 3:
+            return 0.01
+        enough.set()
+        return None
+
+    worker: Worker[int] = Worker("test", print, size=1, on_overrun=print, after=after)
+    worker.submit(0)
+    assert enough.wait(LIMIT_S)
+    assert worker.wait_idle(LIMIT_S)
+    assert len(calls) == 3
+    assert worker.stop(LIMIT_S)
+
+
+@pytest.mark.parametrize("wait_s", [1e10, 1e308, float("inf")])
+def test_a_worker_that_waits_for_ages_takes_the_next_item(wait_s):
+    held = Held(2, after=lambda: wait_s)
+    for item in range(2):
+        held.submit(item)
+        held.finish()
+    assert held.done == [0, 1]
+    assert held.worker.stop(LIMIT_S)
+
+
+RATE_HZ = 30.0
+PERIOD_S = 1 / RATE_HZ
+
+
+def delays_s(arrivals_s: list[float], *, evidence_after_s: float | None = None) -> list[float]:
+    """Delay from each frame's arrival to the update that contains it."""
+    times = UpdateTimes(RATE_HZ)
+    events = [(at_s, False) for at_s in arrivals_s]
+    if evidence_after_s is not None:
+        events += [(at_s + evidence_after_s, True) for at_s in arrivals_s]
+    delays: list[float] = []
+    waiting: list[float] = []
+
+    def publish_until(end_s: float) -> None:
+        due_s = 0.0
+        while (wait_s := times.wait_s(due_s)) is not None and due_s + wait_s <= end_s:
+            due_s += wait_s
+            times.taken()
+            times.book(due_s)
+            delays.extend(due_s - at_s for at_s in waiting)
+            waiting.clear()
+
+    for at_s, can_wait in sorted(events):
+        publish_until(at_s)
+        times.changed(at_s, at_s, can_wait=can_wait)
+        if not can_wait:
+            waiting.append(at_s)
+        publish_until(at_s)
+    publish_until(np.inf)
+    return delays
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 29.97, 30.0, 30.5])
+def test_frames_up_to_the_rate_do_not_wait(rate_hz):
+    rng = np.random.default_rng(0)
+    frames_s = np.arange(900) / rate_hz + rng.uniform(0, 0.01, 900)
+    assert max(delays_s(frames_s.tolist())) < 0.001
+
+
+def test_evidence_takes_no_place_of_a_frame_and_is_published_soon():
+    frames_s = (np.arange(300) * PERIOD_S).tolist()
+    assert max(delays_s(frames_s, evidence_after_s=0.004)) < 0.001
+    times = UpdateTimes(RATE_HZ)
+    assert times.wait_s(0.5) is None  # nothing is due without a change
+    times.changed(1.0, 1.0)
+    assert times.wait_s(1.0) == 0.0
+    assert times.taken() == 1.0
+    times.book(1.0)
+    times.changed(1.01, 1.01, can_wait=True)
+    wait_s = times.wait_s(1.01)
+    assert wait_s is not None
+    assert PERIOD_S < wait_s < 3 * PERIOD_S
+
+
+def test_the_mean_rate_of_what_is_published_is_limited():
+    times = UpdateTimes(RATE_HZ)
+    published = 0
+    for now_s in np.arange(0, 10, 0.001):
+        times.changed(now_s, now_s)
+        if times.wait_s(now_s) == 0.0:
+            times.taken()
+            times.book(now_s)
+            published += 1
+    assert 10 * RATE_HZ * 0.95 < published <= 10 * RATE_HZ * RATE_SLACK + 2
+    times.book(20.0)
+    for now_s in np.arange(20, 20.1, 0.001):  # without `book`, an update takes no place
+        times.changed(now_s, now_s)
+        assert times.wait_s(now_s) == 0.0
+        times.taken()
+
+
+def test_a_checkpoint_that_fails_does_not_end_the_thread(tmp_path, monkeypatch):
+    write = Mock(side_effect=[ConfigurationError("the disk is full"), MemoryError("odd"), None])
+    monkeypatch.setattr(graph_keeper, "copy_state", lambda builder: {})
+    monkeypatch.setattr(graph_keeper, "write_state", write)
+    node = Mock(refusing=lambda: contextlib.suppress(MemoryError))
+    keeper = MapKeeper(node, tmp_path / "map.npz", 10.0)
+    for count in (1, 2, 3):
+        keeper.checkpoint(None)
+        assert keeper._worker.wait_idle(LIMIT_S)
+        assert write.call_count == count
+    keeper.close()
+    node.drop.assert_called_once_with("map_not_written", "the disk is full")
