@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import SceneGraph
-from deworldsg_ros.relations.geometry import measure, pair_features
+from deworldsg_ros.relations.geometry import (
+    MIN_SHAPE_POINTS,
+    measure,
+    pair_features,
+    pairs_in_reach,
+)
 from deworldsg_ros.relations.pairs import floor_height
 from deworldsg_ros.relations.physics import relation_counts
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, pairs_in_reach
 from deworldsg_ros.relations.states import (
     DIRECTED,
     RELATIONS,
