@@ -202,6 +202,22 @@ def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:
     assert builder.full().edges == room(DESK, config())[0].full().edges
 
 
+def test_a_circle_that_ends_gives_back_the_support_that_was_cut() -> None:
+    frames_alone = config(world_model="none")
+    cups = {str(x): thing("cup", 0.3 * x, 0, 0.74, 0.09, 0.09, 0.1) for x in range(4)}
+    builder, ids = room(cups, frames_alone)
+    circle = list(zip(ids.values(), [*list(ids.values())[1:], ids["0"]]))
+    for frames, pair in zip((30, 30, 20, 30), circle):  # the third one is the weakest
+        vote(builder, *pair, "on", frames)
+    assert {pair for pair, edge in edges_of(builder).items() if edge.probability > 0.5} == {
+        circle[index] for index in (0, 1, 3)
+    }
+    vote(builder, *circle[0], None, 200)
+    assert edges_of(builder)[circle[2]].probability > 0.5
+    fresh = GraphBuilder(frames_alone, VOCABULARY, "map", builder.graph, builder.prior)
+    assert builder.full().edges == fresh.full().edges
+
+
 # --- the rule of the paper -----------------------------------------------------------------------
 
 
