@@ -180,16 +180,16 @@ class Ours:
 
     def fill(self, count: int) -> None:
         """Add copies of the nodes elsewhere until there are `count`."""
-        nodes, known = self.graph.nodes, len(self.graph)
+        nodes, slots, known = self.graph.nodes, self.graph.nodes.slots.tolist(), len(self.graph)
         for number in range(count - known):
-            row, shift_m = number % known, offset_m(number // known)
+            slot, shift_m = slots[number % known], offset_m(number // known)
             self.graph.add_node(
-                nodes.means[row] + shift_m,
-                nodes.covariances[row].copy(),
-                nodes.class_probabilities[row].copy(),
-                int(nodes.last_seen_ns[row]),
-                nodes.surface(row) + shift_m.astype(np.float32),
-                float(nodes.weights[row]),
+                nodes.means[slot] + shift_m,
+                nodes.covariances[slot].copy(),
+                nodes.class_probabilities[slot].copy(),
+                int(nodes.last_seen_ns[slot]),
+                nodes.surface(slot) + shift_m.astype(np.float32),
+                float(nodes.weights[slot]),
             )
         memory = self._merging.memory()
         self._merging = self._new_merging()

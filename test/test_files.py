@@ -1,35 +1,22 @@
 """Files are written whole or not at all."""
 
-from __future__ import annotations
-
 import os
 import stat
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from support.killing import full_disk, killed, moments_s, names
 
-from deworldsg_ros.base.files import (
-    PARTIAL,
-    PREFIX,
-    READY,
-    FileLock,
-    check_writable,
-    remove_left_overs,
-    temporary_folder,
-    together,
-    write_atomically,
-)
+from deworldsg_ros.base import files
 
 
 @pytest.mark.parametrize("content", [b"", b"new", "new", lambda file: file.write(b"new")])
 def test_the_file_is_replaced_and_nothing_else_stays(tmp_path, content):
     path = tmp_path / "a.json"
     path.write_bytes(b"old")
-    write_atomically(path, content)
+    files.write_atomically(path, content)
     assert path.read_bytes() == (b"" if content == b"" else b"new")
     assert names(tmp_path) == ["a.json"]
 
@@ -44,7 +31,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, error):
         raise error
 
     with pytest.raises(type(error)):
-        write_atomically(path, fail)
+        files.write_atomically(path, fail)
     assert path.read_bytes() == b"old" and names(tmp_path) == ["a.json"]
 
 
@@ -52,33 +39,33 @@ def test_writers_of_one_file_do_not_mix(tmp_path):
     path = tmp_path / "a.bin"
     contents = [bytes([value]) * 200_000 for value in range(8)]
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda content: write_atomically(path, content), contents * 4))
+        list(pool.map(lambda content: files.write_atomically(path, content), contents * 4))
     assert path.read_bytes() in contents and names(tmp_path) == ["a.bin"]
 
 
 def test_the_file_has_the_usual_permissions(tmp_path):
     (tmp_path / "usual").write_bytes(b"")
-    write_atomically(tmp_path / "ours", b"")
+    files.write_atomically(tmp_path / "ours", b"")
     modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("usual", "ours")]
     assert modes[0] == modes[1]
 
 
 def test_a_folder_that_cannot_be_made_is_reported_before_writing(tmp_path):
-    check_writable(tmp_path / "maps" / "a.map")
+    files.check_writable(tmp_path / "maps" / "a.map")
     assert names(tmp_path / "maps") == []
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(OSError):
-        check_writable(tmp_path / "file" / "a.map")
+        files.check_writable(tmp_path / "file" / "a.map")
     with pytest.raises(IsADirectoryError):
-        check_writable(tmp_path / "maps")
+        files.check_writable(tmp_path / "maps")
 
 
 def test_a_link_stays_and_the_file_that_it_names_is_replaced(tmp_path):
     (tmp_path / "disk").mkdir()
     link = tmp_path / "a.map"
     link.symlink_to(tmp_path / "disk" / "a.map")
-    write_atomically(link, b"1")
-    write_atomically(link, b"2")
+    files.write_atomically(link, b"1")
+    files.write_atomically(link, b"2")
     assert link.is_symlink() and (tmp_path / "disk" / "a.map").read_bytes() == b"2"
     assert names(tmp_path / "disk") == ["a.map"]
 
@@ -89,7 +76,7 @@ def test_a_pipe_is_written_and_not_replaced(tmp_path):
     read: list[bytes] = []
     reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()))
     reader.start()
-    write_atomically(pipe, b"graph")
+    files.write_atomically(pipe, b"graph")
     reader.join(5)
     assert read == [b"graph"] and names(tmp_path) == ["pipe"]
 
@@ -97,7 +84,7 @@ def test_a_pipe_is_written_and_not_replaced(tmp_path):
 def test_the_file_before_stays_under_its_name(tmp_path):
     path, previous = tmp_path / "a.map", tmp_path / "a.map.previous"
     for content in (b"1", b"2", b"3"):
-        write_atomically(path, content, previous=previous)
+        files.write_atomically(path, content, previous=previous)
     assert (path.read_bytes(), previous.read_bytes()) == (b"3", b"2")
 
 
@@ -106,7 +93,7 @@ def test_a_full_disk_keeps_the_old_file(tmp_path, size):
     path = tmp_path / "a.json"
     path.write_bytes(b"old")
     with full_disk(size), pytest.raises(OSError, match="File too large"):
-        write_atomically(path, bytes(100_000), previous=tmp_path / "before")
+        files.write_atomically(path, bytes(100_000), previous=tmp_path / "before")
     assert path.read_bytes() == b"old" and names(tmp_path) == ["a.json"]
 
 
@@ -125,7 +112,7 @@ FILES = ("config.yaml", "graph.json", "graph.png", "run.json")
 
 def write_run(folder: Path, run: int) -> None:
     """Files of one run, each with its number and complete by its length; odd runs lack one."""
-    with together(folder, FILES) as staged:
+    with files.together(folder, FILES) as staged:
         for name in FILES[run % 2 :]:
             (staged / name).write_bytes(b"%05d" % run * 2000)
 
@@ -148,7 +135,7 @@ def test_files_of_two_runs_are_never_side_by_side(tmp_path):
 
 def test_an_error_in_a_run_keeps_the_run_before(tmp_path):
     write_run(tmp_path, 1)
-    with pytest.raises(KeyboardInterrupt), together(tmp_path, FILES) as staged:
+    with pytest.raises(KeyboardInterrupt), files.together(tmp_path, FILES) as staged:
         (staged / "run.json").write_text("new")
         raise KeyboardInterrupt
     assert run_in(tmp_path) == {b"00001"} and names(tmp_path) == [*FILES[1:]]
@@ -156,7 +143,7 @@ def test_an_error_in_a_run_keeps_the_run_before(tmp_path):
 
 def test_a_name_that_is_a_folder_is_refused_at_the_start(tmp_path):
     (tmp_path / "run.json").mkdir()
-    with pytest.raises(IsADirectoryError), together(tmp_path, FILES):
+    with pytest.raises(IsADirectoryError), files.together(tmp_path, FILES):
         pytest.fail("the run has begun")
 
 
@@ -166,29 +153,29 @@ def test_a_kill_at_any_moment_leaves_whole_files_of_one_run(tmp_path):
         runs = iter(range(100 * kill, 100_000))
         killed(lambda runs=runs: write_run(tmp_path, next(runs)), 0.005 + moment_s)
         assert len(run_in(tmp_path)) <= 1
-        remove_left_overs(tmp_path)
+        files.remove_left_overs(tmp_path)
         assert len(run_in(tmp_path)) == 1 and set(names(tmp_path)) <= set(FILES)
 
 
 def test_a_kill_between_two_renames_is_completed_by_the_next_run(tmp_path):
     write_run(tmp_path, 2)
     # As it is left: complete, one file is in place, one is to be removed.
-    ready = tmp_path / f"{PREFIX}x{READY}"
+    ready = tmp_path / f"{files.PREFIX}x{files.READY}"
     (ready / "config.yaml").mkdir(parents=True)
     (tmp_path / "graph.png").unlink()
     (tmp_path / "graph.json").write_bytes(b"00003" * 2000)
     for name in ("graph.png", "run.json"):
         (ready / name).write_bytes(b"00003" * 2000)
-    remove_left_overs(tmp_path)
+    files.remove_left_overs(tmp_path)
     assert run_in(tmp_path) == {b"00003"} and names(tmp_path) == [*FILES[1:]]
 
 
 def test_what_a_living_process_writes_is_no_left_over(tmp_path):
-    (tmp_path / f"{PREFIX}dead{PARTIAL}").write_text("half")
-    (tmp_path / f"{PREFIX}dead2{PARTIAL}").mkdir()
-    with temporary_folder(tmp_path) as folder:
+    (tmp_path / f"{files.PREFIX}dead{files.PARTIAL}").write_text("half")
+    (tmp_path / f"{files.PREFIX}dead2{files.PARTIAL}").mkdir()
+    with files.temporary_folder(tmp_path) as folder:
         (folder / "a").write_text("a")
-        write_atomically(tmp_path / "b", b"b")
+        files.write_atomically(tmp_path / "b", b"b")
         assert names(tmp_path) == sorted([folder.name, "b"])
         assert (folder / "a").exists()
     assert names(tmp_path) == ["b"]
@@ -198,32 +185,14 @@ def test_a_lock_is_held_once_and_a_dead_process_holds_none(tmp_path):
     path = tmp_path / "a.map"
     message = f"process {os.getpid()} writes it; end that"
     with (
-        FileLock(path),
-        FileLock.unless_held(path),
+        files.FileLock(path),
+        files.FileLock.unless_held(path),
         pytest.raises(BlockingIOError, match=message),
     ):
-        FileLock(path)
+        files.FileLock(path)
     assert names(tmp_path) == []
-    killed(lambda: FileLock(path) and threading.Event().wait(), 0.1)
+    killed(lambda: files.FileLock(path) and threading.Event().wait(), 0.1)
     assert names(tmp_path) == [".a.map.lock"]
-    with FileLock(path):
+    with files.FileLock(path):
         pass
     assert names(tmp_path) == []
-
-
-def test_only_one_of_many_gets_the_lock(tmp_path):
-    inside = most = 0
-    guard = threading.Lock()
-
-    def take(_: int) -> None:
-        nonlocal inside, most
-        with suppress(BlockingIOError), FileLock(tmp_path / "a.map"):
-            with guard:
-                inside += 1
-                most = max(most, inside)
-            with guard:
-                inside -= 1
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(take, range(400)))
-    assert most == 1 and names(tmp_path) == []

@@ -1,10 +1,8 @@
 """The four stages composed: frames in, one consistent graph and its updates out."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import msgspec
@@ -19,7 +17,13 @@ from deworldsg_ros.graph.extent import surface_points
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.lifting.stage import Lifting
 from deworldsg_ros.perception.stage import Perception
-from deworldsg_ros.pipeline import PERCEPTION_PARTS, FrameResult, Pipeline
+from deworldsg_ros.pipeline import (
+    PERCEPTION_PARTS,
+    FrameResult,
+    Pipeline,
+    apply_ahead,
+    read_ahead,
+)
 from deworldsg_ros.relations.registry import build_world_model
 from deworldsg_ros.relations.stage import RelationReasoner
 from deworldsg_ros.scene.camera import RgbdFrame
@@ -68,11 +72,6 @@ def test_a_camera_that_stands_still_for_200_frames_sees_one_node_an_object(
     assert edge.probability > 0.999
 
 
-def test_no_graph_before_the_first_frame() -> None:
-    with pytest.raises(RefusedInput, match="no frame was processed"):
-        Pipeline(PAPER, Scripted()).graph()
-
-
 def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
     pipeline = Pipeline(ASKING, Scripted(logits=(0.001, 0.0, 0.0)))
     for index in range(3):
@@ -89,15 +88,6 @@ def test_the_prior_enters_ambiguous_edges_and_completes_neighbours() -> None:
     told = {belief.label: belief.probability for belief in edge.predicates}
     for predicate, value in zip(VOCABULARY.predicates, expected):
         assert told[predicate] == pytest.approx(value, abs=1e-4)
-
-
-def test_a_certain_edge_is_left_alone_by_the_prior() -> None:
-    sure = Pipeline(PAPER, Scripted())
-    asked = Pipeline(ASKING, Scripted())
-    for index in range(3):
-        sure.process(frame(index))
-        asked.process(frame(index))
-    assert asked.graph().edges == sure.graph().edges
 
 
 def test_evidence_that_comes_late_gives_the_same_graph() -> None:
@@ -127,29 +117,18 @@ def test_evidence_that_comes_late_gives_the_same_graph() -> None:
 @pytest.mark.parametrize("points", [False, True])
 def test_a_client_that_missed_nothing_has_the_graph_exactly(points: bool) -> None:
     config = msgspec.structs.replace(PAPER, output=OutputConfig(include_surface_points=points))
-    builder = GraphBuilder(config, VOCABULARY, "map")
-    replica = GraphReplica()
+    builder, replica = GraphBuilder(config, VOCABULARY, "map"), GraphReplica()
     replica.reset(builder.snapshot())
     for index in range(6):
         builder.integrate(local_graph(index))
         update = builder.update()
-        assert update is not None
-        assert update.sequence == index + 1
+        assert update is not None and update.sequence == index + 1
         assert [entry.nodes for entry in update.associations] == [[1, 2, 3]]
-        sent = wire.decode(wire.encode(update), wire.SceneGraphUpdateMessage)
-        replica.apply(sent)
+        replica.apply(wire.decode(wire.encode(update), wire.SceneGraphUpdateMessage))
         assert replica.message() == builder.snapshot()
     assert builder.update() is None
-
-
-@pytest.mark.parametrize("points", [False, True])
-def test_a_snapshot_is_that_of_the_last_update_whatever_came_since(points: bool) -> None:
-    config = msgspec.structs.replace(PAPER, output=OutputConfig(include_surface_points=points))
-    builder = GraphBuilder(config, VOCABULARY, "map")
-    replica = GraphReplica()
-    builder.integrate(local_graph(0))
-    replica.apply(builder.update())
-    builder.integrate(local_graph(1))
+    # A snapshot is that of the last update, whatever came since.
+    builder.integrate(local_graph(6))
     builder.graph.remove_node(1)
     builder.full()
     assert replica.message() == builder.snapshot()
@@ -165,46 +144,15 @@ def test_a_late_update_contains_the_remembered_frames_only() -> None:
     assert wire.ns_from_stamp(update.associations[-1].stamp) == 1099
 
 
-@pytest.mark.parametrize("index", [3, 2])
-def test_a_frame_that_is_not_newer_is_refused_and_changes_nothing(index: int) -> None:
-    builder = GraphBuilder(PAPER, VOCABULARY, "map")
-    builder.integrate(local_graph(3))
-    before = builder.full()
-    with pytest.raises(RefusedInput) as refused:
-        builder.integrate(local_graph(index))
-    assert refused.value.reason == "out_of_order"
-    assert builder.full() == before
-
-
 def test_evidence_of_an_unknown_frame_or_vocabulary_is_refused() -> None:
-    builder = GraphBuilder(PAPER, VOCABULARY, "map")
     evidence = RelationReasoner(PAPER.relations, None).observe(local_graph(0), frame(0).rgb)
-    with pytest.raises(RefusedInput) as refused:
-        builder.add_evidence(evidence)
-    assert refused.value.reason == "unknown_frame"
-    other = GraphBuilder(PAPER, Vocabulary(("cup",), ("on",)), "map")
-    with pytest.raises(RefusedInput) as refused:
-        other.add_evidence(evidence)
-    assert refused.value.reason == "vocabulary_mismatch"
-    with pytest.raises(RefusedInput) as refused:
-        other.integrate(local_graph(0))
-    assert refused.value.reason == "vocabulary_mismatch"
-
-
-def test_nodes_are_published_from_the_chosen_probability_on() -> None:
-    def published(min_existence: float) -> list[wire.NodeState]:
-        pipeline = Pipeline(Config(output=OutputConfig(min_existence=min_existence)), Scripted())
-        pipeline.process(frame(0))
-        assert pipeline.builder is not None
-        assert sum(pipeline.builder.hidden.values()) == 3 - len(pipeline.graph().nodes)
-        return pipeline.graph().nodes
-
-    assert len(published(0.0)) == 3 and published(1.0) == []
-    assert all(0.0 < node.existence < 1.0 for node in published(0.0))
-
-
-def test_the_timed_parts_of_perception_are_its_methods() -> None:
-    assert all(callable(getattr(Perception, method)) for method in PERCEPTION_PARTS)
+    other = Vocabulary(("cup",), ("on",))
+    for known, reason in ((VOCABULARY, "unknown_frame"), (other, "vocabulary_mismatch")):
+        with pytest.raises(RefusedInput) as refused:
+            GraphBuilder(PAPER, known, "map").add_evidence(evidence)
+        assert refused.value.reason == reason
+    with pytest.raises(RefusedInput, match="no frame was processed"):
+        Pipeline(PAPER, Scripted()).graph()
 
 
 def test_the_paper_differs_from_the_default_in_these_options() -> None:
@@ -223,6 +171,73 @@ def test_the_paper_differs_from_the_default_in_these_options() -> None:
         ("relations", "edge_belief"),
         ("relations", "world_model"),
     }
+
+
+# --- work ahead of its use -----------------------------------------------------------------------
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    for _ in range(500):
+        if condition():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it did not happen within 5 s")
+
+
+def threads_ahead() -> list[str]:
+    return [t.name for t in threading.enumerate() if "_ahead" in t.name]
+
+
+def test_reading_is_in_another_thread_and_bounded() -> None:
+    taken: list[int] = []
+    threads = set()
+
+    def items() -> Iterator[int]:
+        for item in range(100):
+            threads.add(threading.current_thread())
+            taken.append(item)
+            yield item
+
+    ahead = read_ahead(items(), 2)
+    assert next(ahead) == 0
+    # One is used, two wait, and the thread holds one more.
+    wait_until(lambda: len(taken) == 4)
+    time.sleep(0.05)
+    assert len(taken) == 4 and threading.current_thread() not in threads
+    ahead.close()
+    assert threads_ahead() == []
+
+
+def test_errors_come_with_their_items() -> None:
+    def items() -> Iterator[int]:
+        yield from (1, 2)
+        raise OSError("the disk is gone")
+
+    seen = []
+    with pytest.raises(OSError, match="the disk is gone"):
+        for item in read_ahead(items(), 5):
+            seen.append(item)
+    assert seen == [1, 2]
+    found = [
+        (item, future.exception()) for item, future in apply_ahead((4).__floordiv__, [0, 2], 2)
+    ]
+    assert isinstance(found[0][1], ZeroDivisionError) and found[1] == (2, None)
+
+
+def test_an_interrupt_of_the_consumer_ends_all_threads() -> None:
+    started: list[int] = []
+
+    def slow(item: int) -> int:
+        started.append(item)
+        time.sleep(0.05)
+        return item
+
+    with pytest.raises(KeyboardInterrupt):
+        for item, _ in apply_ahead(slow, read_ahead(iter(range(1000)), 2), 2):
+            if item == 3:
+                raise KeyboardInterrupt
+    wait_until(lambda: threads_ahead() == [])
+    assert len(started) < 12
 
 
 class Slowest:
@@ -287,22 +302,6 @@ def test_overlapped_stages_give_the_same_results_in_order(detectors: int, caplog
         assert together.times_s[part].count == {"reading": 6, "perception": 5, "lifting": 5}.get(
             part, 4
         )
+    assert all(callable(getattr(Perception, method)) for method in PERCEPTION_PARTS)
     # The time of perception includes that of its detector, wherever that ran.
     assert together.times_s["perception"].total_s > together.times_s["masks"].total_s + 0.002 * 9
-
-
-def test_frames_are_not_read_far_ahead_and_reading_ends_with_the_run() -> None:
-    read: list[int] = []
-
-    def frames() -> Iterator[RgbdFrame]:
-        for index, seen in enumerate(numbered_frames(30)):
-            read.append(index)
-            yield seen
-
-    pipeline, _ = overlapped_pipeline(2)
-    results = pipeline.process_all(frames())
-    next(results)
-    results.close()
-    time.sleep(0.05)
-    assert len(read) < 12
-    assert not [thread for thread in threading.enumerate() if "_ahead" in thread.name]

@@ -1,7 +1,5 @@
 """Counts, the names that misspelt ones may mean, text of others, and numbers."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -224,9 +224,7 @@ class PairStore:
     def release(self, rows: Int64) -> None:
         """Keep pairs no longer if there is no evidence."""
         self.rows["held"][rows] = False
-        known = self.rows.take(rows)
-        is_edge = (known["frames"] > 0) | (known["neighbour_frames"] > 0)
-        self._drop(rows[(known["shown"] == 0) & ~is_edge.any(axis=1)])
+        self._drop(rows[~_has_evidence(self.rows.take(rows))])
 
     def add_frame(self, shown: Int64, voted: Int64, votes: Float64) -> None:
         """Add a frame.
@@ -382,7 +380,7 @@ class PairStore:
         """Add everything about a pair of a node to the pair of another node with the same one."""
         of = self.rows["slots"][row].tolist()
         end = of.index(slot)
-        if of[1 - end] == to:
+        if of[1 - end] == to or not _has_evidence(self.rows[row]):
             return
         pair = np.array([[to, of[1 - end]]], np.int64)
         new, turned = (int(one[0]) for one in self._directed(pair))
@@ -443,6 +441,13 @@ class PairStore:
         while len(self.firsts) < count:
             self.firsts = np.concatenate([self.firsts, np.zeros_like(self.firsts)])
             self._degrees = np.concatenate([self._degrees, np.zeros_like(self._degrees)])
+
+
+def _has_evidence(known: NDArray[np.void]) -> Bool:
+    """Whether a frame has shown pairs (...), or an edge of theirs has evidence."""
+    is_edge = (known["frames"] > 0) | (known["neighbour_frames"] > 0)
+    found: Bool = (known["shown"] > 0) | is_edge.any(axis=-1)
+    return found
 
 
 @kernel

@@ -1,14 +1,11 @@
 """An operator's edits hold for later frames, and undo brings back what was before."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from support.merging import VOCABULARY
 from support.surfaces import CHAIR, CUP, HERE, TABLE, frame, slab, view
 
 from deworldsg_ros.config import Config, MergingConfig, OutputConfig
-from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.edits import MAX_UNDO, DeleteNode, MergeNodes, SetLabel, SplitNode, Undo
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import copy_state, read_map, write_map
@@ -63,33 +60,33 @@ def test_a_label_stays_and_tells_who_said_it(association):
     room.builder.update()
     reply = room.builder.edit(SetLabel(1, "chair"))
     assert (reply.kind, reply.nodes) == ("set_label", [1])
-    update = room.builder.update()
-    assert update is not None
-    (state,) = update.nodes
+    (state,) = room.builder.update().nodes
     assert (state.label, state.label_provenance) == ("chair", "operator")
     assert state.classes == [wire.Belief("chair", 1.0)] and state.entropy_nats == 0.0
     room.builder.edit(Undo())
     assert room.full() == before
     room.builder.edit(SetLabel(1, "chair"))
-    for _ in range(20):
-        assert room.see() == [1]  # the detector goes on to call it a cup: that is this object
-    assert room.labels() == {1: "chair"}
+    assert room.see(20) == [1]  # the detector goes on to call it a cup: that is this object
     room.builder.edit(SetLabel(1, "Anna's mug"))  # in no vocabulary
-    assert room.labels() == {1: "Anna's mug"}
-    room.builder.edit(Undo())
-    assert room.labels() == {1: "chair"}
-    room.builder.edit(Undo())
-    assert room.labels() == {1: "cup"}
+    for label in ("Anna's mug", "chair", "cup"):
+        assert room.labels() == {1: label}
+        if label != "cup":
+            room.builder.edit(Undo())
+    # A frame may show and miss nothing.
+    away = np.eye(4)
+    away[:3, 3] = [50.0, 0.0, 0.0]
+    assert room.builder.integrate(frame(room.stamp + 1, T_world_camera=away)) == []
 
 
 @RULES
-def test_a_deleted_object_stays_deleted_and_others_may_take_its_place(association):
+@pytest.mark.parametrize("away", [0, 20])
+def test_a_deleted_object_stays_deleted_and_others_may_take_its_place(association, away):
     room = Room((HERE, CUP), (WHOLE, TABLE), association=association)
     assert room.labels() == {1: "cup", 2: "table"}
     room.builder.update()
     room.builder.edit(DeleteNode(1))
-    update = room.builder.update()
-    assert update is not None and [gone.id for gone in update.removed_nodes] == [1]
+    assert [gone.id for gone in room.builder.update().removed_nodes] == [1]
+    room.see(away, (WHOLE, TABLE))
     room.see(20)
     assert room.labels() == {2: "table"}
     hidden = room.builder.full().hidden
@@ -102,24 +99,6 @@ def test_a_deleted_object_stays_deleted_and_others_may_take_its_place(associatio
     assert room.labels()[1] == "cup"
 
 
-def test_a_deleted_object_stays_deleted_when_it_was_away():
-    room = Room((HERE, CUP), (WHOLE, TABLE))
-    room.builder.edit(DeleteNode(1))
-    room.see(20, (WHOLE, TABLE))
-    room.see(20)
-    assert room.labels() == {2: "table"}
-
-
-@RULES
-def test_after_an_edit_a_frame_may_show_and_miss_nothing(association):
-    room = Room((HERE, CUP), association=association)
-    room.builder.edit(SetLabel(1, "chair"))
-    away = np.eye(4)
-    away[:3, 3] = [50.0, 0.0, 0.0]
-    assert room.builder.integrate(frame(room.stamp + 1, T_world_camera=away)) == []
-    assert room.labels() == {1: "chair"}
-
-
 def test_merged_objects_stay_one_though_the_detector_sees_two():
     room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
     assert room.labels() == {1: "table", 2: "table", 3: "cup"}
@@ -127,12 +106,8 @@ def test_merged_objects_stay_one_though_the_detector_sees_two():
     before = room.full()
     reply = room.builder.edit(MergeNodes([2, 1]))
     assert reply.nodes == [4] and room.labels() == {3: "cup", 4: "table"}
-    update = room.builder.update()
-    assert update is not None
-    assert {gone.id: gone.merged_into for gone in update.removed_nodes if gone.id < 4} == {
-        1: 4,
-        2: 4,
-    }
+    removed = room.builder.update().removed_nodes
+    assert {gone.id: gone.merged_into for gone in removed if gone.id < 4} == {1: 4, 2: 4}
     node = room.builder.full().nodes[1]
     assert node.box.size_m[0] > 0.95  # both halves
     room.builder.edit(Undo())
@@ -175,21 +150,18 @@ def test_a_split_stays_split_though_the_detector_sees_one():
 
 def test_a_split_takes_the_places_that_are_named():
     room = Room((LONG, TABLE))
-    reply = room.builder.edit(SplitNode(1, [[-0.5, 0.1, 0.7], [-0.1, 0.1, 0.7]]))
+    room.builder.edit(SplitNode(1, [[-0.5, 0.1, 0.7], [-0.1, 0.1, 0.7]]))
     widths = [node.box.size_m[0] for node in room.builder.full().nodes]
     assert sorted(np.round(widths, 1)) == [0.3, 0.8]
-    assert len(reply.nodes) == 2
-    with pytest.raises(RefusedInput, match="no two parts of at least 8 there"):
-        room.builder.edit(SplitNode(reply.nodes[0], [[5, 5, 5], [9, 9, 9]]))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 15, 40])
 def test_an_object_of_few_places_is_not_split(count):
     room = Room((BESIDE, CUP))
-    row = room.builder.graph.nodes.slot(1)
-    room.builder.graph.nodes.set_surface(row, np.tile(BESIDE[:1], (count, 1)))
+    slot = room.builder.graph.nodes.slot(1)
+    room.builder.graph.nodes.set_surface(slot, np.tile(BESIDE[:1], (count, 1)))
     for places in (None, [[0, 0, 0], [1, 1, 1]], [[0, 0, 0], [0, 0, 0]]):
-        with pytest.raises(RefusedInput, match="has no two parts of at least 8 there"):
+        with pytest.raises(RefusedInput, match="no two parts of at least 8"):
             room.builder.edit(SplitNode(1, places))
     assert room.see() == [1]
 
@@ -249,48 +221,36 @@ def test_edits_survive_a_map_and_continue_equally(tmp_path, frames):
     assert again.full().nodes == whole.full().nodes
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (b"[{}]", "missing required field"),
-        (b'[{"id":1,"kind":"paint","stamp_ns":0,"nodes":[1]}]', "Invalid enum value"),
-        (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[99],"label":"x"}]', "id 99"),
-        (b'[{"id":1,"kind":"delete","stamp_ns":0,"nodes":[1]}]', "deleted"),
-        (b'[{"id":1,"kind":"merge","stamp_ns":0,"nodes":[2],"replaced":[1,7]}]', "replaced"),
-        (b'[{"id":1,"kind":"merge","stamp_ns":0,"nodes":[1,2]}]', "1 for merge"),
-        (b'[{"id":1,"kind":"set_label","stamp_ns":0,"nodes":[1],"label":"a\\nb"}]', "regex"),
-    ],
-)
-def test_a_map_with_wrong_edits_is_refused(tmp_path, damage, message):
-    room = Room((HERE, CUP), (WHOLE, TABLE))
-    path = tmp_path / "room.map"
-    write_map(room.builder, path)
-    graph_files.write(path, {**graph_files.read(path), "edits": np.frombuffer(damage, np.uint8)})
-    with pytest.raises(Exception, match=message):
-        read_map(Config(), path)
-
-
 def test_a_map_without_edits_has_no_array_of_them():
     room = Room((HERE, CUP))
-    assert not [name for name in copy_state(room.builder) if "edit" in name or "aside" in name]
-    room.builder.edit(SetLabel(1, "chair"))
-    room.builder.edit(Undo())
-    assert not [name for name in copy_state(room.builder) if "edit" in name or "aside" in name]
+    for _ in range(2):
+        arrays = copy_state(room.builder)
+        assert not [name for name in arrays if "edit" in name or "aside" in name]
+        room.builder.edit(SetLabel(1, "chair"))
+        room.builder.edit(Undo())
 
 
 @pytest.mark.parametrize(
-    ("request_", "message"),
+    ("association", "request_", "message"),
     [
-        (SetLabel(9, "cup"), "object 9 is not in the graph: it is gone, or never was"),
-        (SetLabel(1, "a\u009bb"), "control character"),
-        (MergeNodes([1, 1]), "cannot be merged with itself"),
-        (MergeNodes([1, 8]), "object 8 is not in the graph"),
-        (DeleteNode(9), "object 9 is not"),
-        (Undo(), "nothing to undo: no edit holds"),
+        ("surface", SetLabel(99, "cup"), "object 99 is not in the graph: it is gone, or never was"),
+        ("surface", SetLabel(1, "cup"), "merged into object 4"),
+        ("surface", SetLabel(3, "cup"), "hidden"),
+        ("surface", SetLabel(4, "a\u009bb"), "control character"),
+        ("surface", MergeNodes([4, 4]), "itself"),
+        ("surface", MergeNodes([4, 8]), "object 8"),
+        ("surface", DeleteNode(9), "object 9"),
+        ("surface", SplitNode(4, [[5, 5, 5], [9, 9, 9]]), "no two parts of at least 8"),
+        ("paper", Undo(), "nothing to undo"),
+        ("paper", MergeNodes([1, 2]), "merging.association surface"),
+        ("paper", SplitNode(1), "merging.association surface"),
     ],
 )
-def test_a_bad_edit_changes_nothing(request_, message):
-    room = Room((HERE, CUP), (WHOLE, TABLE))
+def test_a_bad_edit_changes_nothing(association, request_, message):
+    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP), association=association)
+    if association == "surface":
+        room.builder.edit(MergeNodes([1, 2]))
+        room.builder.edit(DeleteNode(3))
     before = copy_state(room.builder)
     with pytest.raises(RefusedInput, match=message) as refusal:
         room.builder.edit(request_)
@@ -298,22 +258,6 @@ def test_a_bad_edit_changes_nothing(request_, message):
     after = copy_state(room.builder)
     assert before.keys() == after.keys()
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
-
-
-def test_an_edited_object_is_named_by_what_it_is_now():
-    room = Room((LEFT, TABLE), (RIGHT, TABLE), (BESIDE, CUP))
-    room.builder.edit(MergeNodes([1, 2]))
-    room.builder.edit(DeleteNode(3))
-    for node_id, reason in ((1, "merged into object 4"), (3, "hidden")):
-        with pytest.raises(RefusedInput, match=reason):
-            room.builder.edit(SetLabel(node_id, "cup"))
-
-
-def test_the_papers_rule_refuses_what_it_cannot_do():
-    room = Room((HERE, CUP), (WHOLE, TABLE), association="paper")
-    for request in (MergeNodes([1, 2]), SplitNode(1)):
-        with pytest.raises(RefusedInput, match="merging.association surface"):
-            room.builder.edit(request)
 
 
 def test_old_edits_hold_but_cannot_be_undone():
@@ -333,13 +277,6 @@ def test_old_edits_hold_but_cannot_be_undone():
     assert len(room.builder.graph) == len(room.labels()) == 1
 
 
-def test_an_object_that_goes_takes_its_edits_with_it():
-    room = Room((HERE, CUP), (WHOLE, TABLE))
-    room.builder.edit(SetLabel(1, "chair"))
-    room.builder.graph.remove_node(1)
-    assert not room.builder.graph.edits
-
-
 def test_what_was_said_of_a_part_holds_when_the_other_part_goes(tmp_path):
     room = Room((LONG, TABLE))
     (whole,) = room.labels()
@@ -351,20 +288,5 @@ def test_what_was_said_of_a_part_holds_when_the_other_part_goes(tmp_path):
     assert len(room.builder.graph) == 1, "the whole table cannot come back"
     write_map(room.builder, tmp_path / "room.map")
     assert list(read_map(Config(), tmp_path / "room.map").graph.edits.labels) == [right]
-    room.builder.graph.remove_node(right)
+    room.builder.graph.remove_node(right)  # an object that goes takes its edits with it
     assert not room.builder.graph.edits
-
-
-def test_a_map_keeps_what_was_said_of_the_part_that_is_left(tmp_path):
-    builder = GraphBuilder(Config(), VOCABULARY, "world")
-    for stamp in range(1, 9):
-        builder.integrate(view(stamp, (LONG, TABLE)))
-    (whole,) = [node.id for node in builder.full().nodes]
-    builder.edit(SetLabel(whole, "bench"))
-    builder.edit(SplitNode(whole))
-    for stamp in range(9, 40):
-        builder.integrate(view(stamp, (RIGHT, TABLE)))
-    assert [node.label for node in builder.full().nodes] == ["bench"]
-    write_map(builder, tmp_path / "room.map")
-    again = read_map(Config(), tmp_path / "room.map")
-    assert [node.label for node in again.full().nodes] == ["bench"]

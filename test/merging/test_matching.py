@@ -1,9 +1,5 @@
 """Match scores against their formulas, the assignment, and the evidence for merging nodes."""
 
-from __future__ import annotations
-
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,25 +9,7 @@ from scipy.optimize import linear_sum_assignment
 from support.merging import local_graph, random_classes, random_covariances, seeds
 
 from deworldsg_ros.graph.nodes import NodeTable
-from deworldsg_ros.merging.matching import (
-    CLASS_AGREEMENT,
-    CLASS_WEIGHT,
-    GAUSSIAN_WEIGHT,
-    MAX_DEVIATIONS,
-    MIN_FRACTION_OTHER_CLASS,
-    NESTED_FRACTION,
-    OVERLAP_THRESHOLD_OTHER_CLASS,
-    OVERLAPPING_WEIGHT,
-    SEPARATE_WEIGHT,
-    SURE_SCORE,
-    TOUCHING_WEIGHT,
-    WIDE_STEP_M,
-    JointEvidence,
-    Matches,
-    assign,
-    match,
-    one_to_one,
-)
+from deworldsg_ros.merging import matching
 from deworldsg_ros.scene.gaussian import bhattacharyya_distance
 
 OVERLAP_THRESHOLD = 0.3
@@ -55,52 +33,38 @@ def test_match_scores_equal_the_formulas(seed: int) -> None:
         nodes.put(nodes.add(index + 1), rng.normal(0, 0.3, 3), covariance, classes, 1.0, 1)
     rows = rng.permutation(5)[:3]
     on_nodes, covered = rng.uniform(0, 1, (2, 4, 3))
-    matches = match(local, nodes, rows, on_nodes, covered, OVERLAP_THRESHOLD, CELL_M)
+    matches = matching.match(local, nodes, rows, on_nodes, covered, OVERLAP_THRESHOLD, CELL_M)
     blur = CELL_M**2 / 12 * np.eye(3)
     for index, column in np.ndindex(4, 3):
         row = rows[column]
         agreement = local.class_probabilities[index] @ nodes.class_probabilities[row]
-        same = agreement > CLASS_AGREEMENT
+        same = agreement > matching.CLASS_AGREEMENT
         fractions = on_nodes[index, column], covered[index, column]
-        overlap, alike = max(fractions), same or min(fractions) >= MIN_FRACTION_OTHER_CLASS
-        threshold = OVERLAP_THRESHOLD if same else OVERLAP_THRESHOLD_OTHER_CLASS
+        overlap, alike = max(fractions), same or min(fractions) >= matching.MIN_FRACTION_OTHER_CLASS
+        threshold = OVERLAP_THRESHOLD if same else matching.OVERLAP_THRESHOLD_OTHER_CLASS
         ours, theirs = local.covariances_world[index] + blur, nodes.covariances[row] + blur
         difference = local.means_world[index] - nodes.means[row]
         apart = min(deviations(difference, ours), deviations(difference, theirs))
         distance = bhattacharyya_distance(local.means_world[index], ours, nodes.means[row], theirs)
-        score = overlap + CLASS_WEIGHT * agreement + GAUSSIAN_WEIGHT * np.exp(-distance)
-        possible = overlap >= threshold and alike and apart <= MAX_DEVIATIONS
+        score = (
+            overlap
+            + matching.CLASS_WEIGHT * agreement
+            + matching.GAUSSIAN_WEIGHT * np.exp(-distance)
+        )
+        possible = overlap >= threshold and alike and apart <= matching.MAX_DEVIATIONS
         assert matches.scores[index, column] == pytest.approx(score if possible else 0.0, abs=1e-9)
         assert matches.touching[index, column] == same
-    assert matches.columns == one_to_one(matches.scores)
+    assert matches.columns == matching.one_to_one(matches.scores)
     assert matches.slots is rows and matches.on_nodes is on_nodes
 
 
 def test_a_frame_without_objects_has_no_matches() -> None:
     empty = local_graph(1, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 4)))
-    nothing = np.zeros((0, 0))
-    matches = match(
-        empty, NodeTable(4), np.zeros(0, np.int64), nothing, nothing, OVERLAP_THRESHOLD, CELL_M
-    )
+    none = np.zeros(0, np.int64), np.zeros((0, 0)), np.zeros((0, 0))
+    matches = matching.match(empty, NodeTable(4), *none, OVERLAP_THRESHOLD, CELL_M)
     assert matches.scores.shape == matches.touching.shape == (0, 0)
     assert matches.columns == []
-    assert one_to_one(np.zeros((2, 0))) == [-1, -1]
-
-
-@given(seeds)
-@settings(max_examples=25)
-def test_the_assignment_has_the_greatest_total(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    scores = rng.uniform(0, 2, (3, 4)) * (rng.random((3, 4)) < 0.6)
-    matched = one_to_one(scores)
-    taken = [column for column in matched if column >= 0]
-    assert len(taken) == len(set(taken))
-    total = sum(scores[row, column] for row, column in enumerate(matched) if column >= 0)
-    assert all(scores[row, column] > 0 for row, column in enumerate(matched) if column >= 0)
-    best = max(
-        scores[range(3), list(columns)].sum() for columns in itertools.permutations(range(4), 3)
-    )
-    assert total == pytest.approx(best)
+    assert matching.one_to_one(np.zeros((2, 0))) == [-1, -1]
 
 
 @given(seeds, st.integers(0, 9), st.integers(0, 9), st.sampled_from([3, 10**6]))
@@ -108,16 +72,19 @@ def test_the_assignment_has_the_greatest_total(seed: int) -> None:
 def test_the_assignment_is_that_of_scipy_ties_too(
     seed: int, count: int, width: int, levels: int
 ) -> None:
-    rng = np.random.default_rng(seed)
-    scores = rng.integers(levels, size=(count, width)) / 7.0
+    scores = np.random.default_rng(seed).integers(levels, size=(count, width)) / 7.0
     rows, columns = linear_sum_assignment(scores, maximize=True)
     expected = np.full(count, -1)
     expected[rows] = columns
-    assert assign(scores).tolist() == expected.tolist()
+    assert matching.assign(scores).tolist() == expected.tolist()
+    matched = np.array(matching.one_to_one(scores), np.int64)
+    taken = matched >= 0
+    total = scores[np.flatnonzero(taken), matched[taken]]
+    assert (total > 0).all() and total.sum() == pytest.approx(scores[rows, columns].sum())
 
 
 def add_frame(
-    evidence: JointEvidence,
+    evidence: matching.JointEvidence,
     seen: list[int],
     known: list[int],
     match_scores: ArrayLike,
@@ -132,96 +99,84 @@ def add_frame(
     scores = np.array(match_scores, float).reshape(shape)
     touching = scores > 0 if touching is None else np.array(touching, bool).reshape(shape)
     matched = [known.index(slot) if slot in known else -1 for slot in seen]
-    matches = Matches(np.array(known), np.broadcast_to(on_nodes, shape), scores, touching, matched)
+    matches = matching.Matches(
+        np.array(known), np.broadcast_to(on_nodes, shape), scores, touching, matched
+    )
     detection_scores = np.broadcast_to(detection_scores, len(seen))
     evidence.add_frame(seen, matches, detection_scores, np.array([camera_m, 0, 0]))
 
 
-def test_a_frame_that_shows_two_objects_outweighs_ten_overlaps() -> None:
-    evidence = JointEvidence()
-    for _ in range(2):
-        add_frame(evidence, [4], [4, 7], [[1, 1]])
-        assert evidence.next_merge() is None
-    add_frame(evidence, [4], [4, 7], [[1, 1]])
-    assert evidence.next_merge() == (4, 7)
+BOTH = ([4], [4, 7], [[1, 1]])
+
+
+@pytest.mark.parametrize(
+    ("frames", "needed"),
+    [
+        pytest.param([BOTH] * 3, 3, id="overlaps"),
+        # Two objects of one frame, which need not touch, outweigh ten overlaps.
+        pytest.param([([4, 7], [4, 7], [[1, 0], [0, 1]])] + [BOTH] * 13, 14, id="shown apart"),
+        pytest.param([([4], [4, 7], [[1, 0]], [[1, 1]])] * 9, 9, id="touching"),
+    ],
+)
+def test_evidence_for_one_object(frames: list[tuple], needed: int) -> None:
+    evidence = matching.JointEvidence()
+    for number, frame in enumerate(frames, start=1):
+        add_frame(evidence, *frame)
+        assert evidence.next_merge() == ((4, 7) if number == needed else None)
     evidence.forget(7)
-
-    # Two objects of one frame, which need not touch.
-    add_frame(evidence, [4, 7], [4, 7], [[1, 0], [0, 1]])
-    for _ in range(12):
-        add_frame(evidence, [4], [4, 7], [[1, 1]])
-    assert evidence.next_merge() is None
-    add_frame(evidence, [4], [4, 7], [[1, 1]])
-    assert evidence.next_merge() == (4, 7)
-    evidence.forget(7)
-    assert evidence.next_merge() is None
-    assert evidence.balances == {}
-
-
-def test_nodes_that_touch_in_nine_frames_are_merged() -> None:
-    evidence = JointEvidence()
-    for _ in range(8):
-        add_frame(evidence, [4], [4, 7], [[1, 0]], [[1, 1]])
-    assert evidence.next_merge() is None
-    add_frame(evidence, [4], [4, 7], [[1, 0]], [[1, 1]])
-    assert evidence.next_merge() == (4, 7)
+    assert evidence.next_merge() is None and evidence.balances == {}
 
 
 def test_after_a_wide_step_one_frame_that_overlaps_both_is_enough() -> None:
-    evidence = JointEvidence()
+    evidence = matching.JointEvidence()
     add_frame(evidence, [4], [4], [[1]])
-    add_frame(evidence, [4], [4, 7], [[1, 1]], camera_m=0.9 * WIDE_STEP_M)
+    add_frame(evidence, *BOTH, camera_m=0.9 * matching.WIDE_STEP_M)
     assert evidence.next_merge() is None
-    add_frame(evidence, [4], [4, 8], [[1, 1]], camera_m=2 * WIDE_STEP_M)
+    add_frame(evidence, [4], [4, 8], [[1, 1]], camera_m=2 * matching.WIDE_STEP_M)
     assert evidence.next_merge() == (4, 8)
 
 
-NESTED = np.array([[1, 0], [NESTED_FRACTION, 1]])
+NESTED = np.array([[1, 0], [matching.NESTED_FRACTION, 1]])
 TOUCHING = np.array([[1, 0], [1, 1]])
 
 
 @pytest.mark.parametrize(
     "detection_score, on_nodes, touching, balance",
     [
-        (SURE_SCORE - 0.01, NESTED, TOUCHING, TOUCHING_WEIGHT),
-        (SURE_SCORE - 0.01, 0.9 * NESTED, TOUCHING, -OVERLAPPING_WEIGHT),
-        (SURE_SCORE - 0.01, NESTED, np.eye(2), -OVERLAPPING_WEIGHT),  # classes differ
-        (SURE_SCORE, NESTED, TOUCHING, -SEPARATE_WEIGHT),
+        (matching.SURE_SCORE - 0.01, NESTED, TOUCHING, matching.TOUCHING_WEIGHT),
+        (matching.SURE_SCORE - 0.01, 0.9 * NESTED, TOUCHING, -matching.OVERLAPPING_WEIGHT),
+        (
+            matching.SURE_SCORE - 0.01,
+            NESTED,
+            np.eye(2),
+            -matching.OVERLAPPING_WEIGHT,
+        ),  # classes differ
+        (matching.SURE_SCORE, NESTED, TOUCHING, -matching.SEPARATE_WEIGHT),
     ],
 )
 def test_an_unsure_box_in_a_box_may_be_the_same_object(
     detection_score: float, on_nodes: np.ndarray, touching: np.ndarray, balance: int
 ) -> None:
-    evidence = JointEvidence()
-    scores = [0.9, detection_score]
-    add_frame(
-        evidence,
-        [4, 7],
-        [4, 7],
-        np.eye(2),
-        touching,
-        detection_scores=scores,
-        on_nodes=on_nodes,
-    )
+    evidence, scores = matching.JointEvidence(), [0.9, detection_score]
+    more = {"detection_scores": scores, "on_nodes": on_nodes}
+    add_frame(evidence, [4, 7], [4, 7], np.eye(2), touching, **more)
     assert evidence.balances == {(4, 7): balance}
 
 
-def test_a_new_node_is_separate_from_the_others_of_its_frame() -> None:
-    evidence = JointEvidence()
-    add_frame(evidence, [2, 5], [2], [[1], [0.5]])
-    assert evidence.balances == {(2, 5): -SEPARATE_WEIGHT}
-
-
 def test_a_merged_node_keeps_the_separations_of_both_parts() -> None:
-    evidence = JointEvidence()
-    add_frame(evidence, [1, 3], [], [[], []])
+    evidence = matching.JointEvidence()
+    add_frame(evidence, [1, 3], [], [[], []])  # new nodes are separate, too
     add_frame(evidence, [2, 3], [3], [[0], [1]])
+    assert evidence.balances == {
+        (1, 3): -matching.SEPARATE_WEIGHT,
+        (2, 3): -matching.SEPARATE_WEIGHT,
+    }
     evidence.merge(1, 2)
-    assert evidence.balances == {(1, 3): -2 * SEPARATE_WEIGHT}
+    assert evidence.balances == {(1, 3): -2 * matching.SEPARATE_WEIGHT}
 
 
 def test_a_node_that_overlaps_two_separate_nodes_merges_with_one_only() -> None:
-    evidence = JointEvidence()
+    evidence = matching.JointEvidence()
     add_frame(evidence, [2, 3], [], [[], []])
     for _ in range(3):
         add_frame(evidence, [1], [1, 2, 3], [[1, 1, 1]])
@@ -229,15 +184,3 @@ def test_a_node_that_overlaps_two_separate_nodes_merges_with_one_only() -> None:
     assert pair in {(1, 2), (1, 3)}
     evidence.merge(*pair)
     assert evidence.next_merge() is None
-
-
-@given(seeds)
-@settings(max_examples=20)
-def test_evidence_continues_from_its_balances(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    evidence, restored = JointEvidence(), JointEvidence()
-    for _ in range(30):
-        slots = rng.permutation(6)[: rng.integers(1, 5)].tolist()
-        add_frame(evidence, slots, [*slots, 6], rng.integers(0, 2, (len(slots), len(slots) + 1)))
-    restored.restore(evidence.balances)
-    assert restored.balances == evidence.balances

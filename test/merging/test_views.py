@@ -1,28 +1,15 @@
-"""What a frame shows of nodes: visibility, points seen through, and coverage by masks."""
-
-from __future__ import annotations
+"""What a frame shows of nodes: which are in view, what is visible, seen through, and covered."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from support.gaussians import moments
-from support.merging import seeds
+from support.merging import moments, random_pose, seeds
 from support.surfaces import CUP, WALL_M, depth_grid, frame, slab
 
 from deworldsg_ros.graph.nodes import NodeTable
-from deworldsg_ros.merging.views import (
-    FULL,
-    HALF,
-    NOT_VISIBLE,
-    QUARTER,
-    SAMPLED_POINTS,
-    View,
-    frame_arrays,
-    see,
-    see_nothing,
-)
+from deworldsg_ros.merging import views
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
@@ -40,32 +27,33 @@ def table_of(*surfaces: np.ndarray, capacity: int = 512) -> NodeTable:
     return nodes
 
 
-def see_all(nodes: NodeTable, local: LocalGraph) -> View:
+def see_all(nodes: NodeTable, local: LocalGraph) -> views.View:
     if local.depth_grid is None:
-        return see_nothing(local)
-    arrays = frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
-    return see(nodes, np.arange(len(nodes)), local, arrays)
+        return views.see_nothing(local)
+    arrays = views.frame_arrays(invert_pose(local.T_world_camera), local.depth_grid)
+    return views.see(nodes, np.arange(len(nodes)), local, arrays)
 
 
 def view_of(points: np.ndarray, background_m: float = WALL_M) -> tuple[bool, int]:
     """Whether a wall's frame sees through a node of these points, and how much is visible."""
     local = frame(1, depth_grid=depth_grid(background_m=background_m))
-    view = see_all(table_of(points, capacity=SAMPLED_POINTS), local)
+    view = see_all(table_of(points, capacity=views.SAMPLED_POINTS), local)
     return bool(view.through[0]), int(view.visibilities[0])
 
 
 @pytest.mark.parametrize(
     ("z_m", "through", "visibility"),
-    [(0.7, True, NOT_VISIBLE), (1.0, False, FULL), (1.5, False, NOT_VISIBLE)],
+    [(0.7, True, views.NOT_VISIBLE), (1.0, False, views.FULL), (1.5, False, views.NOT_VISIBLE)],
 )
 def test_points_before_on_and_behind_the_measured_depth(z_m, through, visibility) -> None:
     points = np.stack([np.linspace(-0.2, 0.2, 10), np.zeros(10), np.full(10, z_m)], axis=1)
     assert view_of(points) == (through, visibility)
-    assert view_of(points[:0]) == (False, NOT_VISIBLE)
+    assert view_of(points[:0]) == (False, views.NOT_VISIBLE)
 
 
 @pytest.mark.parametrize(
-    ("left_m", "visibility"), [(-1.0, FULL), (-1.7, HALF), (-2.4, QUARTER), (-2.8, NOT_VISIBLE)]
+    ("left_m", "visibility"),
+    [(-1.0, views.FULL), (-1.7, views.HALF), (-2.4, views.QUARTER), (-2.8, views.NOT_VISIBLE)],
 )
 def test_visibility_of_a_node_cut_by_the_image_border(left_m, visibility) -> None:
     # The image ends at 1.07 m to the left.
@@ -73,7 +61,10 @@ def test_visibility_of_a_node_cut_by_the_image_border(left_m, visibility) -> Non
     points = np.stack([x_m, np.zeros(40), np.full(40, WALL_M)], axis=1)
     assert view_of(points) == (False, visibility)
     # Nearer to the camera, the image ends sooner.
-    assert view_of(points, background_m=3.0) == (visibility in (HALF, FULL), NOT_VISIBLE)
+    assert view_of(points, background_m=3.0) == (
+        visibility in (views.HALF, views.FULL),
+        views.NOT_VISIBLE,
+    )
 
 
 @given(seeds)
@@ -99,7 +90,7 @@ def halves() -> DepthGrid:
     return replace(depth_grid(), instances=instances)
 
 
-def of_two_masks(grid: DepthGrid | None, *surfaces: np.ndarray) -> View:
+def of_two_masks(grid: DepthGrid | None, *surfaces: np.ndarray) -> views.View:
     local: LocalGraph = frame(1, (LEFT, CUP), (BOARD, CUP), depth_grid=grid)
     return see_all(table_of(*surfaces), local)
 
@@ -121,3 +112,61 @@ def test_the_coverage_of_a_hidden_node_is_unknown() -> None:
     assert np.isnan(of_two_masks(halves(), hidden).covered).all()
     assert np.isnan(of_two_masks(replace(halves(), instances=None), BOARD).covered).all()
     assert of_two_masks(None, BOARD).covered.shape == (2, 0)
+
+
+# --- the nodes that a frame may show -------------------------------------------------------------
+
+# Margin of the comparison with sampled points of a ball, metres.
+SMALL_M = 0.02
+
+
+def shows(
+    frame: views.FrameArrays, mean: np.ndarray, radius: float, rng: np.random.Generator
+) -> bool:
+    """Whether any of many points of a ball is in the image, before its farthest depth."""
+    T, depth_mm, _, (fx, fy, cx, cy) = frame
+    steps = rng.normal(size=(500, 3))
+    steps *= max(radius - SMALL_M, 0.0) / np.linalg.norm(steps, axis=1, keepdims=True)
+    points = (mean + np.concatenate((steps, np.zeros((1, 3))))) @ T[:3, :3].T + T[:3, 3]
+    x, y, z = points[points[:, 2] > 0.1].T
+    u, v = fx * x / z + cx, fy * y / z + cy
+    height, width = depth_mm.shape
+    inside = (u > 0) & (v > 0) & (u < width) & (v < height) & (z < 0.001 * depth_mm.max())
+    return bool(inside.any())
+
+
+@given(seeds)
+@settings(max_examples=40, deadline=None)
+def test_every_node_in_view_is_found_after_any_changes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    grid, known = views.NodeGrid(), {}
+    for _ in range(12):
+        count = int(rng.integers(0, 30))
+        slots = rng.choice(150, count, replace=False)
+        means, bounds = rng.uniform(-12, 12, (150, 3)), rng.uniform(0.01, 0.6, 150) ** 2
+        grid.put(slots, means, bounds)
+        known.update(
+            {slot: (means[slot], views.BALL_DEVIATIONS * bounds[slot] ** 0.5) for slot in slots}
+        )
+        for slot in rng.choice(200, 10).tolist():
+            grid.remove(slot)
+            known.pop(slot, None)
+    wall = depth_grid(background_m=rng.uniform(0.5, 9.0))
+    seen = views.frame_arrays(invert_pose(random_pose(rng)), wall)
+    found = grid.in_view(seen).tolist()
+    assert len(found) == len(set(found)) and set(found) <= known.keys()
+    for slot, (mean, radius) in known.items():
+        assert slot in found or not shows(seen, mean, radius, rng)
+
+
+def test_nodes_elsewhere_are_not_compared() -> None:
+    grid, seen = views.NodeGrid(), views.frame_arrays(np.eye(4), depth_grid(background_m=3.0))
+    assert grid.in_view(seen).tolist() == []
+    slots, means = np.array([3, 5, 7, 9]), np.zeros((10, 3))
+    means[slots] = [[0, 0, 2], [50, 0, 2], [0, 0, 30], [0, 0, -30]]
+    grid.put(slots, means, np.full(10, 0.01))
+    assert grid.in_view(seen).tolist() == [3]
+    grid.remove(3)
+    means[5] = [0, 0, 2]
+    grid.put(slots[1:2], means, np.full(10, 0.01))
+    assert grid.in_view(seen).tolist() == [5]

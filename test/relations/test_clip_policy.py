@@ -1,10 +1,7 @@
 """The choice of clips: uncertain pairs, each once, within the budget; every lost clip counted."""
 
-from __future__ import annotations
-
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,7 +10,6 @@ from support.relations import (
     RecordingModel,
     config,
     crowd_graph,
-    empty_graph,
     pair_graph,
     picture,
 )
@@ -76,19 +72,38 @@ def encoded_clips(stage, *stamps):
     return counts
 
 
-@pytest.mark.parametrize(("entropy_nats", "encoded"), [(0.99, 0), (1.0, 0), (1.01, 1), (1e9, 1)])
-def test_only_pairs_above_the_entropy_threshold_are_encoded(entropy_nats, encoded):
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [
+        ({"entropies": {(1, 2): 0.99}}, "certain"),
+        ({"entropies": {(1, 2): 1.0}}, "certain"),
+        ({"entropies": {(1, 2): 1.01}}, None),
+        ({"entropies": {(1, 2): 1e9}}, None),
+        ({"labels": {1: "chair", 2: "cup"}}, "other_class"),  # frame and graph disagree
+        ({"rows": [0, 1]}, "node_removed"),
+        ({"rows": [1, 1]}, "node_removed"),  # merged
+        ({"rows": [1]}, "node_removed"),
+        ({"newest_ns": 7, "unknown": {6}}, "node_removed"),  # the graph refused the frame
+        ({"newest_ns": 5, "unknown": {6}}, "waits"),  # the graph has not merged it yet
+        ({"tentative": {2}}, "waits"),
+    ],
+)
+def test_which_clips_of_a_pair_are_encoded(state, reason):
     graph = of_pair()
-    graph.entropies[1, 2] = entropy_nats
+    vars(graph).update(state)
     stage = watching(graph)
-    assert encoded_clips(stage, 1) == [encoded]
-    assert stage.counters().dropped == ({} if encoded else {"certain": 1})
+    assert encoded_clips(stage, 6) == [int(reason is None)]
+    counters = stage.counters()
+    assert counters.pending == (reason == "waits")
+    assert counters.dropped == ({reason: 1} if reason not in (None, "waits") else {})
+    vars(graph).update(vars(of_pair()))
+    assert len(stage.drain()) == (reason == "waits")
+    if reason == "other_class":  # the graph has changed its class: another class pair
+        assert encoded_clips(stage, 7, 8) == [1, 0]
 
 
 def test_with_two_predicates_the_prior_never_enters_and_no_clip_is_encoded():
-    graph = of_pair()
-    stage = watching(graph)
-    local = pair_graph(1)
+    stage, local = watching(of_pair()), pair_graph(1)
     small = Vocabulary(VOCABULARY.classes, ("on", "near"))
     object.__setattr__(local, "vocabulary", small)
     stage.observe(local, picture(1))
@@ -103,70 +118,6 @@ def test_a_pair_is_encoded_once_and_again_after_twice_as_many_observations():
         counts += encoded_clips(stage, frame)
     assert [frame for frame, count in enumerate(counts, 3) if count] == [3, 6, 12, 24, 48, 96]
     assert stage.counters().dropped == {"already_encoded": 97 - 6}
-
-
-def test_a_clip_is_dropped_if_frame_and_graph_disagree_on_a_class():
-    graph = of_pair()
-    graph.labels[1] = "chair"
-    stage = watching(graph)
-    assert encoded_clips(stage, 1) == [0] and stage.counters().dropped == {"other_class": 1}
-    graph.labels[1] = "table"  # the graph has changed its class: another class pair
-    assert encoded_clips(stage, 2, 3) == [1, 0]
-
-
-@pytest.mark.parametrize("frames", [1, 40])
-def test_the_clip_of_a_tentative_pair_waits(frames):
-    """40 frames are more than the buffer holds: the clip is cut before they leave."""
-    early, late = RecordingModel(), RecordingModel()
-    assert encoded_clips(watching(of_pair(), early), 1) == [1]
-    graph = of_pair()
-    graph.tentative = {2}
-    stage = watching(graph, late)
-    assert encoded_clips(stage, 1) == [0]
-    for stamp in range(2, frames):
-        stage.observe(empty_graph(stamp), picture(stamp))
-    assert stage.drain() == [] and stage.counters().ready == 0
-    graph.tentative.clear()
-    (evidence,) = stage.drain()
-    assert evidence.stamp_ns == 1 and evidence.pairs.tolist() == [[0, 1], [1, 0]]
-    assert (late.requests[0].clip == early.requests[0].clip).all()
-
-
-def test_a_clip_waits_until_the_graph_has_merged_its_frame():
-    graph = of_pair()
-    graph.newest_ns, graph.unknown = 5, {6}
-    stage = watching(graph)
-    assert encoded_clips(stage, 6) == [0] and stage.counters().pending == 1
-    graph.unknown.clear()
-    assert len(stage.drain()) == 1
-
-
-def test_clips_of_a_frame_that_the_graph_refused_are_dropped():
-    graph = of_pair()
-    graph.newest_ns, graph.unknown = 7, {6}
-    stage = watching(graph)
-    assert encoded_clips(stage, 6) == [0] and stage.counters().dropped == {"node_removed": 1}
-
-
-@pytest.mark.parametrize("rows", [[0, 1], [1, 1], [1]])
-def test_clips_of_removed_or_merged_nodes_are_dropped(rows):
-    graph = of_pair()
-    graph.rows = rows
-    stage = watching(graph)
-    assert encoded_clips(stage, 1) == [0] and stage.counters().dropped == {"node_removed": 1}
-
-
-def test_clips_are_ranked_by_the_current_nodes():
-    """A merge may turn a queued pair into one that was encoded already."""
-    graph = of_pair()
-    stage = watching(graph)
-    assert encoded_clips(stage, 1) == [1]
-    graph.labels.update({3: "cup"})
-    graph.observations[3] = 3
-    graph.rows, graph.tentative = [1, 3], {3}
-    assert encoded_clips(stage, 2) == [0]
-    graph.rows = [1, 2]  # merged
-    assert stage.drain() == [] and stage.counters().dropped == {"already_encoded": 1}
 
 
 def test_every_clip_is_encoded_without_a_graph_and_without_a_budget():
@@ -186,28 +137,26 @@ def test_a_new_graph_resets_the_encodings():
     assert encoded_clips(stage, 3, 4) == [1, 0]
 
 
-def test_order_class_pairs_without_a_prior_then_uncertainty_then_observations():
+@pytest.mark.parametrize(
+    ("uncertain", "observed", "expected"),
+    [
+        # Class pairs without a prior, then uncertainty, then observations. (2, 3) and (5, 6) have
+        # one class pair, and so do (1, 2) and (4, 5).
+        (
+            {(1, 2): 1.1, (4, 5): 1.3, (1, 3): 1.2, (2, 3): 1.2, (5, 6): 1.35},
+            {1: 9, 3: 9},
+            [(5, 6), (4, 5), (1, 3), (2, 3), (1, 2)],
+        ),
+        ({(1, 4): 1.2, (1, 3): 1.2}, {1: 9, 3: 8}, [(1, 3), (1, 4)]),
+    ],
+)
+def test_the_order_of_clips(uncertain, observed, expected):
     graph = Graph(6)
-    graph.entropies = {(1, 2): 1.1, (4, 5): 1.3, (1, 3): 1.2, (2, 3): 1.2, (5, 6): 1.35}
-    graph.observations.update({1: 9, 3: 9})
-    uncertain = set(graph.entropies)
-    graph.entropies.update(
-        {(a, b): 0.0 for a in range(1, 7) for b in range(a + 1, 7) if (a, b) not in uncertain}
-    )
+    graph.entropies = {(a, b): 0.0 for a in range(1, 7) for b in range(a + 1, 7)} | uncertain
+    graph.observations.update(observed)
     stage = watching(graph)
     stage.observe(crowd_graph(1, 6), picture(1))
-    order = [tuple(row + 1 for row in item.pairs[0].tolist()) for item in stage.drain()]
-    # (2, 3) and (5, 6) have one class pair, and so do (1, 2) and (4, 5).
-    assert order == [(5, 6), (4, 5), (1, 3), (2, 3), (1, 2)]
-
-
-def test_the_more_observed_of_two_equally_uncertain_pairs_is_first():
-    graph = Graph(4)
-    graph.entropies = {(1, 2): 0.0, (2, 3): 0.0, (2, 4): 0.0, (3, 4): 0.0, (1, 4): 1.2, (1, 3): 1.2}
-    graph.observations.update({1: 9, 3: 8})
-    stage = watching(graph)
-    stage.observe(crowd_graph(1, 4), picture(1))
-    assert [item.pairs[0].tolist() for item in stage.drain()] == [[0, 2], [0, 3]]
+    assert [tuple((item.pairs[0] + 1).tolist()) for item in stage.drain()] == expected
 
 
 @settings(max_examples=25)
@@ -245,61 +194,51 @@ class ValidIntervalModel(RecordingModel):
     window = "valid_interval"
 
 
-def frames_of_last_clip(model, alone, stamps=(1, 2, 3, 4), **changes):
-    """Stamps of the frames in the clip of the last frame; frames `alone` show one object."""
-    graph = of_pair()
-    graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns in alone else [1, 2]
-    stage = watching(graph, model, **changes)
-    for stamp in stamps:
-        if stamp in alone:
-            stage.observe(crowd_graph(stamp, 1), picture(stamp))
-        else:
-            stage.observe(pair_graph(stamp), picture(stamp))
-    while stage.work() is not None:
-        pass
-    # The clip of the newest frame comes first.
-    x1, y1 = 10, 10
-    shown = model.requests[0].clip
-    height, width = shown.shape[1:3]
-    crops = {s: picture(s)[y1 : y1 + height, x1 : x1 + width] for s in stamps}
-    return [next(s for s, crop in crops.items() if (crop == frame).all()) for frame in shown]
+def shown_stamps(model):
+    """Stamps of the frames in the first clip that was encoded."""
+    clip = model.requests[0].clip
+    height, width = clip.shape[1:3]
+    crops = {stamp: picture(stamp)[10 : 10 + height, 10 : 10 + width] for stamp in range(1, 5)}
+    return [next(s for s, crop in crops.items() if (crop == frame).all()) for frame in clip]
 
 
-@pytest.mark.parametrize("every_clip", [{}, {"max_clips_per_s": 0.0}])
-def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(every_clip):
+@pytest.mark.parametrize("options", [{}, {"max_clips_per_s": 0.0}])
+@pytest.mark.parametrize(
+    ("make", "alone", "expected"),
+    [
+        (ValidIntervalModel, {2}, [3, 4, 4, 4]),
+        (ValidIntervalModel, set(), [1, 2, 3, 4]),
+        (RecordingModel, {2}, [1, 2, 3, 4]),
+        (ValidIntervalModel, None, [1, 2, 3, 4]),  # without a graph every frame is valid
+    ],
+)
+def test_a_clip_of_the_valid_interval_begins_after_the_last_gap(make, alone, expected, options):
     """A probe's card says which frames its clips have; the graph knows what a frame shows."""
-    model = ValidIntervalModel()
-    assert frames_of_last_clip(model, {2}, **every_clip) == [3, 4, 4, 4]
-    assert frames_of_last_clip(ValidIntervalModel(), set(), **every_clip) == [1, 2, 3, 4]
-    assert frames_of_last_clip(RecordingModel(), {2}, **every_clip) == [1, 2, 3, 4]
-
-
-def test_without_a_graph_every_frame_is_valid():
-    model = ValidIntervalModel()
-    stage = RelationReasoner(config(), model, report=lambda _: None)
+    model, graph = make(), of_pair()
+    graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns in alone else [1, 2]
+    if alone is None:
+        stage = RelationReasoner(config(**options), model, report=lambda _: None)
+    else:
+        stage = watching(graph, model, **options)
     for stamp in (1, 2, 3, 4):
-        stage.observe(pair_graph(stamp), picture(stamp))
+        # A frame shows one object alone, or both.
+        local = crowd_graph(stamp, 1) if alone and stamp in alone else pair_graph(stamp)
+        stage.observe(local, picture(stamp))
     stage.drain()
-    assert len(np.unique(model.requests[0].clip, axis=0)) == 4
+    # The clip of the newest frame comes first.
+    assert shown_stamps(model) == expected
 
 
 def test_a_clip_that_waited_is_cut_to_its_valid_interval():
     """Its pixels were stored when its frames left the buffer."""
-    model = ValidIntervalModel()
-    graph = of_pair()
+    model, graph = ValidIntervalModel(), of_pair()
     graph.nodes_of_frame = lambda stamp_ns: [1] if stamp_ns == 2 else [1, 2]
     graph.tentative = {1}
     stage = watching(graph, model)
-    stage.observe(pair_graph(1), picture(1))
-    stage.observe(crowd_graph(2, 1), picture(2))
-    for stamp in (3, 4):
-        stage.observe(pair_graph(stamp), picture(stamp))
-    for stamp in range(5, 14):
-        stage.observe(crowd_graph(stamp, 1), picture(stamp))
+    for stamp in range(1, 14):
+        local = pair_graph(stamp) if stamp in (1, 3, 4) else crowd_graph(stamp, 1)
+        stage.observe(local, picture(stamp))
     assert model.requests == []
     graph.tentative = set()
     assert stage.work() is not None
-    x1, y1, shown = 10, 10, model.requests[0].clip
-    height, width = shown.shape[1:3]
-    for frame, stamp in zip(shown, (3, 4, 4, 4)):
-        assert (frame == picture(stamp)[y1 : y1 + height, x1 : x1 + width]).all()
+    assert shown_stamps(model) == [3, 4, 4, 4]

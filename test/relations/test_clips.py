@@ -1,20 +1,28 @@
-"""Frames, windows, union boxes and crops."""
+"""Frames, windows, union boxes and crops; and the queue of clips, ordered only by the policy."""
 
-from __future__ import annotations
+from collections import Counter
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from support.relations import HEIGHT, WIDTH, picture
+from support.relations import HEIGHT, VOCABULARY, WIDTH, config, picture
 
+from deworldsg_ros.relations import clips
 from deworldsg_ros.relations.clips import (
+    ClipPolicy,
+    ClipQueue,
     FrameBuffer,
+    PairKey,
+    QueuedClip,
+    Rank,
     crop_clip,
     interval_start,
     union_box,
     without_first,
 )
+
+# --- frames --------------------------------------------------------------------------------------
 
 
 def filled(stamps, capacity=32):
@@ -43,29 +51,17 @@ def test_window_is_the_last_frames_up_to_the_stamp(stamps, stamp, window):
 def test_buffer_is_bounded_and_forgets_the_oldest():
     buffer = filled(range(100), capacity=6)
     assert len(buffer) == 6
-    assert buffer.images([93]) is None
-    assert buffer.images([94, 93]) is None
-    (image,) = buffer.images([94])
-    assert (image == picture(94)).all()
+    assert buffer.images([93]) is None and buffer.images([94, 93]) is None
+    image = picture(200)
+    buffer.add(200, image)
+    assert buffer.images([200])[0] is image
+    buffer.add(1, picture(1))  # older than a full buffer: ignored
+    assert buffer.window(200, 9) == (95, 96, 97, 98, 99, 200) and buffer.window(1, 9) == ()
+    buffer.add(201, np.zeros((10, 10, 3), np.uint8))  # another size starts anew
+    assert buffer.window(201, 4) == (201,)
 
 
-def test_frame_older_than_a_full_buffer_is_ignored():
-    buffer = filled([10, 11, 12], capacity=3)
-    buffer.add(1, picture(1))
-    assert buffer.window(12, 9) == (10, 11, 12) and buffer.window(1, 9) == ()
-
-
-def test_another_image_size_starts_anew():
-    buffer = filled([1, 2])
-    buffer.add(3, np.zeros((10, 10, 3), np.uint8))
-    assert buffer.window(3, 4) == (3,)
-
-
-def test_images_are_kept_by_reference():
-    image = picture(1)
-    buffer = FrameBuffer(2)
-    buffer.add(1, image)
-    assert buffer.images([1])[0] is image
+# --- crops ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -84,44 +80,18 @@ def test_union_box(a, b, expected):
     assert union_box(np.array(b, float), np.array(a, float), WIDTH, HEIGHT) == expected
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10_000))
-def test_union_box_is_every_pixel_between_the_outer_edges(seed):
-    corners = np.random.default_rng(seed).uniform(0, (WIDTH, HEIGHT), (2, 2, 2))
-    a, b = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
-    left, top, right, bottom = min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
-    columns = [k for k in range(WIDTH) if left < k + 0.5 and k - 0.5 < right]
-    rows = [k for k in range(HEIGHT) if top < k + 0.5 and k - 0.5 < bottom]
-    expected = (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1)
-    assert union_box(a, b, WIDTH, HEIGHT) == expected
-
-
-def test_clip_is_the_crop_of_each_frame():
-    images = [picture(stamp) for stamp in range(4)]
-    clip = crop_clip(images, (10, 5, 30, 25), 4)
-    assert clip.shape == (4, 20, 20, 3) and clip.dtype == np.uint8
-    for frame, image in zip(clip, images):
-        assert (frame == image[5:25, 10:30]).all()
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_short_clip_repeats_the_most_recent_frame_at_its_end(count):
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_a_clip_is_the_crop_of_each_frame_and_the_last_one_fills_it(count):
     images = [picture(stamp) for stamp in range(count)]
-    clip = crop_clip(images, (0, 0, WIDTH, HEIGHT), 5)
+    clip = crop_clip(images, (10, 5, 30, 25), 5)
+    assert clip.shape == (5, 20, 20, 3) and clip.dtype == np.uint8
     for row in range(5):
-        assert (clip[row] == images[min(row, count - 1)]).all()
-
-
-def test_clip_is_a_copy():
-    image = picture(0)
-    crop_clip([image], (0, 0, 9, 9), 2)[:] = 0
-    assert (image == picture(0)).all()
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_clip_refuses_no_frames_and_too_many(count):
-    with pytest.raises(ValueError, match=f"clip of {count} frames: expected 1 to 2"):
-        crop_clip([picture(0)] * count, (0, 0, 9, 9), 2)
+        assert (clip[row] == images[min(row, count - 1)][5:25, 10:30]).all()
+    clip[:] = 0
+    assert (images[0] == picture(0)).all()  # it is a copy
+    for wrong in (0, 6):
+        with pytest.raises(ValueError, match=f"clip of {wrong} frames: expected 1 to 5"):
+            crop_clip([picture(0)] * wrong, (0, 0, 9, 9), 5)
 
 
 @pytest.mark.parametrize(
@@ -146,3 +116,95 @@ def test_the_valid_interval_is_the_last_one_in_which_both_objects_are_seen(seen,
 def test_first_frames_are_left_out_and_the_last_one_fills(count, frames):
     clip = np.arange(3, dtype=np.uint8).reshape(3, 1, 1, 1) * np.ones((3, 2, 2, 3), np.uint8)
     assert without_first(clip, count)[:, 0, 0, 0].tolist() == frames
+
+
+# --- the queue -----------------------------------------------------------------------------------
+
+
+def queued(stamp_ns, geo_cost=0.1, rows=(0, 1)):
+    box = np.zeros(4)
+    return QueuedClip(
+        stamp_ns, (stamp_ns,), (0, 0, 10, 10), VOCABULARY, rows, (0, 1), (box, box), geo_cost
+    )
+
+
+class ByPair(ClipPolicy):
+    """Every clip belongs to the pair of its rows."""
+
+    def judge(self, clips):
+        return [Rank((clip.stamp_ns,), PairKey(clip.rows, clip.classes)) for clip in clips]
+
+
+def queue_of(size=10, policy=ClipPolicy):
+    dropped = Counter()
+    return ClipQueue(size, policy(config()), lambda reason: dropped.update([reason])), dropped
+
+
+def taken(queue):
+    """Every clip that the queue gives, in order."""
+    return list(iter(queue.take, None))
+
+
+QUEUES = st.lists(
+    st.builds(queued, st.integers(0, 5), st.sampled_from([0.1, 0.2]), st.just((0, 1))), max_size=12
+)
+
+
+@given(QUEUES, st.integers(1, 5))
+def test_keeps_the_best_in_order_and_counts_the_rest(items, size):
+    queue, dropped = queue_of(size)
+    assert queue.take() is None and len(queue) == queue.ready() == queue.clear() == 0
+    for item in items:
+        queue.put([item])
+    assert len(queue) == queue.ready() == min(size, len(items))
+    kept = [(item.stamp_ns, -item.geo_cost) for item in taken(queue)]
+    best = sorted(((item.stamp_ns, -item.geo_cost) for item in items), reverse=True)
+    assert kept == best[:size] and len(queue) == 0
+    assert dropped["queue_full"] == len(best[size:]) == dropped.total()
+
+
+def test_order_does_not_depend_on_the_order_of_arrival():
+    items = [queued(1, rows=(i, j)) for i in range(4) for j in range(i + 1, 4)]
+    for arrival in (items, items[::-1]):
+        queue, _ = queue_of()
+        queue.put(arrival)
+        assert [item.rows for item in taken(queue)] == [item.rows for item in items]
+
+
+def test_only_the_newest_clip_of_a_pair_waits():
+    queue, dropped = queue_of(policy=ByPair)
+    queue.put([queued(1), queued(2), queued(1, rows=(0, 2))])
+    queue.put([queued(3, rows=(0, 2))])
+    assert [(item.stamp_ns, item.rows) for item in taken(queue)] == [(3, (0, 2)), (2, (0, 1))]
+    assert dropped == {"superseded": 2}
+
+
+def test_clips_of_known_pairs_are_cut_before_their_frames_leave_and_others_become_stale():
+    frames = FrameBuffer(2)
+    image = np.arange(300, dtype=np.uint8).reshape(10, 10, 3)
+    frames.add(1, image)
+    (known, lost), (unknown, stale) = queue_of(policy=ByPair), queue_of()
+    for queue in (known, unknown):
+        queue.put([queued(1)])
+        queue.cut(1, frames, 4)
+    item = known.take()
+    assert item.pixels.shape == (4, 10, 10, 3) and (item.pixels == image).all() and not lost
+    assert len(unknown) == 0 and stale == {"stale": 1}
+
+
+def test_cut_clips_have_bounded_memory_and_the_lowest_ranks_are_dropped(monkeypatch):
+    monkeypatch.setattr(clips, "MAX_CUT_BYTES", 2 * 4 * 300)
+    frames = FrameBuffer(3)
+    queue, dropped = queue_of(policy=ByPair)
+    for stamp in (1, 2, 3):
+        frames.add(stamp, np.zeros((10, 10, 3), np.uint8))
+        queue.put([queued(stamp, rows=(0, stamp))])
+    queue.cut(3, frames, 4)
+    assert [item.stamp_ns for item in taken(queue)] == [3, 2] and dropped == {"stale": 1}
+
+
+@pytest.mark.parametrize("size", [0, -1])
+def test_a_size_below_one_is_refused(size):
+    for make in (queue_of, FrameBuffer):
+        with pytest.raises(ValueError, match=f"of {'size ' * (make is queue_of)}{size}"):
+            make(size)

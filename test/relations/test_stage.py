@@ -1,13 +1,14 @@
-"""The reasoner: pairs at once, newest clips first, a bounded queue, every lost clip counted."""
-
-from __future__ import annotations
+"""Stage d: pairs at once, clips in a thread of their own, every lost clip counted."""
 
 import re
+import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from support.relations import (
     VOCABULARY,
+    GatedModel,
     RecordingModel,
     config,
     crowd_graph,
@@ -17,15 +18,21 @@ from support.relations import (
     picture,
 )
 
-from deworldsg_ros.relations import ClassPairPrior, RelationReasoner, build_world_model
+from deworldsg_ros.config import RelationsConfig, from_mapping
+from deworldsg_ros.relations import (
+    WORLD_MODELS,
+    ClassPairPrior,
+    EvidenceWorker,
+    RelationReasoner,
+    build_world_model,
+)
+from deworldsg_ros.relations.world_model import ClipRequest, FakeWorldModel, PairContext
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.wire import codec
 
 
-def reasoner(model=None, queue_size=8):
-    return RelationReasoner(
-        config(), model or RecordingModel(), report=lambda _: None, queue_size=queue_size
-    )
+def reasoner(model=None, queue_size=8, report=lambda _: None):
+    return RelationReasoner(config(), model or RecordingModel(), report, queue_size=queue_size)
 
 
 def observe(stage, *stamps):
@@ -34,51 +41,52 @@ def observe(stage, *stamps):
     return evidence
 
 
+def stamps_of(evidence):
+    return [item.stamp_ns for item in evidence]
+
+
 def accounted(stage):
     counters = stage.counters()
     lost = sum(counters.dropped.values()) - counters.dropped.get("no_frame", 0)
     return counters.queued == counters.encoded + counters.pending + lost
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_frame_without_a_pair_gives_empty_evidence(count):
+# --- pairs and clips -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "graph",
+    [
+        crowd_graph(5, 0),
+        crowd_graph(5, 1),
+        local_graph(5, [[0, 0, 9, 9], [0, 0, 9, 9]], [1.0, 1.5], [0, 1]),  # far apart
+    ],
+)
+def test_a_frame_without_a_pair_gives_empty_evidence(graph):
     stage = reasoner()
-    evidence = stage.observe(crowd_graph(5, count), picture(5))
+    evidence = stage.observe(graph, picture(5))
     assert evidence.pairs.shape == (0, 2) and evidence.predictions.shape == (0, 4)
-    assert stage.work() is None
+    assert stage.work() is None and stage.counters().pending == 0
 
 
-def test_observe_gives_both_directions_without_predictions():
-    evidence = observe(reasoner(), 7)
-    assert evidence.stamp_ns == 7 and evidence.source == "fake"
-    assert evidence.pairs.tolist() == [[0, 1], [1, 0]]
-    assert evidence.pair_classes.tolist() == [[1, 2], [2, 1]]
-    assert evidence.geo_costs[0] == evidence.geo_costs[1] < 0.45
-    assert not evidence.predicted.any()
-
-
-def test_distant_objects_are_not_a_pair():
-    stage = reasoner()
-    graph = local_graph(1, [[0, 0, 9, 9], [0, 0, 9, 9]], [1.0, 1.5], [0, 1])
-    assert len(stage.observe(graph, picture(1)).pairs) == 0
-    assert stage.counters().pending == 0
-
-
-def test_work_predicts_both_directions_from_one_clip():
+def test_both_directions_are_predicted_from_one_clip():
     model = RecordingModel()
     stage = reasoner(model)
-    observe(stage, 7)
-    evidence = stage.work()
+    observed, worked = observe(stage, 7), stage.work()
     assert len(model.requests) == 1 and len(model.requests[0].pairs) == 2
-    assert evidence.stamp_ns == 7 and evidence.pairs.tolist() == [[0, 1], [1, 0]]
-    assert evidence.pair_classes.tolist() == [[1, 2], [2, 1]]
-    assert evidence.predicted.all()
-    np.testing.assert_allclose(evidence.predictions.sum(axis=1), 1.0)
+    for evidence in (observed, worked):
+        assert evidence.stamp_ns == 7 and evidence.source == "fake"
+        assert evidence.pairs.tolist() == [[0, 1], [1, 0]]
+        assert evidence.pair_classes.tolist() == [[1, 2], [2, 1]]
+        assert evidence.geo_costs[0] == evidence.geo_costs[1] < 0.45
+    assert not observed.predicted.any() and worked.predicted.all()
+    np.testing.assert_allclose(worked.predictions.sum(axis=1), 1.0)
     assert stage.work() is None
-    assert codec.evidence_from_message(codec.evidence_to_message(evidence, "world")).predicted.all()
+    sent = codec.evidence_from_message(codec.evidence_to_message(worked, "world"))
+    assert sent.predicted.all()
 
 
-def test_the_world_model_is_given_the_union_crop_of_the_last_reliable_frame():
+def test_the_world_model_is_given_the_union_crop_of_the_last_reliable_frames():
     model = RecordingModel()
     stage = reasoner(model)
     observe(stage, 1, 2)
@@ -97,62 +105,37 @@ def test_the_world_model_is_given_the_union_crop_of_the_last_reliable_frame():
 
 
 def test_frames_without_objects_are_in_the_clip_and_later_frames_are_not():
+    """So a clip does not depend on when it is encoded."""
     model = RecordingModel()
     stage = reasoner(model)
     for stamp in (1, 2, 3, 4, 6):
         stage.observe(empty_graph(stamp), picture(stamp))
-    stage.observe(pair_graph(5), picture(5))
+    observe(stage, 5)
     stage.work()
     for frame, stamp in zip(model.requests[0].clip, (2, 3, 4, 5)):
         assert (frame == picture(stamp)[10:41, 10:51]).all()
 
 
-def test_newest_clip_is_first():
-    stage = reasoner()
-    observe(stage, 1, 2, 3)
-    assert [evidence.stamp_ns for evidence in stage.drain()] == [3, 2, 1]
-
-
-def test_within_a_frame_the_nearest_pair_is_first():
-    stage = reasoner(queue_size=100)
-    stage.observe(crowd_graph(1, 6), picture(1))
-    costs = [evidence.geo_costs[0] for evidence in stage.drain()]
-    assert len(costs) == 15 and costs == sorted(costs)
-
-
-def test_full_queue_loses_the_oldest_and_counts_it():
+def test_lost_clips_are_counted():
     stage = reasoner(queue_size=2)
     observe(stage, 1, 2, 3, 4)
     assert stage.counters().pending == 2
-    assert [evidence.stamp_ns for evidence in stage.drain()] == [4, 3]
+    assert stamps_of(stage.drain()) == [4, 3]  # the newest clip is first
     assert stage.counters().dropped == {"queue_full": 2} and accounted(stage)
-
-
-def test_clip_whose_frames_have_left_is_stale():
-    stage = reasoner()
-    observe(stage, 1)
-    for stamp in range(2, 10):  # the buffer holds two clip lengths
+    observe(stage, 5)
+    for stamp in range(6, 14):  # the buffer holds two clip lengths
         stage.observe(empty_graph(stamp), picture(stamp))
     assert stage.work() is None
-    assert stage.counters().dropped == {"stale": 1} and accounted(stage)
-
-
-def test_clip_does_not_depend_on_when_it_is_encoded():
-    early, late = RecordingModel(), RecordingModel()
-    for model, more in ((early, ()), (late, (5, 6, 7, 8))):
-        stage = reasoner(model)
-        observe(stage, 1, 2, 3, 4)
-        for stamp in more:
-            stage.observe(empty_graph(stamp), picture(stamp))
-        stage.work()
-    assert (early.requests[0].clip == late.requests[0].clip).all()
-
-
-@pytest.mark.parametrize("image", [picture(3)[::2], picture(3)[::2, ::2]])
-def test_pair_in_an_image_of_another_size_is_found_and_its_clip_counted(image):
-    stage = reasoner()
-    assert len(stage.observe(pair_graph(3), image).pairs) == 2
-    assert stage.counters().dropped == {"no_frame": 1} and stage.counters().queued == 0
+    assert stage.counters().dropped == {"queue_full": 2, "stale": 1} and accounted(stage)
+    observe(stage, 20, 21)
+    stage.clear()
+    assert stage.work() is None
+    observe(stage, 1)  # time has jumped back
+    assert stage.work().stamp_ns == 1
+    for image in (picture(3)[::2], picture(3)[::2, ::2]):  # of another size than the boxes
+        assert len(stage.observe(pair_graph(3), image).pairs) == 2
+    lost = {"queue_full": 2, "stale": 1, "cleared": 2, "no_frame": 2}
+    assert stage.counters().dropped == lost and accounted(stage)
 
 
 def test_without_a_world_model_pairs_are_found_and_no_image_is_kept():
@@ -162,6 +145,23 @@ def test_without_a_world_model_pairs_are_found_and_no_image_is_kept():
     assert stage.work() is None and stage.drain() == []
     counters = stage.counters()
     assert (counters.queued, counters.pending, counters.dropped) == (0, 0, {})
+
+
+def test_same_frames_give_the_same_prior():
+    def run():
+        settings = config()
+        stage = RelationReasoner(settings, build_world_model(settings), queue_size=4)
+        prior = ClassPairPrior(len(VOCABULARY.classes), len(VOCABULARY.predicates))
+        for stamp in range(12):
+            stage.observe(crowd_graph(stamp, 4), picture(stamp))
+            for evidence in stage.drain():
+                prior.update(evidence.pair_classes, evidence.predictions)
+        return prior.to_state()
+
+    assert run() == run()
+
+
+# --- failing world models ------------------------------------------------------------------------
 
 
 class BrokenModel(RecordingModel):
@@ -181,64 +181,179 @@ class BrokenModel(RecordingModel):
 @pytest.mark.parametrize(
     ("failure", "message"),
     [
-        (RuntimeError("out of memory"), "world model 'fake' failed: RuntimeError: out of memory"),
-        (np.zeros((0, 4)), r"output has shape \(0, 4\): expected \(2, 4\)"),
-        (np.full((2, 3), 1 / 3), r"output has shape \(2, 3\): expected \(2, 4\)"),
-        (np.full((2, 4), np.nan), "expected rows >= 0 that sum to one"),
-        (np.full((2, 4), 0.3), "expected rows >= 0 that sum to one"),
-        (np.array([[2.0, -1, 0, 0]] * 2), "expected rows >= 0 that sum to one"),
+        (RuntimeError("out of memory"), "'fake' failed: RuntimeError: out of memory"),
+        (np.zeros((0, 4)), r"shape \(0, 4\): expected \(2, 4\)"),
+        (np.full((2, 3), 1 / 3), r"shape \(2, 3\): expected \(2, 4\)"),
+        (np.full((2, 4), np.nan), "sum to one"),
+        (np.full((2, 4), 0.3), "sum to one"),
+        (np.array([[2.0, -1, 0, 0]] * 2), "sum to one"),
     ],
 )
 def test_a_failing_world_model_costs_only_its_clip(failure, message):
     reports = []
-    stage = RelationReasoner(config(), BrokenModel(failure), report=reports.append)
-    observe(stage, 1, 2)
-    assert stage.work().stamp_ns == 1  # the newer one failed
-    assert stage.counters().dropped == {"world_model_error": 1} and accounted(stage)
+    stage = reasoner(BrokenModel(failure, failure), report=reports.append)
+    observe(stage, 1, 2, 3)
+    assert stamps_of(stage.drain()) == [1]  # the newer ones failed
+    assert stage.counters().dropped == {"world_model_error": 2} and accounted(stage)
+    # A repeated failure is reported once.
     assert len(reports) == 1 and re.search(message, reports[0])
 
 
-def test_a_repeated_failure_is_reported_once_and_counted_each_time():
-    reports = []
-    failures = [RuntimeError("no memory")] * 3 + [RuntimeError("other")]
-    stage = RelationReasoner(config(), BrokenModel(*failures), report=reports.append)
-    observe(stage, 1, 2, 3, 4)
-    assert stage.drain() == []
-    assert stage.counters().dropped == {"world_model_error": 4} and len(reports) == 2
-
-
 def test_single_precision_outputs_become_distributions_in_double_precision():
-    output = np.full((2, 4), 0.25, np.float32) * np.float32(1 + 1e-5)
-    stage = reasoner(BrokenModel(output))
+    stage = reasoner(BrokenModel(np.full((2, 4), 0.25, np.float32) * np.float32(1 + 1e-5)))
     observe(stage, 1)
     predictions = stage.work().predictions
     assert predictions.dtype == np.float64
     np.testing.assert_allclose(predictions.sum(axis=1), 1.0, rtol=1e-15)
 
 
-def test_clear_drops_images_and_counts_clips():
-    stage = reasoner()
-    observe(stage, 10, 11)
-    stage.clear()
-    assert stage.work() is None and stage.counters().dropped == {"cleared": 2}
-    observe(stage, 1)  # time has jumped back
-    assert stage.work().stamp_ns == 1 and accounted(stage)
+# --- the worker's thread -------------------------------------------------------------------------
+
+LONG_S = 30.0
 
 
-def test_clip_length_must_be_that_of_the_world_model():
-    with pytest.raises(ConfigurationError, match="clip_length is 8: .*'fake' expects 4; set it"):
+class Receiver:
+    """Collects what the worker delivers, and the threads in which it does."""
+
+    def __init__(self):
+        self.evidence = []
+        self.threads = set()
+
+    def __call__(self, evidence):
+        self.evidence.append(evidence)
+        self.threads.add(threading.get_ident())
+
+
+@contextmanager
+def started(model, receiver, report=lambda _: None, queue_size=8):
+    worker = EvidenceWorker(reasoner(model, queue_size, report), receiver, report)
+    worker.start()
+    try:
+        yield worker
+    finally:
+        if isinstance(model, GatedModel):
+            model.allowed.release()
+        assert worker.stop(LONG_S)
+
+
+@pytest.mark.parametrize("observers", [1, 3])
+def test_every_prediction_is_delivered_in_a_thread_of_its_own(observers):
+    receiver = Receiver()
+
+    def see(number):
+        for stamp in range(3 * number, 3 * number + 3):
+            assert not worker.observe(crowd_graph(stamp, 4), picture(stamp)).predicted.any()
+
+    with started(RecordingModel(), receiver, queue_size=100) as worker:
+        threads = [threading.Thread(target=see, args=(n,)) for n in range(observers)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(LONG_S)
+        assert worker.wait_idle(LONG_S)
+    counters = worker.reasoner.counters()
+    assert counters.queued == 18 * observers == counters.encoded + sum(counters.dropped.values())
+    assert len(receiver.evidence) == counters.encoded
+    assert all(evidence.predicted.all() for evidence in receiver.evidence)
+    assert threading.get_ident() not in receiver.threads
+
+
+def test_a_slow_world_model_delays_no_frame_and_lost_clips_are_counted():
+    model, receiver = GatedModel(), Receiver()
+    with started(model, receiver, queue_size=2) as worker:
+        worker.observe(pair_graph(0), picture(0))
+        assert model.begun.acquire(timeout=LONG_S)
+        for stamp in range(1, 6):  # the model holds the first clip all the while
+            assert len(worker.observe(pair_graph(stamp), picture(stamp)).pairs) == 2
+        assert receiver.evidence == [] and not worker.wait_idle(0.01)
+        counters = worker.reasoner.counters()
+        assert counters.pending == 2 and counters.dropped == {"queue_full": 3}
+        for _ in range(3):
+            model.allowed.release()
+        assert worker.wait_idle(LONG_S)
+    assert stamps_of(receiver.evidence) == [0, 5, 4]
+
+
+def test_stop_returns_though_the_world_model_hangs_and_nothing_is_delivered_after_it():
+    model, receiver = GatedModel(), Receiver()
+    with started(model, receiver) as worker:
+        observe(worker, 0, 1)
+        assert model.begun.acquire(timeout=LONG_S)
+        assert not worker.stop(0.05)
+        model.allowed.release()
+    assert receiver.evidence == [] and worker.reasoner.counters().pending == 0
+    unused = EvidenceWorker(reasoner(), receiver)
+    assert worker.stop(LONG_S) and unused.stop(LONG_S)
+
+
+def test_the_worker_survives_failures(monkeypatch):
+    """Of the world model, the receiver, and the reasoner itself."""
+    reports, delivered, mistakes = [], [], []
+
+    def deliver(evidence):
+        if evidence.stamp_ns == 1:
+            raise RuntimeError("publisher is gone")
+        delivered.append(evidence)
+
+    with started(BrokenModel(RuntimeError("not loaded")), deliver, reports.append) as worker:
+        work = worker.reasoner.work
+
+        def work_or_fail():
+            if mistakes:
+                raise mistakes.pop()
+            return work()
+
+        monkeypatch.setattr(worker.reasoner, "work", work_or_fail)
+        for stamp in range(4):
+            if stamp == 2:
+                mistakes.append(IndexError("a mistake"))
+            observe(worker, stamp)
+            assert worker.wait_idle(LONG_S)
+    assert stamps_of(delivered) == [3, 2]  # the clip of the mistake waited
+    assert [report.partition(": ")[2] for report in reports] == [
+        "RuntimeError: not loaded",
+        "RuntimeError: publisher is gone",
+        "IndexError: a mistake",
+    ]
+
+
+# --- world models by name ------------------------------------------------------------------------
+
+
+def test_world_models_are_chosen_by_name():
+    assert {"none", "fake"} <= set(WORLD_MODELS)
+    assert build_world_model(RelationsConfig()) is None
+    model = build_world_model(RelationsConfig(world_model="fake", clip_length=8))
+    assert isinstance(model, FakeWorldModel) and model.name == "fake" and model.clip_length == 8
+    with pytest.raises(ConfigurationError, match="clip_length is 8: .*'fake' expects 4"):
         RelationReasoner(config(clip_length=8), RecordingModel(clip_length=4))
+    for name in ("", "fakes", "__init__", "..evidence"):
+        with pytest.raises(ConfigurationError, match="expected one of .*fake, none"):
+            build_world_model(RelationsConfig(world_model=name))
+    for key in ("encode", "clips_per_s", "model_path", "batch_size", "seed"):  # of old releases
+        with pytest.raises(ConfigurationError, match=rf"\w+\.{key}\b"):
+            from_mapping({"relations": {key: 1}})
 
 
-def test_same_frames_give_the_same_prior():
-    def run():
-        settings = config()
-        stage = RelationReasoner(settings, build_world_model(settings), queue_size=4)
-        prior = ClassPairPrior(len(VOCABULARY.classes), len(VOCABULARY.predicates))
-        for stamp in range(12):
-            stage.observe(crowd_graph(stamp, 4), picture(stamp))
-            for evidence in stage.drain():
-                prior.update(evidence.pair_classes, evidence.predictions)
-        return prior.to_state()
+BOX = np.array([0.0, 0, 4, 4])
 
-    assert run() == run()
+
+def request(seed=0, classes=((0, 1), (1, 0))):
+    clip = np.random.default_rng(seed).integers(0, 256, (16, 6, 8, 3)).astype(np.uint8)
+    names = VOCABULARY.classes
+    pairs = tuple(PairContext(BOX, BOX, s, o, names[s], names[o]) for s, o in classes)
+    return ClipRequest(clip, pairs, VOCABULARY)
+
+
+def test_the_fake_gives_its_recorded_prediction():
+    """A change here changes every recorded graph made with the fake."""
+    clip = np.arange(2 * 2 * 2 * 3, dtype=np.uint8).reshape(2, 2, 2, 3)
+    pair = PairContext(BOX, BOX, 0, 1, "chair", "table")
+    predicted = FakeWorldModel(2).predict(ClipRequest(clip, (pair,), VOCABULARY))
+    recorded = [
+        0.9795641544637592,
+        0.0032131442532744633,
+        0.0061277984104028205,
+        0.01109490287256345,
+    ]
+    np.testing.assert_allclose(predicted, [recorded], rtol=1e-12)

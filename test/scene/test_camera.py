@@ -1,163 +1,189 @@
-"""Intrinsics, poses and RGB-D frames: round trips and refusals."""
-
-from __future__ import annotations
+"""Intrinsics, poses, the up direction and RGB-D frames: round trips and refusals."""
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import random_pose, seeds
 
-from deworldsg_ros.scene.camera import (
-    Intrinsics,
-    RgbdFrame,
-    check_pose,
-    interpolate_pose,
-    invert_pose,
-    pose_from_quaternion,
-    quaternion_from_rotation,
-)
-from deworldsg_ros.scene.errors import DeWorldSGError, RefusedInput
+from deworldsg_ros.scene import camera
+from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
 
 GOOD = {"fx": 500.0, "fy": 510.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480}
-
-
-def test_intrinsics_matrix() -> None:
-    assert Intrinsics(**GOOD).matrix.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
+NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize("shape", [(0,), (5,), (2, 3)])
 def test_projection_is_the_inverse_of_back_projection(shape: tuple[int, ...]) -> None:
     rng = np.random.default_rng(0)
-    camera = Intrinsics(**GOOD)
+    pinhole = camera.Intrinsics(**GOOD)
+    assert pinhole.matrix.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
     u, v, z = rng.uniform(0, 640, shape), rng.uniform(0, 480, shape), rng.uniform(0.1, 9, shape)
-    points = camera.back_project(u, v, z)
+    points = pinhole.back_project(u, v, z)
     assert points.shape == (*shape, 3)
     homogeneous = np.stack([u, v, np.ones(shape)], axis=-1)
-    expected = z[..., None] * (homogeneous @ np.linalg.inv(camera.matrix).T)
+    expected = z[..., None] * (homogeneous @ np.linalg.inv(pinhole.matrix).T)
     np.testing.assert_allclose(points, expected, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(camera.project(points), np.stack([u, v], axis=-1), rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"fx": 0.0},
-        {"fy": -1.0},
-        {"fx": float("nan")},
-        {"cx": float("inf")},
-        {"width": 0},
-        {"height": -3},
-    ],
-)
-def test_bad_intrinsics_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(RefusedInput) as refused:
-        Intrinsics(**{**GOOD, **bad})
-    assert refused.value.reason == "invalid_intrinsics"
-    assert isinstance(refused.value, DeWorldSGError)
-
-
-@given(seeds)
-def test_pose_and_inverse_cancel(seed: int) -> None:
-    T = random_pose(np.random.default_rng(seed))
-    check_pose(T)
-    np.testing.assert_allclose(invert_pose(T) @ T, np.eye(4), atol=1e-12)
-    np.testing.assert_allclose(invert_pose(invert_pose(T)), T, atol=1e-12)
-
-
-@given(seeds)
-def test_quaternion_round_trip(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    T = random_pose(rng)
-    quat = quaternion_from_rotation(T[:3, :3])
-    assert quat[3] >= 0
-    assert np.linalg.norm(quat) == pytest.approx(1)
-    np.testing.assert_allclose(pose_from_quaternion(T[:3, 3], quat), T, atol=1e-12)
-    # A quaternion and its negative are one rotation; a little off unit is forgiven.
-    np.testing.assert_allclose(pose_from_quaternion(T[:3, 3], -1.004 * quat), T, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("axis", "quat"),
-    [
-        (None, [0.0, 0, 0, 1]),
-        (0, [1.0, 0, 0, 0]),
-        (1, [0.0, 1, 0, 0]),
-        (2, [0.0, 0, 1, 0]),
-    ],
-)
-def test_half_turns(axis: int | None, quat: list[float]) -> None:
-    diagonal = np.ones(3) if axis is None else np.where(np.arange(3) == axis, 1.0, -1.0)
-    T = pose_from_quaternion(np.zeros(3), np.array(quat))
-    np.testing.assert_allclose(T[:3, :3], np.diag(diagonal), atol=1e-15)
-    back = quaternion_from_rotation(np.diag(diagonal))
-    assert abs(back @ quat) == pytest.approx(1)
-
-
-@pytest.mark.parametrize(
-    ("translation", "quat"),
-    [
-        ([0.0, 0, 0], [0.0, 0, 0, 0]),
-        ([0.0, 0, 0], [0.0, 0, 0, 1.1]),
-        ([0.0, 0, 0], [0.0, 0, float("nan"), 1]),
-        ([float("inf"), 0, 0], [0.0, 0, 0, 1]),
-    ],
-)
-def test_bad_quaternions_are_refused(translation: list[float], quat: list[float]) -> None:
-    with pytest.raises(RefusedInput) as refused:
-        pose_from_quaternion(np.array(translation), np.array(quat))
-    assert refused.value.reason == "invalid_pose"
-
-
-@pytest.mark.parametrize(
-    "T",
-    [
-        np.eye(3),
-        np.full((4, 4), np.nan),
-        np.diag([2.0, 1, 1, 1]),
-        np.diag([-1.0, 1, 1, 1]),
-    ],
-)
-def test_bad_poses_are_refused(T: np.ndarray) -> None:
-    with pytest.raises(RefusedInput) as refused:
-        check_pose(T)
-    assert refused.value.reason == "invalid_pose"
+    np.testing.assert_allclose(pinhole.project(points), np.stack([u, v], axis=-1), rtol=1e-12)
 
 
 @given(seeds, st.floats(0, 1))
-def test_interpolation_is_rigid_and_meets_the_ends(seed: int, fraction: float) -> None:
+def test_poses_there_and_back(seed: int, fraction: float) -> None:
     rng = np.random.default_rng(seed)
-    T_a, T_b = random_pose(rng), random_pose(rng)
-    np.testing.assert_allclose(interpolate_pose(T_a, T_b, 0.0), T_a, atol=1e-9)
-    np.testing.assert_allclose(interpolate_pose(T_a, T_b, 1.0), T_b, atol=1e-9)
-    np.testing.assert_allclose(interpolate_pose(T_a, T_a, fraction), T_a, atol=1e-9)
-    between = interpolate_pose(T_a, T_b, fraction)
-    check_pose(between)
-    np.testing.assert_allclose(between, interpolate_pose(T_b, T_a, 1.0 - fraction), atol=1e-7)
+    T, T_b = random_pose(rng), random_pose(rng)
+    camera.check_pose(T)
+    np.testing.assert_allclose(camera.invert_pose(T) @ T, np.eye(4), atol=1e-12)
+    quat = camera.quaternion_from_rotation(T[:3, :3])
+    assert quat[3] >= 0 and np.linalg.norm(quat) == pytest.approx(1)
+    # A quaternion and its negative are one rotation; a little off unit is forgiven.
+    for same in (quat, -1.004 * quat):
+        np.testing.assert_allclose(camera.pose_from_quaternion(T[:3, 3], same), T, atol=1e-12)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T_b, 0.0), T, atol=1e-9)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T_b, 1.0), T_b, atol=1e-9)
+    np.testing.assert_allclose(camera.interpolate_pose(T, T, fraction), T, atol=1e-9)
+    between = camera.interpolate_pose(T, T_b, fraction)
+    camera.check_pose(between)
+    np.testing.assert_allclose(between, camera.interpolate_pose(T_b, T, 1.0 - fraction), atol=1e-7)
 
 
-def frame_parts() -> dict:
-    return {
+@pytest.mark.parametrize("axis", [None, 0, 1, 2])
+def test_half_turns(axis: int | None) -> None:
+    quat = np.eye(4)[3 if axis is None else axis]
+    diagonal = np.ones(3) if axis is None else np.where(np.arange(3) == axis, 1.0, -1.0)
+    T = camera.pose_from_quaternion(np.zeros(3), quat)
+    np.testing.assert_allclose(T[:3, :3], np.diag(diagonal), atol=1e-15)
+    assert abs(camera.quaternion_from_rotation(np.diag(diagonal)) @ quat) == pytest.approx(1)
+
+
+def quaternion(*values: float, x: float = 0.0) -> None:
+    camera.pose_from_quaternion(np.array([x, 0.0, 0.0]), np.array(values))
+
+
+def rgbd(**changes: object) -> camera.RgbdFrame:
+    parts = {
         "stamp_ns": 1,
         "rgb": np.zeros((480, 640, 3), np.uint8),
         "depth_m": np.zeros((480, 640), np.float32),
-        "intrinsics": Intrinsics(**GOOD),
+        "intrinsics": camera.Intrinsics(**GOOD),
         "T_world_camera": np.eye(4),
     }
+    return camera.RgbdFrame(**{**parts, **changes})
 
 
 @pytest.mark.parametrize(
-    ("bad", "reason"),
+    ("make", "reason"),
     [
-        ({"rgb": np.zeros((240, 320, 3), np.uint8)}, "grid_mismatch"),
-        ({"rgb": np.zeros((480, 640), np.uint8)}, "grid_mismatch"),
-        ({"depth_m": np.zeros((480, 320), np.float32)}, "grid_mismatch"),
-        ({"depth_m": np.zeros(7, np.float32)}, "grid_mismatch"),
-        ({"T_world_camera": np.zeros((4, 4))}, "invalid_pose"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fx": 0.0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fy": -1.0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "fx": NAN}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "cx": INF}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "width": 0}), "invalid_intrinsics"),
+        (lambda: camera.Intrinsics(**{**GOOD, "height": -3}), "invalid_intrinsics"),
+        (lambda: quaternion(0, 0, 0, 0), "invalid_pose"),
+        (lambda: quaternion(0, 0, 0, 1.1), "invalid_pose"),
+        (lambda: quaternion(0, 0, NAN, 1), "invalid_pose"),
+        (lambda: quaternion(0, 0, 0, 1, x=INF), "invalid_pose"),
+        (lambda: camera.check_pose(np.eye(3)), "invalid_pose"),
+        (lambda: camera.check_pose(np.full((4, 4), NAN)), "invalid_pose"),
+        (lambda: camera.check_pose(np.diag([2.0, 1, 1, 1])), "invalid_pose"),
+        (lambda: camera.check_pose(np.diag([-1.0, 1, 1, 1])), "invalid_pose"),
+        (lambda: rgbd(rgb=np.zeros((240, 320, 3), np.uint8)), "grid_mismatch"),
+        (lambda: rgbd(rgb=np.zeros((480, 640), np.uint8)), "grid_mismatch"),
+        (lambda: rgbd(depth_m=np.zeros((480, 320), np.float32)), "grid_mismatch"),
+        (lambda: rgbd(depth_m=np.zeros(7, np.float32)), "grid_mismatch"),
+        (lambda: rgbd(T_world_camera=np.zeros((4, 4))), "invalid_pose"),
     ],
 )
-def test_frames_are_checked(bad: dict, reason: str) -> None:
-    assert RgbdFrame(**frame_parts()).frame_id == "world"
+def test_what_is_refused(make, reason: str) -> None:
+    assert rgbd().frame_id == "world"
     with pytest.raises(RefusedInput) as refused:
-        RgbdFrame(**{**frame_parts(), **bad})
+        make()
     assert refused.value.reason == reason
+
+
+# --- the up direction ----------------------------------------------------------------------------
+
+
+def level_pose(up: np.ndarray, yaw: float, pitch: float) -> np.ndarray:
+    """A camera whose image rows are orthogonal to `up`, without roll; it looks at `pitch`."""
+    seed = np.eye(3)[np.abs(up).argmin()]
+    east = np.cross(seed, up) / np.linalg.norm(np.cross(seed, up))
+    north = np.cross(up, east)
+    ahead = np.cos(yaw) * east + np.sin(yaw) * north
+    pose = np.eye(4)
+    pose[:3, 0] = np.cross(ahead, up)
+    pose[:3, 2] = np.cos(pitch) * ahead + np.sin(pitch) * up
+    pose[:3, 1] = np.cross(pose[:3, 2], pose[:3, 0])
+    return pose
+
+
+def poses(seed: int, count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    up = rng.normal(size=3)
+    up /= np.linalg.norm(up)
+    return [level_pose(up, rng.uniform(0, 6), rng.uniform(-0.6, 0.3)) for _ in range(count)]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds, before=st.integers(0, 6), after=st.integers(0, 6))
+def test_a_restored_estimator_continues_equally(seed: int, before: int, after: int) -> None:
+    seen = poses(seed, before + after)
+    whole, again = camera.UpEstimator(), camera.UpEstimator()
+    for pose in seen[:before]:
+        whole.observe(pose)
+    for pose in poses(seed + 1, 3):  # this is forgotten
+        again.observe(pose)
+    state = whole.state()
+    kept = state.copy()
+    again.restore(state)
+    for pose in [None, *seen[before:]]:
+        if pose is not None:
+            whole.observe(pose)
+            again.observe(pose)
+        np.testing.assert_array_equal(again.up_world(), whole.up_world())
+        np.testing.assert_array_equal(again.state(), whole.state())
+    np.testing.assert_array_equal(state, kept)  # the state itself is not changed
+    if not seen:
+        np.testing.assert_array_equal(whole.up_world(), [0, 0, 1])
+
+
+def test_up_is_found_from_level_cameras() -> None:
+    up = np.array([0.6, -0.8, 0.0])
+    estimator = camera.UpEstimator()
+    for yaw in np.linspace(0, 5, 9):
+        estimator.observe(level_pose(up, yaw, -0.3))
+    np.testing.assert_allclose(estimator.up_world(), up, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        np.zeros(0),
+        np.zeros(12),
+        np.zeros((13, 1)),
+        np.zeros(15),
+        np.full(14, 0.5),
+        np.full(13, np.nan),
+        np.array([-1.0] + [0] * 12),
+    ],
+)
+def test_another_state_is_refused(state: np.ndarray) -> None:
+    estimator = camera.UpEstimator()
+    estimator.observe(np.eye(4))
+    before = estimator.state()
+    with pytest.raises(ValueError, match="up direction"):
+        estimator.restore(state)
+    np.testing.assert_array_equal(estimator.state(), before)
+
+
+@pytest.mark.parametrize(("axis", "up"), [("z", [0, 0, 1]), ("y", [0, 1, 0]), ("-y", [0, -1, 0])])
+def test_a_named_axis_is_used_as_given(axis: str, up: list[int]) -> None:
+    estimator = camera.UpEstimator(axis)
+    for pose in poses(2, 4):
+        estimator.observe(pose)
+    np.testing.assert_array_equal(estimator.up_world(), up)
+
+
+def test_an_unknown_axis_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="world_up 'x'"):
+        camera.UpEstimator("x")

@@ -1,7 +1,5 @@
 """Local graphs and evidence that fulfil their schema, with the worst values that it allows."""
 
-from __future__ import annotations
-
 import base64
 import pickle
 from typing import Any

@@ -1,7 +1,5 @@
 """Processes that are killed at a random moment, and disks that are full."""
 
-from __future__ import annotations
-
 import os
 import resource
 import signal

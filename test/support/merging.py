@@ -1,7 +1,5 @@
 """Random Gaussians, poses and local graphs for the tests of scene and merging."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -18,6 +16,13 @@ EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", 
 def set_confirmed(graph: SceneGraph, node_id: int, confirmed: bool) -> None:
     """Publish a node, or hide it."""
     graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
+
+
+def moments(points_xyz: np.ndarray, ridge_m2: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sample mean (3,) and covariance (3, 3) of points (N, 3), N >= 2, with a ridge."""
+    mean = points_xyz.mean(axis=0, dtype=np.float64)
+    centred = points_xyz - mean
+    return mean, centred.T @ centred / (len(points_xyz) - 1) + ridge_m2 * np.eye(3)
 
 
 def random_covariances(

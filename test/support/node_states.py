@@ -1,7 +1,5 @@
 """The messages of the nodes of a graph, as a publication makes them."""
 
-from __future__ import annotations
-
 from weakref import WeakKeyDictionary
 
 from deworldsg_ros.graph.graph import SceneGraph

@@ -4,8 +4,6 @@ Each room has its own wall, floor and colours. A moving camera observes a small 
 one of five relations. Colours and textures do not depend on the relation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -4,8 +4,6 @@ The kernels must find exactly the same inliers. bench/lifting.py compares the ti
 float32; all other numbers are float64.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

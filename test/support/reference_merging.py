@@ -1,7 +1,5 @@
 """Plain reference of the merge rule of Eq. 5-7, with dicts and loops."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

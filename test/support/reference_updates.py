@@ -1,7 +1,5 @@
 """The update between two snapshots, by comparison of everything: slow, and easy to check."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from deworldsg_ros.wire import messages as wire
@@ -15,16 +13,8 @@ def diff(
 ) -> wire.SceneGraphUpdateMessage:
     """The update from one snapshot to the next.
 
-    Args:
-        previous: snapshot of sequence n - 1.
-        current: snapshot of sequence n.
-        removed: ids removed since, each with the node it was merged into
-            (`SceneGraph.take_removals`). They include ids that no snapshot contained, because
-            clients know these from associations.
-        associations: of the frames merged since.
-
-    Raises:
-        ValueError: if the sequence numbers are not consecutive.
+    `removed` are ids removed since (`SceneGraph.take_removals`), also those that no snapshot
+    contained: clients know these from the associations of the frames merged since.
     """
     if current.sequence != previous.sequence + 1:
         raise ValueError(

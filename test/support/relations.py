@@ -1,7 +1,5 @@
 """Small local graphs and world models for the tests of the relations stage."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 

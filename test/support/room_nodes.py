@@ -3,8 +3,6 @@
 All lengths are metres; z points up and the floor is at 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Synthetic frames of three objects, and a perceiver with their true detections."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

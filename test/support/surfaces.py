@@ -1,12 +1,9 @@
 """Surface points of objects, and local graphs of them, for the surface rule."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
-from support.gaussians import moments
-from support.merging import VOCABULARY
+from support.merging import VOCABULARY, moments
 
 from deworldsg_ros.scene.camera import Intrinsics
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations

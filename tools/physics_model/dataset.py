@@ -12,11 +12,20 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph.graph import SceneGraph
-from deworldsg_ros.relations.geometry import NodeShapes, pair_features
+from deworldsg_ros.relations.geometry import (
+    MIN_SHAPE_POINTS,
+    measure,
+    pair_features,
+    pairs_in_reach,
+)
 from deworldsg_ros.relations.pairs import floor_height
 from deworldsg_ros.relations.physics import relation_counts
-from deworldsg_ros.relations.reach import MIN_SHAPE_POINTS, pairs_in_reach
-from deworldsg_ros.relations.states import DIRECTED, RELATIONS, relation_of_predicates
+from deworldsg_ros.relations.states import (
+    DIRECTED,
+    RELATIONS,
+    SHAPE,
+    relation_of_predicates,
+)
 
 # A node is in the box of an object if its mean is; the box is this much larger on every side.
 BOX_MARGIN_M = 0.05
@@ -48,7 +57,7 @@ class Room:
     features: NDArray[np.float64]
     states: NDArray[np.int64]
     counts: NDArray[np.float64]
-    frames: NDArray[np.float64]
+    frames: NDArray[np.int64]
     bottoms_m: NDArray[np.float64]
     heights_m: NDArray[np.float64]
     on_floor: NDArray[np.int64]
@@ -64,59 +73,59 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
         if graph.nodes.confirmed[graph.nodes.slot(node_id)]:
             continue
         graph.remove_node(node_id)
-    nodes = graph.nodes
-    shapes = NodeShapes()
-    shapes.extend(nodes.ids.tolist())
-    points = nodes.surface_points_world
-    rows = np.arange(len(nodes))
-    shapes.put(rows, points, nodes.surface_counts, rows, np.eye(3))
-    at = _match(graph, objects)
-    solid = shapes.counts >= MIN_SHAPE_POINTS
-    floor_m = floor_height(np.sort(shapes.low[solid, 2]).tolist())
-    pairs = pairs_in_reach(shapes.low, shapes.high, shapes.counts)
+    nodes, slots = graph.nodes, graph.nodes.slots
+    places = np.arange(len(slots))
+    shapes = np.zeros(len(slots), SHAPE)
+    points = nodes.surface_points_world[slots]
+    measure(shapes, places, points, nodes.surface_counts[slots], np.eye(3))
+    at = _match(graph, slots, objects)
+    solid = shapes["count"] >= MIN_SHAPE_POINTS
+    floor_m = floor_height(np.sort(shapes["low"][solid, 2]).tolist())
+    pairs = pairs_in_reach(shapes)
     pairs = pairs[(at[pairs] >= 0).all(axis=1) & (at[pairs[:, 0]] != at[pairs[:, 1]])]
     # Two people may judge these differently.
     unclear = {tuple(ids) for ids in content.get("unclear", ())}
     ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
     pairs = pairs[[not {(a, b), (b, a)} & unclear for a, b in ids]]
-    columns = (shapes.low, shapes.high, shapes.means, shapes.covariances, shapes.counts)
     first, second = np.ascontiguousarray(pairs.T)
-    features = pair_features(first, second, *columns, points, floor_m)
+    features = pair_features(first, second, shapes, points, floor_m)
     ids = [(objects[at[a]]["id"], objects[at[b]]["id"]) for a, b in pairs.tolist()]
     states = np.array([_state(truth, a, b) for a, b in ids], np.int64)
-    counts, frames = _votes(graph, nodes.ids[pairs])
+    counts, frames = _votes(graph, slots[pairs])
     return Room(
         classes=graph.vocabulary.classes,
-        class_probabilities=nodes.class_probabilities.copy(),
-        observations=nodes.observations.copy(),
+        class_probabilities=nodes.class_probabilities[slots],
+        observations=nodes.observations[slots],
         pairs=pairs,
         features=features,
         states=states,
         counts=counts,
         frames=frames,
-        bottoms_m=shapes.low[:, 2] - floor_m,
-        heights_m=(shapes.high - shapes.low)[:, 2],
+        bottoms_m=shapes["low"][:, 2] - floor_m,
+        heights_m=(shapes["high"] - shapes["low"])[:, 2],
         on_floor=np.array([_stands_on_floor(objects[k]) if k >= 0 else -1 for k in at], np.int64),
     )
 
 
-def _match(graph: SceneGraph, objects: list[dict[str, Any]]) -> NDArray[np.int64]:
+def _match(
+    graph: SceneGraph, slots: NDArray[np.int64], objects: list[dict[str, Any]]
+) -> NDArray[np.int64]:
     """Index of the object of each node, -1 = none: its class, and its box around the mean."""
     low = np.array([item["aabb"][0] for item in objects]) - BOX_MARGIN_M
     high = np.array([item["aabb"][1] for item in objects]) + BOX_MARGIN_M
     seen = np.array([item["visible_centroid"] for item in objects])
     names = np.array([item["vg"] for item in objects])
     nodes = graph.nodes
-    result = np.full(len(nodes), -1, np.int64)
-    for row in range(len(nodes)):
-        surface = nodes.surface(row)
-        mean = surface.mean(axis=0) if len(surface) else nodes.means[row]
-        label = graph.vocabulary.classes[int(nodes.class_probabilities[row].argmax())]
+    result = np.full(len(slots), -1, np.int64)
+    for place, slot in enumerate(slots.tolist()):
+        surface = nodes.surface(slot)
+        mean = surface.mean(axis=0) if len(surface) else nodes.means[slot]
+        label = graph.vocabulary.classes[int(nodes.class_probabilities[slot].argmax())]
         inside = ((mean >= low) & (mean <= high)).all(axis=1) & (names == label)
         candidates = np.flatnonzero(inside)
         if len(candidates):
             nearest = np.linalg.norm(seen[candidates] - mean, axis=1).argmin()
-            result[row] = candidates[nearest]
+            result[place] = candidates[nearest]
     return result
 
 
@@ -130,19 +139,19 @@ def _state(truth: Truth, a: int, b: int) -> int:
 
 
 def _votes(
-    graph: SceneGraph, ids: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Votes by relation (m, 2, NONE) of pairs of node ids (m, 2), and numbers of frames (m,)."""
+    graph: SceneGraph, slots: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Votes by relation (m, 2, NONE) of pairs of slots (m, 2), and numbers of frames (m,)."""
     relation_of = relation_of_predicates(graph.vocabulary.predicates)
-    votes = np.zeros((2, len(ids), len(relation_of)))
-    frames = np.zeros(len(ids))
-    for row, (a, b) in enumerate(ids.tolist()):
+    votes = np.zeros((len(slots), 2, len(relation_of)), np.float32)
+    frames = np.zeros(len(slots), np.int64)
+    for place, (a, b) in enumerate(graph.nodes.ids[slots].tolist()):
         known = graph.votes.get((min(a, b), max(a, b)))
         if known is not None:
-            frames[row] = known.frames
+            frames[place] = known.frames
             if known.counts is not None:
-                votes[:, row] = known.counts if a < b else known.counts[::-1]
-    return np.stack([relation_counts(votes[end], relation_of) for end in (0, 1)], 1), frames
+                votes[place] = known.counts if a < b else known.counts[::-1]
+    return relation_counts(votes, relation_of)[0], frames
 
 
 def _stands_on_floor(item: dict[str, Any]) -> bool:

@@ -237,7 +237,8 @@ def cross_entropy(probabilities: Array, states: NDArray[np.int64]) -> float:
 def votes_of(model: PhysicsModel, rooms: list[Room]) -> Array:
     """Logits (m, STATE_COUNT) of the votes."""
     counts = np.concatenate([room.counts for room in rooms])
-    return vote_logits(counts, np.concatenate([room.frames for room in rooms]), model.votes)
+    frames = np.concatenate([room.frames for room in rooms])
+    return vote_logits(counts, frames, model.votes)[0]
 
 
 def fit_sources(model: PhysicsModel, rooms: list[Room], geometry: Array) -> PhysicsModel:

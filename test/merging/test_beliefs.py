@@ -1,0 +1,337 @@
+"""Is a node an object, and of which class: against their definitions, and over a walk."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.merging import VOCABULARY
+from support.node_states import node_states
+from support.surfaces import CUP, HERE, depth_grid, frame
+
+from deworldsg_ros.config import MergingConfig
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.merging import SurfaceMerging, beliefs
+from deworldsg_ros.merging.records import NodeRecords
+from deworldsg_ros.merging.views import FULL, HALF, QUARTER
+
+# --- existence, over a walk ----------------------------------------------------------------------
+
+STEP_M = 0.05  # 4 degrees, seen from the cup
+
+
+class Walk:
+    """A cup before a wall, and a camera that moves sideways or stands still."""
+
+    def __init__(self, frames_per_s: float = 10.0, min_existence: float = 0.5) -> None:
+        self.graph = SceneGraph(VOCABULARY, "world")
+        self.merging = SurfaceMerging(MergingConfig(), min_existence)
+        self.period_ns = round(1e9 / frames_per_s)
+        self.stamp_ns = 0
+        self.x_m = 0.0
+        self.direction = 1
+
+    def see(
+        self, times: int = 1, *, score: float = 0.9, step_m: float = STEP_M, z_m: float = 0.0
+    ) -> None:
+        """Frames of the cup; a score of 0 is no detection. The camera moves to and fro."""
+        for _ in range(times):
+            self.stamp_ns += self.period_ns
+            self.x_m += self.direction * step_m
+            if abs(self.x_m) > 0.25:
+                self.direction *= -1
+            pose = np.eye(4)
+            pose[:3, 3] = self.x_m, 0.0, z_m
+            points = HERE - pose[:3, 3].astype(np.float32)
+            in_view = points[np.abs(points[:, 0]) < points[:, 2]]
+            grid = depth_grid(in_view, background_m=1.0 - z_m)
+            changes = {"T_world_camera": pose, "depth_grid": grid, "stamp_ns": self.stamp_ns}
+            objects = [(HERE, CUP)] if score else []
+            scores = np.full(len(objects), score)
+            self.merging.merge(self.graph, frame(0, *objects, scores=scores, **changes))
+
+    def miss(self, times: int = 1, **changes: float) -> None:
+        self.see(times, score=0.0, **changes)
+
+    @property
+    def published(self) -> list[int]:
+        return list(node_states(self.graph, 1))
+
+    @property
+    def existence(self) -> float:
+        return float(self.graph.nodes.existence[0])
+
+    @property
+    def hidden(self) -> dict[int, str]:
+        return self.merging.hidden(self.graph)
+
+
+def test_one_sure_look_is_enough_if_there_are_few() -> None:
+    walk = Walk(frames_per_s=1.0)
+    walk.see()
+    assert walk.published == [1]
+    assert node_states(walk.graph, 1)[1].existence == walk.existence > 0.6
+
+
+def test_one_frame_of_many_is_not_enough() -> None:
+    walk = Walk()
+    walk.miss()
+    walk.see()
+    assert walk.published == [] and 0.0 < walk.existence < 0.5
+    assert walk.hidden == {1: "seen too little"}
+    walk.see(5)
+    assert walk.published == [1] and walk.hidden == {}
+
+
+def test_the_reader_chooses_the_threshold() -> None:
+    cautious, open_ = Walk(min_existence=0.95), Walk(min_existence=0.0)
+    for walk in (cautious, open_):
+        walk.miss()
+        walk.see(score=0.2)
+    assert cautious.published == [] and open_.published == [1]
+    cautious.see(60)
+    assert cautious.published == [1]
+
+
+def test_a_lost_node_of_an_open_graph_is_kept_until_its_time_is_over() -> None:
+    """With a threshold of 0, improbable nodes are published, and may be lost, too."""
+    walk = Walk(min_existence=0.0)
+    walk.miss()
+    walk.see(score=0.2)
+    for pause_s, nodes in (*[(0, 1)] * 8, (11, 1), (31, 0)):
+        walk.stamp_ns += walk.period_ns + pause_s * 10**9
+        local = frame(0, stamp_ns=walk.stamp_ns, depth_grid=depth_grid())
+        walk.merging.merge(walk.graph, local)
+        assert len(walk.graph) == nodes
+        if pause_s:
+            assert walk.published == [] and (not nodes or walk.existence < 0.2)
+
+
+def test_a_node_missed_from_most_positions_is_hidden_until_it_is_detected_again() -> None:
+    walk = Walk()
+    walk.see(12, score=0.4)
+    assert walk.published == [1]
+    walk.miss(600)
+    assert walk.published == [] and list(walk.graph.nodes.slot_of) == [1]
+    assert walk.hidden == {1: "missed by the detector"}
+    walk.see(100, score=0.4)
+    assert walk.published == [1]
+
+
+@pytest.mark.parametrize(
+    ("frames", "changes"),
+    [(12, {"z_m": -0.4}), (3, {"step_m": 1.2})],  # further away than detections; out of view
+)
+def test_misses_that_are_no_evidence_change_nothing(frames: int, changes: dict) -> None:
+    walk = Walk()
+    walk.see(11, step_m=0.0)
+    before = walk.existence
+    walk.miss(frames, **changes)
+    assert walk.existence == before
+
+
+def test_an_improbable_node_is_forgotten() -> None:
+    walk = Walk()
+    walk.miss()
+    walk.see(score=0.2)
+    walk.miss(20)
+    assert walk.existence < 0.2
+    walk.stamp_ns += 11 * 10**9
+    walk.miss(step_m=5.0)
+    assert len(walk.graph) == 0
+
+
+def test_a_loaded_node_is_published(tmp_path: Path) -> None:
+    walk = Walk()
+    walk.see(10)
+    # The saved graph alone, without the memory of the rule.
+    graph_files.save(walk.graph, tmp_path / "graph.npz")
+    walk.graph = graph_files.load(tmp_path / "graph.npz")
+    walk.merging = SurfaceMerging(MergingConfig())
+    walk.merging.restore(walk.graph, {})
+    for look in (walk.miss, walk.see):
+        look()
+        assert walk.published == [1] and list(walk.graph.nodes.slot_of) == [1]
+
+
+# --- existence, by its definition ----------------------------------------------------------------
+
+
+def records_of(count: int) -> NodeRecords:
+    records = NodeRecords()
+    for node_id in range(1, count + 1):
+        records.add(node_id - 1, node_id, np.ones(2) / 2, 0)
+    return records
+
+
+def look(
+    records: NodeRecords,
+    slot: int,
+    position: int,
+    stamp_ns: int,
+    score: float,
+    visibility: int = FULL,
+    weight: float = 1.0,
+) -> None:
+    """A look from one of the positions around a node."""
+    camera_world = 2.0 * np.array([np.cos(0.3 * position), np.sin(0.3 * position), 0.0])
+    arrays = np.array([score]), np.array([visibility]), np.zeros((1, 3))
+    records.last_ns = stamp_ns - round(weight * beliefs.LOOK_NS)
+    records.look(np.array([slot]), *arrays, camera_world, stamp_ns)
+
+
+def existence_of(records: NodeRecords, slot: int = 0) -> float:
+    return float(records.existence(np.array([slot]))[0])
+
+
+def test_at_a_high_detection_rate_a_miss_counts_for_more() -> None:
+    found = []
+    for detects in (True, False):
+        records = records_of(2)
+        # A known object, detected in all looks or in every third one.
+        for index in range(100):
+            score = 0.9 if detects or index % 3 == 0 else 0.0
+            look(records, 0, index, index * 10**9, score)
+        for index in range(100, 106):
+            look(records, 1, index, index * 10**9, 0.9 if index < 103 else 0.0)
+        found.append(existence_of(records, 1))
+    assert found[0] < found[1] - 0.03
+
+
+def test_where_new_nodes_turn_out_to_be_errors_a_new_one_is_less_probable() -> None:
+    found = []
+    for fates in ([10, 60], [60, 10]):
+        records = records_of(1)
+        records.fates[:] = fates
+        look(records, 0, 0, 0, 0.5)
+        found.append(existence_of(records))
+    assert found[0] > found[1] + 0.2
+
+
+def test_the_fate_of_a_node_is_counted_once_and_only_after_a_clear_miss() -> None:
+    records = records_of(3)
+    records.rows["missed_since"][:3] = 0.0, 2.0, 0.0
+    for _ in range(2):
+        beliefs.settle(records.rows, records.fates, np.arange(3), np.array([0.95, 0.05, 0.05]))
+        assert records.fates.tolist() == [11, 11]
+
+
+@pytest.mark.parametrize("behind_s", [0, 10**6])
+def test_records_continue_if_the_clock_is_behind(behind_s: int) -> None:
+    records = records_of(1)
+    for index in range(20):
+        look(records, 0, index, (10**7 + index) * 10**9, 0.9)
+    before = existence_of(records)
+    look(records, 0, 20, (10**7 + 20 - behind_s) * 10**9, 0.9)
+    assert existence_of(records) >= before > 0.9
+
+
+def log_odds(looks: list[list[tuple[float, int, float]]], rate: float) -> float:
+    """The definition in `beliefs`, for a camera that moves between looks.
+
+    Args:
+        looks: the frames of each look: detection score, visibility and weight.
+        rate: of detection.
+    """
+    best = max(score for frames in looks for score, _, _ in frames)
+    best = min(max(best, beliefs.MIN_SCORE), beliefs.MAX_SCORE)
+    detected = missed = since = 0.0
+    for frames in looks:
+        total = sum(weight for _, _, weight in frames)
+        fraction = sum(weight for score, _, weight in frames if score) / total
+        worth = min(beliefs.MAX_WEIGHT, total)
+        evidence = -worth * (1.0 - fraction) * math.log(1.0 - rate)
+        detected += worth * fraction
+        missed += evidence
+        since = 0.0 if fraction else since + evidence
+    return (
+        beliefs.OFFSET
+        + beliefs.SCORE * math.log(best / (1 - best))
+        + beliefs.LOOKS * math.log(detected)
+        - beliefs.MISSES * math.log(1 + missed)
+        - beliefs.MOMENT * math.log(1 + since)
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_log_odds_are_those_of_the_definition(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    records, looks, stamp_ns = records_of(1), [], 0
+    records.looks[:] = 2e12, 1e12  # so many looks that the rates stay one half
+    for index in range(int(rng.integers(1, 8))):
+        count = int(rng.integers(1, 5))
+        scores = rng.choice([0.0, 0.2, 0.6, 0.9], count)
+        scores[0] = scores[0] if index else 0.3
+        visibilities = rng.choice([QUARTER, HALF, FULL], count).tolist()
+        looks.append([(float(s), v, 0.3) for s, v in zip(scores, visibilities)])
+        for seen in looks[-1]:
+            stamp_ns += 10**6
+            look(records, 0, index, stamp_ns, *seen)
+    expected = 1 / (1 + math.exp(-log_odds(looks, 0.5)))
+    assert existence_of(records) == pytest.approx(expected, rel=1e-9)
+
+
+# --- classes -------------------------------------------------------------------------------------
+
+COUNT = 12
+
+
+def named(frames: list[np.ndarray], frames_per_s: float = 10.0) -> np.ndarray:
+    """Class distribution after frames with these distributions."""
+    records = NodeRecords()
+    records.add(0, 1, frames[0], 0)
+    classes = frames[0][None]
+    for index, seen in enumerate(frames[1:], 1):
+        stamp_ns = round(index * 1e9 / frames_per_s)
+        classes = records.name(np.array([0]), seen[None], stamp_ns)
+    assert np.isclose(classes.sum(), 1.0) and (classes > 0).all()
+    return classes[0]
+
+
+def frames_of(labels: list[int], certainty: float = 0.85) -> list[np.ndarray]:
+    """What a detector says: one label, and a little of each."""
+    rest = (1 - certainty) / (COUNT - 1)
+    return [np.where(np.arange(COUNT) == label, certainty, rest) for label in labels]
+
+
+def random_errors(seed: int) -> list[int]:
+    """More labels than there are places for."""
+    wrong = np.random.default_rng(seed).integers(COUNT, size=20).tolist()
+    return [3] * 5 + [label for other in wrong for label in (other, 3)]
+
+
+@pytest.mark.parametrize(
+    "labels",
+    [
+        [3] * 2,
+        ([3] * 4 + [5]) * 10,  # single wrong frames do not matter
+        # The wrong name has more frames, but its single spell could be chance: three are not.
+        [3] * 6 + [5] * 20 + [3] * 6 + [7] * 4 + [3] * 6,
+        *map(random_errors, range(3)),
+    ],
+)
+def test_the_name_that_returns_wins(labels: list[int]) -> None:
+    assert named(frames_of(labels), frames_per_s=20.0).argmax() == 3
+
+
+def filtered(frames: list[np.ndarray], step_s: float) -> np.ndarray:
+    """The same filter with all labels, by matrices; for few classes."""
+    count = len(frames[0])
+    drawn = np.full((count, count), beliefs.WRONG / (count - 1))
+    np.fill_diagonal(drawn, 1 - beliefs.WRONG)
+    joint = drawn * frames[0][None]
+    for seen in frames[1:]:
+        leave = 1 - np.exp(-step_s / beliefs.SPELL_S)
+        joint = (1 - leave) * joint + leave * drawn * joint.sum(axis=1, keepdims=True)
+        joint = joint * ((1 - beliefs.OUTLIERS) * seen + beliefs.OUTLIERS / count)[None]
+        joint /= joint.sum()
+    return beliefs.OTHERS / count + (1 - beliefs.OTHERS) * joint.sum(axis=1)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_filter_is_that_of_the_definition(seed: int) -> None:
+    """With no more classes than places, all labels are considered."""
+    rng = np.random.default_rng(seed)
+    frames = [rng.dirichlet(np.full(beliefs.LABELS, 0.5)) for _ in range(15)]
+    np.testing.assert_allclose(named(frames), filtered(frames, 0.1), rtol=1e-9)

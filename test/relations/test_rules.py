@@ -1,0 +1,326 @@
+"""What relations of different pairs exclude, against slow references and hand-made cases."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit, logit, softmax
+from support.reference_rules import REST, circle_of, near_probabilities
+from support.reference_rules import one_support as reference_support
+
+from deworldsg_ros.graph.pairs import PAIR, link
+from deworldsg_ros.relations import rules
+from deworldsg_ros.relations.states import (
+    BELIEF,
+    MIN_OTHER_VOTES,
+    NEAR,
+    NONE,
+    RELATIONS_OF_STATE,
+    SHAPE,
+    STATE_COUNT,
+)
+
+seeds = st.integers(0, 10_000)
+Room = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def room(seed: int, count: int, scale: float = 3.0) -> Room:
+    """State probabilities, pairs and floor odds of some of the pairs of n objects."""
+    rng = np.random.default_rng(seed)
+    pairs = [p for p in itertools.combinations(range(count), 2) if rng.random() < 0.8]
+    states = softmax(rng.normal(0, scale, (len(pairs), STATE_COUNT)), axis=1)
+    return states, np.array(pairs, np.int64).reshape(-1, 2), np.exp(rng.normal(0, 2, count))
+
+
+def in_circles(seed: int, count: int) -> Room:
+    """Every object is surely carried by the next one, in a circle, if they are a pair."""
+    states, pairs, floor_odds = room(seed, count)
+    order = np.random.default_rng(seed).permutation(count)
+    sure = set(zip(order.tolist(), np.roll(order, 1).tolist()))
+    for row, (first, second) in enumerate(pairs.tolist()):
+        for end, edge in enumerate(((first, second), (second, first))):
+            if edge in sure:
+                states[row] = 0.01 / STATE_COUNT
+                states[row, 1 + end] += 0.99
+    return states, pairs, floor_odds * 1e-3
+
+
+def scene_of(pairs: np.ndarray, count: int) -> rules.Scene:
+    """Objects and their pairs, without a belief."""
+    scene = rules.Scene(
+        np.zeros(count, SHAPE),
+        np.zeros(count, np.int32),
+        np.zeros(len(pairs), PAIR),
+        np.zeros(len(pairs), BELIEF),
+    )
+    scene.pairs["slots"], scene.beliefs["known"] = pairs, True
+    link(scene.pairs, scene.firsts, np.zeros(count, np.int32), np.arange(len(pairs)))
+    return scene
+
+
+# --- one support an object -----------------------------------------------------------------------
+
+
+def supports_of(states: np.ndarray, pairs: np.ndarray, item: int) -> dict[int, float]:
+    """Probability of each support of an object."""
+    found = {}
+    for (first, second), row in zip(pairs.tolist(), states):
+        if item in (first, second):
+            carried = rules.CARRIED_FIRST if item == first else rules.CARRIED_SECOND
+            found[second if item == first else first] = float(row[carried].sum())
+    return found
+
+
+def one_at_most(probabilities: list[float]) -> list[float]:
+    """Independent events, given that one at most holds: the probability of each."""
+    weights = {}
+    for outcome in itertools.product((False, True), repeat=len(probabilities)):
+        if sum(outcome) <= 1:
+            factors = [p if holds else 1 - p for p, holds in zip(probabilities, outcome)]
+            weights[outcome] = np.prod(factors)
+    whole = sum(weights.values())
+    return [
+        sum(weight for outcome, weight in weights.items() if outcome[row]) / whole
+        for row in range(len(probabilities))
+    ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=seeds,
+    count=st.integers(0, 9),
+    scale=st.sampled_from([0.5, 3.0, 12.0]),
+    circles=st.booleans(),
+)
+def test_the_kernel_equals_the_reference(
+    seed: int, count: int, scale: float, circles: bool
+) -> None:
+    states, pairs, floor_odds = in_circles(seed, count) if circles else room(seed, count, scale)
+    before = states.copy()
+    found = rules.one_support(states, pairs, floor_odds)
+    np.testing.assert_array_equal(states, before)
+    for one, other in zip(found, reference_support(states, pairs, floor_odds)):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    after, kept, _ = found
+    assert circle_of(kept, pairs) is None
+    for values in found:
+        assert (values >= -1e-12).all() and (values <= 1 + 1e-9).all()
+    np.testing.assert_allclose(after.sum(axis=1), 1, atol=1e-6)
+    # Within the supports of one direction, and within the rest, the shares stay.
+    for group in (rules.CARRIED_FIRST, rules.CARRIED_SECOND, REST):
+        shares = states[:, group] / states[:, group].sum(axis=1, keepdims=True)
+        total = after[:, group].sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(after[:, group], shares * total, atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds, count=st.integers(2, 5))
+def test_the_supports_of_an_object_are_events_of_which_one_at_most_holds(
+    seed: int, count: int
+) -> None:
+    """With weak supports, no circle and no pair is cut, so that the enumeration is exact."""
+    states, pairs, floor_odds = room(seed, count, scale=1.0)
+    states[:, ~REST] *= 0.5
+    states /= states.sum(axis=1, keepdims=True)
+    after, _, on_floor = rules.one_support(states, pairs, floor_odds)
+    for item in range(count):
+        before = supports_of(states, pairs, item)
+        floor = floor_odds[item] / (1 + floor_odds[item])
+        expected = one_at_most([*before.values(), floor])
+        assert on_floor[item] == pytest.approx(expected[-1])
+        found = supports_of(after, pairs, item)
+        assert list(found.values()) == pytest.approx(expected[:-1], abs=1e-6)
+
+
+# --- near ----------------------------------------------------------------------------------------
+
+ON_ONE_TABLE = {(0, 2): 1.0, (1, 2): 1.0}
+# A definition that does not hold has this probability at most.
+LEAST = 1.0 - rules.NEAR_CERTAINTY + 1e-6
+
+
+def near(
+    gaps: dict[tuple[int, int], float],
+    count: int,
+    *,
+    floor: float | list[float] = 1e9,
+    carried: dict[tuple[int, int], float] | None = None,
+    steps: float = 0.0,
+    centres: dict[tuple[int, int], float] | None = None,
+    unrelated: float = 1.0,
+    seats: tuple[tuple[int, int], ...] = (),
+) -> dict[tuple[int, int], float]:
+    """Near by pair; `carried` are probabilities that the first object rests on the second one."""
+    carried = {} if carried is None else carried
+    pairs = sorted({*gaps, *((min(pair), max(pair)) for pair in carried)})
+    scene = scene_of(np.array(pairs, np.int64).reshape(-1, 2), count)
+    scene.shapes["floor_odds"] = floor
+    beliefs = scene.beliefs
+    beliefs["live"] = True
+    for row, pair in enumerate(pairs):
+        on = [min(carried.get(ends, 0.0), rules.MOST) for ends in (pair, pair[::-1])]
+        beliefs["carried"][row] = on
+        beliefs["states"][row, 1:3] = on
+        beliefs["states"][row, 0] = unrelated * (1.0 - sum(on))
+        beliefs["states"][row, 7] = (1.0 - unrelated) * (1.0 - sum(on))  # against
+        beliefs["gap_m"][row] = gaps.get(pair, np.inf)
+        beliefs["bottom_step_m"][row] = steps
+        beliefs["centre_step_m"][row] = (centres or {}).get(pair, 0.0)
+        beliefs["with_"][row, 0] = pair in seats
+    rules.settle(scene, np.arange(count))
+    found = beliefs["relations"][:, :, NEAR]
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    return dict(zip(pairs, found[:, 0].tolist()))
+
+
+@pytest.mark.parametrize(
+    ("gap_m", "step_m", "on_one_table", "expected"),
+    [
+        (0.0, 0.0, False, 1.0),
+        (rules.NEAR_FLOOR_M, 0.0, False, 0.5),
+        (0.8, 0.0, False, 0.0),
+        (np.inf, 0.0, False, 0.0),
+        (0.0, 0.0, True, 1.0),
+        (rules.NEAR_SUPPORT_M, 0.0, True, 0.5),
+        (0.2, 0.0, True, 0.0),
+        # Books on two shelves of one bookcase are not near.
+        (0.0, -rules.NEAR_LEVEL_M, True, 0.5),
+        (0.0, rules.NEAR_LEVEL_M, True, 0.5),
+        (0.0, 3 * rules.NEAR_LEVEL_M, True, 0.0),
+    ],
+)
+def test_near_on_the_floor_and_on_one_support(gap_m, step_m, on_one_table, expected) -> None:
+    more = {"floor": 0.0, "carried": ON_ONE_TABLE} if on_one_table else {}
+    found = near({(0, 1): gap_m}, 3, steps=step_m, **more)
+    assert found[0, 1] == pytest.approx(rules.NEAR_CERTAINTY * expected, abs=0.035)
+
+
+def test_near_are_the_two_nearest_neighbours() -> None:
+    """Object 0 amid three others; each of them has only 0."""
+    found = near({(0, 1): 0.1, (0, 2): 0.2, (0, 3): 0.3}, 4)
+    assert found[0, 1] > 0.9 and found[0, 2] > 0.9 and found[0, 3] < LEAST
+    # It counts from both ends: 3 would be the nearest one of 0, and has two nearer ones.
+    crowd = near({(0, 3): 0.2, (1, 3): 0.1, (2, 3): 0.15}, 4)
+    assert crowd[0, 3] < LEAST and crowd[1, 3] > 0.9 and crowd[2, 3] > 0.9
+
+
+def test_of_objects_that_touch_those_with_the_nearest_centres_are_near() -> None:
+    """A row of five books: the bounds of each one overlap with those of all others."""
+    gaps = {(a, b): 0.0 for b in range(5) for a in range(b)}
+    on_shelf = {(book, 5): 1.0 for book in range(5)}
+    centres = {(a, b): 0.03 * (b - a) for a, b in gaps}
+    found = near(gaps, 6, floor=0.0, carried=on_shelf, centres=centres)
+    likely = {pair for pair, p in found.items() if p > 0.5}
+    assert likely >= {(0, 1), (1, 2), (2, 3), (3, 4)}
+    assert not likely & {(0, 3), (0, 4), (1, 4)}
+
+
+def test_pairs_that_are_not_near_or_otherwise_related_are_no_neighbours() -> None:
+    """Two objects on the table are nearer than the third one, but on it, not beside it."""
+    carried = {(1, 0): 1.0, (2, 0): 1.0}
+    gaps = {(0, 1): 0.0, (0, 2): 0.0, (0, 3): 0.3}
+    assert near(gaps, 4, carried=carried, floor=[1e9, 0.0, 0.0, 1e9])[0, 3] > 0.9
+    # However many other pairs there are, a more specific relation is not near.
+    others = {(2, 3 + other): 0.1 for other in range(3)}
+    assert near({(0, 1): 0.1} | others, 6, unrelated=0.2)[0, 1] < LEAST
+
+
+def test_a_seat_is_with_its_table_whatever_else_is_near() -> None:
+    gaps = {(0, 1): 0.05, (0, 2): 0.05, (0, 3): 0.2, (0, 4): 0.2}
+    found = near(gaps, 5, seats=((0, 3), (0, 4)))
+    assert min(found.values()) > 0.9
+    far = near({(0, 1): rules.SEAT_GAP_M + 0.2}, 2, seats=((0, 1),))
+    assert far[0, 1] < 0.05 < near({(0, 1): rules.SEAT_GAP_M}, 2, seats=((0, 1),))[0, 1]
+
+
+# --- all rules, around what changed --------------------------------------------------------------
+
+
+class Followed:
+    """A scene of random pairs; `settle` follows what changed."""
+
+    def __init__(self, rng: np.random.Generator, count: int) -> None:
+        self.pairs = np.array(list(itertools.combinations(range(count), 2)), np.int64)
+        self.pairs = self.pairs[rng.random(len(self.pairs)) < 0.6]
+        self.scene = scene_of(self.pairs, count)
+        self.scene.shapes["floor_odds"] = np.exp(rng.normal(0, 3, count))
+        self.scene.shapes["seating"] = rng.random((count, 2)) < 0.3
+        self.logits, self.votes = np.zeros((2, len(self.pairs), STATE_COUNT))
+        self.near_logits, self.worth = np.zeros((2, len(self.pairs)))
+        self.circles: list[set[int]] = []
+
+    def change(self, rng: np.random.Generator, rows: np.ndarray) -> None:
+        """Other evidence on pairs."""
+        beliefs, count = self.scene.beliefs, len(rows)
+        gaps_m = np.where(rng.random(count) < 0.2, np.inf, rng.uniform(0, 0.6, count))
+        beliefs["judged"][rows] = rng.random(count) < 0.9
+        beliefs["gap_m"][rows] = np.where(beliefs["judged"][rows], gaps_m, np.inf)
+        beliefs["bottom_step_m"][rows] = rng.normal(0, 0.08, count)
+        beliefs["centre_step_m"][rows] = rng.uniform(0, 1, count)
+        beliefs["other_votes"][rows] = rng.choice([0.0, MIN_OTHER_VOTES], count)
+        self.logits[rows] = np.log(rng.dirichlet(np.full(STATE_COUNT, 0.15), count) + 1e-9)
+        self.votes[rows] = rng.choice([-1.0, 0.0, 1.0], (count, STATE_COUNT), p=[0.4, 0.58, 0.02])
+        self.near_logits[rows] = rng.choice([-1.0, 0.0, 0.7], count)
+        self.worth[rows] = rng.choice([1.0, 2.5], count)
+        evidence = (self.logits, self.votes, self.near_logits, self.worth)
+        rules.take_in(self.scene, rows, *(values[rows] for values in evidence))
+
+    def settle(self, rows: np.ndarray) -> np.ndarray:
+        """As `RobustBeliefs` does; returns the rows whose relations changed."""
+        slots = np.unique(self.pairs[rows])
+        for circle in self.circles:
+            if circle & set(slots.tolist()):
+                slots = np.union1d(slots, np.array(sorted(circle)))
+        cut, changed = rules.settle(self.scene, slots)
+        for place in cut.tolist():
+            # More objects than those of the circle do no harm.
+            self.circles.append(set(range(len(self.scene.shapes))))
+            assert self.scene.beliefs["kept"][place >> 1, place & 1] <= 0.5
+        assert not self.scene.shapes["mark"].any() and not self.scene.shapes["share"].any()
+        assert len(set(changed.tolist())) == len(changed)
+        return changed
+
+    def reference(self) -> np.ndarray:
+        """The relations of all pairs, by the rules for all pairs at once."""
+        beliefs, shapes = self.scene.beliefs, self.scene.shapes
+        states, kept, on_floor = reference_support(
+            softmax(self.logits, axis=1), self.pairs, shapes["floor_odds"]
+        )
+        apart = beliefs["judged"] & np.isinf(beliefs["gap_m"])
+        told = (self.votes > 0).any(axis=1) | (self.near_logits > 0)
+        live = told | (beliefs["other_votes"] >= MIN_OTHER_VOTES) | ~apart
+        tables, seats = (shapes["seating"][self.pairs, kind] > 0 for kind in range(2))
+        with_ = (tables & seats[:, ::-1]).any(axis=1) & beliefs["judged"]
+        with_ &= beliefs["gap_m"] <= rules.SEAT_GAP_M
+        steps = (beliefs[name] for name in ("gap_m", "bottom_step_m", "centre_step_m"))
+        near = near_probabilities(self.pairs, kept, on_floor, *steps, states[:, 0], with_)
+        near = np.clip(near, 1.0 - rules.NEAR_CERTAINTY, rules.NEAR_CERTAINTY)
+        near = expit(logit(near) + self.worth * self.near_logits)
+        relations = np.zeros((len(self.pairs), 2, NONE + 1))
+        for end in (0, 1):
+            for state in range(1, STATE_COUNT):
+                relations[:, end, RELATIONS_OF_STATE[state, end]] += states[:, state]
+            relations[:, end, NEAR] = states[:, 0] * near
+            relations[:, end, NONE] += states[:, 0] * (1.0 - near)
+        relations[~live] = np.arange(NONE + 1) == NONE
+        return relations
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=seeds, count=st.integers(2, 9))
+def test_relations_that_follow_are_those_of_all_pairs_at_once(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    followed = Followed(rng, count)
+    every = np.arange(len(followed.pairs))
+    relations = followed.scene.beliefs["relations"]
+    for part in (1.0, *[0.2] * 8):
+        rows = every[rng.random(len(every)) < part]
+        before = relations.copy()
+        followed.change(rng, rows)
+        changed = followed.settle(rows)
+        np.testing.assert_allclose(relations, followed.reference(), atol=1e-5)
+        differs = np.flatnonzero((relations != before).any(axis=(1, 2)))
+        taken_in = rows[~followed.scene.beliefs["live"][rows]]
+        assert set(differs.tolist()) <= {*changed.tolist(), *taken_in.tolist()}
