@@ -2,13 +2,9 @@
 
 import importlib
 import sys
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import msgspec
 import pytest
-from support.recordings import write_seven_scenes
 from support.sequences import write_room
 
 from deworldsg_ros.config import Config
@@ -25,16 +21,10 @@ def lab(root_dir):
     """The modules of the tool."""
     path = list(sys.path)
     sys.path.insert(0, str(root_dir / "tools" / "merging_lab"))
-    yield SimpleNamespace(**{name: importlib.import_module(name) for name in NAMES})
+    yield [importlib.import_module(name) for name in NAMES]
     sys.path[:] = path
     for name in NAMES:
         del sys.modules[name]
-
-
-def captured(lab: Any, source: Path, folder: Path, *arguments: str) -> list[str]:
-    """Names of the captures that the command wrote."""
-    lab.capture.main([str(source), "--out", str(folder), *arguments])
-    return sorted(path.name for path in folder.iterdir())
 
 
 # The wrong label of one object lasts longer than the frames.
@@ -42,27 +32,19 @@ def captured(lab: Any, source: Path, folder: Path, *arguments: str) -> list[str]
     ("kind", "faults", "seen"), [("clean", Faults(), 3), ("label", Faults(label=0.1), 2)]
 )
 def test_the_replay_of_a_capture_is_the_graph_of_the_evaluation(lab, tmp_path, kind, faults, seen):
-    rooms, out = write_room(tmp_path / "rooms", frames=6), tmp_path / "out"
-    names = captured(lab, rooms, tmp_path / "cap", "--kinds", kind)
-    assert names == [f"room_0.{kind}.pkl"]
-    capture = lab.captures.read_capture(tmp_path / "cap" / names[0])
-    replayed = lab.replay.replay(capture, Config())
+    captures, capturing, replaying = lab
+    rooms, folder, out = write_room(tmp_path / "rooms", 6), tmp_path / "cap", tmp_path / "out"
+    capturing.main([str(rooms), "--out", str(folder), "--kinds", kind])
+    (path,) = folder.iterdir()
+    assert path.name == f"room_0.{kind}.pkl"
+    capture = captures.read_capture(path)
+    replayed = replaying.replay(capture, Config())
     choice = FrontEndChoice("recorded", faults=faults)
     outcome = evaluate_scan(
         ScanTask(rooms, "replica", "room_0", out, Config(), choice, ProtocolOptions())
     )
     graph = read_graph(out / "room_0")
     assert msgspec.json.encode(replayed.graph) == msgspec.json.encode(graph)
-    score = lab.replay.score(capture, replayed)
+    score = replaying.score(capture, replayed)
     assert (score.results, score.measures) == ([outcome.result], outcome.measures)
     assert score.seen == seen
-
-
-def test_a_recording_without_annotation_has_a_line_of_labels(lab, tmp_path, capsys):
-    kitchen = write_seven_scenes(tmp_path / "kitchen", 3)
-    options = ("--min-score", "0.2", "--settings", "perception.threads=1")
-    assert captured(lab, kitchen, tmp_path / "cap", *options) == ["kitchen.backend-0.2.pkl"]
-    with pytest.raises(SystemExit, match="kind bleed"):
-        captured(lab, kitchen, tmp_path / "cap", "--kinds", "bleed")
-    lab.replay.main([str(tmp_path / "cap")])
-    assert "0 nodes" in capsys.readouterr().out
