@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.perception import box_of
 from support.sequences import BLOCKS, HEIGHT, ROWS, WIDTH, instance_image, write_pgm, write_room
 
 from deworldsg_ros.config import Config, PerceptionConfig
@@ -115,9 +116,7 @@ def test_boxes_are_true_and_masks_are_those_of_the_segmenter(tmp_path):
 
 
 def test_boxes_are_jittered_by_two_pixels_by_default(tmp_path):
-    choice = FrontEndChoice("boxes")
-    assert choice.describe() == "boxes jitter 2"
-    found = perceived(write_room(tmp_path, frames=30), choice)
+    found = perceived(write_room(tmp_path, frames=30), FrontEndChoice("boxes"))
     boxes = [item.frame_graph.boxes_xyxy for item in found if len(item.frame_graph) == 3]
     errors = np.array(boxes) - BOXES
     assert abs(errors.mean()) < 0.4
@@ -191,17 +190,11 @@ def frame(number):
 
 def seen():
     image, detections = np.zeros(SHAPE, np.uint16), []
-    for index, place in enumerate(PLACES):
-        image[place] = index + 1
-        detections.append(
-            Detection(around(image, index + 1), spread({index: 0.9}, 6), 0.9, index + 1)
-        )
+    for value, place in enumerate(PLACES, 1):
+        image[place] = value
+        box, classes = box_of(image == value), spread({value - 1: 0.9}, 6)
+        detections.append(Detection(box, classes, 0.9, value))
     return FrameDetections(detections, [Relation(0, 1, 0.9, spread({0: 0.9}, 2))], image)
-
-
-def around(image, value):
-    rows, columns = np.nonzero(image == value)
-    return np.array([columns.min(), rows.min(), columns.max(), rows.max()], float)
 
 
 def run(frames=600, seed=0, **faults):
@@ -266,7 +259,7 @@ def test_masks_bleed_merge_and_are_cut():
     assert ((share[share < 1] > 0.35) & (share[share < 1] < 0.75)).all()
     for item in run(3, cut=1.0):
         for part in item.detections:
-            assert (part.box_xyxy == around(item.instance_image, part.instance)).all()
+            assert (part.box_xyxy == box_of(item.instance_image == part.instance)).all()
 
 
 def test_faults_are_independent_of_one_another_and_of_the_frames_processed_before():
