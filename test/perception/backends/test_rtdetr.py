@@ -14,7 +14,6 @@ from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
 from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
@@ -218,24 +217,6 @@ def stage(folder, world_up="auto", **changes):
     names = {"detector": "rtdetr", "relation_head": "egtr", "predicate_set": "checkpoint"}
     config = settings(**{**names, "detector_path": str(folder), **changes})
     return build_perception(config, world_up=world_up)
-
-
-def test_rtdetr_sam2_and_egtr_as_one_stage(folders, tmp_path):
-    # Random weights put their boxes anywhere: they are not refined.
-    limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
-    segmenter = {"segmenter": "sam2", "segmenter_path": str(models.save_sam2(tmp_path))}
-    perception = stage(folders["paper"], "z", **segmenter, **limits)
-    depth_m = np.full((48, 64), 1.5, np.float32)
-    frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
-    seen, again = perception.perceive(frame), perception.perceive(frame)
-    vocabulary = perception.vocabulary
-    assert (vocabulary.classes, vocabulary.predicates) == (CLASSES, PREDICATES)
-    count = len(seen.frame_graph)
-    assert 2 <= count <= QUERIES
-    assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
-    assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
-    assert np.array_equal(again.instances, seen.instances)
-    assert np.array_equal(again.frame_graph.relations.logits, seen.frame_graph.relations.logits)
 
 
 def refused(match, build, *arguments, **changes):
