@@ -122,8 +122,6 @@ def test_a_published_file_that_does_not_fit_is_refused_and_not_run(tmp_path, cha
         ({"fingerprint": ""}, True),  # unknown weights
         ({"fingerprint": "fedcba9876543210"}, False),
         ({"family": "dinov2"}, False),
-        ({"feature_dim": 64}, False),
-        ({"image_size": 64}, False),
         ({"clip_length": 16}, False),
     ],
 )
@@ -135,19 +133,12 @@ def test_a_probe_accepts_only_the_backbone_of_its_training(changes, fits):
         assert str(other) in refused("vjepa2 with 48 features", card.require_backbone, other)
 
 
-@pytest.mark.parametrize(
-    ("predicates", "message"),
-    [
-        (("on", "near"), "lacks 'on', 'near' and has 'predicate 0', "),
-        ((*PREDICATES, "on"), "lacks 'on';"),
-        (PREDICATES[:6], "has 'predicate 6';"),
-        (PREDICATES[::-1], "another order"),
-    ],
-)
-def test_a_probe_accepts_only_the_predicates_of_its_training(predicates, message):
+def test_a_probe_accepts_only_the_predicates_of_its_training():
     card = ProbeCard(BACKBONE, PREDICATES)
     card.require_predicates(PREDICATES)
-    refused(message, card.require_predicates, predicates)
+    mixed = "lacks 'on', 'near' and has 'predicate 0', "
+    refused(mixed, card.require_predicates, ("on", "near"))
+    refused("another order", card.require_predicates, PREDICATES[::-1])
 
 
 def test_folders_that_are_incomplete_damaged_or_old_are_refused(tmp_path):
@@ -179,7 +170,6 @@ def backbone(tmp_path_factory):
     ("identity", "inputs", "edge_belief", "told"),
     [
         ({"fingerprint": ""}, "clip", "robust", ["does not know the weights of its backbone"]),
-        # A probe that knows the subject stands beside the paper's rule.
         ({}, "clip_and_boxes", "robust", []),
         ({}, "clip", "paper", []),
         ({}, "clip_and_boxes", "paper", ["The paper's probe gets the clip only"]),

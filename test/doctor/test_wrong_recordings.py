@@ -92,13 +92,6 @@ def test_doctor_names_what_is_wrong(examine, name, code, words):
 
 
 @pytest.mark.slow
-def test_a_colour_topic_as_depth_is_an_error(examine):
-    code, output = examine("right", "doctor", "--depth", "/rgb/image_raw")
-    assert code == 2
-    assert "is a picture" in output
-
-
-@pytest.mark.slow
 def test_a_camera_on_its_side_gives_the_same_objects(examine, tmp_path):
     labels = {}
     for name in ("right", "on its side"):

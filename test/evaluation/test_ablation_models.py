@@ -1,4 +1,4 @@
-"""Ablation (d) and (e) end to end: probes trained on rooms, then a table of another room.
+"""Ablation (d) and (e): a table with world models of clips and their probes.
 
 The backbones are tiny and have random weights: the test shows that the parts fit together.
 """
@@ -6,7 +6,6 @@ The backbones are tiny and have random weights: the test shows that the parts fi
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -14,65 +13,33 @@ pytest.importorskip("torch")
 pytest.importorskip("transformers")
 pytestmark = pytest.mark.models
 
-from support.checkpoints import save_dinov2, save_vjepa2  # noqa: E402  after the guards
-from support.evaluation import PREDICATES, write_dataset  # noqa: E402
-from support.sequences import BLOCKS, RELATIONS, ROWS, write_room, write_sequence  # noqa: E402
-from typer.testing import CliRunner  # noqa: E402
+from support.checkpoints import config_of, save_dinov2, save_vjepa2, torch  # noqa: E402  after the guards
+from support.cli import printed  # noqa: E402
+from support.evaluation import PREDICATES  # noqa: E402
+from support.sequences import write_room  # noqa: E402
 
-from deworldsg_ros.cli.app import app  # noqa: E402
+from deworldsg_ros.checkpoints.cards import ProbeCard  # noqa: E402
+from deworldsg_ros.checkpoints.probe_network import Probe, build_network, save_probe  # noqa: E402
 from deworldsg_ros.graph.graph_files import read_graph  # noqa: E402
+from deworldsg_ros.relations import clip_models  # noqa: E402
 
-SAVERS = {"vjepa2": save_vjepa2, "dinov2": save_dinov2}
-ROWS_OF_MODELS = {"d": "dinov2", "e": "vjepa2"}
-
-
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
-    return result.output
+ROWS = {
+    "d": ("dinov2", save_dinov2, clip_models.load_dinov2),
+    "e": ("vjepa2", save_vjepa2, clip_models.load_vjepa2),
+}
 
 
-def training_rooms(root: Path) -> Path:
-    """A data set with two training scans."""
-    objects = [(name, number) for number, name, _, _ in BLOCKS]
-    write_dataset(root, {scan: (objects, RELATIONS) for scan in ("a", "b")}, split_scans=[])
-    (root / "ReplicaSSG" / "train_scans.txt").write_text("a\nb\n")
-    for scan in ("a", "b"):
-        sequence = write_sequence(root / "data" / scan) / "sequence"
-        for number in range(3):
-            lines = [f"{i} {x1} {ROWS[0]} {x2 - 1} {ROWS[1] - 1}" for i, _, x1, x2 in BLOCKS]
-            (sequence / f"frame-{number:06d}.bb.txt").write_text("\n".join(lines))
-    return root
-
-
-@pytest.fixture(scope="module")
-def probed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Path]]:
-    """Checkpoint and trained probe of each world model."""
-    root = tmp_path_factory.mktemp("probed")
-    rooms = training_rooms(root / "rooms")
-    (root / "names.txt").write_text("\n".join(PREDICATES))
-    found = {}
-    for name, save in SAVERS.items():
-        checkpoint, probe = save(root / name), root / f"probe_{name}"
-        run(
-            *("train-probe", rooms, "--out", probe, "--world-model", name, "--model", checkpoint),
-            *("--predicates", root / "names.txt", "--epochs", 2, "--device", "cpu"),
-        )
-        found[name] = (checkpoint, probe)
-    return found
-
-
-def test_the_ablation_runs_with_world_models_of_clips(
-    probed: dict[str, tuple[Path, Path]], tmp_path: Path
-) -> None:
-    room = write_room(tmp_path / "rooms")
+def test_the_ablation_runs_with_world_models_of_clips(tmp_path):
     settings = []
-    for row, name in ROWS_OF_MODELS.items():
-        checkpoint, probe = probed[name]
-        settings += ["--set", f"{row}:relations.world_model_path={checkpoint}"]
+    for row, (name, save, load) in ROWS.items():
+        model, probe = save(tmp_path / name), tmp_path / f"probe_{name}"
+        torch.manual_seed(0)
+        card = ProbeCard(load(config_of(name, model, clip_length=16)).identity, PREDICATES)
+        save_probe(probe, Probe(card, build_network(card).eval()))
+        settings += ["--set", f"{row}:relations.world_model_path={model}"]
         settings += ["--set", f"{row}:relations.probe_path={probe}"]
-    run(
-        *("evaluate", "table", "ablation", "--layout", "replica", room),
+    printed(
+        *("evaluate", "table", "ablation", "--layout", "replica", write_room(tmp_path / "rooms")),
         *("--front-end", "recorded", "--workers", 1, "--checkpoints", 0),
         *("--out", tmp_path / "out", "--json", tmp_path / "table.json", *settings),
     )
@@ -81,7 +48,7 @@ def test_the_ablation_runs_with_world_models_of_clips(
     assert [rows[name]["scan_count"] for name in "abcde"] == [1] * 5
     without = read_graph(tmp_path / "out" / "c" / "room_0").edges
     assert {edge.provenance for edge in without} == {"visual"}
-    for name in ROWS_OF_MODELS:
+    for name in ROWS:
         edges = read_graph(tmp_path / "out" / name / "room_0").edges
         directions = {(edge.subject, edge.object) for edge in edges}
         # Eq. 10 completes the direction that no frame has seen.

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.sequences import BLOCKS, HEIGHT, ROWS, WIDTH, instance_image, write_pgm, write_room
+from support.perception import box_of
+from support.sequences import BLOCKS, ROWS, instance_image, write_room
 
 from deworldsg_ros.config import Config, PerceptionConfig
 from deworldsg_ros.evaluation.front_ends import (
@@ -103,32 +104,15 @@ def test_boxes_are_true_and_masks_are_those_of_the_segmenter(tmp_path):
     # The images, not the annotation, decide about relations: the blocks float side by side.
     best = graph.relations.logits.argmax(axis=1)
     assert len(best) and "on" not in {graph.vocabulary.predicates[index] for index in best}
-    # And about masks.
-    for path in (root / "data/room_0/sequence").glob("*.depth.pgm"):
-        write_pgm(path, np.zeros((HEIGHT, WIDTH), np.uint16))
-    blind = perceived(root, FrontEndChoice("boxes", jitter_px=0))[0]
-    assert len(blind.frame_graph) == 3
-    assert not (blind.instances == first.instances).all()
     egtr = Config(perception=PerceptionConfig(relation_head="egtr"))
     with pytest.raises(EvaluationError, match=r"perception\.relation_head"):
         perceived(root, FrontEndChoice("boxes"), egtr)
 
 
-def test_boxes_are_jittered_by_two_pixels_by_default(tmp_path):
-    choice = FrontEndChoice("boxes")
-    assert choice.describe() == "boxes jitter 2"
-    found = perceived(write_room(tmp_path, frames=30), choice)
-    boxes = [item.frame_graph.boxes_xyxy for item in found if len(item.frame_graph) == 3]
-    errors = np.array(boxes) - BOXES
-    assert abs(errors.mean()) < 0.4
-    assert 1.7 < errors.std() < 2.3
-
-
 @pytest.mark.parametrize("kind", ["ground-truth", "boxes"])
 def test_faults_of_single_frames(tmp_path, kind):
     root = write_room(tmp_path, frames=12)
-    missed = perceived(root, FrontEndChoice(kind, miss=1.0))
-    assert [len(item.frame_graph) for item in missed] == [0] * 12
+    assert not any(len(item.frame_graph) for item in perceived(root, FrontEndChoice(kind, miss=1)))
     for item in perceived(root, FrontEndChoice(kind, flip=1.0)):
         assert np.not_equal(classes_of(item), [1, 2, 0]).all()
     false = perceived(root, FrontEndChoice(kind, faults=Faults(false=8)))
@@ -143,25 +127,15 @@ def test_faults_of_single_frames(tmp_path, kind):
     assert 0.6 < np.sum([len(boxes) for boxes in first]) / 36 < 0.95
 
 
-@pytest.mark.parametrize(
-    ("values", "offender"),
-    [
+def test_faults_are_parsed_described_and_checked():
+    for values, offender in (
         ({"kind": "video"}, "--front-end video"),
         ({"flip": -0.1}, "--flip -0.1"),
-        ({"miss": 1.1}, "--miss 1.1"),
         ({"jitter_px": -1.0}, "--jitter -1"),
-        *(
-            ({"kind": "boxes", "faults": Faults(**{name: 0.1})}, f"{name} 0.1")
-            for name in ("bleed", "merge", "cut")
-        ),
-    ],
-)
-def test_bad_choices_are_refused(values, offender):
-    with pytest.raises(EvaluationError, match=offender):
-        FrontEndChoice(**values)
-
-
-def test_faults_are_parsed_described_and_checked():
+        ({"kind": "boxes", "faults": Faults(cut=0.1)}, "cut 0.1"),
+    ):
+        with pytest.raises(EvaluationError, match=offender):
+            FrontEndChoice(**values)
     assert parse_faults("") == Faults()
     assert parse_faults("label=0.1, false=2,spell_s=1") == Faults(0.1, 2.0, spell_s=1.0)
     assert parse_faults("cut=0.25,spell_s=1").describe() == "cut 0.25 spell_s 1"
@@ -191,17 +165,11 @@ def frame(number):
 
 def seen():
     image, detections = np.zeros(SHAPE, np.uint16), []
-    for index, place in enumerate(PLACES):
-        image[place] = index + 1
-        detections.append(
-            Detection(around(image, index + 1), spread({index: 0.9}, 6), 0.9, index + 1)
-        )
+    for value, place in enumerate(PLACES, 1):
+        image[place] = value
+        box, classes = box_of(image == value), spread({value - 1: 0.9}, 6)
+        detections.append(Detection(box, classes, 0.9, value))
     return FrameDetections(detections, [Relation(0, 1, 0.9, spread({0: 0.9}, 2))], image)
-
-
-def around(image, value):
-    rows, columns = np.nonzero(image == value)
-    return np.array([columns.min(), rows.min(), columns.max(), rows.max()], float)
 
 
 def run(frames=600, seed=0, **faults):
@@ -225,10 +193,8 @@ def test_a_wrong_label_lasts_a_spell_and_has_the_chosen_rate():
     # A spell has 20 frames.
     starts = np.flatnonzero(np.diff(wrong[0].astype(int), prepend=1) == 1)
     assert len(starts) and all(wrong[0][start : start + 20].all() for start in starts)
-    for item in items:
-        # Another class of the room, as surely as the right one would be.
-        assert set(labels(item).values()) <= set(CLASSES)
-        assert [part.class_probabilities.max() for part in item.detections] == [0.9] * 3
+    # Another class of the room.
+    assert all(set(labels(item).values()) <= set(CLASSES) for item in items)
 
 
 def test_false_boxes_are_on_the_background():
@@ -252,21 +218,19 @@ def test_masks_bleed_merge_and_are_cut():
     # Of two that bleed into one another the second keeps what it took.
     assert (image[35:55, 31:40] == 2).all()
     assert bled.detections[2].box_xyxy.tolist() == [90, 60, 149, 119]
-    assert 0.15 < (areas(run(bleed=0.3), 3) > 40 * 40).mean() < 0.45
     # A merged mask removes the neighbour and its relations.
     merged = run(1, merge=1.0)[0]
     assert [part.instance for part in merged.detections] == [1, 3]
     assert merged.detections[0].box_xyxy.tolist() == [10, 20, 79, 59]
     assert not merged.relations
     assert (merged.instance_image[PLACES[1]] == 1).all()
-    assert areas(run(50, merge=1.0), 3).tolist() == [40 * 40] * 50
     # A cut mask covers a part of its object for a spell.
     share = areas(run(cut=0.3), 3) / (40 * 40)
     assert 0.15 < (share < 1).mean() < 0.45
     assert ((share[share < 1] > 0.35) & (share[share < 1] < 0.75)).all()
     for item in run(3, cut=1.0):
         for part in item.detections:
-            assert (part.box_xyxy == around(item.instance_image, part.instance)).all()
+            assert (part.box_xyxy == box_of(item.instance_image == part.instance)).all()
 
 
 def test_faults_are_independent_of_one_another_and_of_the_frames_processed_before():

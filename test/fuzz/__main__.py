@@ -28,7 +28,7 @@ def main() -> int:
     )
     for name, count in sorted(report.cases.items()):
         print(f"  {name:24} {count:7}  {1000 * report.seconds[name] / count:7.1f} ms each")
-    print(report)
+    print(f"{sum(report.cases.values())} cases, {len(report.failures)} failures")
     peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss >> 10
     print(f"most memory: {peak} MB in a process of cases")
     for path in keep(report, options.corpus):

@@ -8,6 +8,8 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -28,7 +30,7 @@ TURN = 25
 
 @dataclass
 class Report:
-    """What a run found, by target: numbers of cases, what they took, and failures.
+    """What a run found: numbers of cases by target, what they took, and failures.
 
     A failure counts once for each target and place in the code.
     """
@@ -51,12 +53,6 @@ class Report:
                     self.failures[name, place] = failure
                     print(f"{name} ({failure.member}): {failure.text!a}"[:300], flush=True)
 
-    def __str__(self) -> str:
-        lines = [f"{sum(self.cases.values())} cases, {len(self.failures)} failures"]
-        for (name, _), failure in self.failures.items():
-            lines.append(f"  {name} ({failure.member}): {failure.text!a}"[:300])
-        return "\n".join(lines)
-
 
 def run_cases(
     names: Iterable[str],
@@ -75,19 +71,14 @@ def run_cases(
     turns = enumerate(itertools.cycle(order))
 
     def work() -> None:
-        worker = Worker()
-        try:
+        with closing(Worker()) as worker:
             while time.monotonic() < end_s and sum(report.cases.values()) < cases:
                 turn, name = next(turns)
                 report.run(worker, name, (f"{seed} {turn}", TURN))
-        finally:
-            worker.close()
 
-    threads = [threading.Thread(target=work) for _ in range(jobs)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(jobs) as pool:
+        for working in [pool.submit(work) for _ in range(jobs)]:
+            working.result()
     return report
 
 

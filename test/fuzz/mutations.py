@@ -39,8 +39,6 @@ FLOATS = (0.0, -0.0, -1.0, 1e-320, 1e30, 1e308, -1e308, np.inf, -np.inf, np.nan,
 VALUES: tuple[Any, ...] = (
     None, True, [], {}, [[]], "x", *WORDS[:10], *INTEGERS, *FLOATS, 10**40, [0] * 300,
 )  # fmt: skip
-
-
 MAX_PLACES = 10_000
 # A mutation that would make a case longer is left out.
 MAX_CASE_BYTES = 4_000_000
@@ -68,10 +66,8 @@ def raw_bytes(content: bytes, rng: random.Random) -> bytes:
     if kind == 0 and data:
         data[at - 1] ^= 1 << rng.randrange(8)
     elif kind == 1:
-        width = rng.choice("bhiq")
-        value = rng.choice(INTEGERS) & (256 ** struct.calcsize(width) - 1)
-        order = rng.choice(("little", "big"))
-        data[at : at + struct.calcsize(width)] = value.to_bytes(struct.calcsize(width), order)
+        width, order = rng.choice((1, 2, 4, 8)), rng.choice(("little", "big"))
+        data[at : at + width] = (rng.choice(INTEGERS) % 256**width).to_bytes(width, order)
     elif kind == 2:
         del data[at:]
     elif kind == 3:
@@ -89,10 +85,10 @@ def raw_bytes(content: bytes, rng: random.Random) -> bytes:
 def words(content: bytes, rng: random.Random) -> bytes:
     """Replace, drop or repeat words and lines of a text."""
     lines = content.split(b"\n")
-    row = rng.randrange(len(lines))
+    row, other = rng.randrange(len(lines)), rng.randrange(len(lines))
     parts = lines[row].split(b" ")
     column = rng.randrange(len(parts))
-    kind = rng.randrange(6)
+    kind = rng.randrange(7)
     if kind < 3:
         parts[column] = rng.choice((*NUMBERS, *WORDS)).encode(errors="surrogatepass")
     elif kind == 3:
@@ -101,11 +97,10 @@ def words(content: bytes, rng: random.Random) -> bytes:
         times = rng.choice((1, 3, 1000 if len(parts[column]) < 4000 else 1))
         parts[column:column] = [parts[column]] * times
     lines[row] = b" ".join(parts)
-    if kind == 5:
-        other = rng.randrange(len(lines))
+    if kind > 4:
         lines[row], lines[other] = lines[other], lines[row]
-        if rng.randrange(2):
-            del lines[row]
+    if kind == 6:
+        del lines[row]
     return b"\n".join(lines)
 
 
@@ -117,12 +112,10 @@ def json_tree(content: bytes, rng: random.Random) -> bytes:
 def yaml_tree(content: bytes, rng: random.Random) -> bytes:
     """Damage values of a YAML document, or use YAML's own ways to grow one."""
     if rng.randrange(8) == 0:
-        levels = rng.choice((3, 9, 12))
         rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
-        rows += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, levels)]
-        return (
-            content + "\n".join(["", *rows, "b: &b [*b]"][: rng.choice((-1, levels + 2))]).encode()
-        )
+        for i in range(1, rng.choice((3, 9, 12))):
+            rows.append(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]")
+        return content + "\n".join(["", *rows, *["b: &b [*b]"] * rng.randrange(2)]).encode()
     if b"&a0" in content:  # written out, the aliases would fill the memory
         return raw_bytes(content, rng)
     check_yaml(content)  # a mutation before may have nested it so deeply that libyaml crashes
@@ -140,12 +133,10 @@ def _tree(tree: Any, rng: random.Random) -> Any:
     # Aliases of YAML may stand for any number of places.
     while pending and len(places) < MAX_PLACES:
         node = pending.pop()
-        keys = (
-            node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
-        )
-        for key in list(keys):
-            places.append((node, key))
-            pending.append(node[key])
+        if isinstance(node, (dict, list)):
+            keys = list(node) if isinstance(node, dict) else range(len(node))
+            places += [(node, key) for key in keys]
+            pending += [node[key] for key in keys]
     if not places:
         return rng.choice(VALUES)
     node, key = rng.choice(places)
@@ -160,10 +151,8 @@ def _tree(tree: Any, rng: random.Random) -> Any:
         other, place = rng.choice(places)
         node[key] = copy.deepcopy(other[place])  # what aliases share stays shared
     elif kind == 3:
-        deep: Any = node[key]
         for _ in range(rng.choice((1, 3, 60, 400))):
-            deep = [deep]
-        node[key] = deep
+            node[key] = [node[key]]
     else:
         node[key] = rng.choice(VALUES)
     return tree
@@ -187,17 +176,16 @@ def arrays(content: bytes, rng: random.Random) -> bytes:
         entries[name] += bytes(rng.choice((0, 1 << 16)))
     else:
         array = _array(np.load(io.BytesIO(entries[name]), allow_pickle=False), rng)
-        packed = io.BytesIO()
-        np.save(packed, array, allow_pickle=False)
+        np.save(packed := io.BytesIO(), array, allow_pickle=False)
         entries[name] = packed.getvalue()
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", compression) as archive:
+    with zipfile.ZipFile(packed := io.BytesIO(), "w", compression) as archive:
         for entry, data in entries.items():
             archive.writestr(zipfile.ZipInfo(entry), data, compression)
     return packed.getvalue()
 
 
 def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
+    """An array of another type or shape, or with hostile numbers or those of other places."""
     if array.dtype == np.uint8 and array.ndim == 1 and array.tobytes()[:1] in (b"{", b"["):
         damaged = rng.choice((json_tree, words))(array.tobytes(), rng)
         return np.frombuffer(damaged, np.uint8)
@@ -210,40 +198,29 @@ def _array(array: np.ndarray, rng: random.Random) -> np.ndarray:
         return np.concatenate([np.atleast_1d(array)] * 2)
     if kind == 3:
         return array.reshape(array.shape[::-1]) if array.ndim > 1 else array[None]
-    array = array.copy()
-    if array.dtype.names and kind < 8:
-        field = rng.choice(array.dtype.names)
-        array[field] = _values(array[field], rng)
-        return array
-    return _values(array, rng)
-
-
-def _values(array: np.ndarray, rng: random.Random) -> np.ndarray:
-    """Put hostile numbers, or numbers of other places, into an array."""
     if not array.size:
         return np.zeros((1, *array.shape[1:]), array.dtype)
-    flat = array.ravel().copy()
-    for _ in range(rng.choice((1, 1, 3))):
-        at = rng.randrange(flat.size)
+    array = array.copy()
+    field = array[rng.choice(array.dtype.names)] if array.dtype.names and kind < 8 else array
+    places = [np.unravel_index(rng.randrange(field.size), field.shape) for _ in range(4)]
+    for place in places[: rng.choice((1, 1, 3))]:
         if rng.randrange(3) == 0:
-            flat[at] = flat[rng.randrange(flat.size)]
-        elif flat.dtype.kind == "f":
-            flat[at] = rng.choice(FLOATS)
-        elif flat.dtype.kind in "iu":
-            limits = np.iinfo(flat.dtype)
-            small = int(flat[at]) + rng.choice((-1, 1, 2))
-            flat[at] = min(max(rng.choice((*INTEGERS, small, small)), limits.min), limits.max)
+            field[place] = field[places[3]]
+        elif field.dtype.kind == "f":
+            field[place] = rng.choice(FLOATS)
+        elif field.dtype.kind in "iu":
+            limits, near = np.iinfo(field.dtype), int(field[place]) + rng.choice((-1, 1, 2))
+            field[place] = min(max(rng.choice((*INTEGERS, near, near)), limits.min), limits.max)
         else:
-            flat[at] = flat.dtype.type(rng.randrange(2))
+            field[place] = field.dtype.type(rng.randrange(2))
     if rng.randrange(8) == 0:
-        flat[:] = flat[rng.randrange(flat.size)]
-    return flat.reshape(array.shape)
+        field[...] = field[places[3]]
+    return array
 
 
 def png(content: bytes, rng: random.Random) -> bytes:
     """Damage the chunks of a PNG; their checksums are right again."""
-    chunks = []
-    at = 8
+    chunks, at = [], 8
     while at + 12 <= len(content):
         (length,) = struct.unpack_from(">I", content, at)
         chunks.append([content[at + 4 : at + 8], content[at + 8 : at + 8 + length]])
@@ -266,41 +243,25 @@ def png(content: bytes, rng: random.Random) -> bytes:
 
 
 def table(content: bytes, rng: random.Random) -> bytes:
-    """Damage the rows of an SQLite file."""
+    """Damage a value of an SQLite file, or the name of a column."""
     with tempfile.NamedTemporaryFile(suffix=".db3") as file:
         Path(file.name).write_bytes(content)
         database = sqlite3.connect(file.name)
-        database.execute("PRAGMA synchronous = OFF")
-        names = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-        name = rng.choice(names)[0]
-        columns = [row[1] for row in database.execute(f"PRAGMA table_info({name})")]
-        column = rng.choice(columns)
-        value = rng.choice((*INTEGERS[:-2], *FLOATS, *WORDS[:10], None, rng.randbytes(5)))
-        (count,) = database.execute(f"SELECT count(*) FROM {name}").fetchone()
-        at = rng.randrange(max(count, 1))
-        if column == "data" and rng.randrange(2):
-            row = database.execute(f"SELECT rowid, data FROM {name} LIMIT 1 OFFSET {at}").fetchone()
-            database.execute(
-                f"UPDATE {name} SET data = ? WHERE rowid = ?",
-                (raw_bytes(bytes(row[1]), rng), row[0]),
-            )
-        elif rng.randrange(8) == 0:
-            database.execute(f"ALTER TABLE {name} RENAME COLUMN {column} TO other")
+        run = database.execute
+        run("PRAGMA synchronous = OFF")
+        (name,) = rng.choice(run("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall())
+        column = rng.choice([row[1] for row in run(f"PRAGMA table_info({name})")])
+        if rng.randrange(8) == 0:
+            run(f"ALTER TABLE {name} RENAME COLUMN {column} TO other")
         else:
-            database.execute(
-                f"UPDATE {name} SET {column} = ? WHERE rowid IN "
-                f"(SELECT rowid FROM {name} LIMIT 1 OFFSET {at})",
-                (value,),
-            )
+            rowid, value = rng.choice(run(f"SELECT rowid, {column} FROM {name}").fetchall())
+            values = (*INTEGERS[:-2], *FLOATS, *WORDS[:10], None, rng.randbytes(5))
+            damage = isinstance(value, bytes) and rng.randrange(2)
+            value = raw_bytes(value, rng) if damage else rng.choice(values)
+            run(f"UPDATE {name} SET {column} = ? WHERE rowid = ?", (value, rowid))
         database.commit()
         database.close()
         return Path(file.name).read_bytes()
-
-
-def pgm(content: bytes, rng: random.Random) -> bytes:
-    """Damage the header of a PGM image."""
-    head, rest = content[:40], content[40:]
-    return words(head, rng) + rest
 
 
 BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
@@ -311,7 +272,7 @@ BY_SUFFIX: dict[str, tuple[Mutation, ...]] = {
     ".yaml": (yaml_tree, words),
     ".png": (png,),
     ".jpg": (raw_bytes,),
-    ".pgm": (pgm,),
+    ".pgm": (lambda content, rng: words(content[:40], rng) + content[40:],),
     ".db3": (table,),
     ".mcap": (raw_bytes,),
     ".pkl": (raw_bytes,),

@@ -6,7 +6,6 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import hypothesis
 from hypothesis import strategies as st
@@ -24,9 +23,10 @@ class Target:
 
     Attributes:
         name: of the folder of its corpus.
-        make: writes the good files into an empty folder.
-        read: reads the folder, uses what it read as the program does, and asserts what the schema
-            promises.
+        make: writes the good files into an empty folder, or the file.
+        read: reads the folder or the file, uses what it read as the program does, and asserts what
+            the schema promises.
+        file: the name of the file; empty = the whole folder.
         documents: whole contents of the files as a hypothesis strategy; None = mutations only.
         weight: number of cases in proportion to other targets.
     """
@@ -34,11 +34,13 @@ class Target:
     name: str
     make: Callable[[Path], object]
     read: Callable[[Path], object]
+    file: str = ""
     documents: st.SearchStrategy[bytes] | None = None
     weight: int = 1
 
     def good_files(self, folder: Path) -> dict[str, bytes]:
-        """Contents of the files that cases may replace, by name; `make` has filled the folder."""
+        """Make the good files; returns the contents that cases may replace, by name."""
+        self.make(folder / self.file)
         paths = sorted(path for path in folder.rglob("*") if path.is_file())
         return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
@@ -73,16 +75,3 @@ class Target:
             use(name, content)
 
         each()
-
-
-def one_file(
-    name: str,
-    file: str,
-    write: Callable[[Path], object],
-    read: Callable[[Path], object],
-    **options: Any,
-) -> Target:
-    """A target with one file; `write` and `read` get its path."""
-    return Target(
-        name, lambda folder: write(folder / file), lambda folder: read(folder / file), **options
-    )

@@ -1,10 +1,338 @@
-"""All targets by name. Another area adds a module with a list `TARGETS` and its name here."""
+"""All readers by name: files here, messages in `wire_targets`."""
 
 from __future__ import annotations
 
-from fuzz import file_targets, wire_targets
+import dataclasses
+import json
+import pickle
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+from support import evaluation, sequences
+from support import recordings as camera
+from support.merging import VOCABULARY, random_local_graphs
+from support.recordings import pose, stamp_ns
+from support.surfaces import CHAIR, CUP, TABLE, frame, slab
+from support.view import make_edge, make_graph, make_node
+
+from deworldsg_ros.checkpoints import cards, hub
+from deworldsg_ros.cli.configuration import effective_config
+from deworldsg_ros.config import Config, MergingConfig, OutputConfig, to_mapping, to_yaml
+from deworldsg_ros.evaluation.predictions import ScanPrediction, read_predictions
+from deworldsg_ros.graph import graph_files
+from deworldsg_ros.graph_builder import GraphBuilder
+from deworldsg_ros.map_file import read_map, write_map
+from deworldsg_ros.poses.trajectory import read_trajectory, write_tum
+from deworldsg_ros.recordings.folders.annotations import Annotations, read_vertices
+from deworldsg_ros.recordings.folders.sequence import read_ground_truth, read_instances
+from deworldsg_ros.recordings.recording import open_recording
+from deworldsg_ros.recordings.source import TF_MESSAGE
+from deworldsg_ros.wire import messages as wire
+from fuzz import wire_targets
 from fuzz.target import Target
 
+# --- hypothesis: whole documents -------------------------------------------------------------
+
+_TEXT = st.text(max_size=12) | st.sampled_from(["$\\foo$", "__PLOTLY__", "[/foo]", "../x", "\x00"])
+_NUMBERS = st.integers() | st.floats() | st.sampled_from([10**40, 2**63, -(2**63) - 1])
+_JSON: st.SearchStrategy[Any] = st.recursive(
+    st.none() | st.booleans() | _NUMBERS | _TEXT,
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(_TEXT, inner, max_size=5),
+    max_leaves=20,
+)
+JSON_DOCUMENTS = _JSON.map(lambda value: json.dumps(value).encode())
+# Sections and options that exist, with any values.
+_CONFIGURATIONS = st.fixed_dictionaries(
+    {},
+    optional={
+        section: st.dictionaries(st.sampled_from(sorted(values)) | _TEXT, _JSON, max_size=3)
+        for section, values in to_mapping(Config()).items()
+    },
+)
+_PARAMETERS = _CONFIGURATIONS.map(lambda sections: {"/**": {"ros__parameters": sections}})
+_OPTIONS = [f"{name}.{field}" for name, fields in to_mapping(Config()).items() for field in fields]
+_SETTINGS = st.tuples(st.sampled_from(_OPTIONS), _TEXT | _JSON.map(json.dumps))
+
+# --- maps ------------------------------------------------------------------------------------
+
+
+def _map_config(association: Any) -> Config:
+    merging = MergingConfig(association=association)
+    return Config(merging=merging, output=OutputConfig(min_existence=0.0))
+
+
+def _frames() -> list[Any]:
+    table, mug = slab((0, 0.7, 1), (0.4, 0.04, 0.3)), slab((0.1, 0.77, 1), (0.08, 0.1, 0.08))
+    chair = slab((0.9, 0.25, 1), (0.3, 0.4, 0.3))
+    few = [(points[:150], kind) for points, kind in ((table, TABLE), (mug, CUP), (chair, CHAIR))]
+    return [frame(stamp, *few) for stamp in range(1, 7)]
+
+
+def _write_map(association: str, path: Path) -> None:
+    builder = GraphBuilder(_map_config(association), VOCABULARY, "world")
+    paper = association == "paper"
+    for local in random_local_graphs(np.random.default_rng(3), 20) if paper else _frames():
+        builder.integrate(local)
+    write_map(builder, path)
+
+
+def _read_map(association: str, path: Path) -> None:
+    """Continue as graph_node does: publish, merge frames, publish, save."""
+    builder = read_map(_map_config(association), path)
+    builder.update()
+    _check_graph(builder.full())
+    if builder.graph.vocabulary == VOCABULARY and builder.graph.frame_id == "world":
+        newest = int(builder.graph.nodes.last_seen_ns.max(initial=0))
+        for local in _frames()[:3]:
+            builder.integrate(dataclasses.replace(local, stamp_ns=newest + local.stamp_ns))
+        builder.update()
+        _check_graph(builder.full())
+    again = path.parents[1] / f"{association}.again"
+    write_map(builder, again)
+    read_map(_map_config(association), again)
+
+
+def _check_graph(message: wire.SceneGraphMessage) -> None:
+    """What every reader of /scene_graph relies on."""
+    text = wire.encode(message)
+    assert "null" not in text.replace('"null"', ""), "a number is no number"
+    wire.decode(text, wire.SceneGraphMessage)
+    ids = [node.id for node in message.nodes]
+    assert len(set(ids)) == len(ids) and min(ids, default=1) >= 1
+    assert {end for edge in message.edges for end in (edge.subject, edge.object)} <= set(ids)
+
+
+# --- recordings ------------------------------------------------------------------------------
+
+
+def _read_recording(folder: Path) -> None:
+    source = next(path for path in sorted(folder.iterdir()) if path.name != "ReplicaSSG")
+    if source.name == "data":
+        source = source / "room_0"
+    recording = open_recording(source)
+    try:
+        for item in recording.frames():
+            assert np.isfinite(item.T_world_camera).all()
+            read_instances(recording.source, item.stamp_ns)
+    finally:
+        recording.close()
+    read_ground_truth(source)
+
+
+def _write_bag(plugin: str, folder: Path) -> None:
+    camera.write_bag(folder / "bag", camera.camera_items(3), plugin)
+
+
+def _write_bag_with_tf(folder: Path) -> None:
+    items = camera.camera_items(3, compressed=False, with_pose=False)
+    items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
+    for i in range(3):
+        moving = camera.transform(stamp_ns(i), camera.WORLD, camera.CAMERA, pose(i))
+        items.append(("/tf", TF_MESSAGE, stamp_ns(i), moving))
+    camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
+
+
+def _write_rooms(folder: Path) -> None:
+    sequences.write_room(folder, 2)
+    sequences.write_ground_truth(folder / "data" / "room_0")
+
+
+def _write_replica(folder: Path) -> None:
+    evaluation.write_dataset(folder, {"room_0": ([("chair", 1)], [])})
+    sequences.write_sequence(folder / "data" / "room_0", 2)
+
+
+def _write_annotations(layout: str, folder: Path) -> None:
+    scans = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
+    evaluation.write_dataset(folder, scans, layout=layout)
+
+
+def _read_annotations(layout: str, folder: Path) -> None:
+    annotations = Annotations(folder, layout)
+    annotations.scans("test")
+    for scan in ("a", "b"):
+        annotations.scan(scan)
+        annotations.points(scan)
+
+
+# --- other files -----------------------------------------------------------------------------
+
+
+def _read_trajectory(path: Path) -> None:
+    found = read_trajectory(path)
+    assert len(found) and np.isfinite(found.T_world_cameras).all()
+    found.at(stamp_ns(1) + 5, 1, 1, 10**8)
+
+
+def _write_pose_files(folder: Path) -> None:
+    for index in range(2):
+        np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
+
+
+def _write_ply(form: str, path: Path) -> None:
+    points = np.random.default_rng(0).random((5, 3))
+    evaluation.write_ply(path, points, np.arange(5), form)
+
+
+def _read_ply(path: Path) -> None:
+    columns = read_vertices(path, ("x", "y", "z", "objectId"))
+    assert len({len(column) for column in columns.values()}) == 1
+
+
+PREDICTION = ScanPrediction(
+    (evaluation.segment(1, 3), evaluation.segment(2, 3)),
+    np.array([[0.1, 0.8, 0.1], [0.2, 0.2, 0.6]]),
+    np.array([[0, 1]]),
+    np.array([[0.7, 0.2, 0.1]]),
+)
+
+
+def _write_predictions(path: Path) -> None:
+    predictions = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
+    evaluation.write_predictions(path, predictions, 3, 3)
+
+
+def _write_pickle(protocol: int, path: Path) -> None:
+    graph = {
+        "pcd": [points.astype(np.float32) for points in PREDICTION.points_world],
+        "cls": [scores.astype(np.float32) for scores in PREDICTION.class_scores],
+        "edge_index": PREDICTION.edges.T,
+        "edge_cls": PREDICTION.edge_scores.astype(np.float32),
+    }
+    path.write_bytes(pickle.dumps({"a": graph}, protocol))
+
+
+def _read_predictions(path: Path) -> None:
+    for prediction in read_predictions(path).values():
+        assert len(prediction.class_scores) == len(prediction)
+        assert len(prediction.edges) == len(prediction.edge_scores)
+
+
+CARD = cards.CheckpointCard(classes=("cup", "table"), predicates=("on", "near"))
+BACKBONE = cards.BackboneIdentity("vjepa2", 48, 32, 4)
+PROBE = cards.ProbeCard(BACKBONE, ("on", "near"), training={"groups_by_part": {"train": []}})
+
+
+def _read_probe_card(folder: Path) -> None:
+    found = cards.read_probe_card(folder)
+    assert found.seen_groups is not None and found.input_dim > 0
+    str(found.backbone)
+
+
+def _write_headers(path: Path) -> None:
+    entry = {"dtype": "F32", "shape": [2, 2], "data_offsets": [0, 16]}
+    text = json.dumps({"a": entry, "b": entry}).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(16))
+
+
+def _write_graph(folder: Path) -> None:
+    nodes = [make_node(1, "cup", points=[(0, 0, 0)]), make_node(2, "table", (0.3, 0, 0))]
+    graph_files.write_graph(folder, make_graph(nodes, [make_edge(1, 2)]))
+
+
+def _read_setting(path: Path) -> None:
+    effective_config(None, [path.read_bytes().decode(errors="surrogateescape")])
+
+
 TARGETS: dict[str, Target] = {
-    target.name: target for target in (*file_targets.TARGETS, *wire_targets.TARGETS)
+    target.name: target
+    for target in (
+        *(
+            Target(
+                f"map_{rule}",
+                partial(_write_map, rule),
+                partial(_read_map, rule),
+                "room.map",
+                weight=weight,
+            )
+            for rule, weight in (("surface", 3), ("paper", 2))
+        ),
+        Target(
+            "config_yaml",
+            lambda path: path.write_text(to_yaml(Config())),
+            effective_config,
+            "config.yaml",
+            documents=(_CONFIGURATIONS | _PARAMETERS).map(lambda it: json.dumps(it).encode()),
+            weight=2,
+        ),
+        Target(
+            "set_option",
+            lambda path: path.write_text("output.rate_hz=2.5"),
+            _read_setting,
+            "set.txt",
+            documents=_SETTINGS.map(lambda words: "=".join(words).encode(errors="replace")),
+        ),
+        *(
+            Target(f"bag_{name}", partial(_write_bag, plugin), _read_recording, weight=2)
+            for name, plugin in (("mcap", "mcap"), ("sqlite", "sqlite3"))
+        ),
+        Target("bag_tf", _write_bag_with_tf, _read_recording),
+        Target("tum", lambda at: camera.write_tum(at / "freiburg1", 2), _read_recording),
+        Target(
+            "seven_scenes", lambda at: camera.write_seven_scenes(at / "seq-01", 2), _read_recording
+        ),
+        Target("scan_3rscan", lambda at: sequences.write_sequence(at / "scan", 2), _read_recording),
+        Target("scan_replica", _write_replica, _read_recording),
+        Target("scan_rooms", _write_rooms, _read_recording),
+        *(
+            Target(
+                f"annotations_{layout}",
+                partial(_write_annotations, layout),
+                partial(_read_annotations, layout),
+            )
+            for layout in ("replica", "3rscan")
+        ),
+        Target(
+            "trajectory_tum",
+            lambda at: write_tum(at, [stamp_ns(i) for i in range(4)], [pose(i) for i in range(4)]),
+            _read_trajectory,
+            "poses.txt",
+        ),
+        Target(
+            "trajectory_kitti",
+            lambda path: np.savetxt(path, [pose(i)[:3].ravel() for i in range(4)], "%.9g"),
+            _read_trajectory,
+            "poses.txt",
+        ),
+        Target("trajectory_folder", _write_pose_files, read_trajectory),
+        *(
+            Target(f"ply_{name}", partial(_write_ply, form), _read_ply, "points.ply")
+            for name, form in (("ascii", "ascii"), ("binary", "binary_little_endian"))
+        ),
+        Target(
+            "predictions_json",
+            _write_predictions,
+            _read_predictions,
+            "predictions.json",
+            documents=JSON_DOCUMENTS,
+        ),
+        *(
+            Target(
+                f"predictions_pickle_{protocol}",
+                partial(_write_pickle, protocol),
+                _read_predictions,
+                "predictions.pkl",
+            )
+            for protocol in (2, 5)
+        ),
+        Target(
+            "checkpoint_card",
+            lambda path: cards.write_detector_card(path, CARD),
+            cards.read_detector_card,
+            cards.DETECTOR_CARD,
+            documents=JSON_DOCUMENTS,
+        ),
+        Target(
+            "probe_card",
+            lambda folder: cards.write_probe_card(folder, PROBE),
+            _read_probe_card,
+            documents=JSON_DOCUMENTS,
+        ),
+        Target("safetensors", _write_headers, hub.read_headers, "model.safetensors"),
+        Target("scene_graph", _write_graph, graph_files.read_graph, documents=JSON_DOCUMENTS),
+        *wire_targets.TARGETS,
+    )
 }

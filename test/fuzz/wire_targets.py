@@ -40,7 +40,7 @@ from deworldsg_ros.view.page import content_of
 from deworldsg_ros.wire import codec
 from deworldsg_ros.wire import messages as wire
 from deworldsg_ros.wire.follow import GraphReplica
-from fuzz.target import Target, one_file
+from fuzz.target import Target
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = {
@@ -72,7 +72,7 @@ def _message(name: str, use: Callable[[Any], object]) -> Target:
         use(message)
 
     write = partial(Path.write_bytes, data=_example(name))
-    return one_file(f"wire_{name}", "message.json", write, read, weight=6)
+    return Target(f"wire_{name}", write, read, "message.json", weight=6)
 
 
 def _check_objects(graph: FrameGraph | LocalGraph) -> None:
@@ -169,7 +169,7 @@ def _seeded(name: str, use: Callable[[np.random.Generator, Path], object]) -> Ta
         digest = hashlib.sha256(path.read_bytes()).digest()
         use(np.random.default_rng(int.from_bytes(digest[:8], "little")), path.parent)
 
-    return one_file(name, "seed", partial(Path.write_bytes, data=b"hostile"), read)
+    return Target(name, partial(Path.write_bytes, data=b"hostile"), read, "seed")
 
 
 def _use_hostile_frames(config: Config, rng: np.random.Generator, _: Path) -> None:

@@ -125,9 +125,8 @@ def _serve(connection: Connection, folder: Path) -> None:
             _limit_memory(None)
             if name not in goods:
                 place.mkdir()
-                target.make(place)
                 goods[name] = target.good_files(place)
-                target.read(place)  # they are good; imports and kernels are loaded
+                target.read(place / target.file)  # it is good; imports and kernels are loaded
             _limit_memory(CASE_BYTES)
             good = goods[name]
 
@@ -150,7 +149,7 @@ def _outcome(target: Target, place: Path) -> str | None:
     """Read a case; None, or the failure in words."""
     try:
         signal.setitimer(signal.ITIMER_PROF, CASE_S)
-        target.read(place)
+        target.read(place / target.file)
     except DeWorldSGError as error:
         # Errors are shown: their text must be text.
         try:

@@ -61,7 +61,6 @@ def test_a_middleware_without_security_ends_the_node(tmp_path, monkeypatch, stra
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (("-p", "lifting.tau:=7.0"), "error: .*lifting.tau is 7.0, expected float >= 0 and <= 1"),
         (("-p", "lifting.tua:=0.1"), "error: .*lifting.tua .did you mean lifting.tau"),
         (("-p", "inputs.world_up:=y"), "error: .*put it in quotes"),
         (("--params-file", "missing.yaml"), "missing.yaml"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -13,8 +14,7 @@ import pytest
 def checkout(tmp_path: Path, root_dir: Path) -> Path:
     """A folder with nothing but the script."""
     (tmp_path / "checkout" / "scripts").mkdir(parents=True)
-    script = tmp_path / "checkout" / "scripts" / "bootstrap.sh"
-    script.write_text((root_dir / "scripts" / "bootstrap.sh").read_text(encoding="utf-8"))
+    shutil.copy(root_dir / "scripts" / "bootstrap.sh", tmp_path / "checkout" / "scripts")
     return tmp_path / "checkout"
 
 
@@ -30,10 +30,9 @@ def bash(checkout: Path, code: str, **environment: str) -> subprocess.CompletedP
     )
 
 
-def fake_python(folder: Path, name: str, version: str, *, has_venv: bool = True) -> None:
+def fake_python(path: Path, version: str, *, has_venv: bool = True) -> None:
     """A Python that knows its version and, perhaps, venv."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(
         f"""#!/bin/sh
 case "$*" in
@@ -46,43 +45,37 @@ esac
     path.chmod(0o755)
 
 
-@pytest.fixture()
-def pythons(tmp_path: Path) -> Path:
-    """A PATH of its own: python3.10 to python3.13 are missing there, tools are not."""
+@pytest.mark.parametrize(
+    ("versions", "taken", "refused"),
+    [
+        # python3 is preferred, then the newest that is suitable.
+        ({"python3": "3.12", "python3.13": "3.13"}, "python3", ()),
+        ({"python3": "3.14", "python3.10": "3.10", "python3.11": "3.11"}, "python3.11", ()),
+        (
+            {"python3": "3.8", "python3.12": "3.12"},
+            None,
+            (
+                *("expected Python 3.10, 3.11, 3.12 or 3.13", "python3 is 3.8"),
+                "apt install python3.12-venv",
+            ),
+        ),
+    ],
+)
+def test_a_suitable_python_is_found(checkout, tmp_path, versions, taken, refused):
+    """The PATH has nothing else but tools."""
     folder = tmp_path / "pythons"
     folder.mkdir()
     for tool in ("sed", "bash", "dirname"):
         (folder / tool).symlink_to(f"/usr/bin/{tool}")
-    for name in ("python3", "python3.13", "python3.12", "python3.11", "python3.10"):
-        (folder / name).write_text("#!/bin/sh\nexit 127\n")
-        (folder / name).chmod(0o755)
-    return folder
+    for name, version in versions.items():
+        fake_python(folder / name, version, has_venv=taken is not None)
+    done = bash(checkout, "find_python", PATH=str(folder))
+    assert done.stdout == (f"{folder}/{taken}\n" if taken else "")
+    assert all(words in done.stderr for words in refused)
+    assert (done.returncode == 0) is (taken is not None)
 
 
-def test_python3_is_preferred_when_it_is_suitable(checkout: Path, pythons: Path) -> None:
-    fake_python(pythons, "python3", "3.12")
-    fake_python(pythons, "python3.13", "3.13")
-    assert bash(checkout, "find_python", PATH=str(pythons)).stdout == f"{pythons}/python3\n"
-
-
-def test_newest_suitable_python_is_taken_when_python3_is_not(checkout: Path, pythons: Path) -> None:
-    fake_python(pythons, "python3", "3.14")
-    fake_python(pythons, "python3.10", "3.10")
-    fake_python(pythons, "python3.11", "3.11")
-    assert bash(checkout, "find_python", PATH=str(pythons)).stdout == f"{pythons}/python3.11\n"
-
-
-def test_refusal_states_the_found_and_the_expected_value(checkout: Path, pythons: Path) -> None:
-    fake_python(pythons, "python3", "3.8")
-    fake_python(pythons, "python3.12", "3.12", has_venv=False)
-    done = bash(checkout, "find_python", PATH=str(pythons))
-    assert done.returncode != 0
-    assert "expected Python 3.10, 3.11, 3.12 or 3.13" in done.stderr
-    assert "python3 is 3.8" in done.stderr
-    assert "apt install python3.12-venv" in done.stderr
-
-
-def test_a_virtual_environment_of_the_user_is_left_alone(checkout: Path) -> None:
+def test_a_virtual_environment_of_the_user_is_left_alone(checkout):
     (checkout / ".venv" / "bin").mkdir(parents=True)
     done = bash(checkout, "bootstrap run")
     assert done.returncode != 0
@@ -90,7 +83,7 @@ def test_a_virtual_environment_of_the_user_is_left_alone(checkout: Path) -> None
     assert [path.name for path in (checkout / ".venv").iterdir()] == ["bin"]
 
 
-def test_hash_follows_content_and_names_and_not_compiled_files(checkout: Path) -> None:
+def test_hash_follows_content_and_names_and_not_compiled_files(checkout):
     def hash_of_package() -> str:
         return bash(checkout, "hash_of package").stdout
 
@@ -106,7 +99,7 @@ def test_hash_follows_content_and_names_and_not_compiled_files(checkout: Path) -
     assert len({first, second, hash_of_package()}) == 3
 
 
-def test_failing_step_shows_its_output_and_ends_the_start(checkout: Path) -> None:
+def test_failing_step_shows_its_output_and_ends_the_start(checkout):
     code = 'mkdir -p "$stamps"; quietly "a step" sh -c "echo the reason; exit 3"; echo not reached'
     done = bash(checkout, code)
     assert done.returncode != 0
@@ -115,7 +108,7 @@ def test_failing_step_shows_its_output_and_ends_the_start(checkout: Path) -> Non
     assert done.stdout == ""
 
 
-def test_another_ros_is_put_aside(checkout: Path) -> None:
+def test_another_ros_is_put_aside(checkout):
     code = 'forget_other_ros; echo "${ROS_DISTRO-}${PYTHONPATH-}${LD_LIBRARY_PATH-}"'
     done = bash(checkout, code, ROS_DISTRO="humble", PYTHONPATH="/old", LD_LIBRARY_PATH="/old")
     assert done.stdout == "\n"
@@ -123,17 +116,16 @@ def test_another_ros_is_put_aside(checkout: Path) -> None:
 
 
 @pytest.mark.parametrize("profile", ["run", "test"])
-def test_a_locked_install_takes_the_lock_of_the_python_once(checkout: Path, profile: str) -> None:
+def test_a_locked_install_takes_the_lock_of_the_python_once(checkout, profile):
     (checkout / "locks").mkdir()
     for name in ("run-3.12.txt", "test-3.12.txt", "run-3.11.txt"):
         (checkout / "locks" / name).write_text("numpy==1\nsetuptools==79\n")
-    fake_python(checkout / ".venv" / "bin", "python", "3.12")
+    fake_python(checkout / ".venv" / "bin" / "python", "3.12")
     code = (
         'mkdir -p "$stamps"; quietly() { shift; "$@"; }; pip_install() { echo "$@"; }; '
         f"install_requirements wheels {profile}; install_requirements wheels {profile}"
     )
-    done = bash(checkout, code, DEWORLDSG_LOCKED="1")
-    lines = done.stdout.splitlines()
+    lines = bash(checkout, code, DEWORLDSG_LOCKED="1").stdout.splitlines()
     # What builds a package without a wheel comes first.
     assert [Path(line.split()[-1]).stem for line in lines] == ["build", f"{profile}-3.12"]
     assert (checkout / ".venv/.bootstrap/build.txt").read_text() == "setuptools==79\n"
@@ -144,9 +136,7 @@ def test_a_locked_install_takes_the_lock_of_the_python_once(checkout: Path, prof
     ("ros", "profile", "reason"),
     [("sourced", "run", "ROS 2 is sourced"), ("wheels", "test", "no torch")],
 )
-def test_locks_are_refused_where_they_do_not_fit(
-    checkout: Path, ros: str, profile: str, reason: str
-) -> None:
+def test_locks_are_refused_where_they_do_not_fit(checkout, ros, profile, reason):
     code = f"install_requirements {ros} {profile}"
     done = bash(checkout, code, DEWORLDSG_LOCKED="1", DEWORLDSG_TEST_MODELS="1")
     assert done.returncode != 0 and reason in done.stderr

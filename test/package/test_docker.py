@@ -3,42 +3,21 @@
 import re
 import shutil
 import subprocess
-from pathlib import Path
 
 import pytest
 
-FILES = ("Dockerfile", "Dockerfile.wheels")
-KNOWN = {"FROM", "RUN", "ENV", "USER", "WORKDIR", "COPY", "ENTRYPOINT", "CMD"}
 
-
-def instructions(root: Path, name: str) -> list[tuple[str, str]]:
-    """Keyword and arguments of each instruction."""
-    text = (root / "docker" / name).read_text(encoding="utf-8")
+@pytest.mark.parametrize("name", ["Dockerfile", "Dockerfile.wheels"])
+def test_a_file_ends_without_rights_of_root_and_its_commands_are_shell(root_dir, name):
+    text = (root_dir / "docker" / name).read_text(encoding="utf-8")
     text = re.sub(r"^#.*\n", "", text, flags=re.M).replace("\\\n", " ")
-    pairs = [line.split(maxsplit=1) for line in text.splitlines() if line.strip()]
-    return [(keyword, arguments) for keyword, arguments in pairs]
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_a_file_has_known_instructions_no_rights_of_root_and_the_entry_point(root_dir, name):
-    listed = instructions(root_dir, name)
-    of_kind: dict[str, list[str]] = {
-        kind: [arguments for keyword, arguments in listed if keyword == kind] for kind in KNOWN
-    }
-    assert sum(map(len, of_kind.values())) == len(listed)
-    assert listed[0][0] == "FROM" and re.fullmatch(r"[\w/]+:(?!latest)[\w.-]+", listed[0][1])
-    for line in of_kind["RUN"]:
-        subprocess.run(["sh", "-n", "-c", line], check=True, timeout=20)
-        if "apt-get" in line:
-            assert "apt-get update" in line and "--no-install-recommends" in line
-            assert line.rstrip().endswith("rm -rf /var/lib/apt/lists/*")
-    assert of_kind["USER"] == ["robot"]
-    assert all("--chown=robot" in line for line in of_kind["COPY"])
-    installs = [index for index, pair in enumerate(listed) if "entrypoint.sh" in pair[1]]
-    assert min(installs) > listed.index(("USER", "robot"))
-    (folder,) = of_kind["WORKDIR"]
-    assert of_kind["ENTRYPOINT"] == [f'["bash", "{folder}/docker/entrypoint.sh"]']
-    assert "bash docker/entrypoint.sh true" in of_kind["RUN"]
+    listed = [line.split(maxsplit=1) for line in text.splitlines() if line.strip()]
+    for keyword, arguments in listed:
+        if keyword == "RUN":
+            subprocess.run(["sh", "-n", "-c", arguments], check=True, timeout=20)
+        assert keyword != "COPY" or "--chown=robot" in arguments
+    assert [arguments for keyword, arguments in listed if keyword == "USER"] == ["robot"]
+    assert ["RUN", "bash docker/entrypoint.sh true"] in listed
 
 
 def test_the_context_has_all_that_is_installed(root_dir):

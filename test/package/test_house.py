@@ -6,8 +6,6 @@ import ast
 import importlib.util
 import subprocess
 import sys
-from pathlib import Path
-from types import ModuleType
 
 import msgspec
 import pytest
@@ -27,74 +25,46 @@ MAX_KERNELS = 202
 MAX_ENTERED, MAX_SWITCHES = 50, 520
 
 
-def load_tool(root: Path) -> ModuleType:
+@pytest.fixture(scope="module")
+def tool(root_dir):
     """tools/house.py as a module; dataclasses look it up in sys.modules."""
-    spec = importlib.util.spec_from_file_location("house", root / "tools" / "house.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["house"] = module
+    spec = importlib.util.spec_from_file_location("house", root_dir / "tools" / "house.py")
+    module = sys.modules["house"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-@pytest.fixture(scope="module")
-def tool(root_dir: Path) -> ModuleType:
-    """tools/house.py."""
-    return load_tool(root_dir)
-
-
-def above(sizes: dict[str, int], limit: int) -> dict[str, int]:
-    """The entries above a limit."""
-    return {name: size for name, size in sizes.items() if size > limit}
-
-
-def test_the_package_stays_readable(tool: ModuleType, root_dir: Path) -> None:
+def test_the_package_stays_readable(tool, root_dir):
     house = tool.measure(root_dir)
     assert 100 < len(house.modules) <= MAX_MODULES
-    assert above(house.modules, MAX_MODULE_LINES) == {}
-    assert above(house.functions, MAX_FUNCTION_LINES) == {}
-    assert above(house.parameters, MAX_PARAMETERS) == {}
+    for sizes, limit in (
+        (house.modules, MAX_MODULE_LINES),
+        (house.functions, MAX_FUNCTION_LINES),
+        (house.parameters, MAX_PARAMETERS),
+    ):
+        assert {name: size for name, size in sizes.items() if size > limit} == {}
     assert house.kernels <= MAX_KERNELS
     assert len(house.parts) <= MAX_PARTS * len(house.modules), house.parts
 
 
-def test_a_frame_stays_in_few_modules(tool: ModuleType, root_dir: Path) -> None:
+def test_a_frame_stays_in_few_modules(root_dir):
     code = (
-        "import sys, pathlib, house\n"
-        "print(*map(repr, house.trace_frame(pathlib.Path(sys.argv[1]))), sep=chr(10))"
+        "import pathlib, house\n"
+        "print(*map(repr, house.trace_frame(pathlib.Path().absolute().parent)), sep=chr(10))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(root_dir)],
-        cwd=root_dir / "tools",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    modules, switches, _ = map(ast.literal_eval, done.stdout.splitlines())
+    command = [sys.executable, "-c", code]
+    traced = subprocess.check_output(command, cwd=root_dir / "tools", text=True)
+    modules, switches, _ = map(ast.literal_eval, traced.splitlines())
     assert 20 < len(modules) <= MAX_ENTERED
     assert switches <= MAX_SWITCHES
 
 
-def test_no_modules_import_each_other_in_a_circle(tool: ModuleType, root_dir: Path) -> None:
+def test_no_modules_import_each_other_in_a_circle(tool, root_dir):
     assert tool.circles(tool.measure(root_dir).imports) == []
     assert tool.circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
 
 
-def test_the_measuring_tool_counts_what_it_says(tool: ModuleType, tmp_path: Path) -> None:
-    package = tmp_path / "deworldsg_ros" / "part"
-    package.mkdir(parents=True)
-    (package / "a.py").write_text(
-        "from deworldsg_ros.part import b\n\n\n@kernel\ndef f(self, x, *, y=1):\n    return x\n"
-    )
-    (package / "b.py").write_text("LIMIT_M = 0.5\n")
-    house = tool.measure(tmp_path)
-    assert house.modules == {"deworldsg_ros.part.a": 6, "deworldsg_ros.part.b": 1}
-    assert (house.lines, house.kernels, house.parts) == (7, 1, ["deworldsg_ros.part.b"])
-    assert house.functions == {"deworldsg_ros/part/a.py:f": 2}
-    assert house.parameters == {"deworldsg_ros/part/a.py:f": 2}
-
-
-def test_every_option_has_a_user() -> None:
+def test_every_option_has_a_user():
     sections = msgspec.structs.fields(Config)
     count = sum(len(msgspec.structs.fields(section.type)) for section in sections)
     for options in (NodeOptions, ReplayOptions):

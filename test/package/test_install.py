@@ -10,30 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ament_index_python.packages import (
-    get_package_prefix,
-    get_package_share_directory,
-    get_packages_with_prefixes,
-)
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
 
 PACKAGE = "deworldsg_ros"
 SCRIPTS = Path(__file__).parents[2] / "scripts" / "ros"
 EXECUTABLES = {path.name for path in SCRIPTS.iterdir()}
 SOURCES = (
-    *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"),
     *("deworldsg_ros", "resource", "launch", "config", "msg_schemas", "bags", "scripts"),
+    *("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "README.md", "LICENSE"),
 )
 SHARED = ("launch", "config", "msg_schemas", "bags")
 
 
 @dataclass(frozen=True)
 class Install:
-    """An installation of the package.
-
-    Attributes:
-        prefix: what AMENT_PREFIX_PATH names.
-        site: the folder that Python imports the package from.
-    """
+    """An installation: what AMENT_PREFIX_PATH names, and where Python imports the package from."""
 
     prefix: Path
     site: Path
@@ -56,14 +47,12 @@ def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str
 
 def copy_sources(root: Path, target: Path) -> Path:
     """A copy, because both builders leave files beside what they build."""
-    target.mkdir()
+    ignore = shutil.ignore_patterns("__pycache__")
     for name in SOURCES:
-        source = root / name
-        if source.is_dir():
-            ignore = shutil.ignore_patterns("__pycache__")
-            shutil.copytree(source, target / name, ignore=ignore)
-        elif source.exists():
-            shutil.copy2(source, target / name)
+        if (root / name).is_dir():
+            shutil.copytree(root / name, target / name, ignore=ignore)
+        else:
+            shutil.copy2(root / name, target / name)
     return target
 
 
@@ -98,13 +87,6 @@ def install(request, root_dir, tmp_path_factory):
     return Install(prefix, prefix / "lib" / version / "site-packages")
 
 
-@pytest.fixture()
-def sourced(install, monkeypatch):
-    """The installation, with this process as a shell in which it is sourced."""
-    monkeypatch.setenv("AMENT_PREFIX_PATH", install.environment()["AMENT_PREFIX_PATH"])
-    return install
-
-
 def files_below(folder: Path) -> set[str]:
     """The data files below a folder, relative to it."""
     return {
@@ -114,9 +96,11 @@ def files_below(folder: Path) -> set[str]:
     }
 
 
-def test_ros_finds_the_files_of_the_checkout_and_each_executable_once(sourced, root_dir):
-    assert get_package_prefix(PACKAGE) == str(sourced.prefix)
-    assert get_packages_with_prefixes()[PACKAGE] == str(sourced.prefix)
+def test_ros_finds_the_files_of_the_checkout_and_each_executable_once(
+    install, root_dir, monkeypatch
+):
+    monkeypatch.setenv("AMENT_PREFIX_PATH", install.environment()["AMENT_PREFIX_PATH"])
+    assert get_package_prefix(PACKAGE) == str(install.prefix)
     share = Path(get_package_share_directory(PACKAGE))
     assert (share / "package.xml").is_file()
     for folder in SHARED:
@@ -125,10 +109,10 @@ def test_ros_finds_the_files_of_the_checkout_and_each_executable_once(sourced, r
             wanted = {name for name in wanted if not name.endswith(".py")}
         assert wanted <= files_below(share / folder)
     assert files_below(share / "launch") == {"deworldsg.launch.py", "realsense.launch.py"}
-    folder = sourced.prefix / "lib" / PACKAGE
+    folder = install.prefix / "lib" / PACKAGE
     assert {path.name for path in folder.iterdir()} == EXECUTABLES >= {"graph_node", "replay_node"}
     assert all(os.access(path, os.X_OK) for path in folder.iterdir())
-    assert {path.name for path in (sourced.prefix / "bin").iterdir()} == {"deworldsg"}
+    assert {path.name for path in (install.prefix / "bin").iterdir()} == {"deworldsg"}
 
 
 @pytest.mark.parametrize("executable", sorted(EXECUTABLES))

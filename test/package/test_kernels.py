@@ -6,7 +6,6 @@ import itertools
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from numba.core.dispatcher import Dispatcher
@@ -29,7 +28,7 @@ def signatures() -> dict[str, set[object]]:
 
 
 @pytest.mark.slow
-def test_no_frame_waits_for_the_compiler(root_dir: Path) -> None:
+def test_no_frame_waits_for_the_compiler(root_dir):
     pipeline = Pipeline(Config())
     pipeline.lifting.warm_up()
     warm_up(Config())
@@ -62,7 +61,7 @@ print(done)
 """
 
 
-def test_threads_may_call_a_kernel_for_the_first_time_together() -> None:
+def test_threads_may_call_a_kernel_for_the_first_time_together():
     done = subprocess.run(
         [sys.executable, "-c", FIRST_CALLS], capture_output=True, text=True, check=True
     )
@@ -79,7 +78,7 @@ def test_threads_may_call_a_kernel_for_the_first_time_together() -> None:
         "deworldsg_ros.nodes.replay_node, deworldsg_ros.nodes.deworldsg_node",
     ],
 )
-def test_a_start_imports_nothing_slow_that_it_may_not_need(modules: str) -> None:
+def test_a_start_imports_nothing_slow_that_it_may_not_need(modules):
     slow = {"numba", "scipy", "matplotlib", "onnxruntime", "numpy.ma"}
     if "graph_node" in modules:
         slow |= {"cv2", "sensor_msgs"}
@@ -116,9 +115,7 @@ print(calling(1), compiled != [])
 """
 
 
-def test_a_kernel_is_compiled_again_if_one_that_it_calls_in_another_file_changed(
-    tmp_path: Path,
-) -> None:
+def test_a_kernel_is_compiled_again_if_one_that_it_calls_in_another_file_changed(tmp_path):
     def call(step: int, documentation: str) -> list[str]:
         text = CALLED.format(step=step, documentation=documentation)
         (tmp_path / "called.py").write_text(text, encoding="utf-8")

@@ -1,16 +1,9 @@
-"""Content of the launch files.
-
-`launch` and `launch_ros` are not among the wheels of ROS 2. Test doubles, which keep their
-arguments, replace their classes. These tests show the arguments of the launch files; they do not
-show that ROS 2 accepts them.
-"""
+"""Arguments of the launch files. Test doubles replace `launch`, which is not among the wheels."""
 
 import runpy
 import sys
 from collections import defaultdict
-from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 
@@ -20,9 +13,8 @@ from deworldsg_ros.ros.node import RESPAWN_VARIABLE
 class Kept:
     """Test double of a class of launch: it keeps its arguments."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.args = args
-        self.kwargs = kwargs
+    def __init__(self, *args, **kwargs):
+        self.args, self.kwargs = args, kwargs
 
 
 class Doubles(ModuleType):
@@ -31,8 +23,7 @@ class Doubles(ModuleType):
     def __getattr__(self, name):
         if name.startswith("_"):
             raise AttributeError(name)
-        setattr(self, name, type(name, (Kept,), {}))
-        return getattr(self, name)
+        return type(name, (Kept,), {})
 
 
 MODULES = (
@@ -48,7 +39,7 @@ def launch_doubles(monkeypatch):
         monkeypatch.setitem(sys.modules, name, Doubles(name))
 
 
-def described(path: Path) -> dict[str, list[Kept]]:
+def described(path):
     """Entities of a launch file, by kind."""
     (entities,) = runpy.run_path(str(path))["generate_launch_description"]().args
     found = defaultdict(list)

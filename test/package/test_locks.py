@@ -16,7 +16,6 @@ from packaging.version import Version
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PROFILES = {"run": ("build", "run", "ros"), "test": ("build", "run", "ros", "test")}
 PINNED = re.compile(r"([a-z0-9-]+)==(\S+) --hash=sha256:([0-9a-f]{64})")
-LOCKS = [(profile, python) for profile in PROFILES for python in PYTHONS]
 PRESENT = f"{sys.version_info[0]}.{sys.version_info[1]}"
 
 
@@ -38,41 +37,35 @@ def required(root: Path, *extras: str) -> list[Requirement]:
     return [Requirement(line) for line in done.stdout.split()]
 
 
-def advisories(root: Path) -> list[dict[str, str]]:
+def known_problems(root: Path, versions: dict[str, Version]) -> list[str]:
+    """Advisories that some versions are affected by, without those that are accepted."""
     content = json.loads((root / "locks" / "advisories.json").read_text(encoding="utf-8"))
     assert content["source"] and re.fullmatch(r"\d{4}-\d\d-\d\d", content["date"])
-    found: list[dict[str, str]] = content["advisories"]
-    return found
+    return [
+        f"{advisory['package']} {versions[advisory['package']]}: {advisory['id']}"
+        for advisory in content["advisories"]
+        if advisory["package"] in versions
+        and versions[advisory["package"]] in SpecifierSet(advisory["affected"])
+        and not advisory.get("accepted")
+    ]
 
 
 def name_of(requirement: Requirement) -> str:
     return re.sub(r"[-_.]+", "-", requirement.name).lower()
 
 
-@pytest.mark.parametrize(("profile", "python"), LOCKS)
-def test_a_lock_satisfies_pyproject(root_dir: Path, profile: str, python: str) -> None:
+@pytest.mark.parametrize("python", PYTHONS)
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_lock_satisfies_pyproject_and_has_no_known_advisory(root_dir, profile, python):
     versions = locked(root_dir, profile, python)
     for requirement in required(root_dir, *PROFILES[profile]):
         assert requirement.specifier.contains(versions[name_of(requirement)]), requirement
     assert "torch" not in versions
+    assert versions.items() <= locked(root_dir, "test", python).items()
+    assert known_problems(root_dir, versions) == []
 
 
-@pytest.mark.parametrize("python", PYTHONS)
-def test_the_locks_of_both_commands_agree(root_dir: Path, python: str) -> None:
-    run, test = (locked(root_dir, profile, python) for profile in PROFILES)
-    assert run.items() <= test.items()
-
-
-@pytest.mark.parametrize(("profile", "python"), LOCKS)
-def test_no_locked_version_has_a_known_advisory(root_dir: Path, profile: str, python: str) -> None:
-    versions = locked(root_dir, profile, python)
-    for advisory in advisories(root_dir):
-        version = versions.get(advisory["package"])
-        if version is not None and version in SpecifierSet(advisory["affected"]):
-            assert advisory.get("accepted"), f"{advisory['package']} {version}: {advisory['id']}"
-
-
-def test_no_lowest_version_of_pyproject_has_a_known_advisory(root_dir: Path) -> None:
+def test_no_lowest_version_of_pyproject_has_a_known_advisory(root_dir):
     extras = ("build", "run", "ros", "models", "cluster", "mcp", "networkx")
     lowest = {
         name_of(requirement): Version(spec.version)
@@ -81,10 +74,7 @@ def test_no_lowest_version_of_pyproject_has_a_known_advisory(root_dir: Path) -> 
         if spec.operator == ">="
     }
     assert lowest["torch"] and lowest["numpy"]
-    for advisory in advisories(root_dir):
-        version = lowest.get(advisory["package"])
-        if version is not None and version in SpecifierSet(advisory["affected"]):
-            assert advisory.get("accepted"), f"{advisory['package']}>={version}: {advisory['id']}"
+    assert known_problems(root_dir, lowest) == []
 
 
 def install(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -104,7 +94,7 @@ def install(folder: Path, text: str, *options: str) -> subprocess.CompletedProce
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_pip_accepts_the_lock_of_this_python(root_dir: Path, tmp_path: Path) -> None:
+def test_pip_accepts_the_lock_of_this_python(root_dir, tmp_path):
     text = (root_dir / "locks" / f"test-{PRESENT}.txt").read_text(encoding="utf-8")
     done = install(tmp_path, text)
     assert done.returncode == 0, done.stdout[-3000:]
@@ -113,7 +103,7 @@ def test_pip_accepts_the_lock_of_this_python(root_dir: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_pip_refuses_a_file_with_another_hash(root_dir: Path, tmp_path: Path) -> None:
+def test_pip_refuses_a_file_with_another_hash(root_dir, tmp_path):
     text = (root_dir / "locks" / f"run-{PRESENT}.txt").read_text(encoding="utf-8")
     line = next(line for line in text.splitlines() if line.startswith("sortedcontainers=="))
     done = install(tmp_path, line[:-1] + ("0" if line[-1] != "0" else "1"), "--no-deps")

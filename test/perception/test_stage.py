@@ -11,6 +11,7 @@ from support.perception import (
     CUP_ON_TABLE,
     HEIGHT,
     INTRINSICS,
+    PITCH,
     SHAPE,
     TABLE_TOP,
     WIDTH,
@@ -25,9 +26,7 @@ from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
 from deworldsg_ros.ros.health import REASONS
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
-from deworldsg_ros.scene.vocabulary import (
-    REPLICA_SSG_PREDICATES,
-)
+from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 
 class ListedDetector:
@@ -51,7 +50,6 @@ class ListedDetector:
 
 RGB, DEPTH_M, OWNER = render([TABLE_TOP, CUP_ON_TABLE], 0.002)
 TABLE, CUP = box_of(OWNER > 0), box_of(OWNER == 2)
-PITCH = np.radians(30.0)
 T_CAMERA = np.eye(4)
 T_CAMERA[:3, 1] = 0, -np.sin(PITCH), -np.cos(PITCH)
 T_CAMERA[:3, 2] = 0, np.cos(PITCH), -np.sin(PITCH)
@@ -150,7 +148,6 @@ def test_a_backend_that_fails_loses_only_its_own_results(caplog):
     assert found.drops == {} and found.failures == {}
     # The features are sorted by score together with their objects.
     assert backend.features.tolist() == [[2, 3], [4, 5], [0, 1]]
-
     found, _ = with_backend("relation_head", times=3)
     assert len(found.frame_graph) == 3 and found.instances.any()
     assert found.frame_graph.relations.logits.shape == (0, 2)
@@ -159,13 +156,11 @@ def test_a_backend_that_fails_loses_only_its_own_results(caplog):
     # It is logged once, with its traceback.
     assert len(caplog.records) == 1
     assert "the relation head failed" in caplog.text and "Traceback" in caplog.text
-
     found, _ = with_backend("segmenter")
     assert len(found.frame_graph) == 0 and not found.instances.any()
     assert found.instances.shape == failing_backend.SHAPE and found.instances.dtype == np.uint16
     assert found.drops == {"segmenter_error": 3}
     assert list(found.failures) == ["segmenter_error"]
-
     with pytest.raises(RefusedInput, match="CUDA out of memory") as refusal:
         with_backend("detector")
     assert refusal.value.reason == "detector_error"
@@ -185,11 +180,6 @@ def test_a_backend_that_fails_loses_only_its_own_results(caplog):
 def test_an_unknown_backend_is_refused(settings, offender):
     with pytest.raises(ConfigurationError, match=offender):
         build_perception(PerceptionConfig(**settings))
-
-
-def test_detections_have_one_row_of_features_per_object():
-    with pytest.raises(ValueError, match="2 scores, 1 features"):
-        Detections(np.zeros((2, 4)), np.ones((2, 1)), np.zeros(2), np.zeros((1, 3), np.float32))
 
 
 @pytest.mark.parametrize(

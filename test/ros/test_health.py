@@ -71,15 +71,12 @@ def test_other_levels(health, happens, level):
     assert health.report(1.0).level == level
 
 
-def test_missing_inputs_are_the_message(health):
+def test_missing_inputs_are_the_message_and_counts_are_read_back(health):
     missing = ["no camera_info on /x for 3 s", "no pose on /y for 3 s"]
     report = health.report(1.0, missing, values={"queue": "4"})
     assert (report.level, report.message) == (WARN, "; ".join(missing))
     assert report.values["waiting for 2"] == missing[1]
     assert report.values["queue"] == "4"
-
-
-def test_counts_are_read_back_from_a_report(health):
     health.dropped("no_pose", 2, "no pose near 3.0 s")
     for count in (1, 3):
         health.left_out({"few_mask_pixels": count})

@@ -23,27 +23,26 @@ LIMIT_S = 30.0
 class Held:
     """A worker that notes its items; it does not begin before `begin` is set."""
 
-    def __init__(self, size: int = 9, **options) -> None:
+    def __init__(self, size, **options):
         self.begin, self.done, self.overruns = threading.Event(), [], []
-        self.worker = Worker(
-            "test", self._work, size=size, on_overrun=self.overruns.append, **options
-        )
+        overrun = self.overruns.append
+        self.worker = Worker("test", self._work, size=size, on_overrun=overrun, **options)
 
-    def _work(self, item: int) -> None:
+    def _work(self, item):
         assert self.begin.wait(LIMIT_S)
         self.done.append(item)
 
-    def submit(self, *items: int) -> None:
+    def submit(self, *items):
         for item in items:
             self.worker.submit(item)
 
-    def submit_first(self) -> None:
+    def submit_first(self):
         """Submit an item and wait until the thread has taken it."""
         self.worker.submit(0)
         while self.worker.waiting:
             time.sleep(0.001)
 
-    def finish(self) -> None:
+    def finish(self):
         self.begin.set()
         assert self.worker.wait_idle(LIMIT_S)
 
@@ -56,35 +55,32 @@ def test_a_worker_keeps_the_order_and_drops_the_oldest():
     assert not held.worker.wait_idle(0.0)
     held.finish()
     assert held.done == [0, 3, 4, 5]
-    assert held.worker.stop(LIMIT_S)
-
-
-def test_a_worker_stops_with_items_in_its_queue():
-    held = Held()
+    held.begin.clear()
     held.submit_first()
-    held.submit(1, 2, 3, 4)
+    held.submit(6, 7)
     assert not held.worker.stop(0.01)
     held.begin.set()
     assert held.worker.stop(LIMIT_S)
-    assert len(held.done) <= 1
+    assert held.done[4:] in ([], [0])  # what is in its queue does not delay its end
 
 
 def test_a_worker_calls_again_after_the_time_that_was_asked_for():
     calls, enough = [], threading.Event()
 
-    def after() -> float | None:
+    def after():
         calls.append(len(calls))
         if len(calls) < 3:
             return 0.01
         enough.set()
         return None
 
-    worker: Worker[int] = Worker("test", print, size=1, on_overrun=print, after=after)
-    worker.submit(0)
+    held = Held(1, after=after)
+    held.submit(0)
+    held.begin.set()
     assert enough.wait(LIMIT_S)
-    assert worker.wait_idle(LIMIT_S)
+    held.finish()
     assert len(calls) == 3
-    assert worker.stop(LIMIT_S)
+    assert held.worker.stop(LIMIT_S)
 
 
 @pytest.mark.parametrize("wait_s", [1e10, 1e308, float("inf")])
@@ -101,16 +97,13 @@ RATE_HZ = 30.0
 PERIOD_S = 1 / RATE_HZ
 
 
-def delays_s(arrivals_s: list[float], *, evidence_after_s: float | None = None) -> list[float]:
+def delays_s(arrivals_s, *, evidence_after_s=np.inf):
     """Delay from each frame's arrival to the update that contains it."""
-    times = UpdateTimes(RATE_HZ)
+    times, delays, waiting = UpdateTimes(RATE_HZ), [], []
     events = [(at_s, False) for at_s in arrivals_s]
-    if evidence_after_s is not None:
-        events += [(at_s + evidence_after_s, True) for at_s in arrivals_s]
-    delays: list[float] = []
-    waiting: list[float] = []
+    events += [(at_s + evidence_after_s, True) for at_s in arrivals_s if evidence_after_s < 1]
 
-    def publish_until(end_s: float) -> None:
+    def publish_until(end_s):
         due_s = 0.0
         while (wait_s := times.wait_s(due_s)) is not None and due_s + wait_s <= end_s:
             due_s += wait_s
@@ -133,11 +126,11 @@ def delays_s(arrivals_s: list[float], *, evidence_after_s: float | None = None) 
 def test_frames_up_to_the_rate_do_not_wait(rate_hz):
     rng = np.random.default_rng(0)
     frames_s = np.arange(900) / rate_hz + rng.uniform(0, 0.01, 900)
-    assert max(delays_s(frames_s.tolist())) < 0.001
+    assert max(delays_s(frames_s)) < 0.001
 
 
 def test_evidence_takes_no_place_of_a_frame_and_is_published_soon():
-    frames_s = (np.arange(300) * PERIOD_S).tolist()
+    frames_s = np.arange(300) * PERIOD_S
     assert max(delays_s(frames_s, evidence_after_s=0.004)) < 0.001
     times = UpdateTimes(RATE_HZ)
     assert times.wait_s(0.5) is None  # nothing is due without a change

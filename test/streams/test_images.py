@@ -139,17 +139,10 @@ PNG_DEPTH = "16UC1; compressedDepth png"
 @pytest.mark.parametrize(
     ("read", "message", "reason", "offender"),
     [
-        (rgb_from_message, image(RGB, "yuv422"), "unknown_encoding", "'yuv422'"),
-        (rgb_from_message, image(RGB, "16UC1"), "unknown_encoding", "'16UC1'"),
-        (rgb_from_message, image(RGB, "rgb8", height=0), "empty_image", "7x0"),
-        (rgb_from_message, image(RGB, "rgb8", step=20), "bad_step", "20 bytes"),
         (rgb_from_message, image(RGB, "rgb8", step=30), "short_buffer", "105 bytes"),
         (rgb_from_message, image(RGB, "rgb8", data=RGB.ravel()[:104]), "short_buffer", "104 bytes"),
-        (rgb_from_message, image(RGB, "rgb8", data=RGB.ravel()[:0]), "short_buffer", "0 bytes"),
         (rgb_from_message, compressed(b"", "jpeg"), "decode_failed", ""),
         (rgb_from_message, compressed(b"not an image", "jpeg"), "decode_failed", ""),
-        (depth_of, image(RGB, "rgb8"), "not_depth", "rgb8"),
-        (depth_of, image(COUNTS, "16UC1", step=15), "bad_step", "15 bytes"),
         (depth_of, compressed(b"", PNG_DEPTH), "short_buffer", PNG_DEPTH),
         (depth_of, compressed(bytes(12), PNG_DEPTH), "short_buffer", PNG_DEPTH),
         (depth_of, compressed(bytes(40), PNG_DEPTH), "decode_failed", PNG_DEPTH),
@@ -160,6 +153,7 @@ PNG_DEPTH = "16UC1; compressedDepth png"
     ],
 )
 def test_what_is_no_image_is_refused_with_its_reason(read, message, reason, offender):
+    """Other raw images are in the table of abnormal inputs."""
     with pytest.raises(RefusedInput) as caught:
         read(message)
     assert caught.value.reason == reason

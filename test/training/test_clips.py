@@ -142,7 +142,7 @@ def test_clips_show_the_union_of_both_boxes(tmp_path, window, shown):
     assert cut_clips("scan", [], (60, 40), relations, **options) == []
 
 
-def test_boxes_of_a_frame(tmp_path):
+def test_an_index_names_groups_and_boxes(tmp_path):
     path = tmp_path / "bb.txt"
     assert read_boxes(path) == {}
     path.write_text("3 1 2 30 40\n\n")
@@ -150,9 +150,6 @@ def test_boxes_of_a_frame(tmp_path):
     path.write_text("3 1 2 30\n")
     with pytest.raises(RefusedInput, match="line 1: .*, expected id"):
         read_boxes(path)
-
-
-def test_an_index_names_groups_and_boxes(tmp_path):
     np.savez(tmp_path / "a.npz", frames=np.zeros((3, 8, 9, 3), np.uint8))
     line = {"clip": "a.npz", "predicate": "on", "group": "room 1", "pair": "1 2"}
     boxes = {"subject_box": [0, 0, 0.5, 0.5], "object_box": [0, 0.5, 1, 1]}
@@ -173,7 +170,11 @@ def test_an_index_names_groups_and_boxes(tmp_path):
             read_clip_folder(tmp_path)
 
 
-def test_videos_are_read_as_rgb(tmp_path):
+def test_videos_are_read_as_rgb_and_unreadable_clips_are_refused(tmp_path):
+    with pytest.raises(ConfigurationError, match="contains no clips"):
+        read_clip_folder(tmp_path)
+    with pytest.raises(ConfigurationError, match="absent.* is not a folder"):
+        read_clip_folder(tmp_path / "absent")
     path = tmp_path / "on" / "room__1.avi"
     path.parent.mkdir()
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 10, (32, 24))
@@ -185,13 +186,6 @@ def test_videos_are_read_as_rgb(tmp_path):
     frames = clip.read()
     assert frames.shape == (3, 24, 32, 3)
     assert frames[..., 0].min() > 200 and frames[..., 2].max() < 60
-
-
-def test_unreadable_clips_and_folders_without_clips_are_refused(tmp_path):
-    with pytest.raises(ConfigurationError, match="contains no clips"):
-        read_clip_folder(tmp_path)
-    with pytest.raises(ConfigurationError, match="absent.* is not a folder"):
-        read_clip_folder(tmp_path / "absent")
     np.savez(tmp_path / "a.npz", frames=np.zeros((2, 3, 3), np.uint8))
     np.savez(tmp_path / "b.npz", other=np.zeros(2))
     (tmp_path / "c.mp4").write_bytes(b"no video")

@@ -141,7 +141,7 @@ def test_features_are_extracted_once_and_an_interrupted_run_continues(backbone, 
     assert extract(clips[:4])[1] == 4
 
 
-def test_no_room_is_on_two_sides():
+def test_no_room_is_on_two_sides_and_clips_of_a_pair_stay_together():
     groups = [f"room {n % 6}" for n in range(60)]
     pairs = [f"{group} {n}" for n, group in enumerate(groups)]
     split = split_by_group(groups, pairs, held_out_fraction=0.3, seed=2)
@@ -150,27 +150,20 @@ def test_no_room_is_on_two_sides():
     assert all(parts) and sum(len(part) for part in parts) == 6
     assert parts[2] == set(split.held_out_groups) and len(parts[2]) == 2
     assert sorted(np.concatenate(rows).tolist()) == list(range(60))
-
-
-def test_with_one_room_to_train_on_the_clips_of_a_pair_stay_together():
+    # With one room to train on, pairs are divided.
     groups = ["a"] * 20 + ["b"] * 20
     pairs = [f"{group} {n // 4}" for n, group in enumerate(groups)]
     split = split_by_group(groups, pairs, held_out_fraction=0.2, held_out_groups=["b"])
     assert split.validation_by == "pair" and set(split.held_out.tolist()) == set(range(20, 40))
     assert not {pairs[row] for row in split.train} & {pairs[row] for row in split.validation}
 
-
-@pytest.mark.parametrize(
-    ("groups", "held_out", "reported"),
-    [
+    for groups, held_out, reported in (
         (["a"] * 4, (), "1 group"),
         (["a", "b"], ("c",), "held-out groups c have no clips"),
         (["a", "b"], ("a", "b"), "2 of them held out"),
-    ],
-)
-def test_clips_that_cannot_be_split_are_refused(groups, held_out, reported):
-    with pytest.raises(ConfigurationError, match=reported):
-        split_by_group(groups, groups, held_out_fraction=0.2, held_out_groups=held_out)
+    ):
+        with pytest.raises(ConfigurationError, match=reported):
+            split_by_group(groups, groups, held_out_fraction=0.2, held_out_groups=held_out)
 
 
 def fit(inputs, labels, rows, split, options):
@@ -190,13 +183,9 @@ def test_a_rare_predicate_is_learnt_besides_a_frequent_one():
     assert len(found.train_losses) == len(found.validation_losses) <= 60
     answers = found.probe.predict(inputs, np.zeros((200, 8), np.float32))
     assert score(answers, labels, labels).macro_accuracy > 0.85
-
-
-def test_training_stops_if_the_validation_loss_does_not_fall():
-    generator = np.random.default_rng(0)
+    # Training stops where there is nothing to learn.
     inputs = generator.normal(size=(60, 8)).astype(np.float32)
-    labels = generator.integers(0, 3, 60)  # nothing to learn
-    found = fit(inputs, labels, np.arange(60), 40, FitOptions(patience=3))
+    found = fit(inputs, generator.integers(0, 3, 60), np.arange(60), 40, FitOptions(patience=3))
     assert len(found.validation_losses) == found.best_epoch + 4 < 100
 
 

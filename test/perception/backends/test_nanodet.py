@@ -23,8 +23,7 @@ BOTTLE, CHAIR, CUP, VASE = map(COCO_CLASSES.index, ("bottle", "chair", "cup", "v
 
 
 def plain_iou(a, b):
-    width = min(a[2], b[2]) - max(a[0], b[0])
-    height = min(a[3], b[3]) - max(a[1], b[1])
+    width, height = (min(a[i + 2], b[i + 2]) - max(a[i], b[i]) for i in (0, 1))
     shared = max(width, 0) * max(height, 0)
     area = (a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1])
     return shared / (area - shared)
@@ -174,9 +173,8 @@ def test_letterbox_keeps_the_aspect(shape):
 def clock_picture():
     """A drawing of a wall clock, a COCO class that is easy to detect."""
     image = np.full((480, 640, 3), (214, 208, 196), np.uint8)
-    centre = (400, 200)
-    cv2.circle(image, centre, 92, (40, 40, 40), -1, cv2.LINE_AA)
-    cv2.circle(image, centre, 82, (250, 250, 250), -1, cv2.LINE_AA)
+    for radius, grey in ((92, 40), (82, 250)):
+        cv2.circle(image, (400, 200), radius, [grey] * 3, -1, cv2.LINE_AA)
     marks = [(62, 74, hour * np.pi / 6, 5) for hour in range(12)]
     for low, high, angle, width in [*marks, (0, 55, 0.0, 6), (0, 45, 2.0, 6)]:
         ends = [(int(400 + r * np.sin(angle)), int(200 - r * np.cos(angle))) for r in (low, high)]

@@ -14,7 +14,6 @@ from deworldsg_ros.checkpoints.cards import DETECTOR_CARD, CheckpointCard
 from deworldsg_ros.checkpoints.egtr_network import EgtrNetwork
 from deworldsg_ros.perception import build_perception
 from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
-from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError
 
 pytestmark = pytest.mark.models
@@ -65,6 +64,7 @@ def reference(rgb, *, normalise=False, version=1):
 @pytest.mark.parametrize("version", [1, 2])
 def test_all_detections_equal_the_queries_of_the_network(folders, version):
     rgb = image(48, 96)
+    rgb.flags.writeable = False
     found = detector(folders[f"v{version}"]).detect(rgb, 0.0)
     output = reference(rgb, version=version)
     scores = output.logits[0].sigmoid().amax(-1)
@@ -87,20 +87,16 @@ def test_softmax_scores_are_the_distributions_maxima(folders):
     assert np.allclose(found.scores, found.class_probabilities.max(axis=1), atol=1e-6)
 
 
-def test_temperature_sharpens_the_class_distributions_of_eq_5_and_keeps_the_scores(folders, copy):
-    plain = detector(folders["v1"]).detect(image(), 0.0)
-    sharp = detector(with_card(copy, temperature=0.25)).detect(image(), 0.0)
-    p, q = plain.class_probabilities, sharp.class_probabilities
-    assert np.allclose([p.sum(axis=1), q.sum(axis=1)], 1, atol=1e-12)
-    assert np.array_equal(sharp.scores, plain.scores)
-    assert np.array_equal(q.argmax(axis=1), p.argmax(axis=1))
-    assert (q.max(axis=1) >= p.max(axis=1)).all()
-
-
-def test_threshold_keeps_the_best_in_order(folders, copy):
+def test_temperature_sharpens_the_distributions_and_the_threshold_keeps_the_best(folders, copy):
     found = detector(folders["v1"])
     every = found.detect(image(), 0.0)
     assert every.features is None  # without a relation head
+    sharp = detector(with_card(copy, temperature=0.25)).detect(image(), 0.0)
+    p, q = every.class_probabilities, sharp.class_probabilities
+    assert np.allclose([p.sum(axis=1), q.sum(axis=1)], 1, atol=1e-12)
+    assert np.array_equal(sharp.scores, every.scores)
+    assert np.array_equal(q.argmax(axis=1), p.argmax(axis=1))
+    assert (q.max(axis=1) >= p.max(axis=1)).all()
     threshold = float(np.median(every.scores))
     kept = found.detect(image(), threshold)
     assert 0 < len(kept) < len(every)
@@ -109,8 +105,6 @@ def test_threshold_keeps_the_best_in_order(folders, copy):
     # The default is that of the card or of the kind of scores.
     assert found.default_score_threshold == 0.5
     assert detector(folders["softmax"]).default_score_threshold == 0.7
-    own = with_card(copy, class_scores="softmax", score_threshold=0.3)
-    assert detector(own).default_score_threshold == 0.3
 
 
 @pytest.mark.parametrize("layers", [1, 3])
@@ -118,16 +112,6 @@ def test_fewer_decoder_layers_give_the_intermediate_output(copy, layers):
     found = detector(with_card(copy, decoder_layers=layers)).detect(image(), 0.0)
     inner = reference(image()).intermediate_logits[0, layers - 1].sigmoid().amax(-1)
     assert np.allclose(found.scores, inner.sort(descending=True).values, atol=1e-5)
-
-
-def test_other_images_and_half_precision_run_through(folders):
-    found = detector(folders["v1"])
-    exact = found.detect(image(), 0.0).scores
-    read_only = image(33, 47)
-    read_only.flags.writeable = False
-    assert len(found.detect(read_only, 0.0)) == QUERIES
-    found.model, found.dtype = found.model.half(), torch.float16
-    assert np.allclose(found.detect(image(), 0.0).scores, exact, atol=0.05)
 
 
 def naive(network, features, classes=None):
@@ -220,24 +204,6 @@ def stage(folder, world_up="auto", **changes):
     return build_perception(config, world_up=world_up)
 
 
-def test_rtdetr_sam2_and_egtr_as_one_stage(folders, tmp_path):
-    # Random weights put their boxes anywhere: they are not refined.
-    limits = {"score_threshold": 0.0, "max_relations": 10, "refine_detections": False}
-    segmenter = {"segmenter": "sam2", "segmenter_path": str(models.save_sam2(tmp_path))}
-    perception = stage(folders["paper"], "z", **segmenter, **limits)
-    depth_m = np.full((48, 64), 1.5, np.float32)
-    frame = RgbdFrame(1, image(), depth_m, Intrinsics(60.0, 60.0, 31.5, 23.5, 64, 48), np.eye(4))
-    seen, again = perception.perceive(frame), perception.perceive(frame)
-    vocabulary = perception.vocabulary
-    assert (vocabulary.classes, vocabulary.predicates) == (CLASSES, PREDICATES)
-    count = len(seen.frame_graph)
-    assert 2 <= count <= QUERIES
-    assert len(seen.frame_graph.relations.pairs) == min(10, count * (count - 1))
-    assert not seen.drops.keys() & {"segmenter_error", "relation_head_error"}
-    assert np.array_equal(again.instances, seen.instances)
-    assert np.array_equal(again.frame_graph.relations.logits, seen.frame_graph.relations.logits)
-
-
 def refused(match, build, *arguments, **changes):
     with pytest.raises(ConfigurationError, match=match):
         build(*arguments, **changes)
@@ -319,7 +285,6 @@ def test_a_relation_head_that_does_not_fit_is_refused(folders, copy, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("proj_q.1.weight", None, r"missing \(proj_q.1.weight\)"),
         ("rel_predictor.layers.2.weight", None, r"missing \(rel_predictor.layers.2.weight\)"),
         ("proj_v.0.weight", torch.zeros(2), r"unknown \(proj_v.0.weight\)"),
         ("rel_predictor_gate.bias", torch.zeros(2), "size mismatch for rel_predictor_gate.bias"),
