@@ -36,7 +36,7 @@ from deworldsg_ros.evaluation.baselines import (  # noqa: E402
 )
 from deworldsg_ros.evaluation.front_ends import FrontEndChoice, build_front_end  # noqa: E402
 from deworldsg_ros.evaluation.recorded_room import open_annotations  # noqa: E402
-from deworldsg_ros.graph.graph import SceneGraph  # noqa: E402
+from deworldsg_ros.graph.graph import GlobalGraph  # noqa: E402
 from deworldsg_ros.graph_builder import graph_settings  # noqa: E402
 from deworldsg_ros.lifting import Lifting  # noqa: E402
 from deworldsg_ros.merging import Merging, build_merging  # noqa: E402
@@ -165,7 +165,7 @@ class Ours:
         self._lifting = Lifting(self._config.lifting)
         self._lifting.warm_up()
         settings = graph_settings(self._config.merging)
-        self.graph = SceneGraph(perceived.frame_graph.vocabulary, frame.frame_id, **settings)
+        self.graph = GlobalGraph(perceived.frame_graph.vocabulary, frame.frame_id, **settings)
         self._merging = self._new_merging()
         self._merging.warm_up()
 

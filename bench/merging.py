@@ -26,7 +26,7 @@ from support.reference_merging import class_distance, may_merge
 
 from bench.figures import Figure, Paired, Setup, in_turn
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import build_merging
 from deworldsg_ros.merging.paper_rule import bhattacharyya_bound, nearest_slot, observed, warm_up
 from deworldsg_ros.scene.camera import Intrinsics
@@ -78,9 +78,9 @@ class World:
         return probabilities
 
 
-def graph_of(world: World) -> SceneGraph:
+def graph_of(world: World) -> GlobalGraph:
     """A graph with one node per object and 5 edges per node."""
-    graph = SceneGraph(VOCABULARY, "world")
+    graph = GlobalGraph(VOCABULARY, "world")
     rows = np.arange(len(world.means))
     rng = np.random.default_rng(1)
     surfaces = [world.surface_points(row, rng) for row in rows]
@@ -176,7 +176,7 @@ def depth_grid(surfaces: tuple[np.ndarray, ...], camera_world: np.ndarray) -> De
     return DepthGrid(depth_mm, STRIDE_PX, CAMERA, instances)
 
 
-def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
+def search_with_kernel(graph: GlobalGraph, local: LocalGraph) -> list[int]:
     bound = bhattacharyya_bound(0.7)
     return [
         nearest_slot(observed(mean, covariance, probabilities), graph.nodes, bound, 0.8)
@@ -186,7 +186,7 @@ def search_with_kernel(graph: SceneGraph, local: LocalGraph) -> list[int]:
     ]
 
 
-def search_with_linalg(graph: SceneGraph, local: LocalGraph) -> list[int]:
+def search_with_linalg(graph: GlobalGraph, local: LocalGraph) -> list[int]:
     nodes = graph.nodes
     found = []
     for mean, covariance, probabilities in zip(

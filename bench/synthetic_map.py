@@ -22,7 +22,7 @@ from bench.merging import (
     local_graph,
 )
 from deworldsg_ros.config import Config
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph_builder import GraphBuilder, graph_settings
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
@@ -77,7 +77,7 @@ class RoomMap:
         """A graph of all objects, with relations between neighbours in the order of the rooms."""
         count = len(self.means)
         rng = np.random.default_rng(1)
-        graph = SceneGraph(VOCABULARY, "world", **graph_settings(config.merging))
+        graph = GlobalGraph(VOCABULARY, "world", **graph_settings(config.merging))
         rows = np.arange(count)
         surfaces, probabilities = self.surfaces(rows, rng), self.probabilities(rows)
         for row in range(count):

@@ -10,7 +10,7 @@ from typing import Any
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.graph import SceneGraph, nodes_since
+from deworldsg_ros.graph.graph import GlobalGraph, nodes_since
 from deworldsg_ros.graph.messages import hidden_node
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph.provenance import FrameMemory, SeenSpace
@@ -54,11 +54,11 @@ class GraphBuilder:
         config: Config,
         vocabulary: Vocabulary,
         frame_id: str,
-        graph: SceneGraph | None = None,
+        graph: GlobalGraph | None = None,
         prior: ClassPairPrior | None = None,
     ) -> None:
         if graph is None:
-            graph = SceneGraph(vocabulary, frame_id, **graph_settings(config.merging))
+            graph = GlobalGraph(vocabulary, frame_id, **graph_settings(config.merging))
         if prior is None:
             prior = ClassPairPrior(len(vocabulary.classes), len(vocabulary.predicates))
         output = config.output
@@ -224,5 +224,5 @@ def warm_up(config: Config, *parts: str) -> None:
 
 
 def graph_settings(merging: MergingConfig) -> dict[str, Any]:
-    """Settings of `SceneGraph` by name."""
+    """Settings of `GlobalGraph` by name."""
     return {"even_gaussians": merging.association == "surface"}

@@ -145,32 +145,7 @@ def _numba() -> ModuleType:
 
     register: Any = event.register
     register("numba:compile", Compilation())
-    _hasten()
     return numba
-
-
-def _hasten() -> None:
-    """Let numba compile in 85 % of the time."""
-    from llvmlite.binding import ffi
-    from numba.core.targetconfig import ConfigStack
-    from numba.core.types.functions import BaseFunction
-
-    # By itself, it tries dozens of overloads of `a[i] + b` wherever one occurs.
-    function: Any = BaseFunction
-    infer, flags = function.get_call_type, cast(Any, ConfigStack).top_or_none
-    known: dict[Any, Any] = {}
-
-    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-        key = self, context, tuple(args), tuple(kws.items()), flags()
-        found = known.get(key)
-        if found is None:
-            found = known[key] = infer(self, context, args, kws)
-        return found
-
-    function.get_call_type = get_call_type
-    # It takes the time of each call of LLVM, of which there are hundreds of thousands.
-    for callbacks in list(ffi.lib._lock._cblist):
-        ffi.unregister_lock_callback(*callbacks)
 
 
 def _jit(item: _Kernel) -> Any:

@@ -56,6 +56,7 @@ from deworldsg_ros.wire import messages as wire
 
 # --- Processes of the demo: each in its own session with its own log, ended one after the other.
 
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 # Time to end after each signal. graph_node writes its map after SIGINT.
 GRACE_S = ((signal.SIGINT, 8.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
@@ -167,21 +168,36 @@ def ending(console: Console) -> Iterator[list[LoggedProcess]]:
 
 
 @contextlib.contextmanager
-def one_interrupt() -> Iterator[None]:
-    """Only the first SIGINT or SIGTERM interrupts: a second one must not stop the clean-up."""
-    numbers = (signal.SIGINT, signal.SIGTERM)
-
-    def interrupt(*_: Any) -> None:
-        for number in numbers:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    previous = {number: signal.signal(number, interrupt) for number in numbers}
+def _on_interrupt(handler: Callable[..., None]) -> Iterator[None]:
+    """Another handler of SIGINT and SIGTERM."""
+    previous = {number: signal.signal(number, handler) for number in INTERRUPTS}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, former in previous.items():
+            signal.signal(number, former)
+
+
+@contextlib.contextmanager
+def one_interrupt() -> Iterator[None]:
+    """Only the first SIGINT or SIGTERM interrupts: a second one must not stop the clean-up."""
+
+    def interrupt(*_: Any) -> None:
+        for number in INTERRUPTS:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    with _on_interrupt(interrupt):
+        yield
+
+
+def _start_process(processes: list[LoggedProcess], *arguments: Any, **options: Any) -> None:
+    """Append a new process; an interrupt waits, so that no process starts without being listed."""
+    held: list[int] = []
+    with _on_interrupt(lambda number, _: held.append(number)):
+        processes.append(LoggedProcess(*arguments, **options))
+    for number in held[:1]:
+        signal.raise_signal(number)
 
 
 # --- The live view of the demo: viewer_node as one more process, and its address on the terminal.
@@ -228,9 +244,9 @@ class DemoView:
             self._note("it needs the package viser: pip install 'deworldsg_ros[view]'")
             return
         command = [*node_command(VIEWER), "--ros-args", "--params-file", str(self._config)]
-        process = LoggedProcess(VIEWER, command, dds_environment(), self._log)
-        self._processes.append(process)
-        threading.Thread(target=self._announce, args=[process], daemon=True).start()
+        _start_process(self._processes, VIEWER, command, dds_environment(), self._log)
+        viewer = self._processes[-1]
+        threading.Thread(target=self._announce, args=[viewer], daemon=True).start()
 
     def stay_open(self) -> None:
         """Keep the page until Ctrl-C if someone is at the terminal."""
@@ -553,11 +569,10 @@ def _start(
     for node in (*NODES, ODOMETRY_NODE) if options.odometry else NODES:
         values = {"inputs.pose_source": recording.pose_source, "save_path": _quoted(save_path)}
         command = [*node_command(node), *common, *_parameters(values)]
-        processes.append(LoggedProcess(node, command, environment, logs / f"{node}.log"))
+        _start_process(processes, node, command, environment, logs / f"{node}.log")
     command = [*node_command(REPLAY), *common, *_parameters(_replay_values(recording, options))]
-    processes.append(
-        LoggedProcess(REPLAY, command, environment, logs / f"{REPLAY}.log", read_output=True)
-    )
+    log = logs / f"{REPLAY}.log"
+    _start_process(processes, REPLAY, command, environment, log, read_output=True)
 
 
 def _replay_values(recording: _Recording, options: DemoOptions) -> dict[str, Any]:

@@ -36,7 +36,7 @@ class GraphState:
 
     Attributes:
         vocabulary, frame_id: of the graph, and
-        surface_point_capacity, remembered_frames, even_gaussians: its settings; see `SceneGraph`.
+        surface_point_capacity, remembered_frames, even_gaussians: its settings; see `GlobalGraph`.
         nodes: arrays of n rows, by ascending ids, by their names in `NodeTable`.
         surface_points: (m, 3) float32, metres, those of one node after those of another.
         surface_counts: (n,) int64, number of points of each node.
@@ -58,7 +58,7 @@ class GraphState:
     edits: Sequence[Edit] = ()
 
 
-class SceneGraph:
+class GlobalGraph:
     """The state of the map: nodes and directed edges between them.
 
     Stages change it only through its methods. Ids start at 1 and are never reused. When two nodes
@@ -96,7 +96,7 @@ class SceneGraph:
         self.pairs = PairStore(self.nodes, len(vocabulary.predicates))
 
     @classmethod
-    def from_state(cls, state: GraphState) -> SceneGraph:
+    def from_state(cls, state: GraphState) -> GlobalGraph:
         """The graph of a state; ValueError or KeyError if its parts do not fit together."""
         graph = cls(
             state.vocabulary,
@@ -427,7 +427,7 @@ class SceneGraph:
 
 
 def copy_node(
-    graph: SceneGraph,
+    graph: GlobalGraph,
     node_id: int,
     without: Collection[int] = (),
     points_world: Float32 | None = None,
@@ -465,7 +465,7 @@ def copy_node(
 # it stays.
 
 
-def nodes_since(graph: SceneGraph, since_ns: int) -> list[int]:
+def nodes_since(graph: GlobalGraph, since_ns: int) -> list[int]:
     """Ids of the nodes first seen at a stamp or later, ascending."""
     nodes = graph.nodes
     slots = nodes.slots

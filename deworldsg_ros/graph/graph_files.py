@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from deworldsg_ros.base.array_file import Arrays, read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, paused_collector, read_regular, write_atomically
 from deworldsg_ros.graph.edits import MAX_EDITS, Edit
-from deworldsg_ros.graph.graph import GraphState, SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph, GraphState
 from deworldsg_ros.graph.nodes import SAVED, IdState
 from deworldsg_ros.graph.pairs import MAX_ID, PairArrays
 from deworldsg_ros.scene import limits
@@ -258,12 +258,12 @@ def read_content(path: Path) -> bytes:
 FORMAT_VERSION = 2
 
 
-def save(graph: SceneGraph, path: str | Path) -> None:
+def save(graph: GlobalGraph, path: str | Path) -> None:
     """Write the whole state of a graph; OSError if that fails."""
     write(path, to_arrays(graph.state()))
 
 
-def load(path: str | Path) -> SceneGraph:
+def load(path: str | Path) -> GlobalGraph:
     """Read what `save` wrote; RefusedInput ``invalid_graph_file`` if the file is not one."""
     return graph_from_arrays(read(path), str(path))
 
@@ -309,19 +309,19 @@ def _id_arrays(ids: IdState) -> Arrays:
     }
 
 
-def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> SceneGraph:
+def graph_from_arrays(arrays: Arrays, source: str, **settings: Any) -> GlobalGraph:
     """The graph of `to_arrays`.
 
     Args:
         arrays: by name; others are ignored.
         source: file name for errors.
-        settings: of `SceneGraph`; they replace the saved ones.
+        settings: of `GlobalGraph`; they replace the saved ones.
 
     Raises:
         RefusedInput: ``invalid_graph_file`` if the arrays are not those of a graph.
     """
     try:
-        return SceneGraph.from_state(replace(_state(arrays), **settings))
+        return GlobalGraph.from_state(replace(_state(arrays), **settings))
     except (KeyError, ValueError, TypeError, IndexError, MemoryError) as error:
         raise RefusedInput(
             "invalid_graph_file", f"graph file {source}: {reason_of(error)}"

@@ -21,7 +21,7 @@ from deworldsg_ros.graph.extent import (
     rounded_gaussians,
     surface_bytes,
 )
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.scene.arrays import Float64, Int64
 from deworldsg_ros.wire import messages as wire
 
@@ -153,7 +153,7 @@ class NodeStates:
         states: messages by id. Those of nodes that did not change are the same objects as before.
     """
 
-    def __init__(self, graph: SceneGraph, top_k: int, even_gaussians: bool) -> None:
+    def __init__(self, graph: GlobalGraph, top_k: int, even_gaussians: bool) -> None:
         self.states: dict[int, wire.NodeState] = {}
         self._graph = graph
         self._top_k = top_k
@@ -292,7 +292,7 @@ class NodeStates:
         return Extent(state.mean_m, state.covariance_m2, state.box)
 
 
-def hidden_node(graph: SceneGraph, node_id: int, reason: str) -> wire.HiddenNode:
+def hidden_node(graph: GlobalGraph, node_id: int, reason: str) -> wire.HiddenNode:
     """The message of a node that is not published."""
     nodes, slot = graph.nodes, graph.nodes.slot(node_id)
     best = int(nodes.class_probabilities[slot].argmax())

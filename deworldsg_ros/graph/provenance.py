@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.array_file import read_arrays, write_arrays
 from deworldsg_ros.base.files import parse_json, read_regular, write_atomically
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.scene.arrays import Bool, Float64, Int64, UInt16
 from deworldsg_ros.scene.camera import invert_pose
 from deworldsg_ros.scene.checks import checked, holds, within
@@ -214,7 +214,7 @@ class FrameMemory:
         self._frames = 0
 
     def note(
-        self, graph: SceneGraph, local: LocalGraph, node_ids: Sequence[int], votes: Float64
+        self, graph: GlobalGraph, local: LocalGraph, node_ids: Sequence[int], votes: Float64
     ) -> None:
         """Note a merged frame, the node of each of its rows, and its `frame_votes`."""
         names, stamp_ns = graph.vocabulary, local.stamp_ns
@@ -232,7 +232,7 @@ class FrameMemory:
         if self._frames % PRUNE_FRAMES == 0:
             self._follow(graph)
 
-    def all(self, graph: SceneGraph) -> list[SeenFrames]:
+    def all(self, graph: GlobalGraph) -> list[SeenFrames]:
         """The frames of the live nodes and their pairs, by ids."""
         self._follow(graph)
         return [self._seen[key] for key in sorted(self._seen)]
@@ -259,7 +259,7 @@ class FrameMemory:
         if len(clearest) < CLEAREST or strength > clearest[-1].strength:
             _insert(seen, SeenFrame(strength, stamp_ns, name))
 
-    def _follow(self, graph: SceneGraph) -> None:
+    def _follow(self, graph: GlobalGraph) -> None:
         """Follow merges, and forget removed nodes."""
         known, self._seen = self._seen, {}
         for (node_id, other_id), seen in known.items():

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import msgspec
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates, some_of
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.scene.arrays import Float64
@@ -41,7 +41,7 @@ class Publication:
 
     def __init__(
         self,
-        graph: SceneGraph,
+        graph: GlobalGraph,
         edges: Mapping[Pair, wire.EdgeState],
         refresh_edges: EdgeRefresh,
         *,

@@ -20,7 +20,7 @@ from deworldsg_ros.graph.edits import (
     SplitNode,
     Undo,
 )
-from deworldsg_ros.graph.graph import SceneGraph, copy_node
+from deworldsg_ros.graph.graph import GlobalGraph, copy_node
 from deworldsg_ros.merging.life_cycle import LifeCycle
 from deworldsg_ros.merging.matching import CLASS_AGREEMENT
 from deworldsg_ros.merging.records import NodeRecords
@@ -60,7 +60,7 @@ class _Object(NamedTuple):
 
 
 def as_edited(
-    graph: SceneGraph, local: LocalGraph, records: NodeRecords
+    graph: GlobalGraph, local: LocalGraph, records: NodeRecords
 ) -> tuple[LocalGraph, list[int]]:
     """A frame with joined and cut objects.
 
@@ -101,7 +101,7 @@ def as_edited(
 
 
 def reject_deleted(
-    graph: SceneGraph, local: LocalGraph, node_ids: list[int], on_nodes: Float64
+    graph: GlobalGraph, local: LocalGraph, node_ids: list[int], on_nodes: Float64
 ) -> None:
     """Keep objects off deleted nodes of another class: something else may be there now.
 
@@ -117,7 +117,7 @@ def reject_deleted(
             on_nodes[local.class_probabilities @ classes <= CLASS_AGREEMENT, column] = 0.0
 
 
-def may_merge(graph: SceneGraph, a_id: int, b_id: int) -> bool:
+def may_merge(graph: GlobalGraph, a_id: int, b_id: int) -> bool:
     """Whether the operator's edits allow that two nodes become one."""
     edits, nodes = graph.edits, graph.nodes
     if (min(a_id, b_id), max(a_id, b_id)) in edits.separate:
@@ -127,7 +127,7 @@ def may_merge(graph: SceneGraph, a_id: int, b_id: int) -> bool:
     return len(others) != 1 or not nodes.confirmed[nodes.slot(others[0])]
 
 
-def _agrees(graph: SceneGraph, local: LocalGraph, node_id: int) -> Bool:
+def _agrees(graph: GlobalGraph, local: LocalGraph, node_id: int) -> Bool:
     """Whether (n,) the class of each object is that of a node, or of one that it was made of."""
     nodes = graph.nodes
     slots = nodes.slots_of([node_id, *graph.edits.origins(node_id)])
@@ -135,14 +135,16 @@ def _agrees(graph: SceneGraph, local: LocalGraph, node_id: int) -> Bool:
     return np.asarray((agreement > CLASS_AGREEMENT).any(axis=1))
 
 
-def _merged_below(graph: SceneGraph, on_nodes: dict[int, float]) -> int:
+def _merged_below(graph: GlobalGraph, on_nodes: dict[int, float]) -> int:
     """The node on which most of an object lies, if the operator has merged it; 0 = none."""
     best = max(on_nodes, key=lambda node_id: on_nodes[node_id], default=0)
     is_merged = best in graph.edits.merged and on_nodes[best] >= JOINED_FRACTION
     return best if is_merged else 0
 
 
-def _parts_of_object(graph: SceneGraph, points: Float32, on_nodes: dict[int, float]) -> list[Int64]:
+def _parts_of_object(
+    graph: GlobalGraph, points: Float32, on_nodes: dict[int, float]
+) -> list[Int64]:
     """Indices of the points of an object on each part of a node that the operator has split.
 
     The largest part is the first one. All points, if the object lies on one part only.
@@ -282,7 +284,7 @@ class EditReply(msgspec.Struct, frozen=True):
 class Editor:
     """The edits that need nothing but the graph."""
 
-    def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+    def apply(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """Make an edit, or undo one.
 
         Args:
@@ -308,7 +310,7 @@ class Editor:
             return self._merge(graph, request, stamp_ns)
         return self._split(graph, request, stamp_ns)
 
-    def _set_label(self, graph: SceneGraph, request: SetLabel, stamp_ns: int) -> EditReply:
+    def _set_label(self, graph: GlobalGraph, request: SetLabel, stamp_ns: int) -> EditReply:
         try:
             check_labels([request.label])
         except ValueError as error:
@@ -319,13 +321,13 @@ class Editor:
             text += "; the detector does not know this class, so relations take that of the frames"
         return EditReply("set_label", [request.node], text)
 
-    def _merge(self, graph: SceneGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
+    def _merge(self, graph: GlobalGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
         raise refused("the paper's rule cannot merge by hand: use merging.association surface")
 
-    def _split(self, graph: SceneGraph, request: SplitNode, stamp_ns: int) -> EditReply:
+    def _split(self, graph: GlobalGraph, request: SplitNode, stamp_ns: int) -> EditReply:
         raise refused("the paper's rule cannot split by hand: use merging.association surface")
 
-    def _undo(self, graph: SceneGraph) -> EditReply:
+    def _undo(self, graph: GlobalGraph) -> EditReply:
         if not graph.edits:
             raise refused("there is nothing to undo: no edit holds")
         edit = graph.edits.pop()
@@ -342,10 +344,10 @@ class Editor:
             said += " does not hold any more, but the objects before it are forgotten"
         return EditReply("undo", edit.nodes, said)
 
-    def _bring_back(self, graph: SceneGraph, edit: Edit) -> None:
+    def _bring_back(self, graph: GlobalGraph, edit: Edit) -> None:
         raise AssertionError("a rule without merges and splits has no replaced nodes")
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+    def _publish(self, graph: GlobalGraph, node_ids: list[int]) -> None:
         """Publish nodes that an edit has hidden: all, with a rule that hides none."""
         existence = graph.nodes.existence[graph.nodes.slots_of(node_ids)]
         graph.set_existence(node_ids, existence, minimum=-1.0)
@@ -367,7 +369,7 @@ class SurfaceEditor(Editor):
         self._life_cycle = life_cycle
         self.aside = NodeRecords()
 
-    def apply(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+    def apply(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Editor.apply`."""
         reply = super().apply(graph, request, stamp_ns)
         for slot, node_id in zip(self.aside.slots.tolist(), self.aside.ids):
@@ -375,7 +377,7 @@ class SurfaceEditor(Editor):
                 self.aside.remove(slot)
         return reply
 
-    def _merge(self, graph: SceneGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
+    def _merge(self, graph: GlobalGraph, request: MergeNodes, stamp_ns: int) -> EditReply:
         old_ids = sorted(request.nodes)
         if old_ids[0] == old_ids[1]:
             raise refused(f"object {old_ids[0]} cannot be merged with itself: expected two ids")
@@ -389,7 +391,7 @@ class SurfaceEditor(Editor):
         graph.add_edit(Edit(0, "merge", stamp_ns, [kept_id], old_ids, labels[0] or labels[1]))
         return EditReply("merge", [kept_id], f"objects {_names(old_ids)} are object {kept_id} now")
 
-    def _split(self, graph: SceneGraph, request: SplitNode, stamp_ns: int) -> EditReply:
+    def _split(self, graph: GlobalGraph, request: SplitNode, stamp_ns: int) -> EditReply:
         old_id = request.node
         points = graph.nodes.surface(graph.nodes.slot(old_id)).copy()
         parts = _parts(points, request.near_m)
@@ -414,7 +416,7 @@ class SurfaceEditor(Editor):
         text = f"object {old_id} is the objects {_names(new_ids)} now"
         return EditReply("split", new_ids, text)
 
-    def _replace(self, graph: SceneGraph, old_id: int, new: dict[int, Belongs | None]) -> None:
+    def _replace(self, graph: GlobalGraph, old_id: int, new: dict[int, Belongs | None]) -> None:
         """Put the record of a node aside, and give copies of it, or of parts, to new nodes."""
         balances, old = self._balances(graph, [old_id]), graph.nodes.slot(old_id)
         _transfer(graph, self._records, self.aside, old, old)
@@ -424,7 +426,7 @@ class SurfaceEditor(Editor):
             _transfer(graph, self.aside, self._records, old, slot, belongs)
             self._add_balances(graph, slot, balances)
 
-    def _bring_back(self, graph: SceneGraph, edit: Edit) -> None:
+    def _bring_back(self, graph: GlobalGraph, edit: Edit) -> None:
         balances = self._balances(graph, edit.nodes)
         for node_id in edit.nodes:
             self._life_cycle.remove(graph, node_id)
@@ -434,7 +436,7 @@ class SurfaceEditor(Editor):
             self._add_balances(graph, slot, balances)
         self._publish(graph, edit.replaced)
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int]) -> None:
+    def _publish(self, graph: GlobalGraph, node_ids: list[int]) -> None:
         self._life_cycle.publish_again(graph, node_ids)
 
     def memory(self) -> Arrays:
@@ -442,7 +444,7 @@ class SurfaceEditor(Editor):
         memory = self.aside.memory() if len(self.aside.slots) else {}
         return {_ASIDE + name: values for name, values in memory.items()}
 
-    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
+    def restore(self, graph: GlobalGraph, memory: Arrays) -> None:
         """Continue with a graph of an earlier run."""
         own = {
             name.removeprefix(_ASIDE): values
@@ -451,7 +453,7 @@ class SurfaceEditor(Editor):
         }
         self.aside.restore(graph, own, sorted(graph.edits.replaced))
 
-    def _balances(self, graph: SceneGraph, node_ids: Sequence[int]) -> dict[int, int]:
+    def _balances(self, graph: GlobalGraph, node_ids: Sequence[int]) -> dict[int, int]:
         """Evidence that other nodes are one object with one of these, by the id of the other."""
         records = self._records
         slots = set(graph.nodes.slots_of(node_ids).tolist())
@@ -462,7 +464,7 @@ class SurfaceEditor(Editor):
             if slot in slots and other not in slots
         }
 
-    def _add_balances(self, graph: SceneGraph, slot: int, balances: dict[int, int]) -> None:
+    def _add_balances(self, graph: GlobalGraph, slot: int, balances: dict[int, int]) -> None:
         records, slot_of = self._records, graph.nodes.slot_of
         known = {slot_of[other]: n for other, n in balances.items() if other in slot_of}
         records.joint.restore({(slot, at): n for at, n in known.items() if records.has(at)})
@@ -473,7 +475,7 @@ def refused(message: str) -> RefusedInput:
     return RefusedInput("invalid_request", message)
 
 
-def _check_published(graph: SceneGraph, node_id: int) -> None:
+def _check_published(graph: GlobalGraph, node_id: int) -> None:
     if node_id not in graph:
         new_id = graph.resolve(node_id)
         now = f"it is object {new_id} now" if new_id else "it is gone, or never was"
@@ -513,7 +515,7 @@ def _ends(points: Float32) -> Any:
 
 
 def _transfer(
-    graph: SceneGraph,
+    graph: GlobalGraph,
     source: NodeRecords,
     target: NodeRecords,
     slot: int,

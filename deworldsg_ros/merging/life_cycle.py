@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import beliefs
 from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import HALF, NOT_VISIBLE, View
@@ -42,7 +42,7 @@ class LostNodes:
         """Add a node whose object is absent."""
         self._lost_ns[node_id] = stamp_ns
 
-    def match(self, graph: SceneGraph, node_id: int) -> int | None:
+    def match(self, graph: GlobalGraph, node_id: int) -> int | None:
         """The lost node that is the same object as a new node; None if there is not exactly one."""
         nodes = graph.nodes
         slots = nodes.slots_of(list(self._lost_ns))
@@ -68,7 +68,7 @@ class LostNodes:
         return expired
 
 
-def moved_object(graph: SceneGraph, lost_id: int) -> int | None:
+def moved_object(graph: GlobalGraph, lost_id: int) -> int | None:
     """The confirmed node that is the object of a lost node at its new position.
 
     It was first seen after the lost node was last seen, and has the same class and a similar shape.
@@ -81,7 +81,7 @@ def moved_object(graph: SceneGraph, lost_id: int) -> int | None:
     return int(nodes.ids[similar[0]]) if len(similar) == 1 else None
 
 
-def _are_similar(graph: SceneGraph, node_id: int, slots: Int64) -> Bool:
+def _are_similar(graph: GlobalGraph, node_id: int, slots: Int64) -> Bool:
     """Whether a node and those of some slots (n,) have the same class and similar shapes."""
     nodes = graph.nodes
     slot = nodes.slot(node_id)
@@ -126,14 +126,14 @@ class LifeCycle:
         # Nodes that may be forgotten; some may have been removed.
         self._improbable: set[int] = set()
 
-    def restore(self, graph: SceneGraph) -> None:
+    def restore(self, graph: GlobalGraph) -> None:
         """Continue with a graph of an earlier run; call it before the first frame."""
         nodes = graph.nodes
         slots = nodes.slots
         self._improbable = set(nodes.ids[slots[_are_improbable(graph, slots)]].tolist())
 
     def observe(
-        self, graph: SceneGraph, local: LocalGraph, view: View, node_ids: list[int]
+        self, graph: GlobalGraph, local: LocalGraph, view: View, node_ids: list[int]
     ) -> None:
         """Add a frame to the looks at all nodes that it shows; publish, hide and remove nodes.
 
@@ -166,7 +166,7 @@ class LifeCycle:
             if records.has(slot_of.get(node_id)) and node_id not in graph.edits.deleted:
                 self._lose(graph, node_id, local.stamp_ns)
 
-    def _absent(self, graph: SceneGraph, view: View, detected: Collection[int]) -> list[int]:
+    def _absent(self, graph: GlobalGraph, view: View, detected: Collection[int]) -> list[int]:
         """Nodes that enough consecutive frames have seen through."""
         live = self._live(view)
         frames, absent = self._records.rows["through_frames"], []
@@ -188,7 +188,7 @@ class LifeCycle:
         live: Bool = self._records.rows["node_id"][view.slots] == view.ids
         return live
 
-    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+    def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The nodes that are not published, each with its reason, in words."""
         nodes, records = graph.nodes, self._records
         edits = graph.edits
@@ -204,12 +204,12 @@ class LifeCycle:
             reasons[node_id] = "missed by the detector" if is_missed else "seen too little"
         return {**reasons, **dict.fromkeys(edits.deleted, DELETED)}
 
-    def publish_again(self, graph: SceneGraph, node_ids: list[int]) -> None:
+    def publish_again(self, graph: GlobalGraph, node_ids: list[int]) -> None:
         """Publish nodes that an edit has hidden, if they are likely to be objects."""
         existence = self._records.existence(graph.nodes.slots_of(node_ids))
         graph.set_existence(node_ids, existence, self._min_existence)
 
-    def remove(self, graph: SceneGraph, node_id: int) -> None:
+    def remove(self, graph: GlobalGraph, node_id: int) -> None:
         """Remove a node, wherever its object is."""
         if node_id in self._lost:
             self._lost.remove(node_id)
@@ -217,7 +217,7 @@ class LifeCycle:
             self._records.remove(graph.nodes.slot(node_id))
         graph.remove_node(node_id)
 
-    def _publish(self, graph: SceneGraph, node_ids: list[int], slots: Int64) -> None:
+    def _publish(self, graph: GlobalGraph, node_ids: list[int], slots: Int64) -> None:
         """Publish the nodes that are likely to be objects, and hide the others."""
         records = self._records
         probabilities = records.existence(slots)
@@ -233,7 +233,7 @@ class LifeCycle:
                 self._lost.remove(lost_id)
                 self._move(graph, lost_id, node_id)
 
-    def _forget(self, graph: SceneGraph, stamp_ns: int) -> None:
+    def _forget(self, graph: GlobalGraph, stamp_ns: int) -> None:
         """Remove improbable nodes that were not seen for long, and nodes lost for too long."""
         nodes = graph.nodes
         if self._improbable:
@@ -251,7 +251,7 @@ class LifeCycle:
         for node_id in self._lost.take_expired(stamp_ns):
             graph.remove_node(node_id)
 
-    def _lose(self, graph: SceneGraph, node_id: int, stamp_ns: int) -> None:
+    def _lose(self, graph: GlobalGraph, node_id: int, stamp_ns: int) -> None:
         """Remove an absent node from its position; its id may continue elsewhere, now or later."""
         slot = graph.nodes.slot(node_id)
         self._records.remove(slot)
@@ -265,14 +265,14 @@ class LifeCycle:
         else:
             self._move(graph, node_id, moved_id)
 
-    def _move(self, graph: SceneGraph, old_id: int, new_id: int) -> None:
+    def _move(self, graph: GlobalGraph, old_id: int, new_id: int) -> None:
         """Continue the id of a lost node at the node that its object has become."""
         old, new = graph.nodes.slot(old_id), graph.nodes.slot(new_id)
         graph.take_over(old_id, new_id)
         self._records.move(graph, new, old)
 
 
-def _are_improbable(graph: SceneGraph, slots: Int64) -> Bool:
+def _are_improbable(graph: GlobalGraph, slots: Int64) -> Bool:
     """Whether (n,) the nodes of slots are hidden and too improbable to be kept."""
     nodes = graph.nodes
     improbable: Bool = ~nodes.confirmed[slots] & (nodes.existence[slots] < FORGOTTEN)

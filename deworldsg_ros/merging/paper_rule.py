@@ -11,7 +11,7 @@ from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging.editing import Editor, EditReply, may_merge
@@ -187,12 +187,12 @@ class PaperMerging:
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
         warm_up()
-        graph = SceneGraph(Vocabulary(("class",), ("predicate",)), "world")
+        graph = GlobalGraph(Vocabulary(("class",), ("predicate",)), "world")
         observation = (np.zeros(3), np.eye(3), np.ones(1), 1, np.zeros((1, 3), np.float32))
         graph.observe(graph.add_node(*observation), *observation)
         NodeStates(graph, 1, graph.even_gaussians).refresh()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+    def merge(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
 
         Objects are processed in row order. An object may match a node that an earlier row of the
@@ -205,11 +205,11 @@ class PaperMerging:
         graph.add_relations(local, node_ids)
         return node_ids
 
-    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+    def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The deleted nodes; all others are published."""
         return dict.fromkeys(sorted(graph.edits.deleted), DELETED)
 
-    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+    def edit(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Merging.edit`."""
         return Editor().apply(graph, request, stamp_ns)
 
@@ -217,13 +217,13 @@ class PaperMerging:
         """Empty: the rule has no state besides the graph."""
         return {}
 
-    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
+    def restore(self, graph: GlobalGraph, memory: Arrays) -> None:
         """Does nothing: the rule has no state besides the graph."""
 
-    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Does nothing: the rule has no state besides the graph."""
 
-    def _assign(self, graph: SceneGraph, local: LocalGraph, row: int) -> int:
+    def _assign(self, graph: GlobalGraph, local: LocalGraph, row: int) -> int:
         """Fuse an object into its node, or create a node; returns the node's id."""
         observation = (
             local.means_world[row],
@@ -237,7 +237,7 @@ class PaperMerging:
         graph.observe(match, *observation, *seen)
         return self._merge_repeatedly(graph, match)
 
-    def _merge_repeatedly(self, graph: SceneGraph, node_id: int) -> int:
+    def _merge_repeatedly(self, graph: GlobalGraph, node_id: int) -> int:
         """Merge a changed node with its nearest match until no node matches (Eq. 6)."""
         nodes = graph.nodes
         while True:
@@ -254,7 +254,7 @@ class PaperMerging:
                 return node_id
             node_id = graph.merge_nodes(node_id, other_id)
 
-    def _nearest(self, graph: SceneGraph, item: Observed, skipped: int = -1) -> int | None:
+    def _nearest(self, graph: GlobalGraph, item: Observed, skipped: int = -1) -> int | None:
         """Id of the nearest node that passes Eq. 6; None if there is none."""
         slot = nearest_slot(item, graph.nodes, self._bound, self._class_threshold, skipped)
         return None if slot < 0 else int(graph.nodes.ids[slot])

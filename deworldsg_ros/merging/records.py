@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.base.array_file import Arrays
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import beliefs, surface_map
 from deworldsg_ros.merging.beliefs import LABELS
 from deworldsg_ros.merging.cell_kernels import CellSets
@@ -198,7 +198,7 @@ class NodeRecords:
         self.rows["node_id"][slot] = node_id
         beliefs.start(self.rows[slot], np.ascontiguousarray(class_probabilities), stamp_ns)
 
-    def place(self, graph: SceneGraph, slots: Sequence[int] | Int64) -> None:
+    def place(self, graph: GlobalGraph, slots: Sequence[int] | Int64) -> None:
         """Note where the nodes of slots are, after a change of their Gaussians."""
         nodes = graph.nodes
         self.grid.put(np.asarray(slots, np.int64), nodes.means, nodes.eigenvalue_bounds)
@@ -250,7 +250,7 @@ class NodeRecords:
         self.grid.remove(slot)
         return self.map.remove(slot)
 
-    def move(self, graph: SceneGraph, slot: int, to: int) -> None:
+    def move(self, graph: GlobalGraph, slot: int, to: int) -> None:
         """Continue the record of a node as that of another node, which has none."""
         node_id = int(graph.nodes.ids[to])
         self._make_room(to + 1)
@@ -262,7 +262,7 @@ class NodeRecords:
         self._add_cells(to, cells, scores)
         self.place(graph, [to])
 
-    def merge(self, graph: SceneGraph, kept: int, removed: int) -> None:
+    def merge(self, graph: GlobalGraph, kept: int, removed: int) -> None:
         """Combine the records of the nodes of two slots that the graph has merged."""
         record = self.rows[kept]
         beliefs.merge(record, self.rows[removed])
@@ -291,7 +291,7 @@ class NodeRecords:
             "joint": np.array(sorted(pairs), np.int64).reshape(-1, 3),
         }
 
-    def restore(self, graph: SceneGraph, memory: Arrays, node_ids: Sequence[int]) -> None:
+    def restore(self, graph: GlobalGraph, memory: Arrays, node_ids: Sequence[int]) -> None:
         """Continue with these nodes of a graph of an earlier run; see `Merging.restore`."""
         slots = graph.nodes.slots_of(node_ids)
         self._make_room(int(slots.max(initial=-1)) + 1)
@@ -336,7 +336,7 @@ class NodeRecords:
 
 
 def apply_correction(
-    records: NodeRecords, graph: SceneGraph, node_ids: list[int], T_correction: Float64
+    records: NodeRecords, graph: GlobalGraph, node_ids: list[int], T_correction: Float64
 ) -> None:
     """Move the cells of nodes that a pose-graph correction (4, 4) has moved in the graph.
 
@@ -356,7 +356,7 @@ def apply_correction(
         records.place(graph, [slot])
 
 
-def _rebuild(records: NodeRecords, graph: SceneGraph, slots: Int64) -> None:
+def _rebuild(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:
     """Make records from the surfaces and observations in the graph."""
     nodes = graph.nodes
     _name(records, graph, slots)
@@ -365,7 +365,7 @@ def _rebuild(records: NodeRecords, graph: SceneGraph, slots: Int64) -> None:
         beliefs.assume(records.rows[slot], observations)
 
 
-def _name(records: NodeRecords, graph: SceneGraph, slots: Int64) -> None:
+def _name(records: NodeRecords, graph: GlobalGraph, slots: Int64) -> None:
     """Begin the names of nodes that have none."""
     nodes = graph.nodes
     for slot in slots.tolist():

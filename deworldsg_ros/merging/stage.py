@@ -7,7 +7,7 @@ from typing import Protocol
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging.editing import EditReply
 from deworldsg_ros.merging.paper_rule import PaperMerging
 from deworldsg_ros.merging.surface_rule import SurfaceMerging
@@ -26,7 +26,7 @@ class Merging(Protocol):
         """Use other thresholds from the next frame on; the rule stays."""
         ...
 
-    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+    def merge(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph. All calls use the same graph.
 
         Returns:
@@ -38,7 +38,7 @@ class Merging(Protocol):
         """
         ...
 
-    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+    def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """The nodes that are not published, each with its reason, in words."""
         ...
 
@@ -46,7 +46,7 @@ class Merging(Protocol):
         """The state besides the graph, as arrays by name, for `restore`."""
         ...
 
-    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
+    def restore(self, graph: GlobalGraph, memory: Arrays) -> None:
         """Continue with a graph of an earlier run; call it before the first frame.
 
         Args:
@@ -58,7 +58,7 @@ class Merging(Protocol):
         """
         ...
 
-    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+    def edit(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """Make an operator's edit, or undo one; see `Editor.apply`.
 
         Raises:
@@ -66,7 +66,7 @@ class Merging(Protocol):
         """
         ...
 
-    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
         """Update the state of nodes that a pose-graph correction (4, 4) moved in the graph."""
         ...
 

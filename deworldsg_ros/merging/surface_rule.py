@@ -12,7 +12,7 @@ import numpy as np
 from deworldsg_ros.base.array_file import Arrays
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph.edits import EditRequest
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.merging.cell_kernels import CellSets
 from deworldsg_ros.merging.editing import (
@@ -55,7 +55,10 @@ class SurfaceMerging:
 
     def warm_up(self) -> None:
         """Compile the kernels before the first frame."""
-        spare, graph = SurfaceMerging(self._config), SceneGraph(SPARE, "world", even_gaussians=True)
+        spare, graph = (
+            SurfaceMerging(self._config),
+            GlobalGraph(SPARE, "world", even_gaussians=True),
+        )
         for stamp_ns in range(1, 4):
             spare.merge(graph, _spare_frame(stamp_ns))
         NodeStates(graph, 1, graph.even_gaussians).refresh()
@@ -69,7 +72,7 @@ class SurfaceMerging:
         graph.drop_points(list(graph.nodes.slot_of), inside)
         spare._records.map.warm_up()
 
-    def merge(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+    def merge(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         """Merge one frame into the graph; see `Merging.merge`.
 
         Two objects of one frame never become one node, even if both overlap the same node.
@@ -88,7 +91,7 @@ class SurfaceMerging:
         graph.add_relations(local, node_ids)
         return node_ids
 
-    def _merge_frame(self, graph: SceneGraph, local: LocalGraph) -> list[int]:
+    def _merge_frame(self, graph: GlobalGraph, local: LocalGraph) -> list[int]:
         cells = self._records.map.cells_of(local.surface_points_world)
         frame = None
         if local.depth_grid is not None:
@@ -101,7 +104,7 @@ class SurfaceMerging:
         self._life_cycle.observe(graph, local, view, node_ids)
         return node_ids
 
-    def hidden(self, graph: SceneGraph) -> dict[int, str]:
+    def hidden(self, graph: GlobalGraph) -> dict[int, str]:
         """See `Merging.hidden`."""
         return self._life_cycle.hidden(graph)
 
@@ -109,7 +112,7 @@ class SurfaceMerging:
         """See `Merging.memory`."""
         return {**self._records.memory(), **self._editor.memory()}
 
-    def restore(self, graph: SceneGraph, memory: Arrays) -> None:
+    def restore(self, graph: GlobalGraph, memory: Arrays) -> None:
         """See `Merging.restore`."""
         replaced = graph.edits.replaced
         node_ids = [node_id for node_id in graph.nodes.slot_of if node_id not in replaced]
@@ -117,16 +120,16 @@ class SurfaceMerging:
         self._editor.restore(graph, memory)
         self._life_cycle.restore(graph)
 
-    def edit(self, graph: SceneGraph, request: EditRequest, stamp_ns: int) -> EditReply:
+    def edit(self, graph: GlobalGraph, request: EditRequest, stamp_ns: int) -> EditReply:
         """See `Merging.edit`."""
         return self._editor.apply(graph, request, stamp_ns)
 
-    def moved(self, graph: SceneGraph, node_ids: list[int], T_correction: Float64) -> None:
+    def moved(self, graph: GlobalGraph, node_ids: list[int], T_correction: Float64) -> None:
         """See `Merging.moved`."""
         for records in (self._records, self._editor.aside):
             apply_correction(records, graph, node_ids, T_correction)
 
-    def _see(self, graph: SceneGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
+    def _see(self, graph: GlobalGraph, local: LocalGraph, frame: FrameArrays | None) -> View:
         """Compare the frame with the nodes that may be in view."""
         if frame is None:
             return see_nothing(local)
@@ -135,7 +138,7 @@ class SurfaceMerging:
         return see(graph.nodes, slots, local, frame)
 
     def _associate(
-        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, view: View
+        self, graph: GlobalGraph, local: LocalGraph, cells: CellSets, view: View
     ) -> Matches:
         """Match the objects with the nodes whose surfaces they meet."""
         records = self._records
@@ -155,7 +158,7 @@ class SurfaceMerging:
         )
 
     def _update(
-        self, graph: SceneGraph, local: LocalGraph, cells: CellSets, matches: Matches
+        self, graph: GlobalGraph, local: LocalGraph, cells: CellSets, matches: Matches
     ) -> list[int]:
         """Fuse each object into the node that it matched, or add a node; returns the node ids."""
         records, weights = self._records, local.pixel_counts / PIXELS_PER_WEIGHT
@@ -193,7 +196,7 @@ class SurfaceMerging:
 
     def _judge_cells(
         self,
-        graph: SceneGraph,
+        graph: GlobalGraph,
         local: LocalGraph,
         cells: CellSets,
         node_ids: list[int],
@@ -208,7 +211,7 @@ class SurfaceMerging:
             graph.drop_points(node_ids, self._records.map.points_in(rejected, graph.nodes, slots))
 
     def _merge_parts(
-        self, graph: SceneGraph, local: LocalGraph, matches: Matches, node_ids: list[int]
+        self, graph: GlobalGraph, local: LocalGraph, matches: Matches, node_ids: list[int]
     ) -> list[int]:
         """Merge nodes that are parts of one object; returns the node ids of the rows."""
         records = self._records

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from deworldsg_ros.base.kernels import kernel
 from deworldsg_ros.config import Config
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import DECIMALS, listed, some_of
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph.publication import MEASURED_A_CALL, NEW_A_CALL
@@ -209,7 +209,7 @@ class RobustBeliefs:
         table: the geometry of its pairs.
     """
 
-    def __init__(self, config: Config, graph: SceneGraph, table: PairTable) -> None:
+    def __init__(self, config: Config, graph: GlobalGraph, table: PairTable) -> None:
         self._config = config.relations
         self._geometry = config.relations.world_model != "none"
         self._own_head = config.perception.relation_head == "geometric"
@@ -417,7 +417,7 @@ class EdgeBeliefs:
             same objects.
     """
 
-    def __init__(self, config: Config, graph: SceneGraph, prior: ClassPairPrior) -> None:
+    def __init__(self, config: Config, graph: GlobalGraph, prior: ClassPairPrior) -> None:
         self.prior = prior
         self.up = UpEstimator(config.inputs.world_up)
         self._graph = graph
@@ -648,7 +648,7 @@ def _limits(table: PairTable, begun: bool) -> tuple[int, int]:
 
 def warm_up(config: Config) -> None:
     """Compile the kernels, or load them from the cache: things come, move, rest in a circle, go."""
-    graph = SceneGraph(Vocabulary(("table", "cup"), ("on", "near", "with", "other")), "world")
+    graph = GlobalGraph(Vocabulary(("table", "cup"), ("on", "near", "with", "other")), "world")
     beliefs = EdgeBeliefs(config, graph, ClassPairPrior(2, 4))
     points = np.indices((3, 3, 3)).reshape(3, -1).T.astype(np.float32) / 10.0
     for index in range(3):

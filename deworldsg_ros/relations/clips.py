@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import DECIMALS
 from deworldsg_ros.relations.paper import entropy_nats, visual_distribution
 from deworldsg_ros.scene.arrays import Float64, UInt8
@@ -246,7 +246,7 @@ class GraphView(Protocol):
 class LiveGraph:
     """The graph of the same process."""
 
-    def __init__(self, graph: SceneGraph) -> None:
+    def __init__(self, graph: GlobalGraph) -> None:
         self.generation = 0
         # In one process a frame is merged before its clips are ranked: no frame is still to come.
         self.newest_ns = sys.maxsize

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sortedcontainers import SortedList
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import take_first
 from deworldsg_ros.graph.pairs import Pair, PairChanges
 from deworldsg_ros.graph.publication import NEW_A_CALL
@@ -77,7 +77,7 @@ class PairTable:
             graph: only then pairs are judged, because it needs the floor.
     """
 
-    def __init__(self, graph: SceneGraph, model: PhysicsModel, *, geometry: bool) -> None:
+    def __init__(self, graph: GlobalGraph, model: PhysicsModel, *, geometry: bool) -> None:
         self.shapes: NDArray[np.void] = np.zeros(64, SHAPE)
         self.beliefs: NDArray[np.void] = np.zeros(64, BELIEF)
         self.changes: PairChanges = graph.pairs.watch()

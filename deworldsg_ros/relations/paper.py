@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import UNSET
 
 from deworldsg_ros.config import RelationsConfig
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import DECIMALS, Listed, listed
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.scene.arrays import (
@@ -382,7 +382,7 @@ class PaperBeliefs:
         states: the messages by subject and object; those that did not change are the same objects.
     """
 
-    def __init__(self, config: RelationsConfig, graph: SceneGraph, top_k: int) -> None:
+    def __init__(self, config: RelationsConfig, graph: GlobalGraph, top_k: int) -> None:
         self._config = config
         self._graph = graph
         self._top_k = top_k

@@ -119,6 +119,14 @@ def test_an_interrupt_leaves_no_node_behind(recording, tmp_path, number):
             os.kill(pid, 0)
 
 
+def test_a_process_that_starts_during_an_interrupt_is_listed(monkeypatch):
+    monkeypatch.setattr(demo, "LoggedProcess", lambda *_: signal.raise_signal(signal.SIGTERM))
+    processes = []
+    with pytest.raises(KeyboardInterrupt), demo.one_interrupt():
+        demo._start_process(processes, "a node")
+    assert len(processes) == 1
+
+
 def test_the_demo_goes_on_without_the_viewer(tmp_path, monkeypatch):
     console = Console(file=io.StringIO(), width=200)
     monkeypatch.setattr(demo, "find_spec", lambda name: None)

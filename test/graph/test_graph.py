@@ -13,22 +13,22 @@ from support.merging import (
 from support.node_states import node_states
 
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import PRUNE_ABOVE, NodeIds
 from deworldsg_ros.scene.gaussian import fuse, log_determinant
 
 SURE = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def graph_of(count: int, **options: int) -> SceneGraph:
+def graph_of(count: int, **options: int) -> GlobalGraph:
     """Unit spheres 10 m apart, ids 1 to count."""
-    graph = SceneGraph(VOCABULARY, "world", **options)
+    graph = GlobalGraph(VOCABULARY, "world", **options)
     for index in range(count):
         graph.add_node(np.array([10.0 * index, 0, 0]), np.eye(3), SURE, index)
     return graph
 
 
-def content(graph: SceneGraph) -> dict[str, bytes]:
+def content(graph: GlobalGraph) -> dict[str, bytes]:
     return {name: values.tobytes() for name, values in graph_files.to_arrays(graph.state()).items()}
 
 
@@ -36,7 +36,7 @@ def content(graph: SceneGraph) -> dict[str, bytes]:
 
 
 def test_an_empty_graph() -> None:
-    graph = SceneGraph(VOCABULARY, "world")
+    graph = GlobalGraph(VOCABULARY, "world")
     assert len(graph) == 0 and graph.nodes.means.shape == (0, 3)
     assert dict(graph.edges) == dict(graph.votes) == node_states(graph, 3) == {}
     assert graph.take_removals() == {} and graph.resolve(1) == 0
@@ -58,7 +58,7 @@ def test_ids_start_at_1_and_are_never_used_again() -> None:
 @settings(max_examples=40)
 def test_invariants_hold_through_any_edits(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
+    graph = GlobalGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
     given_ids: set[int] = set()
     gone: set[int] = set()
     for _ in range(15):
@@ -180,7 +180,7 @@ def test_observing_many_is_observing_each() -> None:
 
 
 def test_room_for_surface_points_grows_with_the_largest_surface() -> None:
-    graph, once = SceneGraph(VOCABULARY, "world"), SceneGraph(VOCABULARY, "world")
+    graph, once = GlobalGraph(VOCABULARY, "world"), GlobalGraph(VOCABULARY, "world")
     points = np.random.default_rng(0).uniform(size=(700, 3)).astype(np.float32)
     for node_points in (points[:40], points[40:90]):
         graph.add_node(np.zeros(3), np.eye(3), SURE, 0, node_points)

@@ -10,13 +10,13 @@ from support.node_states import node_states
 from support.old_files import version_1
 
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.scene.frame_graph import Vocabulary
 
 
-def random_graph(rng: np.random.Generator, edits: int = 40) -> SceneGraph:
-    graph = SceneGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
+def random_graph(rng: np.random.Generator, edits: int = 40) -> GlobalGraph:
+    graph = GlobalGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)
     edit_at_random(graph, rng, edits)
     return graph
 
@@ -28,7 +28,7 @@ def assert_equal(one: graph_files.Arrays, other: graph_files.Arrays) -> None:
         np.testing.assert_array_equal(values, other[name], err_msg=name)
 
 
-def arrays_of(graph: SceneGraph) -> graph_files.Arrays:
+def arrays_of(graph: GlobalGraph) -> graph_files.Arrays:
     return graph_files.to_arrays(graph.state())
 
 
@@ -62,13 +62,13 @@ def test_a_state_does_not_change_with_its_graph(seed: int) -> None:
     graph = random_graph(rng)
     state = graph.state()
     before = {name: values.copy() for name, values in graph_files.to_arrays(state).items()}
-    for one in (graph, SceneGraph.from_state(state)):
+    for one in (graph, GlobalGraph.from_state(state)):
         edit_at_random(one, rng, 30)
         assert_equal(graph_files.to_arrays(state), before)
 
 
 def test_a_graph_without_predicates_is_saved_and_loaded() -> None:
-    graph = SceneGraph(Vocabulary(("cup",), ()), "world")
+    graph = GlobalGraph(Vocabulary(("cup",), ()), "world")
     graph.add_node(np.zeros(3), np.eye(3), np.ones(1), 1)
     again = graph_files.graph_from_arrays(arrays_of(graph), "saved")
     assert len(again) == 1

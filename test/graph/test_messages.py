@@ -16,7 +16,7 @@ from deworldsg_ros.graph.extent import (
     surface_bytes,
     surface_points,
 )
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates, listed
 from deworldsg_ros.scene.camera import pose_from_quaternion
 from deworldsg_ros.wire import messages as wire
@@ -62,8 +62,8 @@ def points() -> np.ndarray:
     return points.astype(np.float32)
 
 
-def graph_of_one(points: np.ndarray) -> SceneGraph:
-    graph = SceneGraph(VOCABULARY, "world")
+def graph_of_one(points: np.ndarray) -> GlobalGraph:
+    graph = GlobalGraph(VOCABULARY, "world")
     graph.add_node(points.mean(axis=0), np.cov(points.T), CLASSES, 1_500_000_000, points)
     return graph
 
@@ -97,7 +97,7 @@ def test_only_a_real_turn_of_up_makes_new_boxes(points: np.ndarray) -> None:
 
 
 def test_extents_of_known_nodes_may_wait(points: np.ndarray) -> None:
-    graph = SceneGraph(VOCABULARY, "world")
+    graph = GlobalGraph(VOCABULARY, "world")
     for _ in range(3):
         graph.add_node(points.mean(axis=0), np.eye(3), CLASSES, 1, points)
     states = NodeStates(graph, 2, even_gaussians=True)

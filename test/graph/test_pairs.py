@@ -8,15 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import VOCABULARY
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.pairs import PAIR, Pair, PairStore, frame_votes
 
 WIDTH = len(VOCABULARY.predicates)
 seeds = st.integers(0, 10_000)
 
 
-def graph_of(count: int) -> SceneGraph:
-    graph = SceneGraph(VOCABULARY, "world")
+def graph_of(count: int) -> GlobalGraph:
+    graph = GlobalGraph(VOCABULARY, "world")
     for index in range(count):
         graph.add_node(np.array([float(index), 0, 0]), np.eye(3), np.ones(4), index)
     return graph
@@ -68,7 +68,7 @@ class Plain:
                 del values[pair]
 
 
-def told(graph: SceneGraph) -> Plain:
+def told(graph: GlobalGraph) -> Plain:
     """What a graph says of its pairs."""
     plain = Plain()
     assert len(graph.edges) == len(list(graph.edges)) and len(graph.votes) == len(list(graph.votes))
@@ -93,7 +93,7 @@ def assert_equal(one: Plain, other: Plain) -> None:
         }
 
 
-def check_rows(graph: SceneGraph) -> None:
+def check_rows(graph: GlobalGraph) -> None:
     """Each list has each pair of its node once; what is free is zeros."""
     store, nodes = graph.pairs, graph.nodes
     used = np.flatnonzero(store.rows["ids"].any(axis=1))
@@ -147,7 +147,7 @@ class Follower:
         return b"".join(one[name].tobytes() for name in names) + sums
 
 
-def change(graph: SceneGraph, plain: Plain, rng: np.random.Generator) -> None:
+def change(graph: GlobalGraph, plain: Plain, rng: np.random.Generator) -> None:
     """One change of the pairs, at random."""
     ids = list(graph.nodes.slot_of)
     kinds = ["add", "frame", "frame", "votes", "visual", "neighbour", "merge", "take over"]
@@ -222,7 +222,7 @@ def test_any_changes_equal_those_of_plain_dicts(seed: int) -> None:
         if rng.random() < 0.05:  # one that begins late
             followers.append(Follower(graph.pairs))
         if rng.random() < 0.05:
-            graph = SceneGraph.from_state(graph.state())
+            graph = GlobalGraph.from_state(graph.state())
             followers = [Follower(graph.pairs)]
     check_rows(graph)
     for follower in followers:

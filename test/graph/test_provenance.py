@@ -9,10 +9,10 @@ import pytest
 from support.merging import VOCABULARY, local_graph
 from support.surfaces import CAMERA, CUP, HERE, TABLE, slab, view
 
-from deworldsg_ros.client import SceneGraph as AskedGraph
+from deworldsg_ros.client import SceneGraph
 from deworldsg_ros.config import Config, InputsConfig, OutputConfig
 from deworldsg_ros.graph import graph_files, provenance
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.graph_files import write_graph
 from deworldsg_ros.graph.pairs import frame_votes
 from deworldsg_ros.graph_builder import GraphBuilder
@@ -32,7 +32,7 @@ class Memory(provenance.FrameMemory):
 
     def __init__(self, count: int) -> None:
         super().__init__()
-        self.graph = SceneGraph(VOCABULARY, "world")
+        self.graph = GlobalGraph(VOCABULARY, "world")
         for _ in range(count):
             self.graph.add_node(np.zeros(3), np.eye(3), np.full(4, 0.25), 1)
 
@@ -92,11 +92,11 @@ def table_and_cup() -> GraphBuilder:
 def test_explain_names_the_frames_of_a_saved_graph(tmp_path, table_and_cup) -> None:
     message = table_and_cup.full()
     path = write_graph(tmp_path, message)
-    assert AskedGraph.load(tmp_path).explain(1).values["frames"] is None
+    assert SceneGraph.load(tmp_path).explain(1).values["frames"] is None
     stamp_ns = wire.ns_from_stamp(message.stamp)
     seen = table_and_cup.frames.all(table_and_cup.graph)
     provenance.write_seen(path, stamp_ns, seen)
-    found = AskedGraph.load(tmp_path).explain(1)
+    found = SceneGraph.load(tmp_path).explain(1)
     assert found.lines[1] == (
         "frames: first 0.100, last 0.500, clearest 0.100 (cup 76%), 0.200 (cup 76%), "
         "0.300 (cup 76%)"
@@ -104,9 +104,9 @@ def test_explain_names_the_frames_of_a_saved_graph(tmp_path, table_and_cup) -> N
     assert found.values["frames"]["clearest"][0]["stamp_ns"] == 10**8
     # The file of another graph, or a damaged one, is not used.
     provenance.write_seen(path, stamp_ns + 1, seen)
-    assert AskedGraph.load(tmp_path).frames(1) is None
+    assert SceneGraph.load(tmp_path).frames(1) is None
     provenance.path_beside(path).write_text("{")
-    assert AskedGraph.load(tmp_path).frames(1) is None
+    assert SceneGraph.load(tmp_path).frames(1) is None
 
 
 # --- the space that was seen ---------------------------------------------------------------------
@@ -177,7 +177,7 @@ def walk() -> GraphBuilder:
 
 
 def test_a_goal_is_before_the_walls_that_are_no_objects(walk: GraphBuilder) -> None:
-    graph, space = AskedGraph(walk.full()), walk.space
+    graph, space = SceneGraph(walk.full()), walk.space
     cup = graph.one("cup")
     assert graph.goal_near(cup, 1.0).seen_free is None
     far = graph.goal_near(cup, 2.2, towards=(9.0, 0.0, 0.0)).position_m
@@ -200,11 +200,11 @@ def test_maps_and_saved_graphs_have_both(tmp_path: Path, walk: GraphBuilder) -> 
     kept = [name for name in one if name.startswith(("view_", "seen_frames"))]
     assert len(kept) == 5 and all(one[name].tobytes() == other[name].tobytes() for name in kept)
     path = write_graph(tmp_path, walk.full())
-    assert AskedGraph.load(tmp_path).goal_near("cup").seen_free is None
+    assert SceneGraph.load(tmp_path).goal_near("cup").seen_free is None
     provenance.write_space(path, walk.space)
-    assert AskedGraph.load(tmp_path).goal_near("cup").seen_free > 0.0
+    assert SceneGraph.load(tmp_path).goal_near("cup").seen_free > 0.0
     provenance.space_path(path).write_bytes(b"no archive")
-    assert AskedGraph.load(tmp_path).space is None
+    assert SceneGraph.load(tmp_path).space is None
     arrays = graph_files.read(map_path)
     for name, wrong, says in (
         ("view_poses", np.zeros((2, 4, 4)), "view_poses"),

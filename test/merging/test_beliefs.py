@@ -11,7 +11,7 @@ from support.surfaces import CUP, HERE, depth_grid, frame
 
 from deworldsg_ros.config import MergingConfig
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import SurfaceMerging, beliefs
 from deworldsg_ros.merging.records import NodeRecords
 from deworldsg_ros.merging.views import FULL, HALF, QUARTER
@@ -25,7 +25,7 @@ class Walk:
     """A cup before a wall, and a camera that moves sideways or stands still."""
 
     def __init__(self, frames_per_s: float = 10.0, min_existence: float = 0.5) -> None:
-        self.graph = SceneGraph(VOCABULARY, "world")
+        self.graph = GlobalGraph(VOCABULARY, "world")
         self.merging = SurfaceMerging(MergingConfig(), min_existence)
         self.period_ns = round(1e9 / frames_per_s)
         self.stamp_ns = 0

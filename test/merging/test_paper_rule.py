@@ -15,7 +15,7 @@ from support.merging import (
 from support.reference_merging import ReferenceMerging, class_distance, may_merge
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.nodes import NodeTable
 from deworldsg_ros.merging import PaperMerging
 from deworldsg_ros.merging.paper_rule import (
@@ -89,8 +89,8 @@ def test_the_warm_up_compiles_the_only_signature() -> None:
 CERTAIN = np.array([0.97, 0.01, 0.01, 0.01])
 
 
-def merge_all(frames: list[LocalGraph]) -> tuple[SceneGraph, list[list[int]]]:
-    graph = SceneGraph(VOCABULARY, "world")
+def merge_all(frames: list[LocalGraph]) -> tuple[GlobalGraph, list[list[int]]]:
+    graph = GlobalGraph(VOCABULARY, "world")
     merging = PaperMerging(MergingConfig())
     return graph, [merging.merge(graph, local) for local in frames]
 
@@ -172,7 +172,7 @@ def test_the_gates(offset_m: float, classes: list[float], merges: bool) -> None:
 
 def test_the_nearest_node_wins_and_of_equals_the_oldest() -> None:
     for x_m, removed, at in (((0.3, -0.3, 1.3), None, -0.05), ((5.0, 0.3, -0.3), 1, 0.0)):
-        graph, merging = SceneGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
+        graph, merging = GlobalGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
         for x in x_m:
             graph.add_node(np.array([x, 0, 0]), 0.12**2 * np.eye(3), CERTAIN, 0)
         if removed is not None:
@@ -181,7 +181,7 @@ def test_the_nearest_node_wins_and_of_equals_the_oldest() -> None:
 
 
 def test_an_object_between_two_nodes_merges_them_into_the_older_id() -> None:
-    graph, merging = SceneGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
+    graph, merging = GlobalGraph(VOCABULARY, "world"), PaperMerging(MergingConfig())
     assert merging.merge(graph, frame_of(1, 0.0, 0.25, 3.0)) == [1, 2, 3]
     graph.add_visual(2, 3, np.array([1.0, 0, 0]), 1)
     graph.add_visual(1, 3, np.array([0, 2.0, 0]), 1)

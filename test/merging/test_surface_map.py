@@ -12,7 +12,7 @@ from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import read_map, write_map
 from deworldsg_ros.merging import SurfaceMerging
@@ -254,12 +254,12 @@ def view(stamp: int, *half_widths_m: float, instances: bool = True) -> LocalGrap
     return frame(stamp, *zip(points, (TABLE, CUP)), depth_grid=grid)
 
 
-def merged(*frames: LocalGraph, **options: bool) -> tuple[SceneGraph, list[float]]:
+def merged(*frames: LocalGraph, **options: bool) -> tuple[GlobalGraph, list[float]]:
     """The graph, and the half width of the surface of the first node after each frame, metres.
 
     Points beyond it, one in twenty, lie in cells that no earlier frame sampled.
     """
-    graph = SceneGraph(VOCABULARY, "world", **options)
+    graph = GlobalGraph(VOCABULARY, "world", **options)
     merging, widths = SurfaceMerging(MergingConfig()), []
     for local in frames:
         merging.merge(graph, local)

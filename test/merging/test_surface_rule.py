@@ -20,7 +20,7 @@ from support.surfaces import (
 )
 
 from deworldsg_ros.config import MergingConfig
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.merging import SurfaceMerging
 from deworldsg_ros.merging.surface_map import CELL_M
 from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
@@ -34,7 +34,7 @@ class Scene:
     """A graph, its association rule, and a clock."""
 
     def __init__(self) -> None:
-        self.graph = SceneGraph(VOCABULARY, "world")
+        self.graph = GlobalGraph(VOCABULARY, "world")
         self.merging = SurfaceMerging(MergingConfig())
         self.stamp = 0
 

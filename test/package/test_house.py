@@ -17,12 +17,12 @@ MAX_OPTIONS = 58
 MAX_MODULES = 220
 MAX_MODULE_LINES = 700
 MAX_FUNCTION_LINES = 100
-MAX_PARAMETERS = 22
+MAX_PARAMETERS = 8
 # Of all modules: those that one module of their folder alone imports.
-MAX_PARTS = 0.09
-MAX_KERNELS = 202
+MAX_PARTS = 0.08
+MAX_KERNELS = 120
 # Of one frame.
-MAX_ENTERED, MAX_SWITCHES = 50, 520
+MAX_ENTERED, MAX_SWITCHES = 45, 450
 
 
 @pytest.fixture(scope="module")

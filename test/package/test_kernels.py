@@ -127,24 +127,3 @@ def test_a_kernel_is_compiled_again_if_one_that_it_calls_in_another_file_changed
     assert call(1, "One.") == ["4", "False"]
     assert call(1, "Another text, and\n    another line.") == ["4", "False"]
     assert call(5, "One.") == ["12", "True"]
-
-
-BESIDE_KERNELS = """
-import numba
-from deworldsg_ros.base.kernels import kernel
-@kernel
-def ours(x):
-    return 1.0 / x
-theirs = numba.njit(error_model="numpy")(lambda x: 1.0 / x)
-print(ours(2.0), theirs(0.0))
-try:
-    ours(0.0)
-except ZeroDivisionError:
-    print("refused")
-"""
-
-
-def test_functions_of_others_are_compiled_with_their_own_options() -> None:
-    command = [sys.executable, "-c", BESIDE_KERNELS]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["0.5", "inf", "refused"]

@@ -20,7 +20,7 @@ from support.room_nodes import (
     thing,
 )
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.pairs import Pair
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.relations import pairs
@@ -62,7 +62,7 @@ Told = dict[str, np.ndarray]
 class Followed:
     """A table of a graph, and a reader that knows what the table tells of changes alone."""
 
-    def __init__(self, graph: SceneGraph, geometry: bool = True) -> None:
+    def __init__(self, graph: GlobalGraph, geometry: bool = True) -> None:
         self.graph = graph
         self.table = PairTable(graph, load_physics_model(), geometry=geometry)
         self.told: dict[Pair, Told] = {}
@@ -191,7 +191,7 @@ def test_a_table_that_follows_equals_one_made_anew(geometry: bool, seed: int) ->
             up = rng.normal(0, 0.1, 3) + Z
         followed.refresh(up)
         followed.check()
-        fresh = Followed(SceneGraph.from_state(builder.graph.state()), geometry)
+        fresh = Followed(GlobalGraph.from_state(builder.graph.state()), geometry)
         assert_equal(followed.told, fresh.refresh(up))
         assert followed.table.floor_m == fresh.table.floor_m
         assert followed.table.pairs_waiting == followed.table.nodes_waiting == 0

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
@@ -13,7 +13,7 @@ seeds = st.integers(0, 2**32 - 1)
 EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", "votes", "frame"]
 
 
-def set_confirmed(graph: SceneGraph, node_id: int, confirmed: bool) -> None:
+def set_confirmed(graph: GlobalGraph, node_id: int, confirmed: bool) -> None:
     """Publish a node, or hide it."""
     graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
 
@@ -126,7 +126,7 @@ def random_local_graphs(rng: np.random.Generator, frames: int) -> list[LocalGrap
     return graphs
 
 
-def edit_at_random(graph: SceneGraph, rng: np.random.Generator, edits: int) -> None:
+def edit_at_random(graph: GlobalGraph, rng: np.random.Generator, edits: int) -> None:
     """Apply all edits that stages make to a graph, in random order."""
     for _ in range(edits):
         stamp_ns = int(rng.integers(0, 10**12))

@@ -2,15 +2,15 @@
 
 from weakref import WeakKeyDictionary
 
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.wire import messages as wire
 
-_made: WeakKeyDictionary[SceneGraph, dict[int, NodeStates]] = WeakKeyDictionary()
+_made: WeakKeyDictionary[GlobalGraph, dict[int, NodeStates]] = WeakKeyDictionary()
 
 
 def node_states(
-    graph: SceneGraph, top_k: int, with_points: bool = False
+    graph: GlobalGraph, top_k: int, with_points: bool = False
 ) -> dict[int, wire.NodeState]:
     """Messages of the confirmed nodes by ascending id.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deworldsg_ros.graph import graph_files
-from deworldsg_ros.graph.graph import SceneGraph
+from deworldsg_ros.graph.graph import GlobalGraph
 from deworldsg_ros.relations.geometry import (
     MIN_SHAPE_POINTS,
     measure,
@@ -108,7 +108,7 @@ def load_room(map_path: Path, truth_path: Path) -> Room:
 
 
 def _match(
-    graph: SceneGraph, slots: NDArray[np.int64], objects: list[dict[str, Any]]
+    graph: GlobalGraph, slots: NDArray[np.int64], objects: list[dict[str, Any]]
 ) -> NDArray[np.int64]:
     """Index of the object of each node, -1 = none: its class, and its box around the mean."""
     low = np.array([item["aabb"][0] for item in objects]) - BOX_MARGIN_M
@@ -139,7 +139,7 @@ def _state(truth: Truth, a: int, b: int) -> int:
 
 
 def _votes(
-    graph: SceneGraph, slots: NDArray[np.int64]
+    graph: GlobalGraph, slots: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Votes by relation (m, 2, NONE) of pairs of slots (m, 2), and numbers of frames (m,)."""
     relation_of = relation_of_predicates(graph.vocabulary.predicates)
