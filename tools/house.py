@@ -158,7 +158,7 @@ def _is_module(name: str, root: Path) -> bool:
 
 
 def trace_frame(root: Path) -> tuple[set[str], int, int]:
-    """What one frame of the shipped recording enters, in one process.
+    """Trace what one frame of the shipped recording enters, in one process.
 
     Returns:
         The modules, the number of switches from one module to another, and of calls of Python.
