@@ -252,9 +252,7 @@ class PairStore:
             raise ValueError(
                 f"relation logits have shape {logits.shape[1:]}: expected {(self.predicate_count,)}"
             )
-        rows, ends = self._directed(pairs)
-        self._sum(self._logits, "logits", pairs, logits)
-        self._see(rows, ends, stamp_ns, 1, 0)
+        self._see(*self._sum(self._logits, "logits", pairs, logits), stamp_ns, 1, 0)
 
     def add_neighbours(self, pairs: Int64, stamp_ns: int) -> None:
         """Count a frame in which directed pairs (m, 2) were geometric neighbours (Eq. 8)."""
@@ -353,8 +351,10 @@ class PairStore:
         ends = (self.rows["slots"][rows, 0] != pairs[:, 0]).astype(np.int64)
         return rows, ends
 
-    def _sum(self, sums: _Sums, name: str, pairs: Int64, values: Float64) -> None:
-        """Add values (m, R) to the sums of directed pairs (m, 2)."""
+    def _sum(
+        self, sums: _Sums, name: str, pairs: Int64, values: Float64
+    ) -> tuple[Int64, Int64]:
+        """Add values (m, R) to the sums of directed pairs (m, 2); returns rows and directions."""
         rows, ends = self._directed(pairs)
         places = self.rows[name]
         new = dict.fromkeys(
@@ -365,6 +365,7 @@ class PairStore:
         for (row, end), place in zip(new, sums.take(len(new))):
             places[row, end] = place
         _add(sums.rows, places[rows, ends], values)
+        return rows, ends
 
     def _see(
         self, rows: Int64, ends: Int64, stamp_ns: int, frames: int, neighbour_frames: int

@@ -309,7 +309,8 @@ def overlaps(
     set_count = len(starts) - 1
     # For each set and owner that meet: both, and the two numbers of cells. Most rows are not used,
     # and take no memory.
-    found, total = np.empty((set_count * len(counts), 4), np.int64), 0
+    most = min(set_count * len(counts), len(blocks) * MAX_BLOCK_OWNERS)
+    found, total = np.empty((most, 4), np.int64), 0
     block_owners = np.empty(MAX_BLOCK_OWNERS, np.int64)
     most = 0
     for index in range(set_count):

@@ -102,9 +102,11 @@ def with_seen(covered: Float64, slots: Int64, view: View) -> Float64:
     """Fractions (n, k) of some nodes, from the view where it knows the node."""
     if not len(view.slots):
         return covered
-    places = view.slots.searchsorted(slots).clip(max=len(view.slots) - 1)
-    seen = view.covered[:, places]
-    return np.where((view.slots[places] == slots) & ~np.isnan(seen), seen, covered)
+    places = view.slots.searchsorted(slots)
+    places[places == len(view.slots)] = 0
+    seen = view.covered.take(places, 1)
+    known = (view.slots.take(places) == slots) & (seen == seen)  # not NaN
+    return np.where(known, seen, covered)
 
 
 @kernel

@@ -80,10 +80,9 @@ class SurfelMap:
 def about_camera(step: Float64, T_world_camera: Float64) -> Float64:
     """A rotation vector about the camera and a translation (6,), world axes, as (4, 4)."""
     T, camera_world, turn = np.eye(4), T_world_camera[:3, 3], _turn(step)
-    T[:3, :3], T[:3, 3] = turn, step[3:] + camera_world
+    x, y, z = (turn * camera_world).T
     # One after the other: a matrix product rounds in another order.
-    for axis in range(3):
-        T[:3, 3] -= turn[:, axis] * camera_world[axis]
+    T[:3, :3], T[:3, 3] = turn, step[3:] + camera_world - x - y - z
     return T
 
 
