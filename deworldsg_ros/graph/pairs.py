@@ -351,9 +351,7 @@ class PairStore:
         ends = (self.rows["slots"][rows, 0] != pairs[:, 0]).astype(np.int64)
         return rows, ends
 
-    def _sum(
-        self, sums: _Sums, name: str, pairs: Int64, values: Float64
-    ) -> tuple[Int64, Int64]:
+    def _sum(self, sums: _Sums, name: str, pairs: Int64, values: Float64) -> tuple[Int64, Int64]:
         """Add values (m, R) to the sums of directed pairs (m, 2); returns rows and directions."""
         rows, ends = self._directed(pairs)
         places = self.rows[name]

@@ -656,6 +656,7 @@ def warm_up(config: Config) -> None:
         graph.add_node(mean, np.eye(3), np.array([0.7, 0.3]), 1, surface)
     for pair in ((1, 2), (2, 3), (3, 1)):
         graph.add_votes(*pair, np.array([[30.0, 1.0, 1.0, 1.0], [0.0, 0.0, 0.0, 0.0]]))
+        graph.add_visual(*pair, np.zeros(4), 1)
     beliefs.refresh()
     _counted(np.array([1, 2]), np.zeros((2, 3)))
     graph.move_node(2, np.array([[1.0, 0, 0, 9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))

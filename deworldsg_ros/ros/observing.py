@@ -20,8 +20,8 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from deworldsg_ros.doctor import Observations
-from deworldsg_ros.ros.diagnosed import listened, observations_of
 from deworldsg_ros.ros.qos import best_effort, source
+from deworldsg_ros.ros.statuses import listened, observations_of
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.streams.poses import stamp_ns_of
 
@@ -61,7 +61,7 @@ class _Listener:
         self._statuses: dict[str, dict[str, str]] = {}
         self._behind_s: dict[str, float] = {}
         self._stamped: set[str] = set()
-        node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, best_effort(50))
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._take, best_effort(50))
 
     def listen(self, seconds: float) -> Observations:
         """The observations after so many seconds."""
@@ -79,7 +79,7 @@ class _Listener:
             behind_s=self._behind_s,
         )
 
-    def _diagnosed(self, message: Any) -> None:
+    def _take(self, message: Any) -> None:
         for status in message.status:
             if status.hardware_id == "deworldsg_ros":
                 self._statuses[status.name] = {item.key: item.value for item in status.values}

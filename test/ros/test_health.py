@@ -6,7 +6,6 @@ from unittest.mock import Mock
 
 import pytest
 
-from deworldsg_ros.ros.diagnosed import observations_of
 from deworldsg_ros.ros.health import (
     DROPPED,
     ERROR,
@@ -20,6 +19,7 @@ from deworldsg_ros.ros.health import (
     received_in,
 )
 from deworldsg_ros.ros.node import DropLog
+from deworldsg_ros.ros.statuses import observations_of
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""The diagnostics of nodes as observations for the doctor; imports no ROS."""
+"""The statuses in /diagnostics of all nodes as observations for the doctor; imports no ROS."""
 
 from __future__ import annotations
 
