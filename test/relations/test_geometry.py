@@ -186,25 +186,6 @@ def test_features_equal_those_of_the_reference(seed: int) -> None:
     np.testing.assert_allclose(geometry.centre_steps(clouds.shapes, *pairs.T), steps, rtol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
-@given(seed=seeds, kind=st.sampled_from(["place", "north", "up"]))
-def test_features_do_not_depend_on_the_world_frame(seed: int, kind: str) -> None:
-    clouds, rng = random_clouds(seed), np.random.default_rng(seed)
-    pairs = every_pair(len(clouds))
-    here = features_of(clouds_of(*clouds), pairs)
-    if kind == "place":
-        offset = rng.integers(-3, 4, 3).astype(float)
-        there = features_of(clouds_of(*(points + offset for points in clouds)), pairs, offset[2])
-    elif kind == "north":
-        quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-        turn = np.linalg.matrix_power(quarter, int(rng.integers(1, 4)))
-        there = features_of(clouds_of(*(points @ turn.T for points in clouds)), pairs)
-    else:
-        R = geometry.rotation_to_upright(np.array([0.0, 1.0, 0.0]))
-        there = features_of(clouds_of(*(points @ R for points in clouds), R=R), pairs)
-    np.testing.assert_allclose(here, there, atol=1e-5)
-
-
 # --- shapes --------------------------------------------------------------------------------------
 
 

@@ -19,29 +19,6 @@ seeds = st.integers(0, 10_000)
 # --- states and their names ----------------------------------------------------------------------
 
 
-def test_each_state_names_both_directions() -> None:
-    assert states.RELATIONS_OF_STATE.tolist() == [
-        [states.NONE, states.NONE],
-        [states.ON, states.NONE], [states.NONE, states.ON],
-        [states.IN, states.NONE], [states.NONE, states.IN],
-        [states.ATTACHED, states.NONE], [states.NONE, states.ATTACHED],
-        [states.AGAINST, states.NONE], [states.NONE, states.AGAINST],
-        [states.ABOVE, states.UNDER], [states.UNDER, states.ABOVE],
-    ]  # fmt: skip
-    assert states.STATE_COUNT == len(states.RELATIONS_OF_STATE) == 1 + 2 * len(states.DIRECTED)
-    assert set(states.SUPPORTS) < set(states.DIRECTED)
-
-
-@pytest.mark.parametrize("count", [0, 1, 4])
-def test_states_have_the_logits_of_their_ordered_pairs(count: int) -> None:
-    logits = np.random.default_rng(count).normal(size=(2, count, len(states.DIRECTED)))
-    found = states.states_of_relations(logits)
-    assert found.shape == (count, states.STATE_COUNT) and (found[:, 0] == 0).all()
-    for state in range(1, states.STATE_COUNT):
-        relation, end = divmod(state - 1, 2)
-        np.testing.assert_array_equal(found[:, state], logits[end, :, relation])
-
-
 @pytest.mark.parametrize(
     ("predicates", "named"),
     [
