@@ -8,17 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.merging import set_confirmed
-from support.room_nodes import (
-    VOCABULARY,
-    Thing,
-    bowl,
-    chair,
-    plant,
-    room,
-    table,
-    thing,
-    vote,
-)
+from support.room_nodes import DESK, DINNER, VOCABULARY, Thing, chair, room, table, thing, vote
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
 from deworldsg_ros.config import Config, OutputConfig, PerceptionConfig, RelationsConfig
@@ -43,14 +33,6 @@ from deworldsg_ros.wire.follow import GraphReplica
 seeds = st.integers(0, 10_000)
 PREDICATES = VOCABULARY.predicates
 WIDTH = len(PREDICATES)
-DESK = {"table": table(0, 0), "cup": thing("cup", 0.3, 0.1, 0.74, 0.09, 0.09, 0.1)}
-DINNER = {
-    **DESK,
-    "chair": chair(0, 0.5),
-    "bowl": bowl(-0.2, 0, 0.74),
-    "plant": plant(-0.6, 0.2, 0.74),
-    "fridge": thing("refrigerator", 1.3, 0, 0, 0.6, 0.6, 1.7),
-}
 
 
 def config(head: str = "geometric", **relations: object) -> Config:
