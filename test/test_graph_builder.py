@@ -1,5 +1,6 @@
 """The published graph: what it says depends on no history, and updates are what differs."""
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +10,7 @@ from support.merging import local_graph
 from support.reference_updates import diff
 from support.room_nodes import DINNER, VOCABULARY, change, room
 
-from deworldsg_ros.config import Config, RelationsConfig
+from deworldsg_ros.config import Config, OutputConfig, RelationsConfig
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.scene.errors import RefusedInput
 from deworldsg_ros.wire.follow import GraphReplica
@@ -57,7 +58,8 @@ def test_edges_do_not_depend_on_the_history(relations: RelationsConfig, seed: in
 def test_an_update_is_what_two_snapshots_differ_in(
     relations: RelationsConfig, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    builder, _ = room(DINNER, Config(relations=relations))
+    output = OutputConfig(include_surface_points=seed == 1)
+    builder, _ = room(DINNER, Config(relations=relations, output=output))
     rng = np.random.default_rng(seed)
     removals: list[dict[int, int | None]] = []
     take = builder.graph.take_removals
@@ -73,6 +75,8 @@ def test_an_update_is_what_two_snapshots_differ_in(
             assert current is previous and not removals[-1]
             continue
         assert update == diff(previous, current, removals[-1])
+        for node in (*update.nodes, *current.nodes):
+            assert (node.surface_mm is not msgspec.UNSET) == (seed == 1)
         previous, told = current, told + 1
     assert told > 5 and max(removals, key=len)
 
