@@ -185,6 +185,7 @@ ATTACKS: dict[str, Callable[[Arrays], Arrays]] = {
         "seen_frames", lambda a: np.frombuffer(a.tobytes().replace(b"table", b"t\\u001b"), np.uint8)
     ),
     "a version of text": header(version="1"),
+    "a version to come": header(version=3),
     "no means": lambda arrays: {k: v for k, v in arrays.items() if k != "means"},
     "no fates in it": lambda arrays: {k: v for k, v in arrays.items() if k != "merging.fates"},
 }

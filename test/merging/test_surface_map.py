@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.merging import VOCABULARY, random_pose
-from support.node_states import node_states
+from support.merging import VOCABULARY, node_states, random_pose
 from support.surfaces import CAMERA, CUP, TABLE, frame
 
 from deworldsg_ros.config import Config, MergingConfig

@@ -5,7 +5,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from deworldsg_ros.graph.graph import GlobalGraph
+from deworldsg_ros.graph.messages import NodeStates
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations, Vocabulary
+from deworldsg_ros.wire import messages as wire
 
 VOCABULARY = Vocabulary(("cup", "table", "chair", "book"), ("on", "near", "under"))
 
@@ -16,6 +18,16 @@ EDITS = ["add", "observe", "confirm", "merge", "remove", "visual", "neighbour", 
 def set_confirmed(graph: GlobalGraph, node_id: int, confirmed: bool) -> None:
     """Publish a node, or hide it."""
     graph.set_existence([node_id], np.array([float(confirmed)]), 0.5)
+
+
+def node_states(
+    graph: GlobalGraph, top_k: int, with_points: bool = False
+) -> dict[int, wire.NodeState]:
+    """Messages of the confirmed nodes by ascending id, as a publication makes them."""
+    states = NodeStates(graph, top_k, graph.even_gaussians)
+    states.refresh()
+    known = dict(sorted(states.states.items()))
+    return {i: states.with_points(known[i]) for i in known} if with_points else known
 
 
 def moments(points_xyz: np.ndarray, ridge_m2: float) -> tuple[np.ndarray, np.ndarray]:
