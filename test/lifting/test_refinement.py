@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.reference_lifting import kept_layer, reference_lift
 
@@ -72,6 +72,8 @@ def test_inliers_equal_the_reference(seed, kind, quantised, holes, shape):
     alpha=st.sampled_from([0.0, 1.0, 10.0, 300.0]),
     beta=st.sampled_from([0.0, 0.02, 0.3]),
 )
+@example([1.0] * 8 + [2.0] * 8, 0.03, 10.0, 0.02)  # the nearer one of two with tied means
+@example([1.0, 1.25, 1.5], 0.25, 0.0, 0.0)  # a step of exactly the threshold does not cut
 def test_kept_layer_equals_the_reference(data, gamma, alpha, beta):
     depths = np.array(data, np.float32)
     assert dominant_layer(depths, gamma, alpha, beta) == kept_layer(depths, gamma, alpha, beta)
