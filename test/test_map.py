@@ -22,7 +22,6 @@ from deworldsg_ros.config import Config, MergingConfig, OutputConfig, RelationsC
 from deworldsg_ros.graph import graph_files
 from deworldsg_ros.graph_builder import GraphBuilder
 from deworldsg_ros.map_file import claim_map, continue_map, previous_of, read_map, write_map
-from deworldsg_ros.relations.paper import ClassPairPrior
 from deworldsg_ros.scene.errors import ConfigurationError
 from deworldsg_ros.scene.frame_graph import LocalGraph, Relations
 
@@ -169,21 +168,6 @@ def test_objects_of_another_rule_or_cell_size_are_recognised(tmp_path, associati
         arrays |= {"merging.cell_m": np.array(0.02), "merging.blocks": np.zeros(0)}
     graph_files.write(path, arrays)
     assert read_map(Config(), path).integrate(frame(6, (WHOLE, TABLE))) == [1]
-
-
-def test_other_files_are_refused(tmp_path):
-    graph_files.save(builder_of().graph, tmp_path / "graph.map")  # without priors
-    (tmp_path / "text.map").write_text("hello")
-    (tmp_path / "folder.map").mkdir()
-    for name in ("graph.map", "text.map", "folder.map"):
-        with pytest.raises(ConfigurationError, match=f"{name} cannot be used: (?!graph file|')"):
-            read_map(Config(), tmp_path / name)
-    arrays = graph_files.read(saved(builder_of(), tmp_path))
-    prior = np.frombuffer(msgspec.json.encode(ClassPairPrior(2, 5).to_state()), np.uint8)
-    for name, wrong, says in (("prior", prior, "2 classes"), ("up", np.zeros(3), "up direction")):
-        graph_files.write(tmp_path / "room.map", {**arrays, name: wrong})
-        with pytest.raises(ConfigurationError, match=says):
-            read_map(Config(), tmp_path / "room.map")
 
 
 # --- safe writing --------------------------------------------------------------------------------

@@ -76,19 +76,6 @@ def test_invariants_hold_through_any_edits(seed: int) -> None:
         assert len(graph.state().ids.frames) <= 3
 
 
-def test_frames_are_remembered_up_to_a_number() -> None:
-    graph = graph_of(3, remembered_frames=2)
-    graph.remember_frame(10, [1, 2])
-    graph.remember_frame(20, [3])
-    graph.merge_nodes(1, 2)
-    assert graph.nodes_of_frame(10) == [1, 1]
-    graph.remember_frame(30, [])
-    assert graph.nodes_of_frame(10) is None
-    assert graph.nodes_of_frame(20) == [3]
-    graph.remove_node(3)
-    assert graph.nodes_of_frame(20) == [0]
-
-
 def test_removed_ids_are_forgotten_and_those_of_remembered_frames_are_not() -> None:
     rng, frames = np.random.default_rng(0), 20
     live: set[int] = set()

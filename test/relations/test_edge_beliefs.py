@@ -165,17 +165,6 @@ def test_votes_of_another_relation_head_count_more() -> None:
     assert of("egtr") > of("geometric")
 
 
-def test_without_a_world_model_surfaces_do_not_matter() -> None:
-    def told(things: dict[str, Thing]) -> list[wire.EdgeState]:
-        builder, pair = desk(things, world_model="none")
-        vote(builder, *pair, "on", 12)
-        vote(builder, *pair, None, 8)
-        return builder.full().edges
-
-    elsewhere = {**DESK, "cup": thing("cup", 0.3, 2.1, 0.1, 0.09, 0.09, 0.1)}
-    assert told(DESK) == told(elsewhere) and len(told(DESK)) == 1
-
-
 def test_unconfirmed_nodes_have_no_edges_and_take_no_part() -> None:
     """A phantom under the cup would otherwise carry half of it."""
     phantom = {**DESK, "phantom": thing("book", 0.3, 0.1, 0.71, 0.3, 0.3, 0.03)}
@@ -347,18 +336,6 @@ def cups_on_a_table() -> tuple[GraphBuilder, dict[str, int]]:
         for y in range(4)
     }
     return room({"table": table(0.4, 0.4, 1.2, 1.2), **cups}, config())
-
-
-def test_messages_that_did_not_change_are_the_same_objects() -> None:
-    far = {"far table": table(4, 0), "far cup": thing("cup", 4.3, 0.1, 0.74, 0.09, 0.09, 0.1)}
-    builder, ids = room({**DESK, **far}, config())
-    before = edges_of(builder)
-    assert all(one is edges_of(builder)[pair] for pair, one in before.items())
-    vote(builder, ids["cup"], ids["table"], "on", 3)
-    after = edges_of(builder)
-    one, other = (ids["cup"], ids["table"]), (ids["far cup"], ids["far table"])
-    assert after[one] is not before[one] and after[one] != before[one]
-    assert after[other] is before[other]
 
 
 def test_a_large_graph_is_prepared_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:

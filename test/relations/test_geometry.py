@@ -211,17 +211,6 @@ def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
     np.testing.assert_allclose(dirty["high"], clean["high"], atol=0.02)
 
 
-def test_a_shape_that_is_measured_again_forgets_the_old_one() -> None:
-    one, other = (clouds_of(cloud) for cloud in random_clouds(3)[:2])
-    for shapes, points in (one, other):
-        for again, turn in ((other, np.eye(3)), (one, geometry.rotation_to_upright(np.ones(3)))):
-            counts = again.shapes["count"].copy()
-            geometry.measure(shapes, np.array([0]), again.points, counts, turn)
-            fresh = clouds_of(again.of(0), R=turn)
-            assert (shapes == fresh.shapes).all()
-        assert len(points)
-
-
 # --- the upright frame ---------------------------------------------------------------------------
 
 

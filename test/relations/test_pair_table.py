@@ -129,9 +129,14 @@ def test_pairs_out_of_reach_are_not_related() -> None:
     far = thing("refrigerator", 5.0, 0, 0, 0.6, 0.6, 1.7)
     builder, ids = room({**DESK, "far": far})
     followed, apart = Followed(builder.graph), (ids["cup"], ids["far"])
+    nodes, slot = builder.graph.nodes, builder.graph.nodes.slot(ids["far"])
+    points = nodes.surface(slot).copy()
+    nodes.set_surface(slot, points[:3].copy())
     assert set(followed.refresh()) == {(ids["table"], ids["cup"])}
-    # It is known of those that were seen together, and judged to be apart.
+    # It is known of those that were seen together, and judged to be apart when it has points.
     builder.graph.add_votes(*apart, np.ones((2, WIDTH)))
+    assert not followed.refresh()[apart]["judged"]
+    builder.graph.observe(ids["far"], np.zeros(3), np.eye(3), np.ones(80), 9, points)
     told = followed.refresh()[apart]
     assert told["judged"] and np.isinf(told["gap_m"])
     assert softmax(told["state_logits"])[0] > 0.999

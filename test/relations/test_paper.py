@@ -62,14 +62,6 @@ def test_visual_distribution_is_stable(scale: float) -> None:
     np.testing.assert_allclose(paper.visual_distribution(logits + 500), distribution, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("distribution", "wanted"),
-    [([1.0, 0, 0], 0.0), ([0.5, 0.5, 0], math.log(2)), ([0.25] * 4, math.log(4))],
-)
-def test_entropy_in_nats(distribution: list[float], wanted: float) -> None:
-    assert paper.entropy_nats(np.array(distribution)) == pytest.approx(wanted, abs=1e-15)
-
-
 # --- fusion under uncertainty (Eq. 10) -----------------------------------------------------------
 
 
