@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from support.merging import (
     VOCABULARY,
     edit_at_random,
@@ -54,7 +54,6 @@ def test_ids_start_at_1_and_are_never_used_again() -> None:
 
 
 @given(seeds)
-@settings(max_examples=40)
 def test_invariants_hold_through_any_edits(seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = GlobalGraph(VOCABULARY, "world", surface_point_capacity=6, remembered_frames=3)

@@ -28,7 +28,6 @@ def arrays_of(graph: GlobalGraph) -> graph_files.Arrays:
 
 
 @given(seeds)
-@settings(max_examples=25)
 def test_save_and_load_lose_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     rng = np.random.default_rng(seed)
     graph = random_graph(rng, int(rng.integers(0, 60)))

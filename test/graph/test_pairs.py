@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import VOCABULARY
 
@@ -200,7 +200,6 @@ def change(graph: GlobalGraph, plain: Plain, rng: np.random.Generator) -> None:
         graph.pairs.release(graph.pairs.of(slots))
 
 
-@settings(max_examples=50, deadline=None)
 @given(seed=seeds)
 def test_any_changes_equal_those_of_plain_dicts(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -268,7 +267,6 @@ def test_evidence_for_removed_ids_reaches_their_successors() -> None:
 # --- the votes of a frame ------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, count=st.integers(0, 4), width=st.integers(0, 6))
 def test_the_votes_of_a_frame_are_a_divided_sigmoid(seed: int, count: int, width: int) -> None:
     logits = np.random.default_rng(seed).normal(0, 5, (count, width))

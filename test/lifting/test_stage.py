@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.merging import random_pose
 from support.reference_lifting import reference_lift
@@ -62,7 +62,6 @@ def lift(scene, count=6, pairs=(), boxes=None, pixels="refined", **constants):
     return lifting.lift(graph, instances, depth_m, camera, T, "world")
 
 
-@settings(max_examples=25)
 @given(seed=SEEDS)
 def test_gaussians_equal_the_reference(seed):
     scene = make_scene(seed)

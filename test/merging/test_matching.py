@@ -21,7 +21,6 @@ def deviations(difference: np.ndarray, covariance: np.ndarray) -> float:
 
 
 @given(seeds)
-@settings(max_examples=25)
 def test_match_scores_equal_the_formulas(seed: int) -> None:
     rng = np.random.default_rng(seed)
     local = local_graph(

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.relations import (
     VOCABULARY,
@@ -159,7 +159,6 @@ def test_the_order_of_clips(uncertain, observed, expected):
     assert [tuple((item.pairs[0] + 1).tolist()) for item in stage.drain()] == expected
 
 
-@settings(max_examples=25)
 @given(
     st.lists(st.tuples(st.integers(1, 2 * SECOND_NS), st.integers(0, 6)), max_size=12),
     st.sampled_from([0.3, 1.0, 2.5, 10.0]),

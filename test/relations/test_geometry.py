@@ -168,7 +168,6 @@ def distance(points_a, points_b) -> float:
 # --- features ------------------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds)
 def test_features_equal_those_of_the_reference(seed: int) -> None:
     clouds = clouds_of(*random_clouds(seed))
@@ -214,7 +213,6 @@ def test_a_few_points_off_the_object_do_not_change_its_bounds() -> None:
 # --- the upright frame ---------------------------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.tuples(up_components, up_components, up_components))
 @example((0.0, 0.0, 2.0))
 @example((0.0, 0.0, -1.0))
@@ -257,7 +255,6 @@ def brute_force(items: Iterable[int], shapes: np.ndarray) -> set[frozenset[int]]
     return {frozenset((a, b)) for a, b in pairs if are_in_reach(shapes[a], shapes[b])}
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, count=st.integers(0, 9))
 def test_pairs_in_reach_are_those_of_brute_force(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

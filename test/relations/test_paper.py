@@ -5,7 +5,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support import merging
 
@@ -21,7 +21,6 @@ seeds = st.integers(0, 10_000)
 WIDTH, HEIGHT = 640, 480
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 12), seeds)
 def test_neighbours_are_those_of_the_loop_over_all_pairs(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -87,7 +86,6 @@ def reference(logits, prior, alpha: float, threshold: float):
     return fused, "prior" if logits is None else "fused", entropy
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     seeds,
     st.integers(1, 60),
@@ -146,7 +144,6 @@ def prior_of(*predictions: tuple[np.ndarray, np.ndarray]) -> paper.ClassPairPrio
 ONE = ([[0, 1]], [[0.2, 0.3, 0.5]])
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(0, 40), seeds, st.integers(1, 7))
 def test_the_prior_is_the_mean_in_any_order_and_any_portions(count, seed, portions) -> None:
     classes, predictions = random_predictions(count, seed)
@@ -216,7 +213,6 @@ def test_sums_that_differ_from_one_by_float32_rounding_are_normalised() -> None:
 # --- the bounded evidence of one frame -----------------------------------------------------------
 
 
-@settings(max_examples=30, deadline=None)
 @given(seeds, st.sampled_from([0.01, 0.1, 0.5, 0.9]), st.sampled_from([1.0, 1e3, 1e300]))
 def test_bounded_logits_are_those_of_a_mixture(seed: int, rate: float, scale: float) -> None:
     logits = np.random.default_rng(seed).normal(0, 4, (3, 6))

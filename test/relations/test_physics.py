@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import softmax
 
@@ -179,7 +179,6 @@ def evidence_of(votes: float, frames: float, scales: physics.VoteScales = SCALES
     return frames / (frames + scales.n_half) * scales.slope * told
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, count=st.integers(0, 5))
 def test_the_evidence_is_that_of_the_formula(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -219,7 +218,6 @@ def test_votes_are_summed_by_relation(count: int, others: str) -> None:
 # --- both sources --------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=seeds, scale=st.sampled_from([0.0, 1.0, 30.0, 1000.0]), count=st.sampled_from([0, 6]))
 def test_geometry_never_excludes_a_state_and_votes_add_to_it(
     seed: int, scale: float, count: int

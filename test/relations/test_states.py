@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from deworldsg_ros.relations import states
@@ -113,7 +113,6 @@ def predicates_of(belief: np.void, end: int, votes: np.ndarray, frames: int) -> 
     return found
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=seeds, count=st.integers(0, 6))
 def test_predicates_share_the_probability_of_their_relation(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
@@ -134,7 +133,6 @@ def test_predicates_share_the_probability_of_their_relation(seed: int, count: in
     np.testing.assert_array_equal(states.related_pairs(beliefs, rows), related[rows])
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=seeds, threshold_nats=st.sampled_from([0.0, 0.5, 1.0]))
 def test_what_is_uncertain(seed: int, threshold_nats: float) -> None:
     rng = np.random.default_rng(seed)
@@ -150,7 +148,6 @@ def test_what_is_uncertain(seed: int, threshold_nats: float) -> None:
 SYMMETRIC = np.array([False, True, True, False])
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=seeds, count=st.integers(0, 6))
 def test_said_predicates(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
