@@ -130,7 +130,7 @@ def _write_bag_with_tf(folder: Path) -> None:
     items = camera.camera_items(3, compressed=False, with_pose=False)
     items = [item for item in items if "color" in item[0] or item[2] == stamp_ns(0)]
     for i in range(3):
-        moving = camera.transform(stamp_ns(i), camera.WORLD, camera.CAMERA, pose(i))
+        moving = camera.tf(stamp_ns(i), (camera.WORLD, camera.CAMERA, pose(i)))
         items.append(("/tf", TF_MESSAGE, stamp_ns(i), moving))
     camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
 

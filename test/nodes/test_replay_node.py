@@ -10,7 +10,7 @@ from geometry_msgs.msg import PoseStamped
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from support.nodes import NodeProcess, peer, run_to_end, wait_until
-from support.recordings import camera_items, pose, stamp_ns, transform, write_bag
+from support.recordings import camera_items, pose, stamp_ns, tf, write_bag
 
 from deworldsg_ros.recordings import replaying, source
 from deworldsg_ros.streams.poses import stamp_ns_of
@@ -83,7 +83,7 @@ def test_messages_of_a_bag_arrive_byte_for_byte(tmp_path, bag):
 def test_poses_from_tf_are_published_as_poses(tmp_path):
     items = camera_items(COUNT, with_pose=False)
     for i in range(COUNT):
-        moving = transform(stamp_ns(i), "map", "camera_optical", pose(i))
+        moving = tf(stamp_ns(i), ("map", "camera_optical", pose(i)))
         items.append(("/tf", source.TF_MESSAGE, stamp_ns(i), moving))
     bag = write_bag(tmp_path / "bag", sorted(items, key=lambda item: item[2]))
     messages, _ = received(tmp_path, bag)

@@ -14,7 +14,7 @@ from support.recordings import (
     pose,
     rgb_pixels,
     stamp_ns,
-    transform,
+    tf,
     write_bag,
 )
 
@@ -87,18 +87,18 @@ def tf_items():
     """/tf of a base that carries the camera, /tf_static of the camera on it; late in the bag."""
     bases = [pose(i) @ invert_pose(T_BASE_CAMERA) for i in range(COUNT)]
     times_ns = [stamp_ns(i) for i in range(COUNT)]
-    static = transform(0, "base", CAMERA, T_BASE_CAMERA)
+    static = tf(0, ("base", CAMERA, T_BASE_CAMERA))
     return [
-        *(
-            ("/tf", ros.TF_MESSAGE, t, transform(t, WORLD, "base", T))
-            for t, T in zip(times_ns, bases)
-        ),
+        *(("/tf", ros.TF_MESSAGE, t, tf(t, (WORLD, "base", T))) for t, T in zip(times_ns, bases)),
         ("/tf_static", ros.TF_MESSAGE, max(times_ns), static),
     ]
 
 
-def odometry_items(*child):
-    return [("/odom", ros.ODOMETRY, stamp_ns(i), odometry(i, *child)) for i in range(COUNT)]
+def odometry_items(child=CAMERA, T_camera_child=np.eye(4)):
+    return [
+        ("/odom", ros.ODOMETRY, stamp_ns(i), odometry(stamp_ns(i), pose(i) @ T_camera_child, child))
+        for i in range(COUNT)
+    ]
 
 
 def robot_items():
@@ -161,7 +161,7 @@ def test_the_configuration_decides_between_poses_odometry_and_tf(tmp_path, pose_
 
 def test_tf_that_does_not_connect_the_camera_drops_frames_with_a_reason(tmp_path):
     elsewhere = [
-        ("/tf", ros.TF_MESSAGE, stamp_ns(i), transform(stamp_ns(i), WORLD, "arm", np.eye(4)))
+        ("/tf", ros.TF_MESSAGE, stamp_ns(i), tf(stamp_ns(i), (WORLD, "arm", np.eye(4))))
         for i in range(COUNT)
     ]
     items = in_time(camera_items(COUNT, with_pose=False) + elsewhere)
