@@ -55,23 +55,16 @@ class Target:
         names = list(good)
         # Every third turn.
         if self.documents is None or rng.randrange(3):
-            for _ in range(count):
-                name = rng.choice(names)
+            for name in rng.choices(names, k=count):
                 use(name, mutate(name, good[name], rng))
             return
         name = rng.choice(names)
-
-        @hypothesis.seed(rng.randrange(2**32))
-        @hypothesis.settings(
+        known = hypothesis.settings(
             max_examples=count,
             database=None,
-            deadline=None,
             derandomize=False,
             phases=[hypothesis.Phase.generate],
             suppress_health_check=list(hypothesis.HealthCheck),
         )
-        @hypothesis.given(self.documents)
-        def each(content: bytes) -> None:
-            use(name, content)
-
-        each()
+        each = hypothesis.given(self.documents)(lambda content: use(name, content))
+        hypothesis.seed(rng.randrange(2**32))(known(each))()
