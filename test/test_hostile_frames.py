@@ -143,7 +143,7 @@ def test_a_refused_local_graph_leaves_the_graph_as_it_was(config: Config) -> Non
 
 @of_all
 def test_the_largest_sums_of_logits_are_published_and_saved(config: Config, tmp_path) -> None:
-    builder, replica, local = GraphBuilder(config, VOCABULARY, "map"), GraphReplica(), some(2, 3)
+    builder, replica, local = GraphBuilder(config, VOCABULARY, "map"), GraphReplica(), some(2, 1)
     pairs = np.tile([[0, 1]], (limits.MAX_RELATIONS, 1))
     logits = np.tile(np.array([1.0, -1.0, 1.0]) * limits.MAX_LOGIT, (len(pairs), 1))
     relations = Relations(pairs, logits, np.ones(len(pairs)))

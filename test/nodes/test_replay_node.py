@@ -108,7 +108,7 @@ def test_without_the_nodes_it_replays_at_the_recorded_rate(tmp_path, bag):
 def test_a_signal_ends_it_with_0(tmp_path, bag, number):
     with NodeProcess("replay_node", tmp_path, **options(bag, rate=0.02)) as process:
         wait_until(lambda: '"Started"' in process.log, 30, "the replay to start")
-        process._process.send_signal(number)
+        process.send_signal(number)
         assert process.wait(10) == 0, process.log
         assert "Traceback" not in process.log
 

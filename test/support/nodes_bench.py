@@ -235,11 +235,6 @@ class Bench:
         self.peer.close()
 
 
-def bench(make: type[StageNode], topics: dict[str, type]) -> Iterator[Bench]:
-    with Bench(make, topics) as made:
-        yield made
-
-
 CAMERA = {
     "rgb/image_raw": Image,
     "depth/image_raw": Image,

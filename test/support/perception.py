@@ -35,14 +35,7 @@ class Slab:
 def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RGB, depth and the slab of each pixel (H, W), counted from 1; 0 = floor or back wall."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    rays_camera = np.stack(
-        [
-            (u - INTRINSICS.cx) / INTRINSICS.fx,
-            (v - INTRINSICS.cy) / INTRINSICS.fy,
-            np.ones(SHAPE),
-        ],
-        axis=2,
-    )
+    rays_camera = INTRINSICS.back_project(u, v, np.ones(SHAPE))
     right = np.array([1.0, 0.0, 0.0])
     forward_camera = np.array([0.0, 0.0, 1.0])
     forward = forward_camera - (forward_camera @ UP_CAMERA) * UP_CAMERA

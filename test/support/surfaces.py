@@ -3,10 +3,10 @@
 import dataclasses
 
 import numpy as np
-from support.merging import VOCABULARY, moments
+from support.merging import local_graph, moments
 
 from deworldsg_ros.scene.camera import Intrinsics
-from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph, Relations
+from deworldsg_ros.scene.frame_graph import DepthGrid, LocalGraph
 
 CUP, TABLE, CHAIR = 0, 1, 2
 
@@ -26,25 +26,19 @@ def frame(stamp: int, *objects: tuple[np.ndarray, int], **changes) -> LocalGraph
     classes = np.full((count, 4), 0.05)
     for row, (_, kind) in enumerate(objects):
         classes[row, kind] = 0.85
+    graph = local_graph(
+        stamp * 10**8,
+        np.array([mean for mean, _ in gaussians]).reshape(-1, 3),
+        np.array([covariance for _, covariance in gaussians]).reshape(-1, 3, 3),
+        classes,
+        points=tuple(points for points, _ in objects),
+    )
     fields = {
-        "stamp_ns": stamp * 10**8,
-        "frame_id": "world",
-        "width": 640,
-        "height": 480,
-        "T_world_camera": np.eye(4),
-        "vocabulary": VOCABULARY,
-        "instance_ids": np.arange(1, count + 1),
         "boxes_xyxy": np.tile([10.0, 10, 100, 100], (count, 1)),
-        "class_probabilities": classes.reshape(count, 4),
-        "scores": np.full(count, 0.9),
-        "means_world": np.array([mean for mean, _ in gaussians]).reshape(-1, 3),
-        "covariances_world": np.array([cov for _, cov in gaussians]).reshape(-1, 3, 3),
         "depths_m": np.full(count, 2.0),
         "pixel_counts": np.array([len(points) for points, _ in objects], np.int64),
-        "surface_points_world": tuple(points for points, _ in objects),
-        "relations": Relations.none(len(VOCABULARY.predicates)),
     }
-    return LocalGraph(**{**fields, **changes})
+    return dataclasses.replace(graph, **{**fields, **changes})
 
 
 WHOLE = slab((0, 0, 1), (2.2, 0.8, 0.01))
