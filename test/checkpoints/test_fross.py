@@ -9,7 +9,7 @@ from support.torch_models import PREDICATES, WIDTH, image, segmented, settings, 
 from typer.testing import CliRunner
 
 from deworldsg_ros.checkpoints.cards import read_detector_card
-from deworldsg_ros.checkpoints.fross import Names, import_checkpoint, infer_config
+from deworldsg_ros.checkpoints.fross import Names, import_checkpoint
 from deworldsg_ros.cli.models import app
 from deworldsg_ros.perception.backends.rtdetr import EgtrRelationHead, RtDetrDetector
 from deworldsg_ros.scene.errors import ConfigurationError
@@ -226,39 +226,6 @@ def test_the_first_architecture_in_its_own_spelling(tmp_path, bottleneck):
     # Without a config.json: FROSS's three layers, no statistics.
     card = read_detector_card(tmp_path / "out" / "deworldsg.json")
     assert (card.decoder_layers, card.frequency_bias, card.class_scores) == (3, False, "softmax")
-
-
-def test_published_sizes_are_recognised():
-    """The r50vd_m of FROSS, by the shapes alone."""
-    sizes = {
-        "backbone.conv1.conv1_3.conv.weight": (64, 32, 3, 3),
-        "decoder.denoising_class_embed.weight": (151, 256),
-        "encoder.encoder.0.layers.0.linear1.weight": (1024, 256),
-        "encoder.fpn_blocks.0.conv1.conv.weight": (128, 512, 1, 1),
-        "decoder.decoder.layers.5.linear1.weight": (1024, 256),
-        "decoder.decoder.layers.0.linear1.weight": (1024, 256),
-        "decoder.decoder.layers.0.cross_attn.attention_weights.weight": (96, 256),
-        "decoder.decoder.layers.0.cross_attn.num_points_scale": (12,),
-        "decoder.dec_score_head.0.weight": (150, 256),
-    }
-    for stage, (width, depth) in enumerate([(256, 3), (512, 4), (1024, 6), (2048, 3)]):
-        for block in range(depth):
-            name = f"backbone.res_layers.{stage}.blocks.{block}.branch2c.conv.weight"
-            sizes[name] = (width, width // 4, 1, 1)
-    for level, width in enumerate((512, 1024, 2048)):
-        sizes[f"encoder.input_proj.{level}.conv.weight"] = (256, width, 1, 1)
-        sizes[f"decoder.input_proj.{level}.conv.weight"] = (256, 256, 1, 1)
-    empty = {name: torch.empty(shape, device="meta") for name, shape in sizes.items()}
-    found = infer_config(empty, {}, "here")
-    published = transformers.RTDetrV2Config(hidden_expansion=0.5, num_labels=150)
-    fields = ("d_model", "decoder_layers", "encoder_ffn_dim", "hidden_expansion", "num_labels")
-    lists = ("encoder_in_channels", "decoder_in_channels", "decoder_n_points", "num_queries")
-    for field in (*fields, *lists):
-        both = (np.atleast_1d(getattr(config, field)) for config in (found, published))
-        assert np.array_equal(*both), field
-    for field in ("hidden_sizes", "depths", "layer_type", "embedding_size", "out_features"):
-        there = getattr(published.backbone_config, field)
-        assert np.array_equal(getattr(found.backbone_config, field), there), field
 
 
 WRONG_SIZE = f"{DETECTOR}decoder.enc_output.proj.weight"

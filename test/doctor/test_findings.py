@@ -1,7 +1,5 @@
 """Observations become sentences; without observations there are none."""
 
-from __future__ import annotations
-
 import pytest
 
 from deworldsg_ros.doctor import FrameChecks, Observations, find

@@ -1,7 +1,5 @@
 """The shipped recording, made wrong on purpose: what its frames, `doctor` and `run` say."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`python -m endurance.crash [KILLS]`: kill -9 of the nodes at random moments of a replay."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

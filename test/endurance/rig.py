@@ -1,7 +1,5 @@
 """Four node processes, and a camera that repeats a recording for ever with stamps that grow."""
 
-from __future__ import annotations
-
 import os
 import signal
 import struct

@@ -1,7 +1,5 @@
 """A part of `scripts/crash` and `scripts/soak`."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -3,8 +3,6 @@
 The backbones are tiny and have random weights: the test shows that the parts fit together.
 """
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Graphs of several robots in worlds of their own become one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

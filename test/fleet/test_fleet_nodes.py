@@ -1,7 +1,5 @@
 """fleet_link_node and fleet_node as processes: a graph on a topic goes to the fleet and back."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 from pathlib import Path

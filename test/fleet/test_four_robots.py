@@ -1,7 +1,5 @@
 """Four robots, each in a world of its own; the network fails in between."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

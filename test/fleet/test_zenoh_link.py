@@ -1,7 +1,5 @@
 """Feeds and followers over a real Zenoh router; which robots are asked, over an imitated one."""
 
-from __future__ import annotations
-
 import time
 import zlib
 from types import SimpleNamespace as Value

@@ -1,7 +1,5 @@
 """Runs cases of the targets in turns, and keeps those that failed."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import threading

@@ -1,7 +1,5 @@
 """Damage to good files: bytes, words, trees, arrays, images and tables, by the kind of the file."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

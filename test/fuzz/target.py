@@ -1,7 +1,5 @@
 """A reader under test: its good files, and cases made from them."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable
 from dataclasses import dataclass

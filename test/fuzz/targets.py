@@ -1,7 +1,5 @@
 """All readers by name: files here, messages in `wire_targets`."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import pickle

@@ -1,7 +1,5 @@
 """The messages of all topics, and graphs that get hostile but well-formed local graphs."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable

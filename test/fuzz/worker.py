@@ -1,7 +1,5 @@
 """A process that runs cases in limits of memory and time; a new one takes its place if it dies."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import multiprocessing

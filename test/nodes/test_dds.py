@@ -1,7 +1,5 @@
 """Four node processes over DDS: the graph, its updates, its file, and the end of the nodes."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, field
 from pathlib import Path

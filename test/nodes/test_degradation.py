@@ -1,7 +1,5 @@
 """A model that raises, hangs or is lost: its stage goes on, says so, and recovers by itself."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

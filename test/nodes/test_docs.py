@@ -1,7 +1,5 @@
 """Tables of the pages equal the code; `python test/nodes/test_docs.py` writes them."""
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

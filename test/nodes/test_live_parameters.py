@@ -1,7 +1,5 @@
 """Parameters that change while a node runs, those that do not, and the QoS of its topics."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Two robots in two namespaces keep two graphs apart."""
 
-from __future__ import annotations
-
 import contextlib
 from functools import partial
 

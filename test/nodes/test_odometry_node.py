@@ -1,7 +1,5 @@
 """odometry_node: poses from images, lost frames, the transform on /tf."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

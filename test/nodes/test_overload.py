@@ -1,7 +1,5 @@
 """What hangs, stalls or floods does not stop a node: queues are bounded, losses counted."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -1,7 +1,5 @@
 """region_node: a client of its topics has the part, also when the centre or the region changes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

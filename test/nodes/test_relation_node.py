@@ -1,7 +1,5 @@
 """relation_node: predictions of the world model, and the pairs that it encodes."""
 
-from __future__ import annotations
-
 import pytest
 from msgspec.structs import replace
 from std_msgs.msg import String

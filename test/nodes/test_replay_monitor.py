@@ -1,7 +1,5 @@
 """A replay waits for a pipeline that works, and keeps its own pace without one."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 

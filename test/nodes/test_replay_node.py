@@ -1,7 +1,5 @@
 """replay_node: published messages, waiting, exit codes."""
 
-from __future__ import annotations
-
 import signal
 
 import msgspec

@@ -1,7 +1,5 @@
 """The services of graph_node, called by the live client, the command line, and as ROS does."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """A node adapts to the publishers: best effort, compressed images, odometry, TF, later changes."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """viewer_node: topics become a graph and joined frames; abnormal messages change nothing."""
 
-from __future__ import annotations
-
 from unittest.mock import Mock
 
 import numpy as np

@@ -1,7 +1,5 @@
 """All kernels of a run are compiled before its first frame, each for one layout."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """The lock files: complete, equal to what pyproject.toml asks for, and free of known advisories."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

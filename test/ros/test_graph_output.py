@@ -1,7 +1,5 @@
 """The graph on topics: JSON in pieces, detections, markers, and /tf."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace as Value
 
 import msgspec

@@ -1,7 +1,5 @@
 """ROS parameters: declared from the configuration, checked at start-up, refused in one line."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Threads of the nodes: their queues, the times of updates, and the one that writes the map."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

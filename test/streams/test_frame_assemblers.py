@@ -1,7 +1,5 @@
 """Joining: the same messages give the same frames, whatever their order between the topics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Images: every layout there and back, every refusal with its reason."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import cv2

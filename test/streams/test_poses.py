@@ -1,7 +1,5 @@
 """Poses, their interpolation, the gate against jumps, and the TF tree."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 

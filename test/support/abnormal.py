@@ -1,7 +1,5 @@
 """Abnormal input on live topics: what each node gets, and the reason under which it is counted."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Software rendering takes seconds a frame on a busy machine. So `Screen` looks ag
 expected is there.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Small checkpoints of world models and probes: real architectures and file formats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

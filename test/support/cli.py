@@ -1,7 +1,5 @@
 """Runs commands: in a process of their own, as a user does, or in this one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

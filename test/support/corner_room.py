@@ -1,7 +1,5 @@
 """Exact RGB-D frames of the corner of a room: two textured walls and a floor."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame, rigid_motion

@@ -1,7 +1,5 @@
 """A TCP link that can be cut: what is sent meanwhile is neither delivered nor refused."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

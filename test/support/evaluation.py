@@ -1,7 +1,5 @@
 """Tiny data sets in the official layouts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A test double of the detector, the segmenter and the relation head. Each can fail or hang."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A WebSocket client of the server for Foxglove."""
 
-from __future__ import annotations
-
 import json
 import struct
 import time

@@ -1,7 +1,5 @@
 """Images that somebody made to harm a reader."""
 
-from __future__ import annotations
-
 # Begins a scan of a JPEG.
 SCAN = b"\xff\xda"
 

@@ -1,7 +1,5 @@
 """Node processes, and a camera that publishes a recording to them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

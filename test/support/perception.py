@@ -1,7 +1,5 @@
 """Synthetic RGB-D scenes with known masks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

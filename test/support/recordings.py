@@ -1,7 +1,5 @@
 """Small recordings of a moving camera: bags and folders in all layouts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path

@@ -6,8 +6,6 @@ is small, and any version makes the same checkpoint. tools/old_checkpoints makes
 imports this module with an older version of transformers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

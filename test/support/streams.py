@@ -1,7 +1,5 @@
 """Messages of a small camera, as recordings have them."""
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 from typing import Any
