@@ -40,7 +40,6 @@ class Recovery:
 
 
 def kill_and_restart(rig: Rig, name: str) -> Recovery:
-    """Kill a node, start it again, and wait until the graph is updated."""
     rig.kill(name)
     kept: set[int] = set()
     if name == "graph_node":

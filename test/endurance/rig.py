@@ -57,14 +57,12 @@ class Rig:
         self._started_s = self._last_s = self._result_s = 0.0
 
     def start(self, name: str) -> None:
-        """Start a node; does not wait for it."""
         folder = self._folder / str(time.monotonic_ns())
         folder.mkdir(parents=True)
         parameters = {"map_path": f"'{self.map_path}'", "map_period_s": MAP_PERIOD_S}
         self.processes[name] = NodeProcess(name, folder, parameters=parameters)
 
     def start_all(self) -> None:
-        """Start all nodes and wait until they are ready."""
         for name in NODES:
             self.start(name)
         for process in self.processes.values():
@@ -90,7 +88,6 @@ class Rig:
         return True
 
     def close(self) -> None:
-        """End the nodes."""
         for process in self.processes.values():
             process.end()
         self.peer.close()
@@ -112,7 +109,6 @@ class Rig:
             self._next += 1
 
     def _read(self) -> None:
-        """Take what has arrived."""
         self.updates += len(self._update_texts)
         if self._results:  # a result also ends the frames before it
             self._in_flight, self._result_s = 0, time.monotonic()
@@ -126,7 +122,6 @@ class Rig:
 
 
 def shifted(message: RawRoleMessage, by_ns: int) -> bytes:
-    """The serialized message with a later stamp."""
     data = bytearray(message.data)
     STAMP.pack_into(data, STAMP_AT, *divmod(message.stamp_ns + by_ns, 10**9))
     return bytes(data)

@@ -44,13 +44,10 @@ ROOM_DISTANCE_M = 20.0
 
 
 class Series:
-    """A value over time, such as the memory of a process."""
-
     def __init__(self, samples: Iterable[tuple[float, float]] = ()) -> None:
         self.samples = list(samples)  # of the time in seconds, and the value
 
     def settled(self, settle_s: float) -> Series:
-        """The samples after a time."""
         return Series(sample for sample in self.samples if sample[0] >= settle_s)
 
     def slope_per_h(self) -> float:
@@ -63,7 +60,6 @@ class Series:
         return float(3600 * np.median(values / times_s))
 
     def ends(self) -> tuple[float, float]:
-        """Medians of the first and the last third."""
         values = [value for _, value in self.samples]
         third = max(1, len(values) // 3)
         return float(np.median(values[:third])), float(np.median(values[-third:]))
@@ -159,7 +155,6 @@ def merge(
 
 
 def problems_of_merging(name: str, costs: Costs) -> Iterator[str]:
-    """What grows; prints the figures."""
     print(
         f"{name}: {costs.frames} frames, {1e3 * costs.first:.2f} ms a frame at first, "
         f"{1e3 * costs.last:.2f} ms at the end; memory grew by {costs.grown_mb:.1f} MB",
@@ -170,7 +165,6 @@ def problems_of_merging(name: str, costs: Costs) -> Iterator[str]:
 
 
 def problems_of_replay(minutes: float) -> Iterator[str]:
-    """What grows; prints the figures."""
     with tempfile.TemporaryDirectory() as folder:
         memory, latencies = replay(minutes, Path(folder))
     settle_s = min(SETTLE_S, 12 * minutes)

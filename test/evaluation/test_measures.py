@@ -40,7 +40,6 @@ def scene(labels, relations):
 
 
 def node(number, label, x, weight=1.0, observations=1):
-    """A cube of 1 m at x."""
     corners = [(dx, dy, dz) for dx in (-0.5, 0.5) for dy in (-0.5, 0.5) for dz in (-0.5, 0.5)]
     mean = np.array([x, 0.5, 0.5])
     return NodeView(number, label, 0.8, mean, mean + corners, weight, observations)

@@ -112,7 +112,6 @@ def invoke(command, *arguments):
 
 
 def values_of(tmp_path, command, *arguments):
-    """The numbers that a command wrote, and its words."""
     json_file = tmp_path / "new" / "numbers.json"
     code, text = invoke(command, "--layout", "replica", *arguments, "--json", json_file)
     assert code == 0, text

@@ -294,7 +294,6 @@ def test_invalid_options_of_a_table_are_refused(root, tmp_path, arguments, words
 
 
 def test_the_printed_numbers_are_in_the_paper(shared_dir):
-    """Every printed row stands in the paper's source, number by number."""
     text = (shared_dir / "paper" / "deworldsg.tex").read_text(encoding="utf-8")
     for wrapper in ("\\textbf{", "}", " ", "\n"):
         text = text.replace(wrapper, "")

@@ -39,7 +39,6 @@ class Report:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self, worker: Worker, name: str, cases: Cases) -> None:
-        """Run cases of a target."""
         began_s = time.monotonic()
         found = list(worker.run(name, cases))
         with self._lock:

@@ -73,7 +73,6 @@ def raw_bytes(content: bytes, rng: random.Random) -> bytes:
 
 
 def words(content: bytes, rng: random.Random) -> bytes:
-    """Replace, drop or repeat words and lines of a text."""
     lines = content.split(b"\n")
     row, other = rng.randrange(len(lines)), rng.randrange(len(lines))
     parts = lines[row].split(b" ")
@@ -89,7 +88,6 @@ def words(content: bytes, rng: random.Random) -> bytes:
 
 
 def json_tree(content: bytes, rng: random.Random) -> bytes:
-    """Damage values of a JSON document."""
     return json.dumps(_tree(json.loads(content), rng)).encode(errors="surrogatepass")
 
 

@@ -49,8 +49,6 @@ Cases = list[tuple[str, bytes]] | tuple[str, int]
 
 
 class Worker:
-    """Runs cases, one after the other."""
-
     def __init__(self) -> None:
         self._start()
 
@@ -74,7 +72,6 @@ class Worker:
             yield self._restart(target, member, f"crash: it ended with {self.process.exitcode}")
 
     def close(self) -> None:
-        """End the process and remove its files."""
         if self.process.is_alive():
             self.process.kill()
         self.process.join(10.0)

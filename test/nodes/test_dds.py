@@ -48,7 +48,6 @@ class Run:
     markers: list[MarkerArray] = field(default_factory=list)
 
     def values(self) -> dict[str, dict[str, str]]:
-        """The newest diagnostics, by node."""
         return {
             status.name.split(":")[0]: {item.key: item.value for item in status.values}
             for status in self.statuses

@@ -60,7 +60,6 @@ def with_faults(*faults: dict[str, Any]):
 
 
 def objects_after_a_frame(at: Bench) -> int:
-    """Send a frame; the number of objects in its frame graph."""
     at.texts.clear()
     works(at, lambda: send_frame(at))
     at.expect(lambda: bool(at.texts), "a frame graph")

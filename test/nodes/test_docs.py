@@ -37,7 +37,6 @@ def reasons_table() -> str:
 
 
 def parameters_table(kind: type, section: str = "") -> str:
-    """All parameters, or those of one section."""
     rows = []
     for field in fields(kind):
         if section in ("", field.path[0]):

@@ -19,8 +19,6 @@ WORLD_MODEL = {"relations.world_model": "fake", "relations.clip_length": 4}
 
 
 def clips_are(at: Bench, **expected: int) -> None:
-    """Wait until the counts of clips are these."""
-
     def reached() -> bool:
         values = at.node.more_values()
         return all(

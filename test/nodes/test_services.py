@@ -55,7 +55,6 @@ class Robot(Bench):
         return future.result()
 
     def call(self, kind, topic, request):
-        """The response to `ros2 service call`."""
         client = self.peer.node.create_client(kind, topic)
         self.expect(client.service_is_ready, "the service")
         future = client.call_async(request)
@@ -63,7 +62,6 @@ class Robot(Bench):
         return future.result()
 
     def command(self, *words):
-        """Output of the command line."""
         done = self.ask(typer.testing.CliRunner().invoke, app, list(words))
         assert done.exit_code == 0, done.output
         return done.output

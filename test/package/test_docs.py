@@ -36,7 +36,6 @@ FETCHED = re.compile(
 
 @cache
 def tracked() -> tuple[Path, ...]:
-    """Files of the repository that are in version control and still there."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     paths = (Path(line) for line in listed.stdout.splitlines())
@@ -54,8 +53,6 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_links(page: Path, text: str) -> list[str]:
-    """Relative links of a page to a file or a heading that does not exist."""
-
     def is_broken(link: str) -> bool:
         name, _, anchor = link.partition("#")
         target = (page.parent / name).resolve() if name else page
@@ -82,7 +79,6 @@ def missing_files(text: str) -> list[str]:
 
 
 def defined_in(path: Path) -> set[str]:
-    """Names of all functions and classes of a module."""
     kinds = (ast.FunctionDef, ast.ClassDef)
     tree = ast.parse(path.read_text(encoding="utf-8"))
     return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}

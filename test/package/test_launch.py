@@ -40,7 +40,6 @@ def launch_doubles(monkeypatch):
 
 
 def described(path):
-    """Entities of a launch file, by kind."""
     (entities,) = runpy.run_path(str(path))["generate_launch_description"]().args
     found = defaultdict(list)
     for entity in entities:

@@ -21,7 +21,6 @@ DISTRIBUTIONS = {
 
 
 def requirements(root: Path, *extras: str) -> dict[str, str]:
-    """Requirement lines by lower-case distribution name."""
     script = root / "scripts" / "requirements.py"
     done = subprocess.run(
         [sys.executable, script, *extras], capture_output=True, text=True, check=True, timeout=60
@@ -48,7 +47,6 @@ def test_versions_descriptions_licences_and_ros_packages_agree(root_dir):
 
 
 def imported_modules(root: Path) -> set[str]:
-    """Top-level names of everything that the package imports."""
     texts = [path.read_text(encoding="utf-8") for path in (root / "deworldsg_ros").rglob("*.py")]
     found = r"^ *(?:from|import) (\w+)(?=[\w.]* import |$| as )"
     return {name for text in texts for name in re.findall(found, text, re.M)}

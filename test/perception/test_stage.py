@@ -31,8 +31,6 @@ from deworldsg_ros.scene.vocabulary import REPLICA_SSG_PREDICATES
 
 
 class ListedDetector:
-    """Returns the detections that it was made with."""
-
     default_score_threshold = 0.45
 
     def __init__(self, boxes, classes, scores, names=("table", "cup", "person")):

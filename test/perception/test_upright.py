@@ -34,7 +34,6 @@ def turn(axis, angle_deg):
 
 
 def pitched(angle_deg):
-    """LEVEL, looking down by an angle."""
     return LEVEL @ turn("x", -angle_deg)
 
 

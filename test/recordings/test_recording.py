@@ -102,7 +102,6 @@ def odometry_items(child=CAMERA, T_camera_child=np.eye(4)):
 
 
 def robot_items():
-    """A camera on a base, and the odometry of the base."""
     items = camera_items(COUNT, with_pose=False) + tf_items()
     return in_time(items + odometry_items("base", invert_pose(T_BASE_CAMERA)))
 
@@ -117,7 +116,6 @@ def raw_messages(path):
 
 
 def replayed_poses(path):
-    """Types of the poses that a replay publishes."""
     return {item.msgtype for item in raw_messages(path) if item.role is Role.POSE}
 
 

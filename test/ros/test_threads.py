@@ -35,7 +35,6 @@ class Held:
             self.worker.submit(item)
 
     def submit_first(self):
-        """Submit an item and wait until the thread has taken it."""
         self.worker.submit(0)
         while self.worker.waiting:
             time.sleep(0.001)

@@ -104,7 +104,6 @@ def _camera(node: str) -> list[Case]:
 
 
 def _text(node: str, topic: str, make: Callable[[int], Any]) -> list[Case]:
-    """JSON that is no message."""
     cases: list[tuple[str, Make, str]] = [
         ("no JSON", lambda at: "{not json", "invalid_message"),
         ("empty text", lambda at: "", "invalid_message"),
@@ -120,7 +119,6 @@ def _text(node: str, topic: str, make: Callable[[int], Any]) -> list[Case]:
 
 
 def _stamps(node: str, topic: str, make: Callable[[int], Any]) -> list[Case]:
-    """Stamps of one message that jump."""
     jumps = {"an hour ahead": HOUR_NS, "an hour ago": -HOUR_NS, "0": None}
     return [
         Case(node, topic, f"stamp {text}", _late(make, by_ns), "time_jump")

@@ -52,7 +52,6 @@ def chromium() -> str:
 
 @contextmanager
 def browser() -> Iterator[Any]:
-    """A browser of playwright, closed at the end."""
     api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     path = chromium()
     with api.sync_playwright() as playwright:
@@ -84,7 +83,6 @@ def opened_page(
 
 
 def pixels_of(shot: bytes) -> np.ndarray:
-    """A screenshot as (H, W, 3)."""
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
 
 
@@ -102,7 +100,6 @@ class Screen:
         self._colours = class_colours(labels)
 
     def until(self, holds: Callable[[], bool], what: str) -> None:
-        """Wait until a condition holds."""
         end_s = time.monotonic() + LIMIT_S
         while not holds():
             assert time.monotonic() < end_s, what
@@ -115,7 +112,6 @@ class Screen:
 
     @property
     def camera(self) -> Any:
-        """The camera of the one browser."""
         from deworldsg_ros.view.live.scene import camera_of
 
         (client,) = self.viewer._server.get_clients().values()
@@ -130,16 +126,13 @@ class Screen:
         self.until(lambda: set(filter(self._shows, self._colours)) == set(labels), f"only {labels}")
 
     def says(self, text: str) -> None:
-        """Wait until the panel has a text."""
         self.page.get_by_text(text).first.wait_for()
 
     def open(self, *folders: str) -> None:
-        """Open folders of the panel."""
         for folder in folders:
             self.page.get_by_text(folder, exact=True).first.click()
 
     def click_at(self, point: Any) -> None:
-        """Click a point (3,) of the world."""
         (place,), _ = self.camera.project(np.array([point], float))
         self.page.mouse.click(*place.tolist())
 

@@ -14,7 +14,6 @@ WALLS = ((0, 3.0), (1, 0.8), (2, -0.4))
 
 
 def corner_frame(T_world_camera: np.ndarray, stamp_ns: int = 0) -> RgbdFrame:
-    """The exact frame at a camera pose."""
     v, u = np.mgrid[: INTRINSICS.height, : INTRINSICS.width]
     rays = INTRINSICS.back_project(u, v, np.ones(u.shape))
     directions = rays @ T_world_camera[:3, :3].T

@@ -17,7 +17,6 @@ class CutLink:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def close(self) -> None:
-        """End all connections."""
         self._closed.set()
         self._listener.close()
 

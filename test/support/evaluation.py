@@ -118,7 +118,6 @@ def write_predictions(
     class_count: int,
     predicate_count: int,
 ) -> None:
-    """Write predictions in the project's open format."""
     scans = {
         scan: {
             "nodes": [

@@ -63,7 +63,6 @@ def hostile_grid(rng: np.random.Generator, width: int, height: int) -> DepthGrid
 
 
 def hostile_local_graph(rng: np.random.Generator, stamp_ns: int) -> LocalGraph:
-    """A local graph of 0 to 6 objects."""
     count = int(rng.integers(0, 7))
     width, height = int(rng.choice([1, 64, 640])), int(rng.choice([1, 48, 480]))
     means = rng.choice(PLACES_M, (count, 3)) * rng.choice([-1, 1], (count, 3))
@@ -121,7 +120,6 @@ def hostile_evidence(rng: np.random.Generator, local: LocalGraph) -> RelationEvi
 
 
 def hostile_scene_graph(rng: np.random.Generator) -> wire.SceneGraphMessage:
-    """A scene graph of 0 to 8 nodes, as its schema allows it."""
     count = int(rng.integers(0, 9))
     ids = rng.choice([1, 2, 3, 4, 5, 7, 2**31, 2**53 + 1, 2**63 - 1], count, replace=False)
     pairs = [(a, b) for a in [*ids, 6] for b in [*ids, 8] if a != b and rng.random() < 0.2]
@@ -225,7 +223,6 @@ def _hostile_stamp(rng: np.random.Generator) -> dict[str, int]:
 
 
 def state_of(builder: GraphBuilder) -> bytes:
-    """Everything that a graph builder knows, as bytes."""
     memory = builder.merging.memory()
     return pickle.dumps(
         (builder.graph.state(), memory, builder.prior.to_state(), builder.up.state().tobytes())

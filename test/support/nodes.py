@@ -68,16 +68,13 @@ class NodeProcess(subprocess.Popen):
 
     @property
     def log(self) -> str:
-        """The output of the process."""
         return self.log_path.read_text()
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs."""
         return self.poll() is None
 
     def wait_ready(self, limit_s: float = 150.0) -> None:
-        """Wait until the node logs that it is ready."""
         wait_until(lambda: "ready" in self.log or not self.alive, limit_s, f"{self.name} to start")
         assert self.alive, self.log
 
@@ -126,11 +123,9 @@ class Peer:
         self.also_spin: list[SingleThreadedExecutor] = []
 
     def spin_until(self, condition: Callable[[], bool], limit_s: float, what: str) -> None:
-        """Run callbacks until a condition is true. `what` names it if the time is over."""
         wait_until(condition, limit_s, what, self._spin_once)
 
     def spin_for(self, duration_s: float) -> None:
-        """Run callbacks for a duration."""
         end_s = time.monotonic() + duration_s
         while time.monotonic() < end_s:
             self._spin_once()
@@ -155,15 +150,12 @@ class Peer:
         return received
 
     def collect(self, topic: str, depth: int = 100, *, latched: bool = False) -> list[str]:
-        """A list that receives the texts of a topic."""
         return self.listen(String, topic, depth, latched=latched, parts=lambda it: [it.data])
 
     def statuses(self) -> list[DiagnosticStatus]:
-        """A list that receives the diagnostics of all nodes."""
         return self.listen(DiagnosticArray, "/diagnostics", 50, parts=lambda it: it.status)
 
     def close(self) -> None:
-        """End the node and its context."""
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         rclpy.try_shutdown(context=self.context)
@@ -171,7 +163,6 @@ class Peer:
 
 @contextlib.contextmanager
 def peer(name: str = "test_peer") -> Iterator[Peer]:
-    """A peer that is closed at the end."""
     made = Peer(name)
     try:
         yield made
@@ -203,7 +194,6 @@ class Camera:
         )
 
     def publish(self, message: RawRoleMessage, data: bytes) -> None:
-        """Publish serialized data on the topic of a message."""
         self._publishers[message.role].publish(data)
 
     def frames(self) -> Iterator[int]:

@@ -34,7 +34,6 @@ LIMIT_S = 20.0
 
 
 def stamped(message: Any, stamp_ns: int, frame_id: str = "camera") -> Any:
-    """The message, with this stamp and frame."""
     set_stamp(message, stamp_ns)
     message.header.frame_id = frame_id
     return message
@@ -114,7 +113,6 @@ def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
 
 
 def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
-    """A chair and a cup beside it."""
     message = local_graph(stamp_ns)
     message.predicates = ["on", "under", "near"]
     (chair,) = message.objects
@@ -205,7 +203,6 @@ class Bench:
         self.send(**{name: make(stamp_ns) for name, make in makers.items() if make is not None})
 
     def next_stamp(self) -> int:
-        """The stamp of the next frame, nanoseconds."""
         self.stamp_ns += STEP_NS
         return self.stamp_ns
 
@@ -216,7 +213,6 @@ class Bench:
         return self.node.health.products
 
     def expect(self, condition: Callable[[], bool], what: str) -> None:
-        """Run callbacks until a condition is true."""
         self.peer.spin_until(condition, LIMIT_S, f"{what}; drops are {self.node.health.drops}")
 
     def refuses(self, reason: str, provoke: Callable[[], None], number: int = 1) -> None:
@@ -280,7 +276,6 @@ def fake_perception(patch: pytest.MonkeyPatch) -> Backend:
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:
-    """Expect a product after valid input."""
     before = at.products()
     send()
     at.expect(lambda: at.products() > before, "a product")

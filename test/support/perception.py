@@ -67,7 +67,6 @@ def render(slabs: list[Slab], noise_m: float = 0.0) -> tuple[np.ndarray, np.ndar
 
 
 def segmented(names, instances, depth_m):
-    """Objects with equal scores for a relation head."""
     scores = np.full(len(names), 0.8)
     instances = instances.astype(np.uint16)
     return SegmentedObjects(names, scores, None, instances, depth_m, INTRINSICS, UP_CAMERA)

@@ -68,7 +68,6 @@ def parameters_of(path: Path) -> dict[str, list]:
 
 
 def picture(*shape: int) -> torch.Tensor:
-    """A normalised input of a network."""
     return torch.from_numpy(noise("picture", list(shape))).float()
 
 

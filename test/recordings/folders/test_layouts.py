@@ -40,7 +40,6 @@ COUNT = 4
 
 
 def write(kind: str, root: Path) -> Path:
-    """A folder of this kind with a few frames."""
     if kind == "7scenes":
         return write_seven_scenes(root / "k", COUNT)
     if kind == "tum":
