@@ -2,11 +2,10 @@
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
+from support.cli import invoke
 
 from deworldsg_ros.checkpoints.catalogue import require_checkpoints
-from deworldsg_ros.cli.app import app
-from deworldsg_ros.config import Config, PerceptionConfig, load_config, to_mapping
+from deworldsg_ros.config import Config, PerceptionConfig, load_config
 
 FOLDERS = ("fross_3dssg", "sam2.1-hiera-tiny", "vjepa2-vitg-fpc64-384", "probe_3dssg")
 
@@ -34,7 +33,7 @@ def test_each_program_refuses_the_paper_without_weights(root_dir, tmp_path, word
     """Every program says it at once, before a model is loaded or a process starts."""
     recording, config = root_dir / "bags" / "demo_room", root_dir / "config" / "paper.yaml"
     command = [*words, recording, "--config", config, "--out", tmp_path / "out"]
-    result = CliRunner().invoke(app, [str(word) for word in command])
+    result = invoke(*command)
     assert result.exit_code == code
     assert all(name in result.output for name in ("EGTR", "SAM 2", "V-JEPA 2"))
 
@@ -48,24 +47,3 @@ def test_existing_folders_hub_ids_and_embedded_models_pass(root_dir, tmp_path):
     )
     with pytest.raises(Exception, match=r"RT-DETR \(perception.detector_path ''\)"):
         require_checkpoints(PerceptionConfig(detector="rtdetr"))
-
-
-def test_the_files_of_the_paper_differ_only_where_they_have_to(root_dir):
-    def added(one, other):
-        one, other = (to_mapping(load_config(root_dir / "config" / name)) for name in (one, other))
-        values = [(s, f, value) for s, fields in one.items() for f, value in fields.items()]
-        return {f"{s}.{f}": value for s, f, value in values if value != other[s][f]}
-
-    # Networks, their paths and the score threshold of softmax scores.
-    assert added("paper.yaml", "paper_rules.yaml").keys() == {
-        *("perception.detector", "perception.detector_path", "perception.segmenter"),
-        *("perception.segmenter_path", "perception.relation_head", "perception.predicate_set"),
-        *("perception.score_threshold", "relations.world_model", "relations.world_model_path"),
-        "relations.probe_path",
-    }
-    # What options can say of the released predictions.
-    assert added("released.yaml", "paper.yaml") == {
-        "perception.segmenter": "sam3",
-        "perception.segmenter_path": "./models/sam3",
-        "relations.entropy_threshold_nats": 0.0,
-    }

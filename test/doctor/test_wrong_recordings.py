@@ -7,11 +7,9 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from support.cli import DEMO_ROOM
+from support.cli import DEMO_ROOM, invoke, refusal
 from support.recordings import encoded
-from typer.testing import CliRunner
 
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.doctor import FrameSampler, Observations, find
 from deworldsg_ros.graph.graph_files import read_graph
 from deworldsg_ros.perception.stage import turned
@@ -128,7 +126,7 @@ def examine(frames, tmp_path):
     def call(name, *command):
         bag = tmp_path / f"{name}.mcap"
         write_mcap(map(ros.serialize, messages(WRONG[name](frames))), bag)
-        result = CliRunner().invoke(app, [*command[:1], str(bag), *map(str, command[1:])])
+        result = invoke(command[0], bag, *command[1:])
         return result.exit_code, " ".join((result.stdout + result.stderr).split())
 
     return call
@@ -167,8 +165,6 @@ def test_a_camera_on_its_side_gives_the_same_objects(examine, tmp_path):
     assert (labels["on its side"] & labels["right"]).total() >= labels["right"].total() - 1 > 8
 
 
-@pytest.mark.parametrize("arguments", [[], [str(DEMO_ROOM), "--live"]])
+@pytest.mark.parametrize("arguments", [[], [DEMO_ROOM, "--live"]])
 def test_doctor_wants_a_recording_or_running_nodes(arguments):
-    result = CliRunner().invoke(app, ["doctor", *arguments])
-    assert result.exit_code == 2
-    assert "either a RECORDING or --live" in result.stderr
+    assert "either a RECORDING or --live" in refusal("doctor", *arguments)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import theilslopes
 from support.merging import VOCABULARY
 from support.surfaces import CHAIR, CUP, TABLE, frame, slab
 
@@ -51,13 +52,9 @@ class Series:
         return Series(sample for sample in self.samples if sample[0] >= settle_s)
 
     def slope_per_h(self) -> float:
-        """Median slope between samples that are half of the time apart (as Theil and Sen)."""
-        half = len(self.samples) // 2
-        if half < 1:
-            return 0.0
-        samples = np.array(self.samples)
-        times_s, values = (samples[half : 2 * half] - samples[:half]).T
-        return float(3600 * np.median(values / times_s))
+        """Median slope of all pairs of a thousand samples (Theil and Sen)."""
+        times_s, values = np.array(self.samples[:: len(self.samples) // 1000 + 1]).T
+        return 3600 * float(theilslopes(values, times_s).slope)
 
     def ends(self) -> tuple[float, float]:
         values = [value for _, value in self.samples]

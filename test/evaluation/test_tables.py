@@ -10,12 +10,11 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from support.cli import invoke
 from support.evaluation import one_hot, segment, write_dataset, write_predictions
 from support.sequences import write_room
-from typer.testing import CliRunner
 
 from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_probe_card
-from deworldsg_ros.cli.app import app
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
 from deworldsg_ros.evaluation import tables
@@ -55,10 +54,9 @@ def job(root, out, scan="room_0", **changes):
     return Job("row", replace(task, **changes))
 
 
-def invoke(root, kind, out, *arguments):
-    words = ["evaluate", "table", kind, "--layout", "replica", root, "--front-end", "recorded"]
-    words += ["--out", out, *arguments]
-    return CliRunner().invoke(app, [str(word) for word in words])
+def evaluate(root, kind, out, *arguments):
+    words = ("evaluate", "table", kind, "--layout", "replica", root, "--front-end", "recorded")
+    return invoke(*words, "--out", out, *arguments)
 
 
 def table(root, kind, out, *arguments):
@@ -66,7 +64,7 @@ def table(root, kind, out, *arguments):
     json_file = out.with_suffix(".json")
     options = ("--checkpoints", 0, "--json", json_file, *arguments)
     options += () if kind == "runtime" else ("--workers", 1)
-    result = invoke(root, kind, out, *options)
+    result = evaluate(root, kind, out, *options)
     assert result.exit_code == 0, result.output
     rows = json.loads(json_file.read_text())["rows"]
     return {row["name"]: row for row in rows if not row["printed"]}, result.output
@@ -288,7 +286,7 @@ def test_a_row_with_a_changed_method_has_no_printed_row(root_dir, tmp_path, sett
 )
 def test_invalid_options_of_a_table_are_refused(root, tmp_path, arguments, words):
     kind, *options = arguments
-    result = invoke(root, kind, tmp_path, *options)
+    result = evaluate(root, kind, tmp_path, *options)
     assert result.exit_code == (1 if "room_9" in options else 2)
     assert words in " ".join(result.output.split())
 
@@ -336,7 +334,7 @@ def test_released_predictions_stand_below_the_row_of_the_paper(
     file, out = tmp_path / "deworldsg_predictions.pkl", tmp_path / "out"
     write_released(file, sorted(scans), len(scans) - 1)
     options = ("--layout", layout, "--predictions", f"{name}={file}", "--json", out / "t.json")
-    result = invoke(data, "predictions", out, *options)
+    result = evaluate(data, "predictions", out, *options)
     assert result.exit_code == 0, result.output
     rows = {row["name"]: row for row in json.loads((out / "t.json").read_text())["rows"]}
     if printed is None:

@@ -10,7 +10,7 @@ import cv2
 import lz4.frame
 import numpy as np
 import pytest
-from support.images import SCAN, many_scans
+from support.recordings import SCAN, many_scans
 
 from deworldsg_ros.base.files import parse_any_json, parse_yaml, read_regular
 from deworldsg_ros.base.words import stamp_ns_from_text

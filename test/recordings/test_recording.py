@@ -10,6 +10,7 @@ from support.recordings import (
     WORLD,
     camera_items,
     depth_mm,
+    frames_of,
     odometry,
     pose,
     rgb_pixels,
@@ -21,7 +22,6 @@ from support.recordings import (
 from deworldsg_ros.config import InputsConfig
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.bags.topics import TopicChoice
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.recording import open_recording, open_source
 from deworldsg_ros.recordings.source import Role
 from deworldsg_ros.recordings.writer import write_mcap
@@ -29,11 +29,6 @@ from deworldsg_ros.scene.camera import Intrinsics, invert_pose
 from deworldsg_ros.scene.errors import RecordingError
 
 COUNT = 6
-
-
-def frames_of(path, **options):
-    with closing(open_recording(path, **options)) as recording:
-        return list(recording.frames()), recording
 
 
 def assert_whole(frames, count=COUNT):
@@ -62,12 +57,12 @@ def test_frames_equal_the_recorded_messages(tmp_path, storage, compressed):
 def test_given_intrinsics_replace_those_of_a_bag(tmp_path, compressed, has_info):
     items = camera_items(COUNT, compressed=compressed)
     kept = [item for item in items if has_info or "camera_info" not in item[0]]
-    options = DatasetOptions(intrinsics=(50.0, 51.0, 3.0, 4.0))
-    frames, recording = frames_of(write_bag(tmp_path / "bag", kept), options=options)
+    given = (50.0, 51.0, 3.0, 4.0)
+    frames, recording = frames_of(write_bag(tmp_path / "bag", kept), intrinsics=given)
     assert len(frames) == COUNT
     assert not recording.drops
     size = INTRINSICS.width, INTRINSICS.height
-    assert {frame.intrinsics for frame in frames} == {Intrinsics(50.0, 51.0, 3.0, 4.0, *size)}
+    assert {frame.intrinsics for frame in frames} == {Intrinsics(*given, *size)}
 
 
 @pytest.mark.parametrize("compressed", [True, False])

@@ -11,8 +11,15 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 from deworldsg_ros.recordings import source as ros
 from deworldsg_ros.recordings.bags.storage import RawBag, RawMessage
+from deworldsg_ros.recordings.folders.dataset import DatasetOptions
+from deworldsg_ros.recordings.recording import Recording, open_recording
 from deworldsg_ros.recordings.source import typestore
-from deworldsg_ros.scene.camera import Intrinsics, pose_from_quaternion, quaternion_from_rotation
+from deworldsg_ros.scene.camera import (
+    Intrinsics,
+    RgbdFrame,
+    pose_from_quaternion,
+    quaternion_from_rotation,
+)
 
 WIDTH, HEIGHT = 64, 48
 INTRINSICS = Intrinsics(60.0, 61.0, 31.5, 23.5, WIDTH, HEIGHT)
@@ -47,6 +54,15 @@ def pose(index: float) -> np.ndarray:
 
 def encoded(pixels: np.ndarray, suffix: str = ".png") -> bytes:
     return bytes(cv2.imencode(suffix, pixels)[1])
+
+
+SCAN = b"\xff\xda"  # begins a scan of a JPEG
+
+
+def many_scans(jpeg: bytes, number: int) -> bytes:
+    """A JPEG whose last scan is repeated until it has this number of scans."""
+    last, end = jpeg.rindex(SCAN), len(jpeg) - 2
+    return jpeg[:end] + jpeg[last:end] * (number - jpeg.count(SCAN)) + jpeg[end:]
 
 
 def raw_image(time_ns: int, pixels: np.ndarray, encoding: str) -> Any:
@@ -211,3 +227,8 @@ def write_tum(
         text = [f"{ns // 10**9}.{ns % 10**9:09d} {content}" for ns, content in lines]
         (folder / f"{name}.txt").write_text("\n".join(["# timestamp and content", *text]) + "\n")
     return folder
+
+
+def frames_of(path: Path, inputs: Any = None, **options: Any) -> tuple[list[RgbdFrame], Recording]:
+    with closing(open_recording(path, inputs, options=DatasetOptions(**options))) as recording:
+        return list(recording.frames()), recording

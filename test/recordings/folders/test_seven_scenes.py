@@ -8,12 +8,12 @@ from support.recordings import (
     INTRINSICS,
     depth_mm,
     encoded,
+    frames_of,
     pose,
     rgb_pixels,
     write_seven_scenes,
 )
 
-from deworldsg_ros.recordings.folders.dataset import DatasetOptions
 from deworldsg_ros.recordings.folders.seven_scenes import (
     BASELINE_M,
     COLOR_FX_FY_CX_CY,
@@ -21,13 +21,7 @@ from deworldsg_ros.recordings.folders.seven_scenes import (
     FIRST_STAMP_NS,
     register_depth,
 )
-from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.scene.camera import Intrinsics
-
-
-def frames_of(path, **options):
-    recording = open_recording(path, options=DatasetOptions(**options))
-    return list(recording.frames()), recording
 
 
 @pytest.mark.parametrize(("options", "step_ns"), [({}, 4e9 / 30), ({"rate_hz": 10.0}, 1e8)])
