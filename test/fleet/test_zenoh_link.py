@@ -131,15 +131,6 @@ class Network:
         return [Value(ok=Value(payload=Value(to_bytes=lambda: packed)))]
 
 
-class Clock:
-    """The clock of the module."""
-
-    now_s = 100.0
-
-    def monotonic(self):
-        return self.now_s
-
-
 @pytest.fixture
 def network():
     return Network()
@@ -152,7 +143,7 @@ def robots(network):
 
 @pytest.fixture
 def clock(monkeypatch):
-    clock = Clock()
+    clock = Value(now_s=100.0, monotonic=lambda: clock.now_s)
     monkeypatch.setattr(zenoh_link, "time", clock)
     return clock
 

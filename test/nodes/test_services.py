@@ -38,7 +38,7 @@ class Robot(Bench):
         files = {"map_path": str(folder / "a.map"), "save_path": str(folder / "a.json")}
         values = {"output.min_existence": 0.0, "inputs.world_up": "z", **files}
         super().__init__(GraphNode, {"deworldsg/local_graph": String}, parameters=values)
-        self._threads = ThreadPoolExecutor(1)
+        self._threads = self.enter_context(ThreadPoolExecutor(1))
         self._seen = 0
 
     def see(self, frames=1):
@@ -68,10 +68,6 @@ class Robot(Bench):
 
     def refusals(self):
         return self.node.health.drops.get("invalid_request", 0)
-
-    def close(self):
-        self._threads.shutdown()
-        super().close()
 
 
 @pytest.fixture

@@ -28,10 +28,10 @@ def locked(root: Path, profile: str, python: str) -> dict[str, Version]:
 
 
 def required(root: Path, *extras: str) -> list[Requirement]:
+    """What scripts/requirements.py prints."""
     script = root / "scripts" / "requirements.py"
-    done = subprocess.run(
-        [sys.executable, script, *extras], capture_output=True, text=True, check=True, timeout=60
-    )
+    command = [sys.executable, str(script), *extras]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
     return [Requirement(line) for line in done.stdout.split()]
 
 
@@ -75,35 +75,14 @@ def test_no_lowest_version_of_pyproject_has_a_known_advisory(root_dir):
     assert known_problems(root_dir, lowest) == []
 
 
-def install(folder: Path, text: str, *options: str) -> subprocess.CompletedProcess[str]:
-    """Let pip check a lock against the package index, without installing it."""
-    path = folder / "lock.txt"
-    path.write_text(text, encoding="utf-8")
-    pip = (sys.executable, "-m", "pip", "install", "--no-input", "--disable-pip-version-check")
-    dry = ("--dry-run", "--ignore-installed", "--no-build-isolation", "--require-hashes")
-    return subprocess.run(
-        [*pip, *dry, *options, "-r", str(path)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=880,
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_pip_accepts_the_lock_of_this_python(root_dir, tmp_path):
-    text = (root_dir / "locks" / f"test-{PRESENT}.txt").read_text(encoding="utf-8")
-    done = install(tmp_path, text)
-    assert done.returncode == 0, done.stdout[-3000:]
+def test_pip_accepts_the_lock_of_this_python(root_dir):
+    """It asks the package index, and installs nothing."""
+    lock = root_dir / "locks" / f"test-{PRESENT}.txt"
+    pip = (sys.executable, "-m", "pip", "install", "--no-input", "--disable-pip-version-check")
+    dry = ("--dry-run", "--ignore-installed", "--no-build-isolation", "--require-hashes", "-r")
+    done = subprocess.run([*pip, *dry, str(lock)], capture_output=True, text=True, timeout=880)
+    assert done.returncode == 0, done.stderr[-3000:]
     planned = done.stdout.rpartition("Would install")[2].split()
-    assert len(planned) == len(text.splitlines())
-
-
-@pytest.mark.slow
-def test_pip_refuses_a_file_with_another_hash(root_dir, tmp_path):
-    text = (root_dir / "locks" / f"run-{PRESENT}.txt").read_text(encoding="utf-8")
-    line = next(line for line in text.splitlines() if line.startswith("sortedcontainers=="))
-    done = install(tmp_path, line[:-1] + ("0" if line[-1] != "0" else "1"), "--no-deps")
-    assert done.returncode != 0
-    assert "DO NOT MATCH THE HASHES" in done.stdout
+    assert len(planned) == len(lock.read_text(encoding="utf-8").splitlines())

@@ -55,20 +55,14 @@ class FakeHub:
             def log_message(self, *arguments: object) -> None:
                 pass
 
-            def do_HEAD(self) -> None:
-                self._answer(with_body=False)
-
             def do_GET(self) -> None:
-                self._answer(with_body=True)
-
-            def _answer(self, with_body: bool) -> None:
                 path = self.path.partition("?")[0]
                 if path == f"/api/models/{hub.repository}":
-                    return self._send(200, hub.metadata(), {}, with_body)
+                    return self._send(200, hub.metadata(), {})
                 prefix = f"/{hub.repository}/resolve/{COMMIT}/"
                 name = path.removeprefix(prefix)
                 if not path.startswith(prefix) or name not in hub.files:
-                    return self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"}, with_body)
+                    return self._send(404, b"{}", {"X-Error-Code": "RepoNotFound"})
                 content, asked = hub.files[name], self.headers.get("Range", "")
                 etag = hashlib.sha256(content).hexdigest()
                 hub.requested.append((self.command, name, asked))
@@ -79,22 +73,23 @@ class FakeHub:
                     first = int(asked.removeprefix("bytes=").partition("-")[0])
                     total = len(content)
                     headers["Content-Range"] = f"bytes {first}-{total - 1}/{total}"
-                    return self._send(206, content[first:], headers, with_body)
-                return self._send(200, content, headers, with_body)
+                    return self._send(206, content[first:], headers)
+                return self._send(200, content, headers)
 
-            def _send(
-                self, status: int, body: bytes, headers: dict[str, str], with_body: bool
-            ) -> None:
+            def do_HEAD(self) -> None:
+                self.do_GET()
+
+            def _send(self, status: int, body: bytes, headers: dict[str, str]) -> None:
                 self.send_response(status)
                 for key, value in {**headers, "Content-Length": str(len(body))}.items():
                     self.send_header(key, value)
                 self.end_headers()
                 name = self.path.rpartition("/")[2]
-                if with_body and name in hub.cut:
+                if self.command == "GET" and name in hub.cut:
                     hub.cut.remove(name)
                     self.wfile.write(body[: len(body) // 2])
                     self.close_connection = True
-                elif with_body:
+                elif self.command == "GET":
                     self.wfile.write(body)
 
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)

@@ -1,7 +1,5 @@
 """A node in the process of the test, publishers on its input topics, and valid messages."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,7 +15,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
 from support.failing_backend import Backend
-from support.nodes import Peer
+from support.nodes import peer
 
 from deworldsg_ros.nodes.graph_node import GraphNode
 from deworldsg_ros.perception import Perception
@@ -132,12 +130,16 @@ def overrides(parameters: dict[str, Any]) -> list[Parameter]:
 
 
 @contextlib.contextmanager
-def alone(make: type[StageNode], parameters: dict[str, Any] | None = None) -> Iterator[Any]:
-    """A node that nobody spins, for its methods."""
+def alone(
+    make: type[StageNode], parameters: dict[str, Any] | None = None, **options: Any
+) -> Iterator[Any]:
+    """A node that nobody spins, in a context of its own: one allows one message type per topic."""
+    if parameters is not None:
+        options["parameter_overrides"] = overrides(parameters)
     context = rclpy.Context()
     rclpy.init(context=context)
     try:
-        node = make(context=context, parameter_overrides=overrides(parameters or {}))
+        node = make(context=context, **options)
         try:
             yield node
         finally:
@@ -147,7 +149,7 @@ def alone(make: type[StageNode], parameters: dict[str, Any] | None = None) -> It
         rclpy.try_shutdown(context=context)
 
 
-class Bench:
+class Bench(contextlib.ExitStack):
     """A node in the process of the test, and a peer with publishers on its input topics.
 
     `parameters` are the node's overrides, by name; `with` closes both.
@@ -161,16 +163,13 @@ class Bench:
         parameters: dict[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        if parameters is not None:
-            options["parameter_overrides"] = overrides(parameters)
-        self.peer = Peer("bench")
-        # The node has its own context, because a context allows one message type per topic.
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self.node = make(context=self._context, **options)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self.peer.also_spin.append(self._executor)
+        super().__init__()
+        self.peer = self.enter_context(peer("bench"))
+        self.node = self.enter_context(alone(make, parameters, **options))
+        self.executor = SingleThreadedExecutor(context=self.node.context)
+        self.executor.add_node(self.node)
+        self.callback(self.executor.shutdown, timeout_sec=1.0)
+        self.peer.also_spin.append(self.executor)
         self._publishers = {
             topic: self.peer.node.create_publisher(kind, topic, qos or reliable(50))
             for topic, kind in topics.items()
@@ -181,12 +180,6 @@ class Bench:
             LIMIT_S,
             "the node to subscribe",
         )
-
-    def __enter__(self) -> Bench:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def send(self, **messages: Any) -> None:
         """Publish messages. A keyword is a topic with __ for /."""
@@ -222,13 +215,6 @@ class Bench:
         self.expect(
             lambda: self.node.health.drops.get(reason, 0) >= before + number, f"a drop of {reason}"
         )
-
-    def close(self) -> None:
-        self._executor.shutdown(timeout_sec=1.0)
-        self.node.close()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self._context)
-        self.peer.close()
 
 
 CAMERA = {
