@@ -25,14 +25,7 @@ STAMP, STAMP_AT = struct.Struct("<iI"), 4
 
 
 class Rig:
-    """The nodes and their camera; `folder` is for everything that the nodes write.
-
-    Attributes:
-        processes: by name.
-        graph: the newest whole graph; None before the first.
-        updates: number of updates so far.
-        values: newest diagnostics of each node, by its name.
-    """
+    """The nodes and their camera; `folder` is for everything that the nodes write."""
 
     def __init__(self, folder: Path) -> None:
         # A domain of its own, and shared memory for images, also outside of pytest.
@@ -40,9 +33,9 @@ class Rig:
         self._folder, self.map_path = folder, folder / "room.map"
         self.processes: dict[str, NodeProcess] = {}
         self.peer = Peer("endurance")
-        self.graph: wire.SceneGraphMessage | None = None
+        self.graph: wire.SceneGraphMessage | None = None  # the newest whole one
         self.updates = 0
-        self.values: dict[str, dict[str, str]] = {}
+        self.values: dict[str, dict[str, str]] = {}  # newest diagnostics of each node
         self._graph_texts = self.peer.collect("/scene_graph", 1, latched=True)
         self._update_texts = self.peer.collect("/scene_graph/updates")
         self._results = self.peer.collect("deworldsg/local_graph")

@@ -134,16 +134,7 @@ def _write_bag_with_tf(folder: Path) -> None:
     camera.write_bag(folder / "bag", sorted(items, key=lambda item: item[2]))
 
 
-def _write_rooms(folder: Path) -> None:
-    sequences.write_room(folder, 2)
-    sequences.write_ground_truth(folder / "data" / "room_0")
-
-
-def _write_replica(folder: Path) -> None:
-    evaluation.write_dataset(folder, {"room_0": ([("chair", 1)], [])})
-    sequences.write_sequence(folder / "data" / "room_0", 2)
-
-
+ONE_ROOM = {"room_0": ([("chair", 1)], [])}
 SCANS = {"a": ([("chair", 1), ("table", 2)], [(1, 2, "near")]), "b": ([("book", 3)], [])}
 
 
@@ -162,11 +153,6 @@ def _read_trajectory(path: Path) -> None:
     found = read_trajectory(path)
     assert len(found) and np.isfinite(found.T_world_cameras).all()
     found.at(stamp_ns(1) + 5, 1, 1, 10**8)
-
-
-def _write_pose_files(folder: Path) -> None:
-    for index in range(2):
-        np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose(index), "%.9g")
 
 
 def _read_ply(path: Path) -> None:
@@ -237,8 +223,12 @@ def _recordings() -> Iterator[Target]:
         "tum": lambda at: camera.write_tum(at / "freiburg1", 2),
         "seven_scenes": lambda at: camera.write_seven_scenes(at / "seq-01", 2),
         "scan_3rscan": lambda at: sequences.write_sequence(at / "scan", 2),
-        "scan_replica": _write_replica,
-        "scan_rooms": _write_rooms,
+        "scan_replica": lambda at: sequences.write_sequence(
+            evaluation.write_dataset(at, ONE_ROOM) / "data" / "room_0", 2
+        ),
+        "scan_rooms": lambda at: sequences.write_ground_truth(
+            sequences.write_room(at, 2) / "data" / "room_0"
+        ),
     }
     for name, write in made.items():
         yield Target(name, write, _read_recording)
@@ -273,7 +263,14 @@ def _others() -> Iterator[Target]:
     }
     for name, write in trajectories.items():
         yield Target(f"trajectory_{name}", write, _read_trajectory, "poses.txt")
-    yield Target("trajectory_folder", _write_pose_files, read_trajectory)
+    yield Target(
+        "trajectory_folder",
+        lambda at: [
+            np.savetxt(at / f"frame-{index:06d}.pose.txt", poses[index], "%.9g")
+            for index in range(2)
+        ],
+        read_trajectory,
+    )
     points = np.random.default_rng(0).random((5, 3))
     for name, form in (("ascii", "ascii"), ("binary", "binary_little_endian")):
         write = partial(evaluation.write_ply, points=points, ids=np.arange(5), form=form)

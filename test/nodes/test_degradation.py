@@ -66,10 +66,6 @@ def objects_after_a_frame(at: Bench) -> int:
     return len(wire.decode(at.texts[-1], wire.FrameGraphMessage).objects)
 
 
-def drops(at: Bench, reason: str) -> int:
-    return int(at.node.health.drops.get(reason, 0))
-
-
 def warns(at: Bench, words: str) -> bool:
     report = at.node.health.report(0.0, at.node.waiting_for(0))
     return report.level == WARN and words in report.message
@@ -84,7 +80,7 @@ def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, re
         assert warns(at, f"the {part.replace('_', ' ')} fails: injected fault")
         # Without detections the frame has no product.
         at.expect(lambda n=products: (at.products() > n) is (part != "detector"), "a product")
-        assert drops(at, f"{part}_error") == count
+        assert at.node.health.drops[f"{part}_error"] == count
     assert objects_after_a_frame(at) > 0
     assert not warns(at, f"the {part.replace('_', ' ')}")
     assert loaded_on == ["auto"]
@@ -94,7 +90,7 @@ def test_a_model_that_raises_is_counted_and_the_node_continues(at, loaded_on, re
 def test_a_segmenter_that_hangs_gives_frames_without_objects(at):
     assert objects_after_a_frame(at) == 0
     assert objects_after_a_frame(at) == 0
-    assert drops(at, "segmenter_error") == 2
+    assert at.node.health.drops["segmenter_error"] == 2
     assert warns(at, "the segmenter has given no result for")
     at.peer.spin_for(HANG_S)
     assert objects_after_a_frame(at) > 0

@@ -3,7 +3,6 @@
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,6 +20,8 @@ from support.nodes_bench import (
     stamped,
     works,
 )
+from support.recordings import encoded
+from support.streams import compressed_depth
 
 from deworldsg_ros.nodes.segmentation_node import SegmentationNode
 from deworldsg_ros.ros import inputs
@@ -29,16 +30,13 @@ from deworldsg_ros.scene.errors import ConfigurationError
 
 
 def compressed_rgb(stamp_ns: int) -> CompressedImage:
-    message = CompressedImage(format="rgb8; jpeg compressed bgr8")
-    message.data = cv2.imencode(".jpg", np.zeros((48, 64, 3), np.uint8))[1].tobytes()
-    return stamped(message, stamp_ns)
+    jpeg = encoded(np.zeros((48, 64, 3), np.uint8), ".jpg")
+    return stamped(CompressedImage(format="rgb8; jpeg compressed bgr8", data=jpeg), stamp_ns)
 
 
-def compressed_depth(stamp_ns: int) -> CompressedImage:
-    message = CompressedImage(format="16UC1; compressedDepth png")
-    png = cv2.imencode(".png", np.full((48, 64), 1500, np.uint16))[1].tobytes()
-    message.data = bytes(12) + png
-    return stamped(message, stamp_ns)
+def depth_png(stamp_ns: int) -> CompressedImage:
+    data = compressed_depth(np.full((48, 64), 1500, np.uint16))
+    return stamped(CompressedImage(format="16UC1; compressedDepth png", data=data), stamp_ns)
 
 
 def odometry(stamp_ns: int, frame_id: str = "odom", child: str = "camera") -> Odometry:
@@ -64,7 +62,7 @@ def send_other(at: Bench, **changes: Any) -> None:
     makers = {
         "rgb__camera_info": camera_info,
         "rgb__image_raw__compressed": compressed_rgb,
-        "depth__image_raw__compressedDepth": compressed_depth,
+        "depth__image_raw__compressedDepth": depth_png,
         "camera__pose": odometry,
     }
     at.send_made(**{**makers, **changes})

@@ -10,6 +10,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
+from support.requirements import required
 
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PROFILES = {"run": ("build", "run", "ros"), "test": ("build", "run", "ros", "test")}
@@ -25,14 +26,6 @@ def locked(root: Path, profile: str, python: str) -> dict[str, Version]:
     versions = {match[1]: Version(match[2]) for match in matches if match}
     assert len(versions) == len(lines)
     return versions
-
-
-def required(root: Path, *extras: str) -> list[Requirement]:
-    """What scripts/requirements.py prints."""
-    script = root / "scripts" / "requirements.py"
-    command = [sys.executable, str(script), *extras]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
-    return [Requirement(line) for line in done.stdout.split()]
 
 
 def known_problems(root: Path, versions: dict[str, Version]) -> list[str]:

@@ -87,13 +87,7 @@ def pixels_of(shot: bytes) -> np.ndarray:
 
 
 class Screen:
-    """The page of the live viewer.
-
-    Args:
-        page: of playwright.
-        viewer: the viewer.
-        labels: the classes of its graph.
-    """
+    """The page of a live viewer, whose graph has the classes `labels`."""
 
     def __init__(self, page: Any, viewer: Any, labels: list[str]) -> None:
         self.page, self.viewer = page, viewer

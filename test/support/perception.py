@@ -18,12 +18,7 @@ CAMERA_HEIGHT_M = 1.5
 
 @dataclass
 class Slab:
-    """An axis-aligned box. Its frame has z up and its origin on the floor below the camera.
-
-    Attributes:
-        low, high: (3,) metres; x right, y forward, z up.
-        colour: RGB.
-    """
+    """An axis-aligned box, metres: x right, y forward, z up, from the floor below the camera."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
