@@ -61,8 +61,8 @@ def test_every_way_to_a_result_gives_the_same_numbers(root, tmp_path):
     found = evaluate_graph(annotations, "room_0", graph, ProtocolOptions())
     assert found == (outcome.result, outcome.measures)
     prediction = to_prediction(translate(graph, annotations), annotations.vocabulary)
-    write_predictions(tmp_path / "p.json", {"room_0": prediction}, 3, 3)
-    (again,) = evaluate_predictions(annotations, read_predictions(tmp_path / "p.json")).scans
+    write_predictions(tmp_path / "p.pkl", {"room_0": prediction})
+    (again,) = evaluate_predictions(annotations, read_predictions(tmp_path / "p.pkl")).scans
     assert again.matching == outcome.result.matching
     assert again.relationship_ranks == outcome.result.relationship_ranks
     assert load_config(tmp_path / "out" / "room_0" / "config.yaml") == CONFIG

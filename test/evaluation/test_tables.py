@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -20,6 +19,7 @@ from deworldsg_ros.config import Config, MergingConfig, load_config
 from deworldsg_ros.evaluation import tables
 from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
+from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.rows import (
     ABLATION_3DSSG,
     MAIN_3DSSG,
@@ -149,8 +149,8 @@ def test_the_main_table(root, tmp_path):
     run_job(job(root, tmp_path / "before"))
     graph = read_graph(tmp_path / "before" / "room_0")
     vocabulary = Vocabulary(("book", "chair", "table"), ("near", "on", "under"))
-    write_predictions(tmp_path / "p.json", {"room_0": to_prediction(graph, vocabulary)}, 3, 3)
-    other = ("--predictions", f"SGFN={tmp_path / 'p.json'}")
+    write_predictions(tmp_path / "p.pkl", {"room_0": to_prediction(graph, vocabulary)})
+    other = ("--predictions", f"SGFN={tmp_path / 'p.pkl'}")
     rows, text = table(root, "main", out, *other)
     assert list(rows) == ["fross", "kim", "paper_rules", "default", "SGFN"]
     assert rows["default"]["title"] == "default: recorded detections, embedded world model"
@@ -303,18 +303,11 @@ def test_the_printed_numbers_are_in_the_paper(shared_dir):
         assert f"{value:.2f}ms" in text.replace("~", "").replace("\\", "")
 
 
-def write_released(path, scans, right):
-    """Predictions with the right classes in the first `right` scans, as the release stores them."""
-    content = {
-        scan: {
-            "pcd": [segment(1).astype(np.float32), segment(2).astype(np.float32)],
-            "cls": np.array([one_hot(1 if number < right else 0), one_hot(2)], np.float32),
-            "edge_index": np.array([[0], [1]]),
-            "edge_cls": np.array([one_hot(0)], np.float32),
-        }
-        for number, scan in enumerate(scans)
-    }
-    path.write_bytes(pickle.dumps(content))
+def released(is_right):
+    """A prediction with the right classes or one wrong class."""
+    classes = np.array([one_hot(1 if is_right else 0), one_hot(2)], np.float32)
+    points = (segment(1), segment(2))
+    return ScanPrediction(points, classes, np.array([[0, 1]]), np.array([one_hot(0)]))
 
 
 @pytest.mark.parametrize(
@@ -332,7 +325,7 @@ def test_released_predictions_stand_below_the_row_of_the_paper(
     scan = ((("chair", 1), ("table", 2)), ((1, 2, "near"),))
     data = write_dataset(tmp_path / "data", dict.fromkeys(sorted(scans), scan), layout=layout)
     file, out = tmp_path / "deworldsg_predictions.pkl", tmp_path / "out"
-    write_released(file, sorted(scans), len(scans) - 1)
+    write_predictions(file, {scan: released(scan != max(scans)) for scan in sorted(scans)})
     options = ("--layout", layout, "--predictions", f"{name}={file}", "--json", out / "t.json")
     result = evaluate(data, "predictions", out, *options)
     assert result.exit_code == 0, result.output

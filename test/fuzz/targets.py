@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pickle
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -168,19 +167,12 @@ PREDICTION = ScanPrediction(
 )
 
 
-def _write_predictions(path: Path) -> None:
-    predictions = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
-    evaluation.write_predictions(path, predictions, 3, 3)
-
-
-def _write_pickle(protocol: int, path: Path) -> None:
-    graph = {
-        "pcd": [points.astype(np.float32) for points in PREDICTION.points_world],
-        "cls": [scores.astype(np.float32) for scores in PREDICTION.class_scores],
-        "edge_index": PREDICTION.edges.T,
-        "edge_cls": PREDICTION.edge_scores.astype(np.float32),
-    }
-    path.write_bytes(pickle.dumps({"a": graph}, protocol))
+_NODES = [{"id": i, "class_probabilities": [0.1, 0.8, 0.1], "points": [[i, 0, 0]]} for i in (0, 1)]
+_EDGES = [{"subject": 0, "object": 1, "predicate_probabilities": [0.7, 0.2, 0.1]}]
+OPEN_PREDICTIONS = {
+    **{"format": "scene graph predictions 1", "num_classes": 3, "num_predicates": 3},
+    "scans": {"a": {"nodes": _NODES, "edges": _EDGES}, "b": {"nodes": [], "edges": []}},
+}
 
 
 def _read_predictions(path: Path) -> None:
@@ -276,11 +268,17 @@ def _others() -> Iterator[Target]:
         write = partial(evaluation.write_ply, points=points, ids=np.arange(5), form=form)
         yield Target(f"ply_{name}", write, _read_ply, "points.ply")
     for protocol in (2, 5):
-        write, name = partial(_write_pickle, protocol), f"predictions_pickle_{protocol}"
+        both = {"a": PREDICTION, "b": ScanPrediction.empty(3, 3)}
+        write = partial(evaluation.write_predictions, predictions=both, protocol=protocol)
+        name = f"predictions_pickle_{protocol}"
         yield Target(name, write, _read_predictions, "predictions.pkl")
     yield Target("safetensors", _write_headers, hub.read_headers, "model.safetensors")
     documents = {
-        "predictions_json": (_write_predictions, _read_predictions, "predictions.json"),
+        "predictions_json": (
+            partial(evaluation.write_json, content=OPEN_PREDICTIONS),
+            _read_predictions,
+            "predictions.json",
+        ),
         "checkpoint_card": (
             lambda path: cards.write_detector_card(path, CARD),
             cards.read_detector_card,

@@ -1,11 +1,11 @@
 """Tiny data sets in the official layouts."""
 
 import json
+import pickle
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from deworldsg_ros.evaluation.predictions import ScanPrediction
@@ -113,32 +113,16 @@ def one_hot(index: int) -> list[float]:
 
 
 def write_predictions(
-    path: Path,
-    predictions: Mapping[str, ScanPrediction],
-    class_count: int,
-    predicate_count: int,
+    path: Path, predictions: Mapping[str, ScanPrediction], protocol: int | None = None
 ) -> None:
+    """Write predictions as FROSS does, in a pickle."""
     scans = {
         scan: {
-            "nodes": [
-                {"id": row, "class_probabilities": scores, "points": points.tolist()}
-                for row, (scores, points) in enumerate(
-                    zip(prediction.class_scores.tolist(), prediction.points_world)
-                )
-            ],
-            "edges": [
-                {"subject": subject, "object": object_, "predicate_probabilities": scores}
-                for (subject, object_), scores in zip(
-                    prediction.edges.tolist(), prediction.edge_scores.tolist()
-                )
-            ],
+            "pcd": list(prediction.points_world),
+            "cls": prediction.class_scores,
+            "edge_index": prediction.edges.T,
+            "edge_cls": prediction.edge_scores,
         }
         for scan, prediction in predictions.items()
     }
-    content = {
-        "format": "scene graph predictions 1",
-        "num_classes": class_count,
-        "num_predicates": predicate_count,
-        "scans": scans,
-    }
-    path.write_bytes(msgspec.json.encode(content))
+    path.write_bytes(pickle.dumps(scans, protocol))

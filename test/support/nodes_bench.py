@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -14,6 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import String
+from support import merging
 from support.failing_backend import Backend
 from support.nodes import peer
 
@@ -22,9 +24,11 @@ from deworldsg_ros.perception import Perception
 from deworldsg_ros.ros import models
 from deworldsg_ros.ros.node import StageNode
 from deworldsg_ros.ros.qos import reliable
+from deworldsg_ros.scene.frame_graph import Vocabulary
 from deworldsg_ros.streams.images import fill_image
 from deworldsg_ros.streams.poses import set_stamp
 from deworldsg_ros.wire import messages as wire
+from deworldsg_ros.wire.codec import local_graph_to_message
 
 WIDTH, HEIGHT = 64, 48
 STEP_NS = 100 * 10**6
@@ -88,35 +92,19 @@ def frame_graph(stamp_ns: int) -> wire.FrameGraphMessage:
     )
 
 
-def local_graph(stamp_ns: int) -> wire.LocalGraphMessage:
-    return wire.LocalGraphMessage(
-        **schema(wire.LocalGraphMessage, stamp_ns, "map"),
-        width=WIDTH,
-        height=HEIGHT,
-        T_world_camera=np.eye(4).ravel().tolist(),
-        objects=[
-            wire.LiftedObject(
-                instance=1,
-                box_xyxy=[1.0, 1.0, 9.0, 9.0],
-                score=0.9,
-                class_probabilities=[0.9, 0.1],
-                mean_m=[0.0, 0.0, 1.0],
-                covariance_m2=(0.01 * np.eye(3)).ravel().tolist(),
-                depth_m=1.0,
-                pixel_count=50,
-            )
-        ],
-        relations=[],
+def local_graph(
+    stamp_ns: int, count: int = 1, predicates: tuple[str, ...] = ("on",)
+) -> wire.LocalGraphMessage:
+    """A chair, and a cup beside it if there are two."""
+    graph = merging.local_graph(
+        stamp_ns,
+        np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])[:count],
+        np.tile(0.01 * np.eye(3), (count, 1, 1)),
+        np.array([[0.9, 0.1], [0.1, 0.9]])[:count],
+        vocabulary=Vocabulary(("chair", "cup"), predicates),
+        frame_id="map",
     )
-
-
-def two_objects(stamp_ns: int) -> wire.LocalGraphMessage:
-    message = local_graph(stamp_ns)
-    message.predicates = ["on", "under", "near"]
-    (chair,) = message.objects
-    cup = {"instance": 2, "class_probabilities": [0.1, 0.9], "mean_m": [0.1, 0.0, 1.0]}
-    message.objects.append(msgspec.structs.replace(chair, **cup))
-    return message
+    return local_graph_to_message(replace(graph, width=WIDTH, height=HEIGHT))
 
 
 def evidence(stamp_ns: int) -> wire.RelationEvidenceMessage:
@@ -244,7 +232,8 @@ def send_frame(at: Bench, **changes: Any) -> None:
 def send_pair(at: Bench) -> int:
     """Send an image and a local graph of two objects; returns their stamp."""
     stamp_ns = at.next_stamp()
-    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=two_objects(stamp_ns))
+    pair = local_graph(stamp_ns, 2, ("on", "under", "near"))
+    at.send(rgb__image_raw=rgb(stamp_ns), deworldsg__local_graph=pair)
     return stamp_ns
 
 
