@@ -46,7 +46,6 @@ ALL_IS_WELL = {
     [
         ({}, None, ""),
         (ALL_IS_WELL, None, ""),
-        ({"found_nodes": False}, "no_nodes", "ROS_DOMAIN_ID"),
         ({"silent": {"/rgb": ("/camera/color",)}}, "no_publisher", "/camera/color"),
         ({"silent": {"/rgb": ()}}, "no_publisher", "Start the driver"),
         ({"behind_s": {"/odom": 0.3, "/pose": 3600.0}}, "clock", "/pose are 3600 s beh"),

@@ -1,8 +1,4 @@
-"""`python -m endurance.soak [MINUTES]`: memory and times of long runs.
-
-Three parts: the nodes with an endless replay; the graph under a camera that stands still; the graph
-of a robot that goes through many rooms.
-"""
+"""`python -m endurance.soak [MINUTES]`: memory and times of long runs."""
 
 from __future__ import annotations
 
@@ -179,7 +175,7 @@ def problems_of_replay(minutes: float) -> Iterator[str]:
 
 def main() -> int:
     """Returns 1 if the memory or the times grow."""
-    parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="scripts/soak", description=__doc__)
     parser.add_argument("minutes", nargs="?", type=float, default=60.0, help="of replay; 0 = none")
     parser.add_argument("--frames", type=int, default=100_000, help="of the still camera")
     parser.add_argument("--rooms", type=int, default=300)

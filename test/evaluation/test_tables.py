@@ -17,7 +17,7 @@ from deworldsg_ros.checkpoints.cards import BackboneIdentity, ProbeCard, write_p
 from deworldsg_ros.cli.configuration import effective_config
 from deworldsg_ros.config import Config, MergingConfig, load_config
 from deworldsg_ros.evaluation import tables
-from deworldsg_ros.evaluation.front_ends import Faults, FrontEndChoice
+from deworldsg_ros.evaluation.front_ends import FrontEndChoice
 from deworldsg_ros.evaluation.pose_sources import KINDS, PoseSource, repose
 from deworldsg_ros.evaluation.predictions import ScanPrediction
 from deworldsg_ros.evaluation.rows import (
@@ -209,12 +209,6 @@ TRUE_POSES = [PoseSource()]
 
 def rows_of(kind, poses=TRUE_POSES, files=UNCHANGED, front_end="backend"):
     return {row.name: row for row in table_rows(kind, poses, FrontEndChoice(front_end), files)}
-
-
-def test_each_condition_applies_to_its_rows():
-    hard = rows_of("hard", front_end="recorded")
-    assert hard["paper_rules-label"].front_end.faults == Faults(label=0.1)
-    assert hard["paper_rules-jitter"].poses.noise.jitter_deg == 1.0
 
 
 @pytest.mark.parametrize("kind", TABLES)

@@ -19,14 +19,9 @@ class Target:
     DeWorldSGError. Everything else is a failure: other exceptions (also AssertionError,
     for content that should not have been accepted), too much memory or time, a dead process.
 
-    Attributes:
-        name: of the folder of its corpus.
-        make: writes the good files into an empty folder, or the file.
-        read: reads the folder or the file, uses what it read as the program does, and asserts what
-            the schema promises.
-        file: the name of the file; empty = the whole folder.
-        documents: whole contents of the files as a hypothesis strategy; None = mutations only.
-        weight: number of cases in proportion to other targets.
+    `make` writes the good files into an empty folder, or the one `file`. `read` uses what it read
+    as the program does, and asserts what the schema promises. `documents` are whole contents as a
+    strategy, besides mutations; `weight` is the number of cases in proportion to other targets.
     """
 
     name: str

@@ -47,12 +47,9 @@ def run(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str
 
 def copy_sources(root: Path, target: Path) -> Path:
     """A copy, because both builders leave files beside what they build."""
-    ignore = shutil.ignore_patterns("__pycache__")
     for name in SOURCES:
-        if (root / name).is_dir():
-            shutil.copytree(root / name, target / name, ignore=ignore)
-        else:
-            shutil.copy2(root / name, target / name)
+        copy = shutil.copytree if (root / name).is_dir() else shutil.copy2
+        copy(root / name, target / name)
     return target
 
 

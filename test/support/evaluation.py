@@ -63,11 +63,7 @@ def write_dataset(
     layout: str = "replica",
     split_scans: Sequence[str] | None = None,
 ) -> Path:
-    """Write a data set and return its root.
-
-    A scan is a list of objects (label, id) and a list of relations (subject, object, predicate).
-    `surface` contains the points of an object.
-    """
+    """Write scans, each of objects (label, id) and relations (subject, object, predicate)."""
     lists, objects, relations, mapping, keys = NAMES[layout]
     labels = {name: name for name in CLASSES} | {"wall": "wall"}
     write_json(root / mapping, dict(zip(keys, (labels, CLASSES, PREDICATES))))

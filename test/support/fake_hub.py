@@ -17,19 +17,13 @@ def git_blob(content: bytes) -> str:
 
 
 class FakeHub:
-    """Serves the files of one model; weights are large files with a SHA-256.
-
-    Attributes:
-        requested: method, file and range of each download.
-        damaged: names of files that are served with one wrong byte.
-        cut: names of files whose next download ends in the middle.
-    """
+    """Serves the files of one model; weights are large files with a SHA-256."""
 
     def __init__(self, repository: str, files: dict[str, bytes], licence: str = "mit") -> None:
         self.repository, self.files, self.licence = repository, files, licence
-        self.requested: list[tuple[str, str, str]] = []
-        self.damaged: set[str] = set()
-        self.cut: set[str] = set()
+        self.requested: list[tuple[str, str, str]] = []  # method, file and range
+        self.damaged: set[str] = set()  # names of files that are served with one wrong byte
+        self.cut: set[str] = set()  # names of files whose next download ends in the middle
         self.url = ""
 
     def metadata(self) -> bytes:
