@@ -2,8 +2,8 @@
 
 import sys
 from collections import Counter
+from itertools import islice
 
-import cv2
 import numpy as np
 import pytest
 from support import failing_backend
@@ -24,6 +24,7 @@ from deworldsg_ros.config import PerceptionConfig
 from deworldsg_ros.perception import Detections, Perception, build_perception
 from deworldsg_ros.perception.backends.geometric import GeometricRelationHead
 from deworldsg_ros.perception.backends.rgbd import RgbdSegmenter
+from deworldsg_ros.recordings.recording import open_recording
 from deworldsg_ros.ros.health import REASONS
 from deworldsg_ros.scene.camera import Intrinsics, RgbdFrame
 from deworldsg_ros.scene.errors import ConfigurationError, RefusedInput
@@ -205,23 +206,11 @@ def test_names_of_a_model_that_no_message_may_contain_are_refused(names, offende
         Perception(detector, RgbdSegmenter(), GeometricRelationHead(("on",)), PerceptionConfig())
 
 
-KINECT = Intrinsics(528.408586, 528.408586, 320.3179, 236.720192, 640, 480)
-
-
-def kinect_frame(path):
-    rgb = cv2.cvtColor(cv2.imread(f"{path}.color.jpg"), cv2.COLOR_BGR2RGB)
-    depth_m = cv2.imread(f"{path}.depth.png", cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000
-    return RgbdFrame(0, rgb, depth_m, KINECT, np.loadtxt(f"{path}.pose.txt"))
-
-
 def test_the_objects_of_the_kitchen_and_cups_on_the_table_are_found(shared_dir):
-    folder = shared_dir / "data" / "redkitchen"
-    if not folder.is_dir():
-        pytest.skip("no recording of the kitchen")
+    recording = open_recording(shared_dir / "data" / "redkitchen")
     perception = build_perception(PerceptionConfig())
     frames_with, cups, predicates = Counter(), 0, Counter()
-    for number in range(240, 500, 20):
-        seen = kinect_frame(folder / f"frame-{number:06d}")
+    for seen in islice(recording.frames(), 60, 125, 5):
         found = perception.perceive(seen)
         graph = found.frame_graph
         names = [graph.vocabulary.classes[k] for k in graph.class_probabilities.argmax(1)]

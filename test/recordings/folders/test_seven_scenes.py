@@ -36,15 +36,6 @@ def test_registered_frames_with_their_times_and_poses(tmp_path, options, step_ns
         assert np.abs(frame.rgb.astype(int) - rgb_pixels(index)).mean() < 4  # JPEG
 
 
-@pytest.mark.slow
-def test_the_real_kitchen_is_read_whole(shared_dir):
-    frames, recording = frames_of(shared_dir / "data" / "redkitchen")
-    assert len(frames) == 250
-    assert not recording.drops
-    assert frames[0].rgb.shape == (480, 640, 3)
-    assert 0.4 < np.median(frames[0].depth_m[frames[0].depth_m > 0]) < 4
-
-
 # The original layout: a wall at a known distance, seen by the Kinect's two cameras.
 
 SIZE = (640, 480)
