@@ -107,10 +107,7 @@ def test_endpoints_that_cannot_be_used_are_refused_in_one_line(endpoint, opened)
 
 
 class Network:
-    """A Zenoh session: the names of robots that are there, and the logs of those that answer.
-
-    A log may be an exception, which is raised. `asked` has the names of the robots that were asked.
-    """
+    """A Zenoh session: who is there, the logs of those that answer, and who was asked."""
 
     def __init__(self):
         self.tokens, self.logs, self.asked = [], {}, []

@@ -66,14 +66,11 @@ def broken_links(page: Path, text: str) -> list[str]:
 
 
 def missing_files(text: str) -> list[str]:
-    """Source files named in backticks that the repository does not contain.
-
-    A name may leave out leading folders: `lifting/stage.py`, `stage.py`. Names with a placeholder
-    in capitals (`NAME.py`) are not checked.
-    """
+    """Source files named in backticks, perhaps without leading folders, that do not exist."""
     ends = {"/".join(path.parts[start:]) for path in tracked() for start in range(len(path.parts))}
     words = [word for code in CODE.findall(FENCE.sub("", text)) for word in code.split()]
     names = [word for word in words if SOURCE_PATH.fullmatch(word)]
+    # Not names with a placeholder in capitals (`NAME.py`).
     checked = [re.sub(r"^(\.\./)+", "", name) for name in names if not Path(name).stem.isupper()]
     return [name for name in checked if name not in ends | ELSEWHERE]
 

@@ -272,17 +272,18 @@ def graph(stamp_ns: int) -> Any:
     return SimpleNamespace(stamp_ns=stamp_ns)
 
 
-def instances(stamp_ns: int) -> Any:
-    return image(np.zeros((6, 8), np.uint16), "mono16", stamp_ns)
-
-
 @given(st.permutations([0] * 3 + [1] * 3 + [2] * 3 + [3] * 3 + [4]))
 def test_lifting_frames_do_not_depend_on_interleaving(order):
-    assembler = LiftingAssembler(INPUTS)
+    assembler, nothing = LiftingAssembler(INPUTS), np.zeros((6, 8), np.uint16)
     stamps = [T0 + step * PERIOD for step in range(3)]
     streams = [
         iter([lambda at=at: assembler.add_frame_graph(graph(at)) for at in stamps]),
-        iter([lambda at=at: assembler.add_instances(instances(at), at) for at in stamps]),
+        iter(
+            [
+                lambda at=at: assembler.add_instances(image(nothing, "mono16", at), at)
+                for at in stamps
+            ]
+        ),
         iter([lambda at=at: assembler.add_depth(depth(at), at) for at in stamps]),
         iter([lambda at=at: assembler.add_pose(pose(at, (at - T0) * 1e-7), at) for at in stamps]),
         iter([lambda: assembler.add_camera_info(camera_info(), T0)]),

@@ -237,17 +237,13 @@ def send_pair(at: Bench) -> int:
     return stamp_ns
 
 
-def fake_perception(patch: pytest.MonkeyPatch) -> Backend:
+def fake_perception(patch: pytest.MonkeyPatch) -> None:
     """Nodes are made with this test double of all models."""
-    backend = Backend()
     patch.setattr(
         models,
         "build_perception",
-        lambda config, *, world_up: Perception(
-            backend, backend, backend, config, world_up=world_up
-        ),
+        lambda config, **options: Perception(*[Backend()] * 3, config, **options),
     )
-    return backend
 
 
 def works(at: Bench, send: Callable[[], None]) -> None:
