@@ -20,6 +20,7 @@ def calls():
         count += event in ("call", "c_call")
 
     before = sys.getprofile()
+    merge(rooms(1, 20), 5)  # loading compiled kernels ends the profile
     sys.setprofile(note)
     yield lambda: count
     sys.setprofile(before)
