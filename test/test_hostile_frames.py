@@ -146,7 +146,7 @@ def test_the_largest_sums_of_logits_are_published_and_saved(config: Config, tmp_
     for stamp_ns in range(1, 5):
         builder.integrate(replace(local, stamp_ns=stamp_ns * 10**8, relations=relations))
         check_published(builder, replica)
-    (pair,) = builder.graph.edges
+    pair = next(iter(builder.graph.edges))
     for _ in range(2000):  # as such frames would
         builder.graph.add_visual(*pair, logits.sum(axis=0), 1)
     check_map(builder, config, tmp_path / "a.map")
