@@ -31,9 +31,6 @@ def content(graph: GlobalGraph) -> dict[str, bytes]:
     return {name: values.tobytes() for name, values in graph_files.to_arrays(graph.state()).items()}
 
 
-# --- ids -----------------------------------------------------------------------------------------
-
-
 def test_an_empty_graph() -> None:
     graph = GlobalGraph(VOCABULARY, "world")
     assert len(graph) == 0 and graph.nodes.means.shape == (0, 3)
@@ -109,9 +106,6 @@ def test_a_new_merge_of_a_node_that_no_remembered_frame_shows_is_not_forgotten()
     ids.remember_frame(0, [2])
     assert len(ids.state().successors) < PRUNE_ABOVE
     assert ids.resolve(1) == 2
-
-
-# --- nodes ---------------------------------------------------------------------------------------
 
 
 def test_observing_many_is_observing_each() -> None:

@@ -93,8 +93,6 @@ def test_the_intrinsics_option_implies_registered_depth(tmp_path):
     assert (frames[0].depth_m[240] > 0).all()
 
 
-# --- depth projected into the colour camera ----------------------------------------------------
-
 CAMERA = Intrinsics(50.0, 50.0, 19.5, 14.5, 40, 30)
 
 
