@@ -91,8 +91,8 @@ class GraphTools:
 
         Args:
             question: e.g. "cup on dining table", "chair within 0.5 m of table and near window",
-                "anything near (1, 2, 0.5) within 1 m", "how many cups", "largest plant", "is the bear
-                on the sofa". Names of classes may be synonyms; `notes` tell how they were taken.
+                "anything near (1, 2, 0.5) within 1 m", "how many cups", "largest plant",
+                "is the bear on the sofa". `notes` tell how the name of a class was taken.
         """
         graph = self._graph()
         return {**_about(graph), **ask(graph, question).to_dict()}
